@@ -1,0 +1,1 @@
+"""Diagnosis of electrohydraulic actuators from a short built-in test."""

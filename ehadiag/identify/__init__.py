@@ -1,0 +1,1 @@
+"""Identification: first approximation, genetic algorithm, refinement, uncertainty."""

@@ -1,0 +1,119 @@
+"""The project's one compiler decorator: numba options, and a cache that cannot go stale.
+
+numba's own file cache does not see edits in another module that a kernel inlines, and finds no
+place to write in a read-only installation without HOME. Here every compiled kernel lives in one
+folder keyed by the versions of the compiler and a hash of *all* kernel sources.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import caching
+
+__all__ = ["cache_folder", "kernel"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+KERNEL_FOLDERS = ("ehadiag/model", "ehadiag/identify", "ehadiag_sim")
+
+
+def kernel(function: F) -> F:
+    """Compile on first call: no interpreter lock, IEEE division, cached on disk."""
+    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    if hasattr(dispatcher, "enable_caching"):  # absent with NUMBA_DISABLE_JIT=1
+        dispatcher._cache = _KernelCache(function)
+    return dispatcher
+
+
+@cache
+def cache_folder() -> Path:
+    """Return the folder of compiled kernels, created if need be.
+
+    `EHADIAG_CACHE_DIR`, else the user's cache folder, else a folder of this user's own below the
+    system's temporary folder.
+    """
+    leaf = f"kernels-{_digest()}"
+    candidates = []
+    if named := os.environ.get("EHADIAG_CACHE_DIR"):
+        candidates.append(Path(named))
+    if xdg := os.environ.get("XDG_CACHE_HOME"):
+        candidates.append(Path(xdg) / "ehadiag")
+    if home := os.environ.get("HOME"):
+        candidates.append(Path(home) / ".cache" / "ehadiag")
+    owner = os.getuid() if hasattr(os, "getuid") else "user"
+    candidates.append(Path(tempfile.gettempdir()) / f"ehadiag-{owner}")
+    for folder in candidates:
+        if _usable(folder / leaf):
+            return folder / leaf
+    return Path(tempfile.mkdtemp(prefix="ehadiag-"))
+
+
+def _usable(folder: Path) -> bool:
+    """Create the folder; it must be writable and, as it holds code, nobody else's."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        info = folder.stat()
+    except OSError:
+        return False
+    ours = not hasattr(os, "getuid") or info.st_uid == os.getuid()
+    return ours and os.access(folder, os.W_OK)
+
+
+@cache
+def _digest() -> str:
+    """Hash of compiler versions and of every kernel source that is installed."""
+    digest = hashlib.sha256()
+    for part in (sys.version, np.__version__, numba.__version__, llvmlite.__version__):
+        digest.update(part.encode())
+    for folder in KERNEL_FOLDERS:
+        for root in dict.fromkeys((Path(__file__).parent.parent, *map(Path, sys.path))):
+            sources = sorted((root / folder).glob("*.py"))
+            for source in sources:
+                digest.update(source.name.encode())
+                digest.update(source.read_bytes())
+            if sources:
+                break
+    return digest.hexdigest()[:16]
+
+
+class _Locator:
+    """Tells numba where one function's index and machine code go."""
+
+    def __init__(self, function: Callable[..., Any], source: str) -> None:
+        self._lineno = function.__code__.co_firstlineno
+        self._source = source
+
+    def ensure_cache_path(self) -> None:
+        cache_folder().mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder())
+
+    def get_source_stamp(self) -> str:
+        return _digest()
+
+    def get_disambiguator(self) -> str:
+        return f"{Path(self._source).parent.name}-{self._lineno}"
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], source: str) -> _Locator:
+        return cls(function, source)
+
+
+class _KernelCacheImpl(caching.CompileResultCacheImpl):
+    _locator_classes = (_Locator,)
+
+
+class _KernelCache(caching.FunctionCache):
+    _impl_class = _KernelCacheImpl

@@ -1,0 +1,1 @@
+"""Monitoring model: a fast model of the actuator for identification and monitoring."""

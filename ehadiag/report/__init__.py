@@ -1,0 +1,1 @@
+"""Verdict, machine-readable and human-readable results."""

@@ -1,0 +1,1 @@
+"""Acquisition over CAN and serial links: frames in, validated and aligned samples out."""

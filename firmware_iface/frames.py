@@ -1,0 +1,92 @@
+"""Frames as they come from a bus or a recording: one at a time, and in bulk as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["MAX_PAYLOAD", "Frame", "FrameTable"]
+
+MAX_PAYLOAD = 64
+"""Bytes of the longest payload (CAN FD)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One data or error frame.
+
+    Attributes
+    ----------
+    time_ns: host time stamp, ns since the epoch (or since the start of a log without a date).
+    can_id: identifier, 11 or 29 bits, without flag bits.
+    data: payload, 0 to 64 bytes.
+    extended: 29-bit identifier.
+    fd: CAN FD frame.
+    error: error frame; identifier and payload then carry no message.
+    remote: remote request; carries no payload.
+    sent: transmitted by this program (own echo), not received.
+    """
+
+    time_ns: int
+    can_id: int
+    data: bytes
+    extended: bool = False
+    fd: bool = False
+    error: bool = False
+    remote: bool = False
+    sent: bool = False
+
+    def __post_init__(self) -> None:
+        limit = 0x1FFFFFFF if self.extended else 0x7FF
+        if not 0 <= self.can_id <= limit and not self.error:
+            raise ValueError(f"identifier {self.can_id:#x} outside 0 … {limit:#x}")
+        if len(self.data) > MAX_PAYLOAD:
+            raise ValueError(f"payload of {len(self.data)} bytes, at most {MAX_PAYLOAD}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTable:
+    """Many frames as columns, in order of arrival; n rows.
+
+    Attributes
+    ----------
+    time_ns: int64, shape (n,).
+    can_id: uint32, shape (n,).
+    length: uint8, payload bytes, shape (n,).
+    data: uint8, shape (n, width), zero beyond `length`; width 8, or 64 where a frame is longer.
+    extended, fd, error, remote, sent: bool, shape (n,).
+    """
+
+    time_ns: NDArray[np.int64]
+    can_id: NDArray[np.uint32]
+    length: NDArray[np.uint8]
+    data: NDArray[np.uint8]
+    extended: NDArray[np.bool_]
+    fd: NDArray[np.bool_]
+    error: NDArray[np.bool_]
+    remote: NDArray[np.bool_]
+    sent: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    @classmethod
+    def from_frames(cls, frames: Iterable[Frame]) -> FrameTable:
+        """Collect frames into columns."""
+        rows = list(frames)
+        width = 8 if all(len(row.data) <= 8 for row in rows) else MAX_PAYLOAD
+        packed = b"".join(row.data.ljust(width, b"\0") for row in rows)
+        return cls(
+            time_ns=np.array([row.time_ns for row in rows], dtype=np.int64),
+            can_id=np.array([row.can_id for row in rows], dtype=np.uint32),
+            length=np.array([len(row.data) for row in rows], dtype=np.uint8),
+            data=np.frombuffer(packed, dtype=np.uint8).reshape(len(rows), width),
+            extended=np.array([row.extended for row in rows], dtype=np.bool_),
+            fd=np.array([row.fd for row in rows], dtype=np.bool_),
+            error=np.array([row.error for row in rows], dtype=np.bool_),
+            remote=np.array([row.remote for row in rows], dtype=np.bool_),
+            sent=np.array([row.sent for row in rows], dtype=np.bool_),
+        )
