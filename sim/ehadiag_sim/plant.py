@@ -1,0 +1,229 @@
+"""The detailed actuator simulator: plant, sensors and control law, tick by tick or a whole test."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.actuator import Actuator
+from ehadiag.channels import CHANNELS, POSITION
+from ehadiag.errors import ConfigurationError
+from ehadiag.recording import (
+    BitState,
+    CommandMode,
+    Environment,
+    MessageCounts,
+    Outcome,
+    Quality,
+    Recording,
+    Samples,
+)
+from ehadiag.storedtest import StoredTest
+from ehadiag_sim.coefficients import coefficients
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.controller import PositionController
+from ehadiag_sim.kernels import P12, STATES, XJ, XS, step_tick
+
+__all__ = ["DEFAULT_STEP", "Plant", "SimulatedRun", "respond", "simulate"]
+
+DEFAULT_STEP = 0.25e-6
+"""Integration step, s."""
+SHORTEST_STEP = 1e-9
+
+
+class Plant:
+    """One actuator with its converters and control law, at rest in the middle to begin with.
+
+    In each tick the control law works on the jack position that was digitised at the end of the
+    tick before, its current is held for the tick, and at the end all channels are digitised.
+
+    Raises
+    ------
+    ConfigurationError: a step that is not finite or not within 1 ns … one tick.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        faults: Faults | None = None,
+        effects: Effects | None = None,
+        sensors: Sensors | None = None,
+        seed: int = 0,
+        step: float = DEFAULT_STEP,
+    ) -> None:
+        self._coefficients = coefficients(actuator, faults or Faults(), effects or Effects())
+        self._sensors = sensors or Sensors()
+        self._offsets = np.array(self._sensors.offsets_lsb)
+        self._noise = np.random.default_rng(seed)
+        self._controller = PositionController(actuator.controller)
+        self._substeps, self._step = _substeps(actuator.controller.rate, step)
+        self._state = np.zeros(STATES)
+        self._current = 0.0
+        self._codes = self._digitise()
+
+    def tick(self, command: float, mode: CommandMode) -> NDArray[np.int64]:
+        """Advance by one control tick; return the four ADC codes at its end, shape (4,).
+
+        `command` in A (current mode) or m (position mode).
+        """
+        measured = (int(self._codes[3]) - (1 << (POSITION.bits - 1))) * POSITION.lsb
+        self._current = self._controller.current(command, mode, measured)
+        step_tick(self._state, self._coefficients, self._current, self._step, self._substeps)
+        self._codes = self._digitise()
+        return self._codes
+
+    @property
+    def codes(self) -> NDArray[np.int64]:
+        """ADC codes of the last tick (before the first: of the plant at rest), shape (4,)."""
+        return self._codes
+
+    @property
+    def truth(self) -> tuple[float, float, float, float]:
+        """Noise-free current (A), spool (m), pressure (Pa), jack position (m) now."""
+        state = self._state
+        return self._current, float(state[XS]), float(state[P12]), float(state[XJ])
+
+    def _digitise(self) -> NDArray[np.int64]:
+        error = self._offsets + self._sensors.noise_lsb * self._noise.standard_normal(len(CHANNELS))
+        return np.array(
+            [
+                channel.encode(np.float64(value + noise * channel.lsb))
+                for channel, value, noise in zip(CHANNELS, self.truth, error, strict=True)
+            ],
+            dtype=np.int64,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedRun:
+    """One simulated test: the truth and what the converters made of it.
+
+    Attributes
+    ----------
+    test: the stored test that ran.
+    effects: the conditions it ran under.
+    command: command of each tick, A or m, shape (ticks,).
+    current, spool, pressure, position: noise-free A, m, Pa, m at the end of each tick, (ticks,).
+    codes: ADC codes of the four channels at the end of each tick, shape (4, ticks).
+    """
+
+    test: StoredTest
+    effects: Effects
+    command: NDArray[np.float64]
+    current: NDArray[np.float64]
+    spool: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    position: NDArray[np.float64]
+    codes: NDArray[np.int64]
+
+    @property
+    def samples(self) -> Samples:
+        """The samples as a bus without losses delivers them; time stamps from zero."""
+        decoded = [
+            channel.decode(codes) for channel, codes in zip(CHANNELS, self.codes, strict=True)
+        ]
+        ends = np.array([(1 << channel.bits) - 1 for channel in CHANNELS])[:, None]
+        period_ns = round(1e9 / self.test.rate)
+        return Samples(
+            period_ns=period_ns,
+            mode=_mode(self.test),
+            current=decoded[0],
+            spool=decoded[1],
+            pressure=decoded[2],
+            position=decoded[3],
+            command=self.command.copy(),
+            saturated=(self.codes == 0) | (self.codes == ends),
+            host_ns=np.arange(1, self.test.ticks + 1, dtype=np.int64) * period_ns,
+        )
+
+    def recording(self, source: str) -> Recording:
+        """Return the test as an acquisition without a fault would hand it over."""
+        samples = self.samples
+        perfect = MessageCounts(received=samples.ticks, accepted=samples.ticks)
+        counts = samples.saturated.sum(axis=1)
+        return Recording(
+            source=source,
+            samples=samples,
+            test_id=self.test.id,
+            serial=None,
+            outcome=Outcome(state=BitState.COMPLETE),
+            environment=Environment(
+                supply_pressure=self.effects.supply_pressure,
+                return_pressure=self.effects.return_pressure,
+                oil_temperature=self.effects.oil_temperature,
+            ),
+            quality=Quality(
+                messages={"ServoTelemetry": perfect, "ServoCommand": perfect},
+                saturated={c.name: int(n) for c, n in zip(CHANNELS, counts, strict=True)},
+            ),
+        )
+
+
+def simulate(
+    actuator: Actuator,
+    test: StoredTest,
+    faults: Faults | None = None,
+    effects: Effects | None = None,
+    sensors: Sensors | None = None,
+    seed: int = 0,
+    step: float = DEFAULT_STEP,
+) -> SimulatedRun:
+    """Run a stored test from rest; the same seed gives the same run.
+
+    `step` is the integration step in s, shortened so that a whole number makes a tick.
+
+    Raises
+    ------
+    ConfigurationError: a step out of range; test and controller at different rates.
+    """
+    if test.rate != actuator.controller.rate:
+        raise ConfigurationError(
+            f"test {test.name!r} runs at {test.rate:g} Hz, the controller of actuator "
+            f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
+        )
+    effects = effects or Effects()
+    plant = Plant(actuator, faults, effects, sensors, seed, step)
+    command, mode = test.command(), _mode(test)
+    truth = np.empty((4, test.ticks))
+    codes = np.empty((4, test.ticks), dtype=np.int64)
+    for tick, value in enumerate(command.tolist()):
+        codes[:, tick] = plant.tick(value, mode)
+        truth[:, tick] = plant.truth
+    return SimulatedRun(test, effects, command, *truth, codes)
+
+
+def respond(
+    actuator: Actuator,
+    currents: NDArray[np.float64],
+    faults: Faults | None = None,
+    effects: Effects | None = None,
+    step: float = DEFAULT_STEP,
+) -> NDArray[np.float64]:
+    """Noise-free response of the plant alone to given currents (A, one a tick), from rest.
+
+    Returns spool (m), pressure (Pa), jack position (m) at the end of each tick, (3, ticks).
+    """
+    plant = coefficients(actuator, faults or Faults(), effects or Effects())
+    substeps, step = _substeps(actuator.controller.rate, step)
+    state = np.zeros(STATES)
+    out = np.empty((3, len(currents)))
+    for tick, current in enumerate(currents.tolist()):
+        step_tick(state, plant, current, step, substeps)
+        out[:, tick] = state[XS], state[P12], state[XJ]
+    return out
+
+
+def _mode(test: StoredTest) -> CommandMode:
+    return CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+
+
+def _substeps(rate: float, step: float) -> tuple[int, float]:
+    """Whole number of steps in a tick, and their length in s."""
+    period = 1.0 / rate
+    if not (math.isfinite(step) and SHORTEST_STEP <= step <= period):
+        raise ConfigurationError(f"integration step {step:g} s: need 1e-9 … {period:g} s")
+    count = math.ceil(period / step - 1e-6)
+    return count, period / count
