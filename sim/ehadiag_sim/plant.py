@@ -32,6 +32,7 @@ __all__ = ["DEFAULT_STEP", "Plant", "SimulatedRun", "respond", "simulate"]
 DEFAULT_STEP = 0.25e-6
 """Integration step, s."""
 SHORTEST_STEP = 1e-9
+LSB = np.array([channel.lsb for channel in CHANNELS])
 
 
 class Plant:
@@ -52,6 +53,7 @@ class Plant:
         effects: Effects | None = None,
         sensors: Sensors | None = None,
         seed: int = 0,
+        *,
         step: float = DEFAULT_STEP,
     ) -> None:
         self._coefficients = coefficients(actuator, faults or Faults(), effects or Effects())
@@ -69,7 +71,7 @@ class Plant:
 
         `command` in A (current mode) or m (position mode).
         """
-        measured = (int(self._codes[3]) - (1 << (POSITION.bits - 1))) * POSITION.lsb
+        measured = float(POSITION.decode(self._codes[3:])[0])
         self._current = self._controller.current(command, mode, measured)
         step_tick(self._state, self._coefficients, self._current, self._step, self._substeps)
         self._codes = self._digitise()
@@ -87,13 +89,11 @@ class Plant:
         return self._current, float(state[XS]), float(state[P12]), float(state[XJ])
 
     def _digitise(self) -> NDArray[np.int64]:
-        error = self._offsets + self._sensors.noise_lsb * self._noise.standard_normal(len(CHANNELS))
-        return np.array(
-            [
-                channel.encode(np.float64(value + noise * channel.lsb))
-                for channel, value, noise in zip(CHANNELS, self.truth, error, strict=True)
-            ],
-            dtype=np.int64,
+        noise = self._sensors.noise_lsb * self._noise.standard_normal(len(CHANNELS))
+        volts = np.array(self.truth) + (self._offsets + noise) * LSB
+        # One value at a time costs the real-time emulator little; the code stays Channel's own.
+        return np.concatenate(
+            [channel.encode(volts[i : i + 1]) for i, channel in enumerate(CHANNELS)]
         )
 
 
@@ -168,6 +168,7 @@ def simulate(
     faults: Faults | None = None,
     effects: Effects | None = None,
     sensors: Sensors | None = None,
+    *,
     seed: int = 0,
     step: float = DEFAULT_STEP,
 ) -> SimulatedRun:
@@ -185,14 +186,23 @@ def simulate(
             f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
         )
     effects = effects or Effects()
-    plant = Plant(actuator, faults, effects, sensors, seed, step)
+    plant = Plant(actuator, faults, effects, sensors, seed, step=step)
     command, mode = test.command(), _mode(test)
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
     for tick, value in enumerate(command.tolist()):
         codes[:, tick] = plant.tick(value, mode)
         truth[:, tick] = plant.truth
-    return SimulatedRun(test, effects, command, *truth, codes)
+    return SimulatedRun(
+        test=test,
+        effects=effects,
+        command=command,
+        current=truth[0],
+        spool=truth[1],
+        pressure=truth[2],
+        position=truth[3],
+        codes=codes,
+    )
 
 
 def respond(
