@@ -7,6 +7,8 @@ the rest is explicit; dry friction follows Borello's algorithm (model.md section
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,28 +46,23 @@ def play(held: float, value: float, half_width: float) -> float:
 
 @kernel
 def velocity_after(
-    velocity: float,
-    force: float,
-    damping: float,
-    mass: float,
-    static: float,
-    dynamic: float,
-    step: float,
+    momentum: float, force: float, step: float, per_mass: float, static: float, dynamic: float
 ) -> float:
     """Velocity of a mass with dry friction after one step (Borello's algorithm).
 
-    `force` holds everything but dry friction and the viscous force `damping·velocity`, which is
-    implicit. A change of sign within the step stops at exactly zero, so that the next step
-    decides between sticking and breaking away.
+    `momentum` is mass times velocity before, `force` all but dry friction and the viscous force,
+    which is implicit: `per_mass` = 1/(mass + step·viscous coefficient). A change of sign within
+    the step stops at exactly zero, so that the next step decides between sticking and breaking
+    away.
     """
-    if velocity == 0.0:
+    if momentum == 0.0:
         friction = max(-static, min(static, force))
-    elif velocity > 0.0:
+    elif momentum > 0.0:
         friction = dynamic
     else:
         friction = -dynamic
-    after = (velocity + step / mass * (force - friction)) / (1.0 + step / mass * damping)
-    if velocity * after < 0.0:
+    after = (momentum + step * (force - friction)) * per_mass
+    if momentum * after < 0.0:
         return 0.0
     return after
 
@@ -88,45 +85,49 @@ def step_tick(
     p12, ball = state[P12], state[BALL]
     state[MOTOR] = play(state[MOTOR], current, p.HYSTERESIS)
     torque = p.GM * state[MOTOR]
-    flapper_denominator = 1.0 + step / p.JF * p.CF
+    per_flapper = 1.0 / (p.JF + step * p.CF)
+    per_spool = 1.0 / (p.MS + step * p.DAMPING)
+    per_jack_free = 1.0 / (p.MJ + step * p.CJ)
     knee = p.PSR / p.GP
+    stiffness = p.GP / p.GQ
+    share = 1.0 / (1.0 + stiffness * p.CLK)
+    drag = share * stiffness * p.AJ
+    per_jack = 1.0 / (p.MJ + step * (p.AJ * drag + p.CJ))
 
     for _ in range(substeps):
-        dxf = (dxf + step / p.JF * (torque - p.KSF * ball - p.KF * xf)) / flapper_denominator
+        dxf = (p.JF * dxf + step * (torque - p.KSF * ball - p.KF * xf)) * per_flapper
         xf += step * dxf
         if abs(xf) >= p.XFM:
-            xf = p.XFM if xf > 0.0 else -p.XFM
+            xf = math.copysign(p.XFM, xf)
             dxf = 0.0
 
-        dxs = velocity_after(dxs, p.FORCE * xf, p.DAMPING, p.MS, p.FSS, p.FDS, step)
+        dxs = velocity_after(p.MS * dxs, p.FORCE * xf, step, per_spool, p.FSS, p.FDS)
         xs += step * dxs
         if abs(xs) >= p.XSM:
-            xs = p.XSM if xs > 0.0 else -p.XSM
+            xs = math.copysign(p.XSM, xs)
             dxs = 0.0
         ball = play(ball, xs, p.BACKLASH)
 
-        if abs(xs) <= knee:
-            source = p.GP * xs
-            resistance = p.GP / p.GQ
-        else:
-            source = p.PSR if xs > 0.0 else -p.PSR
-            resistance = p.PSR / (p.GQ * abs(xs))
-        g = 1.0 / (1.0 + resistance * p.CLK)
-        drag = g * resistance * p.AJ
-        before = dxj
-        dxj = velocity_after(
-            before, p.AJ * g * source - p.FR, p.AJ * drag + p.CJ, p.MJ, p.FSJ, p.FDJ, step
-        )
-        p12 = g * source - drag * dxj
+        blocked = share * p.GP * xs  # pressure at zero jack velocity
+        slope, per = drag, per_jack
+        if abs(xs) > knee:
+            beyond = p.PSR / (p.GQ * abs(xs))
+            part = 1.0 / (1.0 + beyond * p.CLK)
+            blocked = part * math.copysign(p.PSR, xs)
+            slope = part * beyond * p.AJ
+            per = 1.0 / (p.MJ + step * (p.AJ * slope + p.CJ))
+        momentum = p.MJ * dxj
+        dxj = velocity_after(momentum, p.AJ * blocked - p.FR, step, per, p.FSJ, p.FDJ)
+        p12 = blocked - slope * dxj
         if abs(p12) > p.PSR:
             # A jack driven back against the valve: the pressure cannot exceed the supply.
-            p12 = p.PSR if p12 > 0.0 else -p.PSR
-            dxj = velocity_after(before, p.AJ * p12 - p.FR, p.CJ, p.MJ, p.FSJ, p.FDJ, step)
+            p12 = math.copysign(p.PSR, p12)
+            dxj = velocity_after(momentum, p.AJ * p12 - p.FR, step, per_jack_free, p.FSJ, p.FDJ)
         xj += step * dxj
         if abs(xj) >= p.XJM:
-            xj = p.XJM if xj > 0.0 else -p.XJM
+            xj = math.copysign(p.XJM, xj)
             dxj = 0.0
-            p12 = max(-p.PSR, min(p.PSR, g * source))
+            p12 = blocked
 
     state[XF], state[DXF] = xf, dxf
     state[XS], state[DXS] = xs, dxs

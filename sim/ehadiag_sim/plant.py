@@ -27,11 +27,23 @@ from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.controller import PositionController
 from ehadiag_sim.kernels import P12, STATES, XJ, XS, step_tick
 
-__all__ = ["DEFAULT_STEP", "Plant", "SimulatedRun", "respond", "simulate"]
+__all__ = [
+    "DEFAULT_STEP",
+    "Effects",
+    "Faults",
+    "Plant",
+    "Sensors",
+    "SimulatedRun",
+    "bus_command",
+    "respond",
+    "simulate",
+]
 
 DEFAULT_STEP = 0.25e-6
 """Integration step, s."""
 SHORTEST_STEP = 1e-9
+COMMAND_STEP = {CommandMode.CURRENT: 0.5e-6, CommandMode.POSITION: 2e-6}
+"""Resolution of commands (A, m): the computer acts on what its bus shows (`ServoCommand`)."""
 LSB = np.array([channel.lsb for channel in CHANNELS])
 
 
@@ -105,7 +117,7 @@ class SimulatedRun:
     ----------
     test: the stored test that ran.
     effects: the conditions it ran under.
-    command: command of each tick, A or m, shape (ticks,).
+    command: command of each tick at the bus's resolution, A or m, shape (ticks,).
     current, spool, pressure, position: noise-free A, m, Pa, m at the end of each tick, (ticks,).
     codes: ADC codes of the four channels at the end of each tick, shape (4, ticks).
     """
@@ -187,7 +199,7 @@ def simulate(
         )
     effects = effects or Effects()
     plant = Plant(actuator, faults, effects, sensors, seed, step=step)
-    command, mode = test.command(), _mode(test)
+    command, mode = bus_command(test), _mode(test)
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
     for tick, value in enumerate(command.tolist()):
@@ -203,6 +215,17 @@ def simulate(
         position=truth[3],
         codes=codes,
     )
+
+
+def bus_command(test: StoredTest) -> NDArray[np.float64]:
+    """Command of each tick as the control computer holds it, SI (A or m), shape (ticks,).
+
+    It has the resolution of the bus signal. The reference recordings show this: their currents
+    follow the rounded command, and 2 µm of it are 0.6 LSB of current.
+    """
+    step = COMMAND_STEP[_mode(test)]
+    rounded: NDArray[np.float64] = np.rint(test.command() / step) * step
+    return rounded
 
 
 def respond(
