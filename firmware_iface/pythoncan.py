@@ -1,0 +1,238 @@
+"""Every python-can interface, by its name, as a transport."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from ehadiag.errors import ConfigurationError, EhadiagError, InputOutputError
+from firmware_iface.frames import Frame
+from firmware_iface.transport import Transport
+
+if TYPE_CHECKING:
+    import can
+
+__all__ = ["BusOptions", "PythonCanTransport", "frame_of", "message_of"]
+
+MULTICAST_GROUP = "239.74.163.2"
+"""Default channel of udp_multicast; python-can's own is IPv6 and needs a route few hosts have."""
+MULTICAST_PORT = 43113
+RECEIVE_BUFFER = 4 << 20
+"""Bytes asked of the kernel for a socket's receive buffer: a second of a full bus and more."""
+SEND_TIMEOUT = 0.5
+"""s; a bus that takes no frame for so long is lost."""
+BUS_OFF = 0x40
+"""Bit of SocketCAN's error class (linux/can/error.h, CAN_ERR_BUSOFF)."""
+LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
+    "slcan": {"listen_only": True},
+    "vector": {"listen_only": True},
+    "nixnet": {"listen_only": True},
+    "kvaser": {"driver_mode": False},
+}
+"""Options that silence an adapter. PCAN and Systec take a bus state instead."""
+PASSIVE_STATE = ("pcan", "systec")
+SOCKETCAN_ERRORS = ("socketcan", "virtual", "udp_multicast")
+"""Interfaces whose error frames carry SocketCAN's error class as identifier."""
+NOT_A_FRAME = "could not unpack received message"
+"""What python-can says of a datagram that is none of its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusOptions:
+    """Options of a bus, named as python-can names them; None leaves its default.
+
+    Attributes
+    ----------
+    interface: socketcan, virtual, udp_multicast, slcan, pcan, kvaser, vector, ixxat, …
+    channel: as the interface understands it.
+    bitrate, data_bitrate: bit/s.
+    fd: accept CAN FD frames.
+    app_name: Vector's application name.
+    extra: further keyword arguments of the interface (python-can's `--bus-kwargs`).
+    allow_multicast: let udp_multicast join a group beyond the loopback interface.
+    """
+
+    interface: str
+    channel: str | None = None
+    bitrate: int | None = None
+    data_bitrate: int | None = None
+    fd: bool = False
+    app_name: str | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    allow_multicast: bool = False
+
+
+class PythonCanTransport(Transport):
+    """One python-can bus; see `Transport` for what it promises.
+
+    Raises
+    ------
+    ConfigurationError: unknown interface, missing driver or module, a wrong option, multicast that
+        would leave the machine without leave.
+    InputOutputError: the channel is absent, busy or refused.
+    """
+
+    def __init__(self, options: BusOptions, *, transmit: bool = False) -> None:
+        name = f"{options.interface} {options.channel or ''}".strip()
+        super().__init__(name, transmit=transmit)
+        self._options = options
+        self._bus = _open(options, name, transmit)
+        self._bus_closed = False
+        self._damaged = 0
+
+    def _receive(self, timeout: float) -> Frame | None:
+        try:
+            message = self._bus.recv(timeout)
+        except Exception as error:
+            if str(error) == NOT_A_FRAME:
+                self._damaged += 1
+                self._degrade(f"{self._damaged} datagrams on the group were no CAN frames")
+                return None
+            # Drivers raise what they like; all of it means that this bus gives no more frames.
+            raise self._fail(_one_line(error)) from None
+        if message is None:
+            return None
+        frame = frame_of(message)
+        of_kernel = self._options.interface in SOCKETCAN_ERRORS
+        if frame.error and frame.can_id & BUS_OFF and of_kernel:
+            raise self._fail("bus off; check wiring and bit rate, then restart the interface")
+        return frame
+
+    def _send(self, frame: Frame) -> None:
+        try:
+            self._bus.send(message_of(frame), timeout=SEND_TIMEOUT)
+        except Exception as error:
+            raise self._fail(f"cannot send: {_one_line(error)}") from None
+
+    def _close(self) -> None:
+        if not self._bus_closed:
+            self._bus_closed = True
+            with contextlib.suppress(Exception):
+                self._bus.shutdown()
+
+
+def frame_of(message: can.Message) -> Frame:
+    """Turn a python-can message into a frame.
+
+    Times are rounded to whole microseconds: python-can's float seconds carry no more, and only so
+    a recorded frame reads back with the very stamp it had on the bus.
+    """
+    limit = 0x1FFFFFFF if message.is_extended_id else 0x7FF
+    return Frame(
+        time_ns=round(message.timestamp * 1e6) * 1000,
+        can_id=message.arbitration_id & (0x1FFFFFFF if message.is_error_frame else limit),
+        data=b"" if message.is_remote_frame else bytes(message.data),
+        extended=message.is_extended_id,
+        fd=message.is_fd,
+        error=message.is_error_frame,
+        remote=message.is_remote_frame,
+        sent=not message.is_rx,
+    )
+
+
+def message_of(frame: Frame) -> can.Message:
+    """Turn a frame into a python-can message."""
+    import can  # noqa: PLC0415 - costs half a second
+
+    return can.Message(
+        timestamp=frame.time_ns * 1e-9,
+        arbitration_id=frame.can_id,
+        is_extended_id=frame.extended,
+        is_remote_frame=frame.remote,
+        is_error_frame=frame.error,
+        is_fd=frame.fd,
+        is_rx=not frame.sent,
+        data=frame.data,
+    )
+
+
+def _open(options: BusOptions, name: str, transmit: bool) -> can.BusABC:
+    import can  # noqa: PLC0415 - costs half a second
+
+    arguments = _arguments(options, transmit)
+    if options.interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise ConfigurationError(f"interface {options.interface!r} unknown, need one of {known}")
+    try:
+        bus = can.Bus(**arguments)
+    except EhadiagError:
+        raise
+    except (can.CanInterfaceNotImplementedError, ImportError, NameError) as error:
+        raise ConfigurationError(
+            f"{name}: driver or Python module of the interface is missing: {_one_line(error)}"
+        ) from None
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ConfigurationError(f"{name}: wrong option: {_one_line(error)}") from None
+    except (can.CanError, OSError) as error:
+        raise InputOutputError(
+            f"{name}: cannot open: {_one_line(error)}; is the adapter plugged in, the channel up "
+            "and not in use?"
+        ) from None
+    except Exception as error:
+        raise InputOutputError(f"{name}: cannot open: {_one_line(error)}") from None
+    _widen_buffer(bus)
+    return bus
+
+
+def _arguments(options: BusOptions, transmit: bool) -> dict[str, Any]:
+    arguments: dict[str, Any] = {"interface": options.interface, "ignore_config": True}
+    for key in ("channel", "bitrate", "data_bitrate", "app_name"):
+        value = getattr(options, key)
+        if value is not None:
+            arguments[key] = value
+    if options.fd:
+        arguments["fd"] = True
+    if options.interface == "udp_multicast":
+        arguments |= _multicast(options)
+    if not transmit:
+        arguments |= LISTEN_ONLY.get(options.interface, {})
+        if options.interface in PASSIVE_STATE:
+            arguments["state"] = importlib.import_module("can").BusState.PASSIVE
+    return arguments | dict(options.extra)
+
+
+def _multicast(options: BusOptions) -> dict[str, Any]:
+    """Keep the group on this machine unless the user lets it out.
+
+    Without leave the kernel's own route must be the loopback interface: a hop limit of zero alone
+    keeps frames in, but the group's membership report goes out and foreign frames come in.
+    """
+    group = options.channel or MULTICAST_GROUP
+    port = int(options.extra.get("port", MULTICAST_PORT))
+    if options.allow_multicast:
+        return {"channel": group}
+    family = socket.AF_INET6 if ":" in group else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((group, port))  # asks for the route, sends nothing
+            own = probe.getsockname()[0]
+    except OSError as error:
+        raise InputOutputError(
+            f"udp_multicast {group}: no route to the group: {error.strerror or error}; on "
+            f"loopback: ip link set lo multicast on; ip route add {group} dev lo"
+        ) from None
+    if own != "::1" and not own.startswith("127."):
+        raise ConfigurationError(
+            f"udp_multicast {group}: would leave the machine through {own}; run inside "
+            "tools/loopnet.sh, or allow it with --allow-multicast"
+        )
+    return {"channel": group, "hop_limit": 0}
+
+
+def _widen_buffer(bus: can.BusABC) -> None:
+    """Ask the kernel for room, so that a reader that waits for a processor loses no frame."""
+    try:
+        descriptor = bus.fileno()
+        with socket.socket(fileno=os.dup(descriptor)) as twin:
+            twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    except (NotImplementedError, OSError, AttributeError):
+        return  # no socket behind this interface
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
