@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +21,9 @@ from ehadiag.recording import (
     Samples,
 )
 from ehadiag.storedtest import StoredTest
-from ehadiag_sim.coefficients import coefficients
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.controller import PositionController
-from ehadiag_sim.kernels import P12, STATES, XJ, XS, step_tick
+from ehadiag_sim.dynamics import DEFAULT_STEP, Dynamics
 
 __all__ = [
     "DEFAULT_STEP",
@@ -35,13 +33,9 @@ __all__ = [
     "Sensors",
     "SimulatedRun",
     "bus_command",
-    "respond",
     "simulate",
 ]
 
-DEFAULT_STEP = 0.25e-6
-"""Integration step, s."""
-SHORTEST_STEP = 1e-9
 COMMAND_STEP = {CommandMode.CURRENT: 0.5e-6, CommandMode.POSITION: 2e-6}
 """Resolution of commands (A, m): the computer acts on what its bus shows (`ServoCommand`)."""
 LSB = np.array([channel.lsb for channel in CHANNELS])
@@ -68,13 +62,11 @@ class Plant:
         *,
         step: float = DEFAULT_STEP,
     ) -> None:
-        self._coefficients = coefficients(actuator, faults or Faults(), effects or Effects())
+        self._dynamics = Dynamics(actuator, faults, effects, step)
         self._sensors = sensors or Sensors()
         self._offsets = np.array(self._sensors.offsets_lsb)
         self._noise = np.random.default_rng(seed)
         self._controller = PositionController(actuator.controller)
-        self._substeps, self._step = _substeps(actuator.controller.rate, step)
-        self._state = np.zeros(STATES)
         self._current = 0.0
         self._codes = self._digitise()
 
@@ -85,7 +77,7 @@ class Plant:
         """
         measured = float(POSITION.decode(self._codes[3:])[0])
         self._current = self._controller.current(command, mode, measured)
-        step_tick(self._state, self._coefficients, self._current, self._step, self._substeps)
+        self._dynamics.advance(self._current)
         self._codes = self._digitise()
         return self._codes
 
@@ -97,8 +89,8 @@ class Plant:
     @property
     def truth(self) -> tuple[float, float, float, float]:
         """Noise-free current (A), spool (m), pressure (Pa), jack position (m) now."""
-        state = self._state
-        return self._current, float(state[XS]), float(state[P12]), float(state[XJ])
+        plant = self._dynamics
+        return self._current, plant.spool, plant.pressure, plant.position
 
     def _digitise(self) -> NDArray[np.int64]:
         noise = self._sensors.noise_lsb * self._noise.standard_normal(len(CHANNELS))
@@ -228,35 +220,5 @@ def bus_command(test: StoredTest) -> NDArray[np.float64]:
     return rounded
 
 
-def respond(
-    actuator: Actuator,
-    currents: NDArray[np.float64],
-    faults: Faults | None = None,
-    effects: Effects | None = None,
-    step: float = DEFAULT_STEP,
-) -> NDArray[np.float64]:
-    """Noise-free response of the plant alone to given currents (A, one a tick), from rest.
-
-    Returns spool (m), pressure (Pa), jack position (m) at the end of each tick, (3, ticks).
-    """
-    plant = coefficients(actuator, faults or Faults(), effects or Effects())
-    substeps, step = _substeps(actuator.controller.rate, step)
-    state = np.zeros(STATES)
-    out = np.empty((3, len(currents)))
-    for tick, current in enumerate(currents.tolist()):
-        step_tick(state, plant, current, step, substeps)
-        out[:, tick] = state[XS], state[P12], state[XJ]
-    return out
-
-
 def _mode(test: StoredTest) -> CommandMode:
     return CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-
-
-def _substeps(rate: float, step: float) -> tuple[int, float]:
-    """Whole number of steps in a tick, and their length in s."""
-    period = 1.0 / rate
-    if not (math.isfinite(step) and SHORTEST_STEP <= step <= period):
-        raise ConfigurationError(f"integration step {step:g} s: need 1e-9 … {period:g} s")
-    count = math.ceil(period / step - 1e-6)
-    return count, period / count
