@@ -1,0 +1,315 @@
+"""Decoded frames onto the tick grid of each test, with the counts of what was wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.recording import (
+    CommandMode,
+    Environment,
+    MessageCounts,
+    Quality,
+    Recording,
+    Samples,
+)
+from firmware_iface.busmap import BusMap
+from firmware_iface.decode import Decoded, DecodedTable, decode
+from firmware_iface.episodes import Episode, find_episodes, read_status
+from firmware_iface.frames import FrameTable
+from firmware_iface.ticks import TickAxis, place
+
+__all__ = ["assemble"]
+
+CHANNEL_KEYS = ("current", "spool", "pressure", "position")
+FROZEN_TICKS = 100
+FROZEN_LIVELY = 0.2
+"""Share of ticks, outside a frozen stretch, in which a live channel changes its code."""
+
+
+def assemble(
+    table: FrameTable, bus_map: BusMap, source: str, notes: tuple[str, ...] = ()
+) -> tuple[Recording, ...]:
+    """All tests in a frame table, at least one recording (without samples if none ran).
+
+    Parameters
+    ----------
+    table: frames in order of arrival.
+    bus_map: what they mean.
+    source: file or bus, for reports.
+    notes: facts known before decoding.
+    """
+    decoded = decode(table, bus_map)
+    axis = place(decoded, bus_map.tick_ns)
+    status = read_status(decoded, axis, bus_map)
+    notes += _protection_notes(bus_map)
+    if axis is None:
+        notes += ("no telemetry in the recording",)
+    else:
+        notes += axis.notes
+    episodes = find_episodes(decoded, axis, status, bus_map)
+    return tuple(
+        _recording(item, decoded, axis, bus_map, source, notes, len(table)) for item in episodes
+    )
+
+
+def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
+    notes = []
+    for message in bus_map.messages.values():
+        if message.crc is None and any(r.name.startswith("channels.") for r in message.roles):
+            notes.append(f"{message.name}: no check sum; a corrupt frame cannot be told")
+    return tuple(notes)
+
+
+def _recording(
+    episode: Episode,
+    decoded: DecodedTable,
+    axis: TickAxis | None,
+    bus_map: BusMap,
+    source: str,
+    notes: tuple[str, ...],
+    rows: int,
+) -> Recording:
+    begin, end = _row_span(episode, axis, rows)
+    extra: list[str] = []
+    samples = None
+    if axis is not None and episode.ticks > 0:
+        samples, extra = _samples(episode, decoded, axis, bus_map)
+    elif axis is not None:
+        extra = ["no test in the recording"]
+    counts = {
+        name: _counts(item, axis, episode, begin, end) for name, item in decoded.messages.items()
+    }
+    if bus_map.policy.crc == "refuse" and any(item.crc_errors for item in counts.values()):
+        samples, extra = None, [*extra, "frames with a wrong check sum: refused by the policy"]
+    if bus_map.policy.range == "refuse" and any(item.range_errors for item in counts.values()):
+        samples, extra = None, [*extra, "values outside their range: refused by the policy"]
+    quality = Quality(
+        messages=counts,
+        saturated=_saturated(samples),
+        foreign=_within(decoded.foreign, begin, end),
+        error_frames=_within(decoded.errors, begin, end),
+        notes=(*notes, *episode.notes, *extra),
+    )
+    return Recording(
+        source=source,
+        samples=samples,
+        test_id=episode.test_id,
+        serial=episode.serial,
+        outcome=episode.outcome,
+        environment=_environment(decoded, begin, end),
+        quality=quality,
+    )
+
+
+def _row_span(episode: Episode, axis: TickAxis | None, rows: int) -> tuple[int, int]:
+    """Rows of the table that belong to a test: from its neighbour before to its neighbour after."""
+    if axis is None or episode.ticks == 0:
+        return 0, rows
+    inside = (axis.tick >= episode.first) & (axis.tick < episode.first + episode.ticks)
+    hits = np.flatnonzero(inside)
+    if len(hits) == 0:
+        return 0, rows
+    first, last = int(hits[0]), int(hits[-1])
+    begin = int(axis.row[first - 1]) + 1 if first > 0 else 0
+    end = int(axis.row[last + 1]) if last + 1 < len(axis.row) else rows
+    return begin, end
+
+
+def _within(rows: NDArray[np.int64], begin: int, end: int) -> int:
+    return int(np.searchsorted(rows, end) - np.searchsorted(rows, begin))
+
+
+def _fill(
+    item: Decoded, role: str, tick: NDArray[np.int64], episode: Episode
+) -> NDArray[np.float64]:
+    """Values of a role on the test's grid; of two frames for one tick the first counts."""
+    out = np.full(episode.ticks, np.nan)
+    value = item.values[role]
+    at = tick - episode.first
+    usable = (at >= 0) & (at < episode.ticks) & np.isfinite(value)
+    out[at[usable][::-1]] = value[usable][::-1]
+    return out
+
+
+def _samples(
+    episode: Episode, decoded: DecodedTable, axis: TickAxis, bus_map: BusMap
+) -> tuple[Samples, list[str]]:
+    columns, saturated = [], np.zeros((len(CHANNEL_KEYS), episode.ticks), dtype=np.bool_)
+    notes: list[str] = []
+    host = np.full(episode.ticks, -1, dtype=np.int64)
+    for index, key in enumerate(CHANNEL_KEYS):
+        role = f"channels.{key}"
+        item = next(m for m in decoded.messages.values() if role in m.values)
+        tick = axis.ticks.get(item.message.name)
+        if tick is None:
+            columns.append(np.full(episode.ticks, np.nan))
+            notes.append(f"no {item.message.name} for the {key}")
+            continue
+        columns.append(_fill(item, role, tick, episode))
+        at = tick - episode.first
+        usable = (at >= 0) & (at < episode.ticks) & np.isfinite(item.values[role])
+        saturated[index, at[usable][::-1]] = item.saturated[role][usable][::-1]
+        if key == "spool":
+            host[at[usable][::-1]] = item.time_ns[usable][::-1]
+        frozen = _frozen(columns[-1], saturated[index])
+        if frozen:
+            seconds = frozen * bus_map.tick_ns * 1e-9
+            notes.append(f"{key} stood at one code for {seconds:.3g} s though it moves elsewhere")
+    mode, command, said = _command(episode, decoded, axis, bus_map)
+    samples = Samples(
+        period_ns=bus_map.tick_ns,
+        mode=mode,
+        current=columns[0],
+        spool=columns[1],
+        pressure=columns[2],
+        position=columns[3],
+        command=command,
+        saturated=saturated,
+        host_ns=host,
+    )
+    return samples, notes + said
+
+
+def _frozen(value: NDArray[np.float64], saturated: NDArray[np.bool_]) -> int:
+    """Length of a frozen stretch in ticks, 0 if the channel never stood still suspiciously."""
+    known = np.flatnonzero(np.isfinite(value) & ~saturated)
+    if len(known) < 2 * FROZEN_TICKS:
+        return 0
+    edges = np.flatnonzero(np.diff(value[known]) != 0.0)
+    bounds = np.concatenate(([-1], edges, [len(known) - 1]))
+    lengths = np.diff(bounds)
+    longest = int(lengths.argmax())
+    run = int(lengths[longest])
+    elsewhere = len(known) - run
+    span = int(known[bounds[longest + 1]] - known[bounds[longest] + 1]) + 1
+    lively = elsewhere > FROZEN_TICKS and len(edges) >= FROZEN_LIVELY * elsewhere
+    return span if run >= FROZEN_TICKS and lively else 0
+
+
+def _command(
+    episode: Episode, decoded: DecodedTable, axis: TickAxis, bus_map: BusMap
+) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
+    """Mode and command of a test; NaN where no frame said, or where it said another mode."""
+    notes: list[str] = []
+    mode = bus_map.fixed_mode
+    modes = _role_on_grid("command.mode", episode, decoded, axis, bus_map)
+    if modes is not None:
+        numbers = modes[np.isfinite(modes)].astype(np.int64)
+        known = numbers[np.isin(numbers, list(bus_map.modes))]
+        if len(known):
+            values, count = np.unique(known, return_counts=True)
+            mode = bus_map.modes[int(values[np.argmax(count)])]
+    if mode is None:
+        mode = CommandMode.CURRENT
+        notes.append("no command says its mode; taken as a current")
+    command = _role_on_grid(f"command.{mode.name.lower()}", episode, decoded, axis, bus_map)
+    if command is None:
+        return mode, np.full(episode.ticks, np.nan), [*notes, "no command frames"]
+    if modes is not None:
+        wanted = [number for number, meaning in bus_map.modes.items() if meaning is mode]
+        other = np.isfinite(modes) & ~np.isin(modes, wanted)
+        if other.any():
+            notes.append(f"{int(other.sum())} commands of another mode left out")
+            command[other] = np.nan
+    return mode, command, notes
+
+
+def _role_on_grid(
+    role: str, episode: Episode, decoded: DecodedTable, axis: TickAxis, bus_map: BusMap
+) -> NDArray[np.float64] | None:
+    found = bus_map.find(role)
+    if found is None:
+        return None
+    name = found[0].name
+    tick = axis.ticks.get(name)
+    if tick is None or len(tick) == 0:
+        return None
+    return _fill(decoded.messages[name], role, tick, episode)
+
+
+def _counts(
+    item: Decoded, axis: TickAxis | None, episode: Episode, begin: int, end: int
+) -> MessageCounts:
+    received = _within(item.received, begin, end)
+    crc_errors = _within(item.crc_bad, begin, end)
+    length_errors = _within(item.length_bad, begin, end)
+    range_errors = _within(item.range_bad, begin, end)
+    tick = axis.ticks.get(item.message.name) if axis is not None else None
+    inside = slice(*np.searchsorted(item.row, [begin, end]))
+    if tick is not None and axis is not None and episode.ticks > 0:
+        at = tick[inside]
+        at = at - episode.first
+        stream = item.stream[inside]
+        keep = (at >= 0) & (at < episode.ticks)
+        at, stream = at[keep], stream[keep]
+        expected = _expected(at, stream, episode.ticks, axis.every.get(item.message.name, 1))
+        position = at * (int(stream.max()) + 1 if len(stream) else 1) + stream
+    elif item.counter is not None:
+        position = _sequence(item.counter[inside], item.message.modulus)
+        expected = int(position.max() - position.min()) + 1 if len(position) else 0
+    else:
+        position = np.arange(inside.stop - inside.start)
+        expected = len(position) + crc_errors + length_errors
+    accepted = len(np.unique(position))
+    return MessageCounts(
+        received=received,
+        accepted=accepted,
+        lost=max(expected - accepted - crc_errors - length_errors, 0),
+        repeated=len(position) - accepted,
+        out_of_order=_late(position),
+        crc_errors=crc_errors,
+        length_errors=length_errors,
+        range_errors=range_errors,
+    )
+
+
+def _expected(at: NDArray[np.int64], stream: NDArray[np.int64], ticks: int, every: int) -> int:
+    """Frames that a test of that length holds."""
+    if len(at) == 0:
+        return -(-ticks // every)
+    return sum(
+        len(range(int(at[stream == item].min() % every), ticks, every))
+        for item in np.unique(stream)
+    )
+
+
+def _sequence(counter: NDArray[np.int64], modulus: int) -> NDArray[np.int64]:
+    """Continue the counter of a message that is sent on event: the nearest number counts."""
+    if len(counter) == 0:
+        return counter
+    step = np.diff(counter) % modulus
+    step = np.where(step > modulus // 2, step - modulus, step)
+    return np.concatenate(([0], np.cumsum(step)))
+
+
+def _late(position: NDArray[np.int64]) -> int:
+    """Frames that came after a later one, repeats aside."""
+    if len(position) == 0:
+        return 0
+    first = np.unique(position, return_index=True)[1]
+    once = position[np.sort(first)]
+    return int(np.count_nonzero(once < np.maximum.accumulate(once)))
+
+
+def _saturated(samples: Samples | None) -> dict[str, int]:
+    if samples is None:
+        return {}
+    return {key: int(samples.saturated[index].sum()) for index, key in enumerate(CHANNEL_KEYS)}
+
+
+def _environment(decoded: DecodedTable, begin: int, end: int) -> Environment:
+    def median(key: str) -> float | None:
+        role = f"environment.{key}"
+        for item in decoded.messages.values():
+            if role in item.values:
+                value = item.values[role][slice(*np.searchsorted(item.row, [begin, end]))]
+                value = value[np.isfinite(value)]
+                return float(np.median(value)) if len(value) else None
+        return None
+
+    return Environment(
+        supply_pressure=median("supply_pressure"),
+        return_pressure=median("return_pressure"),
+        oil_temperature=median("oil_temperature"),
+    )

@@ -1,0 +1,129 @@
+"""The mapping file: which messages and signals of a DBC play which role here.
+
+Untrusted input: every key is known, sizes are limited, and nothing in it is executed.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+import msgspec
+
+__all__ = [
+    "ChannelSignals",
+    "CommandSignals",
+    "EnvironmentSignals",
+    "MappingFile",
+    "Policy",
+    "Protection",
+    "RequestSignals",
+    "SignalRef",
+    "StatusSignals",
+]
+
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+Number = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
+State = Literal["idle", "arming", "running", "complete", "aborted", "refused"]
+Action = Literal["drop", "flag", "refuse"]
+
+
+class SignalRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One signal. SI value = SI(unit, physical * scale + offset)."""
+
+    message: Name
+    signal: Name
+    unit: str | None = None
+    """Overrides the DBC's unit text."""
+    scale: float = 1.0
+    """On top of the DBC's own, e.g. -1 where a sensor is mounted the other way round."""
+    offset: float = 0.0
+
+
+class ChannelSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The four measured channels."""
+
+    current: SignalRef
+    spool: SignalRef
+    pressure: SignalRef
+    position: SignalRef
+
+
+class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the computer commands; at least one of current and position."""
+
+    current: SignalRef | None = None
+    position: SignalRef | None = None
+    mode: SignalRef | None = None
+    test_id: SignalRef | None = None
+    modes: dict[Literal["current", "position"], Number] = msgspec.field(
+        default_factory=lambda: {"current": 1, "position": 2}
+    )
+
+
+class EnvironmentSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Supply, return, oil."""
+
+    supply_pressure: SignalRef | None = None
+    return_pressure: SignalRef | None = None
+    oil_temperature: SignalRef | None = None
+
+
+class StatusSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """State of the built-in test."""
+
+    state: SignalRef | None = None
+    reason: SignalRef | None = None
+    test_id: SignalRef | None = None
+    elapsed: SignalRef | None = None
+    serial: SignalRef | None = None
+    states: dict[State, Number] = msgspec.field(
+        default_factory=lambda: {name: number for number, name in enumerate(get_args(State))}
+    )
+
+
+class RequestSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a tester asks for a test."""
+
+    code: SignalRef | None = None
+    test_id: SignalRef | None = None
+    codes: dict[Literal["start", "abort"], Number] = msgspec.field(
+        default_factory=lambda: {"start": 1, "abort": 2}
+    )
+
+
+class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How one message is guarded."""
+
+    counter: Name | None = None
+    counts: Literal["frames", "ticks"] = "frames"
+    """`ticks`: messages of one control tick carry the same number."""
+    crc: Name | None = None
+    crc_kind: Literal["crc8-j1850-id"] = "crc8-j1850-id"
+
+
+class Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What happens to a recording or sample that fails a check.
+
+    `drop`: the sample is left out and counted; `flag`: it is used, counted and noted; `refuse`:
+    the recording is handed on without samples.
+    """
+
+    crc: Action = "drop"
+    range: Action = "drop"
+
+
+class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole mapping file."""
+
+    schema: Literal["ehadiag.mapping/1"]
+    dbc: Annotated[str, msgspec.Meta(min_length=1, max_length=255)]
+    """Path of the DBC, in or below the mapping's own folder."""
+    tick_ms: Annotated[float, msgspec.Meta(ge=0.05, le=1000)] = 1.0
+    """Control period."""
+    channels: ChannelSignals
+    command: CommandSignals = CommandSignals()
+    environment: EnvironmentSignals = EnvironmentSignals()
+    status: StatusSignals = StatusSignals()
+    request: RequestSignals = RequestSignals()
+    protection: Annotated[dict[Name, Protection], msgspec.Meta(max_length=256)] = {}
+    policy: Policy = Policy()

@@ -1,0 +1,140 @@
+"""End-to-end protection: check sums and counters, over whole columns at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["CRC_KINDS", "crc8", "crc8_rows", "unwrap"]
+
+POLYNOMIAL = 0x1D
+INITIAL = 0xFF
+FINAL_XOR = 0xFF
+CRC_KINDS = ("crc8-j1850-id",)
+"""Check sums by name. `crc8-j1850-id`: CRC-8 SAE J1850 over the low byte of the identifier, its
+next byte, and the payload without the check sum's own byte (bus.md)."""
+
+NEAR = 16
+"""Counter steps up to this are taken at their word when the host's clock contradicts them."""
+SLACK_TICKS = 8.0
+"""Host-time jitter that a real gap may show, in ticks."""
+SLACK_RATE = 1e-3
+"""The same as a share of the gap: two clocks drift apart."""
+
+
+def _table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        value = byte
+        for _ in range(8):
+            value = ((value << 1) ^ POLYNOMIAL if value & 0x80 else value << 1) & 0xFF
+        table.append(value)
+    return tuple(table)
+
+
+TABLE = _table()
+TABLE_COLUMN = np.array(TABLE, dtype=np.uint8)
+TABLE_COLUMN.setflags(write=False)
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8 SAE J1850 of a byte string."""
+    value = INITIAL
+    for byte in data:
+        value = TABLE[value ^ byte]
+    return value ^ FINAL_XOR
+
+
+def crc8_rows(
+    can_id: int, data: NDArray[np.uint8], crc_byte: int, length: int
+) -> NDArray[np.uint8]:
+    """`crc8-j1850-id` of each payload.
+
+    Parameters
+    ----------
+    can_id: identifier that all rows share.
+    data: payloads, shape (n, width).
+    crc_byte: position of the check sum, left out of the sum.
+    length: payload bytes.
+
+    Returns
+    -------
+    Check sums, shape (n,).
+    """
+    start = TABLE[TABLE[INITIAL ^ (can_id & 0xFF)] ^ (can_id >> 8 & 0xFF)]
+    value = np.full(len(data), start, dtype=np.uint8)
+    for column in range(length):
+        if column != crc_byte:
+            value = TABLE_COLUMN[value ^ data[:, column]]
+    value ^= np.uint8(FINAL_XOR)
+    return value
+
+
+def unwrap(
+    counter: NDArray[np.int64], time_ns: NDArray[np.int64], period_ns: int, modulus: int = 256
+) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Continue a wrapping counter without limit, by the host's time where it has turned over.
+
+    Counter steps are exact and time is coarse, so time only chooses how many whole turns a step
+    hides. Time may also lie: a stalled receiver hands over frames late and in a burst, and a host
+    clock may be set. A stall is told from lost frames by what follows it.
+
+    Parameters
+    ----------
+    counter: values in order of arrival, 0 … modulus - 1, shape (n,).
+    time_ns: host time stamps, shape (n,).
+    period_ns: time per count.
+    modulus: counts per turn.
+
+    Returns
+    -------
+    Position of each frame, congruent with its counter, the first one its counter value; and notes
+    on the host's clock.
+    """
+    if len(counter) == 0:
+        return np.empty(0, dtype=np.int64), ()
+    step = np.diff(counter) % modulus
+    ticks = np.diff(time_ns) / period_ns
+    jump = step + modulus * np.rint((ticks - step) / modulus).astype(np.int64)
+    signed = np.where(step > modulus // 2, step - modulus, step)
+    residue = ticks - jump
+    strange = np.abs(residue) > SLACK_TICKS + SLACK_RATE * np.abs(ticks)
+    trusted = strange & (np.abs(signed) <= NEAR)
+    jump[trusted] = signed[trusted]
+    residue = ticks - jump
+    rebase, notes = _clock_steps(np.flatnonzero(trusted), ticks, jump, residue, period_ns)
+    lateness = np.concatenate(([0.0], np.cumsum(residue - rebase)))
+    position = np.concatenate(([0], np.cumsum(jump)))
+    # A stretch between large gaps that stays late or early by whole turns was placed wrongly.
+    breaks = np.flatnonzero(np.abs(jump) > NEAR) + 1
+    if len(breaks):
+        starts = np.concatenate(([0], breaks))
+        earliest = np.minimum.reduceat(lateness, starts)
+        turns = np.cumsum(np.rint(np.diff(earliest) / modulus).astype(np.int64))
+        lengths = np.diff(np.concatenate((starts, [len(counter)])))
+        position += modulus * np.repeat(np.concatenate(([0], turns)), lengths)
+    return position + int(counter[0]), notes
+
+
+def _clock_steps(
+    places: NDArray[np.int64],
+    ticks: NDArray[np.float64],
+    jump: NDArray[np.int64],
+    residue: NDArray[np.float64],
+    period_ns: int,
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Steps of the host clock itself (in ticks, at the differences where they happen)."""
+    rebase = np.zeros_like(residue)
+    notes = []
+    after = 20
+    for place in places:
+        size = residue[place]
+        following = slice(place + 1, place + 1 + after)
+        expected = max(int(jump[following].sum()), 1)
+        burst = ticks[following].sum() < 0.5 * expected
+        if abs(size) < 2 * SLACK_TICKS or (size > 0 and burst):
+            continue
+        rebase[place] = size
+        if len(notes) < 3:
+            notes.append(f"host clock stepped by {size * period_ns * 1e-9:+.3f} s")
+    return rebase, tuple(notes)
