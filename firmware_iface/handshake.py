@@ -35,7 +35,7 @@ REASONS = {
     BitReason.INTERLOCK_OPEN: "interlock open",
 }
 ACTIVE = (BitState.ARMING, BitState.RUNNING)
-FRESH_MS = 100
+FRESH_S = 0.1
 """A listener that comes later to a test waits for the next one: it has missed the start."""
 
 
@@ -66,7 +66,8 @@ class BitStatus:
     state: BitState
     reason: BitReason = BitReason.NONE
     test_id: int = 0
-    elapsed_ms: int = 0
+    elapsed: float = 0.0
+    """s."""
     serial: int | None = None
 
 
@@ -174,30 +175,30 @@ class Handshake:
         """Let time pass; to be called at least every 50 ms."""
         waited = (now - self._since) / 1e9
         times = self.times
+        actions: list[Action] = []
         match self.phase:
             case Phase.SETTLING if waited >= times.settle:
                 self._enter(Phase.REQUESTED, now)
-                return [Action.START]
+                actions = [Action.START]
             case Phase.WAITING if waited >= times.wait:
-                return self._end(f"no test was started within {times.wait:g} s")
+                self._end(f"no test was started within {times.wait:g} s")
             case Phase.REQUESTED if waited >= times.status:
-                return self._abort(f"no status within {times.status:g} s of the request", now)
+                actions = self._abort(f"no status within {times.status:g} s of the request", now)
             case Phase.ARMING if waited >= times.arming:
-                return self._abort(f"still arming after {times.arming:g} s", now)
-            case Phase.RUNNING:
-                if (now - self._heard) / 1e9 >= times.telemetry:
-                    return self._abort(f"telemetry lost for {times.telemetry:g} s", now)
-                if waited >= self.duration + times.finish:
-                    over = f"not complete {times.finish:g} s after its {self.duration:g} s"
-                    return self._abort(over, now)
+                actions = self._abort(f"still arming after {times.arming:g} s", now)
+            case Phase.RUNNING if (now - self._heard) / 1e9 >= times.telemetry:
+                actions = self._abort(f"telemetry lost for {times.telemetry:g} s", now)
+            case Phase.RUNNING if waited >= self.duration + times.finish:
+                late = f"not complete {times.finish:g} s after its {self.duration:g} s"
+                actions = self._abort(late, now)
             case Phase.TRAILING if waited >= times.trail:
-                return self._end("")
+                self._end("")
             case Phase.ABORTING if waited >= times.abort:
-                return self._end(f"{self._why}; the abort was not confirmed", confirmed=False)
+                self._end(f"{self._why}; the abort was not confirmed", confirmed=False)
             case Phase.ABORTING if (now - self._aborted_at) / 1e9 >= times.repeat:
                 self._aborted_at = now
-                return [Action.ABORT]
-        return []
+                actions = [Action.ABORT]
+        return actions
 
     def on_status(self, now: int, status: BitStatus) -> list[Action]:
         """Take a valid status message."""
@@ -208,7 +209,7 @@ class Handshake:
                     return self._end(f"test {status.test_id} of another tester is running")
             case Phase.WAITING:
                 wanted = self.test_id in (None, status.test_id)
-                fresh = status.elapsed_ms <= FRESH_MS
+                fresh = status.elapsed <= FRESH_S
                 if status.state in ACTIVE and wanted and fresh:
                     self._follow(now, status)
             case Phase.REQUESTED:
@@ -278,25 +279,25 @@ class Handshake:
         return []
 
     def _progressed(self, now: int, status: BitStatus) -> list[Action]:
-        ours = self.test_id in (None, status.test_id)
         if status.state is BitState.REFUSED:
             # The answer to another request; the computer goes on with the running test.
             return self.on_foreign_request(now)
-        if not ours and status.state is not BitState.IDLE:
+        if status.test_id != self.test_id and status.state is not BitState.IDLE:
             return self._end(f"the status changed to test {status.test_id}")
         self._status = status
-        if status.state is BitState.RUNNING and self.phase is Phase.ARMING:
-            self._run(now)
-        elif status.state is BitState.COMPLETE and self.phase is Phase.RUNNING:
-            self._enter(Phase.TRAILING, now)
-        elif status.state is BitState.COMPLETE:
-            return self._end("complete without having run")
-        elif status.state is BitState.ABORTED:
-            return self._end("aborted by the flight-control computer")
-        elif status.state is BitState.IDLE:
-            return self._end("the flight-control computer fell back to idle")
-        elif status.state is BitState.ARMING and self.phase is Phase.RUNNING:
-            return self._abort("the test began anew", now)
+        match status.state, self.phase:
+            case BitState.RUNNING, Phase.ARMING:
+                self._run(now)
+            case BitState.COMPLETE, Phase.RUNNING:
+                self._enter(Phase.TRAILING, now)
+            case BitState.COMPLETE, _:
+                self._end("complete without having run")
+            case BitState.ABORTED, _:
+                self._end("aborted by the flight-control computer")
+            case BitState.IDLE, _:
+                self._end("the flight-control computer fell back to idle")
+            case BitState.ARMING, Phase.RUNNING:
+                return self._abort("the test began anew", now)
         return []
 
     def _follow(self, now: int, status: BitStatus) -> None:

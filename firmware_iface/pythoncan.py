@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import ipaddress
 import os
 import socket
+import sys
+import threading
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.errors import ConfigurationError, EhadiagError, InputOutputError
@@ -21,7 +26,7 @@ __all__ = ["BusOptions", "PythonCanTransport", "frame_of", "message_of"]
 
 MULTICAST_GROUP = "239.74.163.2"
 """Default channel of udp_multicast; python-can's own is IPv6 and needs a route few hosts have."""
-MULTICAST_PORT = 43113
+ROUTES = Path("/proc/net/route")
 RECEIVE_BUFFER = 4 << 20
 """Bytes asked of the kernel for a socket's receive buffer: a second of a full bus and more."""
 SEND_TIMEOUT = 0.5
@@ -38,6 +43,8 @@ LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
 PASSIVE_STATE = ("pcan", "systec")
 SOCKETCAN_ERRORS = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames carry SocketCAN's error class as identifier."""
+ECHOES = ("udp_multicast",)
+"""Interfaces that hand a sender its own frames, unmarked."""
 NOT_A_FRAME = "could not unpack received message"
 """What python-can says of a datagram that is none of its own."""
 
@@ -84,6 +91,7 @@ class PythonCanTransport(Transport):
         self._bus = _open(options, name, transmit)
         self._bus_closed = False
         self._damaged = 0
+        self._echoes = _EchoFilter() if options.interface in ECHOES else None
 
     def _receive(self, timeout: float) -> Frame | None:
         try:
@@ -98,12 +106,16 @@ class PythonCanTransport(Transport):
         if message is None:
             return None
         frame = frame_of(message)
+        if self._echoes is not None and self._echoes.is_own(frame):
+            return None
         of_kernel = self._options.interface in SOCKETCAN_ERRORS
         if frame.error and frame.can_id & BUS_OFF and of_kernel:
             raise self._fail("bus off; check wiring and bit rate, then restart the interface")
         return frame
 
     def _send(self, frame: Frame) -> None:
+        if self._echoes is not None:
+            self._echoes.sent(frame)
         try:
             self._bus.send(message_of(frame), timeout=SEND_TIMEOUT)
         except Exception as error:
@@ -114,6 +126,29 @@ class PythonCanTransport(Transport):
             self._bus_closed = True
             with contextlib.suppress(Exception):
                 self._bus.shutdown()
+
+
+class _EchoFilter:
+    """Knows own frames when they come back: each once and in the order sent."""
+
+    def __init__(self) -> None:
+        self._expected: deque[tuple[int, bytes]] = deque(maxlen=4096)
+        self._lock = threading.Lock()  # one thread sends, another receives
+
+    def sent(self, frame: Frame) -> None:
+        """Expect this frame back."""
+        with self._lock:
+            self._expected.append((frame.can_id, frame.data))
+
+    def is_own(self, frame: Frame) -> bool:
+        """Whether a received frame is an own one; those before it were lost on the way back."""
+        key = (frame.can_id, frame.data)
+        with self._lock:
+            if key not in self._expected:
+                return False
+            while self._expected.popleft() != key:
+                pass
+            return True
 
 
 def frame_of(message: can.Message) -> Frame:
@@ -203,25 +238,40 @@ def _multicast(options: BusOptions) -> dict[str, Any]:
     keeps frames in, but the group's membership report goes out and foreign frames come in.
     """
     group = options.channel or MULTICAST_GROUP
-    port = int(options.extra.get("port", MULTICAST_PORT))
     if options.allow_multicast:
         return {"channel": group}
-    family = socket.AF_INET6 if ":" in group else socket.AF_INET
     try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((group, port))  # asks for the route, sends nothing
-            own = probe.getsockname()[0]
-    except OSError as error:
-        raise InputOutputError(
-            f"udp_multicast {group}: no route to the group: {error.strerror or error}; on "
-            f"loopback: ip link set lo multicast on; ip route add {group} dev lo"
-        ) from None
-    if own != "::1" and not own.startswith("127."):
+        address = ipaddress.ip_address(group)
+    except ValueError:
         raise ConfigurationError(
-            f"udp_multicast {group}: would leave the machine through {own}; run inside "
-            "tools/loopnet.sh, or allow it with --allow-multicast"
+            f"udp_multicast {group}: not an IP address; need a group such as {MULTICAST_GROUP}"
+        ) from None
+    interface = _route(address)
+    if interface != "lo":
+        where = f"leave the machine through {interface}" if interface else "find no loopback route"
+        raise ConfigurationError(
+            f"udp_multicast {group}: would {where}; run inside tools/loopnet.sh, or allow it "
+            "with --allow-multicast"
         )
     return {"channel": group, "hop_limit": 0}
+
+
+def _route(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str | None:
+    """Interface that the kernel sends to an IPv4 address through; None where it cannot be told."""
+    try:
+        lines = ROUTES.read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return None
+    found: tuple[int, str] | None = None
+    for line in lines:
+        columns = line.split()
+        # The kernel prints addresses as hexadecimal words of this machine's byte order.
+        target, mask = (int(columns[i], 16).to_bytes(4, sys.byteorder) for i in (1, 7))
+        bits = int.from_bytes(mask, "big")
+        same = int(address) & bits == int.from_bytes(target, "big")
+        if address.version == 4 and same and (found is None or bits > found[0]):
+            found = (bits, columns[0])
+    return None if found is None else found[1]
 
 
 def _widen_buffer(bus: can.BusABC) -> None:

@@ -11,12 +11,24 @@ from ehadiag.errors import BusLostError, EhadiagError
 from firmware_iface.frames import Frame
 from firmware_iface.transport import Transport, TransportState
 
-__all__ = ["CAPACITY", "Receiver"]
+__all__ = ["CAPACITY", "DirectReader", "Receiver", "open_source"]
 
 CAPACITY = 65_536
 """Frames; some seconds of a fully loaded 1 Mbit/s bus."""
 POLL = 0.05
 """s; how fast the thread notices that it shall stop."""
+
+
+def open_source(
+    transport: Transport,
+    *,
+    sink: Callable[[Frame], None] | None = None,
+    idle: Callable[[], None] | None = None,
+) -> Receiver | DirectReader:
+    """Return the receive thread for a bus, a plain reader for what does not run in real time."""
+    if transport.real_time:
+        return Receiver(transport, sink=sink, idle=idle)
+    return DirectReader(transport, sink=sink)
 
 
 class Receiver:
@@ -107,7 +119,7 @@ class Receiver:
         return self._transport.at_end and self._queue.empty()
 
     def now_ns(self) -> int:
-        """Present time on the clock that stamps the frames, ns."""
+        """Present time for time limits, ns from any zero."""
         return self._transport.now_ns()
 
     def receive(self, timeout: float) -> Frame | None:
@@ -161,3 +173,55 @@ class Receiver:
             self._queue.put_nowait(None)
         except queue.Full:
             return
+
+
+class DirectReader:
+    """The receive thread's face without a thread: for simulated time, which waits for its reader.
+
+    A thread would only fill the queue faster than it can be emptied.
+    """
+
+    overflow = 0
+
+    def __init__(
+        self, transport: Transport, *, sink: Callable[[Frame], None] | None = None
+    ) -> None:
+        self._transport = transport
+        self._sink = sink
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    @property
+    def name(self) -> str:
+        """Name of the transport."""
+        return self._transport.name
+
+    @property
+    def state(self) -> TransportState:
+        """State of the transport."""
+        return self._transport.state
+
+    @property
+    def detail(self) -> str:
+        """One sentence on a state that is not OPEN; empty otherwise."""
+        return self._transport.detail
+
+    @property
+    def at_end(self) -> bool:
+        """Whether no frame can come any more."""
+        return self._transport.at_end
+
+    def now_ns(self) -> int:
+        """Present time for time limits, ns from any zero."""
+        return self._transport.now_ns()
+
+    def receive(self, timeout: float) -> Frame | None:
+        """Return the next frame, None when none came within `timeout` s."""
+        frame = self._transport.receive(timeout)
+        if frame is not None and self._sink is not None:
+            self._sink(frame)
+        return frame

@@ -65,6 +65,11 @@ class ReplayTransport(Transport):
         """Whether the last frame was read."""
         return self._next is None
 
+    @property
+    def real_time(self) -> bool:
+        """Whether the log's own rhythm is kept."""
+        return self._speed is not None
+
     def now_ns(self) -> int:
         """Time in the log, ns."""
         if self._speed is None:
@@ -86,7 +91,7 @@ class ReplayTransport(Transport):
         return frame
 
     def _send(self, frame: Frame) -> None:
-        raise AssertionError("not opened to send")
+        raise AssertionError(f"not opened to send {frame}")
 
     def _close(self) -> None:
         self._next = None

@@ -30,7 +30,7 @@ class TransportState(Enum):
 
 
 class FrameSource(Protocol):
-    """What a reader of frames needs: the part that transports and the receive thread share."""
+    """What a reader of frames needs; the receive thread gives it."""
 
     @property
     def name(self) -> str:
@@ -44,11 +44,19 @@ class FrameSource(Protocol):
     def detail(self) -> str:
         """One sentence on a state that is not OPEN; empty otherwise."""
 
+    @property
+    def overflow(self) -> int:
+        """Frames dropped because the reader was too slow."""
+
+    @property
+    def at_end(self) -> bool:
+        """Whether no frame can come any more."""
+
     def receive(self, timeout: float) -> Frame | None:
         """Return the next frame, None when none came within `timeout` s."""
 
     def now_ns(self) -> int:
-        """Present time on the clock that stamps the frames, ns."""
+        """Present time for time limits, ns from any zero."""
 
 
 class Transport(abc.ABC):
@@ -61,8 +69,9 @@ class Transport(abc.ABC):
     - `receive(timeout)` waits at most `timeout` s (0: does not wait), returns frames in order of
       arrival, each once, foreign, error and remote frames among them. None means that no frame
       came, never that the bus ended. It is called by one thread at a time.
-    - `Frame.time_ns` is an integer on one clock, the one of `now_ns()`: host time, simulated time
-      or the log's. A simulated transport need not wait in real time.
+    - `Frame.time_ns` is an integer on one clock: host time, the adapter's, simulated time or the
+      log's. Time limits go by `now_ns()`, which never steps: the monotonic clock of the host, or
+      the simulated time where `real_time` is false and nothing waits.
     - Nothing is sent unless the transport was opened with `transmit=True`; an adapter that can be
       set to listen only is set so otherwise. `send` may be called from another thread than
       `receive`. Own frames do not come back through `receive`.
@@ -102,9 +111,18 @@ class Transport(abc.ABC):
         """Whether no frame can come any more: the end of a log, never true of a bus."""
         return False
 
+    @property
+    def real_time(self) -> bool:
+        """Whether frames come when the bus brings them; false: as fast as they are read."""
+        return True
+
     def now_ns(self) -> int:
-        """Present time on the clock that stamps the frames, ns since the epoch."""
-        return time.time_ns()
+        """Present time for time limits, ns from any zero."""
+        return time.monotonic_ns()
+
+    def stamp_ns(self) -> int:
+        """Time stamp for a frame that is sent now, ns."""
+        return time.time_ns() // 1000 * 1000
 
     def receive(self, timeout: float) -> Frame | None:
         """Return the next frame, None when none came within `timeout` s.
