@@ -21,6 +21,9 @@ __all__ = ["StiffReference"]
 TOLERANCE = 1e-9
 ABSOLUTE = np.array([1e-13, 1e-10] * 3)
 """m and m/s: a millionth of a converter's step and less."""
+REVERSAL = 1e-9
+"""m/s. A mass that creeps towards its equilibrium under dynamic friction never stops by the
+equations; a root at zero would find the solver's rounding and let it stick."""
 
 Vector = NDArray[np.float64]
 
@@ -169,7 +172,7 @@ class StiffReference:
 
     def _comes_to_rest(self, mass: _Mass) -> _Event:
         way = mass.motion
-        return _Event(lambda y: float(way * y[mass.v]), -1, lambda: self._stand(mass))
+        return _Event(lambda y: float(way * y[mass.v] + REVERSAL), -1, lambda: self._stand(mass))
 
     def _start(self, index: int, way: int) -> None:
         self._masses[index].motion = way
