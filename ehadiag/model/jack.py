@@ -20,27 +20,36 @@ __all__ = ["jack_response"]
 
 SHORTEST = 1e-9
 """Pieces shorter than this (s) are taken as no time at all."""
-TRAVEL = 1.5e-6
+TRAVEL = 1.0e-6
 """Spool travel (m) within one part of a piece, near the closed orifice."""
 RATIO = 0.15
 """The same as a share of the spool's distance from the middle, elsewhere."""
 BEND = 0.1e-6
 """Largest distance (m) between a part's path and its chord."""
 MOST_PARTS = 32
+BISECTIONS = 30
+DRIFT = -0.45
+"""Fastest fall of tau that the parabola serves (its second coefficient grows beyond bounds)."""
 
 
 @kernel
-def _valve(constants: PlantConstants, spool: float) -> tuple[float, float]:
-    """No-flow pressure after leakage g PS (Pa) and g R (Pa s/m³) at a spool position (m)."""
+def _valve(constants: PlantConstants, spool: float) -> tuple[float, float, float, float]:
+    """Second stage at a spool position (m), leakage solved for.
+
+    Returns g PS (Pa), g R (Pa s/m³) and the derivatives of both by the spool position.
+    """
     c = constants
     pressure = c.GP * spool
     if abs(pressure) <= c.PSR:
         resistance = c.GP / c.GQ
-    else:
-        pressure = c.PSR if spool > 0.0 else -c.PSR
-        resistance = c.PSR / (c.GQ * abs(spool))
+        share = 1.0 / (1.0 + resistance * c.CLK)
+        return share * pressure, share * resistance, share * c.GP, 0.0
+    inverse = 1.0 / spool
+    pressure = math.copysign(c.PSR, spool)
+    resistance = pressure * inverse / c.GQ
     share = 1.0 / (1.0 + resistance * c.CLK)
-    return share * pressure, share * resistance
+    slope = -share * share * resistance * inverse
+    return share * pressure, share * resistance, -pressure * c.CLK * slope, slope
 
 
 @kernel
@@ -55,16 +64,16 @@ def _parts(origin: float, target: float, rise0: float, rise1: float) -> int:
 
 
 @kernel
-def _sign_change(start: float, slope: float, excess: float, tau: float, span: float) -> float:
-    """First time in 0 … span at which start + slope t + excess exp(-t/tau) changes sign, s."""
+def _sign_change(c0: float, c1: float, c2: float, excess: float, rate: float, span: float) -> float:
+    """First time in 0 … span where c0 + c1 t + c2 t² + excess exp(-rate t) changes sign, s."""
     low, high = 0.0, span
-    sign = 1.0 if start + excess > 0.0 else -1.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        if sign * (start + slope * middle + excess * math.exp(-middle / tau)) > 0.0:
-            low = middle
+    sign = 1.0 if c0 + excess > 0.0 else -1.0
+    for _ in range(BISECTIONS):
+        t = 0.5 * (low + high)
+        if sign * (c0 + t * (c1 + t * c2) + excess * math.exp(-rate * t)) > 0.0:
+            low = t
         else:
-            high = middle
+            high = t
     return high
 
 
@@ -72,6 +81,7 @@ def _sign_change(start: float, slope: float, excess: float, tau: float, span: fl
 def jack_response(
     constants: PlantConstants,
     fdj: float,
+    origin: float,
     nodes: NDArray[np.float64],
     node_end: NDArray[np.int64],
     pressure: NDArray[np.float64],
@@ -82,6 +92,7 @@ def jack_response(
     Parameters
     ----------
     fdj: fault constant `FDJ`, 0 … 1.
+    origin: spool position before the first tick, m.
     nodes, node_end: the spool's path, see `ehadiag.model.spool.spool_response`.
     pressure: out, Pa, shape (n,).
     position: out, m, shape (n,).
@@ -90,8 +101,9 @@ def jack_response(
     dynamic = c.FDJ0 + fdj * (c.FDJ1 - c.FDJ0)
     static = 2.0 * dynamic
     velocity, place, direction = 0.0, 0.0, 0.0
-    spool = 0.0
-    supply, resistance = _valve(c, spool)
+    spool = origin
+    area2 = c.AJ * c.AJ
+    supply, resistance, _, _ = _valve(c, spool)
     node = 0
     for k in range(node_end.shape[0]):
         while node < node_end[k]:
@@ -102,12 +114,18 @@ def jack_response(
             for part in range(1, parts + 1):
                 left = span / parts
                 x = part / parts
+                y = 1.0 - x
                 end_spool = (
                     origin
                     + x * x * (3.0 - 2.0 * x) * (target - origin)
-                    + x * (1.0 - x) * ((1.0 - x) * rise0 - x * rise1)
+                    + x * y * (y * rise0 - x * rise1)
                 )
-                end_supply, end_resistance = _valve(c, end_spool)
+                end_rate = (
+                    6.0 * x * y * (target - origin)
+                    + y * (1.0 - 3.0 * x) * rise0
+                    + x * (3.0 * x - 2.0) * rise1
+                ) / span
+                end_supply, end_resistance, gain_supply, gain_resistance = _valve(c, end_spool)
                 while left > SHORTEST:
                     if direction == 0.0:
                         push0 = c.AJ * supply - c.FR
@@ -119,29 +137,41 @@ def jack_response(
                         if push0 * direction <= static:
                             wait = (static * direction - push0) / (push1 - push0)
                             spool += wait * (end_spool - spool)
-                            supply, resistance = _valve(c, spool)
+                            supply, resistance, _, _ = _valve(c, spool)
                             left -= wait * left
                         continue
-                    _, middle = _valve(c, 0.5 * (spool + end_spool))
+                    # Over a part the steady velocity s is a parabola that ends with the slope of
+                    # the spool's path, tau a straight line: tau v' + v = s is then met by another
+                    # parabola p exactly, and v - p decays.
                     load = c.FR + direction * dynamic
-                    tau = c.MJ / (c.AJ * c.AJ * middle + c.CJ)
-                    steady0 = (c.AJ * supply - load) / (c.AJ * c.AJ * resistance + c.CJ)
-                    steady1 = (c.AJ * end_supply - load) / (c.AJ * c.AJ * end_resistance + c.CJ)
-                    slope = (steady1 - steady0) / left
-                    excess = velocity - steady0 + tau * slope
-                    fade = math.exp(-left / tau)
-                    end_velocity = steady1 - tau * slope + excess * fade
+                    ease0 = 1.0 / (area2 * resistance + c.CJ)
+                    ease1 = 1.0 / (area2 * end_resistance + c.CJ)
+                    steady0 = (c.AJ * supply - load) * ease0
+                    steady1 = (c.AJ * end_supply - load) * ease1
+                    slope1 = (c.AJ * gain_supply - steady1 * area2 * gain_resistance) * ease1
+                    slope1 *= end_rate
+                    mean = (steady1 - steady0) / left
+                    bend = (slope1 - mean) / left
+                    tau = c.MJ * ease0
+                    drift = max((c.MJ * ease1 - tau) / left, DRIFT)
+                    p2 = bend / (1.0 + 2.0 * drift)
+                    p1 = (2.0 * mean - slope1 - 2.0 * p2 * tau) / (1.0 + drift)
+                    p0 = steady0 - tau * p1
+                    excess = velocity - p0
+                    rate = (0.5 * area2 * (resistance + end_resistance) + c.CJ) / c.MJ
+                    fade = math.exp(-left * rate)
+                    end_velocity = p0 + left * (p1 + left * p2) + excess * fade
                     if end_velocity * direction > 0.0:
-                        place += left * (0.5 * (steady0 + steady1) - tau * slope)
-                        place += tau * excess * (1.0 - fade)
+                        place += left * (p0 + left * (0.5 * p1 + left * p2 / 3.0))
+                        place += excess * (1.0 - fade) / rate
                         velocity = end_velocity
                         if abs(place) >= c.XJM and place * velocity > 0.0:
-                            place = c.XJM if place > 0.0 else -c.XJM
+                            place = math.copysign(c.XJM, place)
                             velocity, direction = 0.0, 0.0
                         break
-                    moved = _sign_change(steady0 - tau * slope, slope, excess, tau, left)
+                    moved = _sign_change(p0, p1, p2, excess, rate, left)
                     spool += moved / left * (end_spool - spool)
-                    supply, resistance = _valve(c, spool)
+                    supply, resistance, _, _ = _valve(c, spool)
                     left -= moved
                     velocity, direction = 0.0, 0.0
                 spool, supply, resistance = end_spool, end_supply, end_resistance
@@ -151,4 +181,4 @@ def jack_response(
         position[k] = place
         if nodes[node - 1, 4] != 0.0:
             spool += nodes[node - 1, 4]
-            supply, resistance = _valve(c, spool)
+            supply, resistance, _, _ = _valve(c, spool)

@@ -28,6 +28,8 @@ NODE_LEVEL = 5
 """Away from events a node is written only at multiples of tick / 2^NODE_LEVEL."""
 NODES_PER_TICK = 128
 """Room for nodes of one tick."""
+BEND = 0.02e-6
+"""A node is written where the path bends away from its chord by about this much, m."""
 NODE_COLUMNS = 5
 
 TAYLOR_ORDER = 12
@@ -105,18 +107,20 @@ def spool_response(
     tables: SpoolTables,
     current: NDArray[np.float64],
     tick: float,
+    origin: float,
     measured: NDArray[np.float64],
     anchor: NDArray[np.float64],
     spool: NDArray[np.float64],
     nodes: NDArray[np.float64],
     node_end: NDArray[np.int64],
 ) -> int:
-    """Spool position at the end of every tick, from rest in the middle.
+    """Spool position at the end of every tick, from rest.
 
     Parameters
     ----------
     current: servovalve current of each tick, A, shape (n,).
     tick: s.
+    origin: spool position before the first tick, m; the flapper is in equilibrium there.
     measured: measured spool position, m, shape (n,), NaN where missing; used only to re-anchor.
     anchor: (gain, small, large): after each tick the innovation e is filtered, f += gain (e - f);
         where abs(e) > large the model is moved by e, where abs(f) > small by f. All m but gain.
@@ -134,14 +138,17 @@ def spool_response(
     c = constants
     force = c.AS * c.GPF
     breakaway = tables.static / force
-    xf, wf, xs, vs = 0.0, 0.0, 0.0, 0.0
+    xs = min(max(origin, -c.XSM), c.XSM)
+    xf = (c.GM * current[0] - c.KSF * xs) / c.KF
+    xf = min(max(xf, -breakaway), breakaway)
+    wf, vs = 0.0, 0.0
     spool_dir = 0  # direction of motion, 0 at rest
     clamp = 0  # flapper on its stop: +1, -1; free: 0
     whole = 1 << FINEST
     count = 0
     filtered = 0.0
     anchored = 0
-    begin = 0.0  # velocity at the start of the piece
+    begin, slowest, fastest = 0.0, 0.0, 0.0  # velocity at the start of the piece, its range
     for k in range(current.shape[0]):
         torque = c.GM * current[k]
         position = 0
@@ -234,18 +241,20 @@ def spool_response(
                 clamp = 0
             position += span
             since += span
-            if event > 0 or position == whole or (
-                position & ((whole >> NODE_LEVEL) - 1) == 0 and count - first < NODES_PER_TICK - 8
-            ):
-                if count - first < NODES_PER_TICK - 1 or position == whole:
-                    nodes[count, 0] = tick * since / whole
-                    nodes[count, 1] = xs
-                    nodes[count, 2] = begin
-                    nodes[count, 3] = end
-                    nodes[count, 4] = 0.0
-                    begin = vs
-                    count += 1
-                    since = 0
+            slowest, fastest = min(slowest, end), max(fastest, end)
+            wanted = event > 0 or (
+                position & ((whole >> NODE_LEVEL) - 1) == 0
+                and 0.125 * (fastest - slowest) * (tick * since / whole) > BEND
+            )
+            if position == whole or (wanted and count - first < NODES_PER_TICK - 1):
+                nodes[count, 0] = tick * since / whole
+                nodes[count, 1] = xs
+                nodes[count, 2] = begin
+                nodes[count, 3] = end
+                nodes[count, 4] = 0.0
+                begin, slowest, fastest = vs, vs, vs
+                count += 1
+                since = 0
             if level > BASE and position & ((whole >> (level - 1)) - 1) == 0:
                 level -= 1
         node_end[k] = count

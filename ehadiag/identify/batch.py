@@ -1,0 +1,139 @@
+"""Kernels of the objective: many candidates against one or more recordings.
+
+Candidates are rows of a matrix; recordings stand one behind the other in flat arrays, so that one
+compiled function serves any number of either.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.jit import kernel
+from ehadiag.model.constants import PlantConstants
+from ehadiag.model.jack import jack_response
+from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response, spool_tables
+
+__all__ = ["Batch", "Workspace", "costs", "residuals", "workspace"]
+
+
+class Batch(NamedTuple):
+    """Recordings (or spans of them) to explain; m of them, N ticks in all.
+
+    constants: shape (m, fields of PlantConstants).
+    tick: s, shape (m,).
+    start: first tick of each span in the flat arrays, then N, shape (m + 1,).
+    origin: spool position before the first tick of each span, m, shape (m,).
+    current: A, shape (N,).
+    spool, pressure: measured, m and Pa, shape (N,), NaN where missing.
+    weight: reciprocal noise of spool and pressure, 0 where not used, shape (2, N).
+    anchor: re-anchoring in each span (see `Anchor`), shape (m, 3).
+    """
+
+    constants: NDArray[np.float64]
+    tick: NDArray[np.float64]
+    start: NDArray[np.int64]
+    origin: NDArray[np.float64]
+    current: NDArray[np.float64]
+    spool: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    anchor: NDArray[np.float64]
+
+
+class Workspace(NamedTuple):
+    """Scratch arrays, so that no evaluation allocates; one for each thread."""
+
+    spool: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    position: NDArray[np.float64]
+    nodes: NDArray[np.float64]
+    node_end: NDArray[np.int64]
+
+
+def workspace(batch: Batch) -> Workspace:
+    """Scratch for a batch."""
+    longest = int(np.diff(batch.start).max())
+    return Workspace(
+        spool=np.empty(longest),
+        pressure=np.empty(longest),
+        position=np.empty(longest),
+        nodes=np.empty((longest * NODES_PER_TICK, NODE_COLUMNS)),
+        node_end=np.empty(longest, dtype=np.int64),
+    )
+
+
+@kernel
+def _constants(row: NDArray[np.float64]) -> PlantConstants:
+    return PlantConstants(
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], row[9],
+        row[10], row[11], row[12], row[13], row[14], row[15], row[16], row[17], row[18], row[19],
+        row[20], row[21], row[22], row[23], row[24],
+    )  # fmt: skip
+
+
+@kernel
+def residuals(
+    batch: Batch, candidate: NDArray[np.float64], work: Workspace, out: NDArray[np.float64]
+) -> int:
+    """Weighted gaps, measured less modelled, of spool and pressure: out, shape (2, N).
+
+    `candidate` is (Kintas, FSS, FDJ, spool offset in m, pressure offset in Pa). A missing sample
+    gives 0. Returns how often the model was re-anchored.
+    """
+    anchored = 0
+    for index in range(batch.tick.shape[0]):
+        a, b = batch.start[index], batch.start[index + 1]
+        n = b - a
+        constants = _constants(batch.constants[index])
+        tick = batch.tick[index]
+        tables = spool_tables(constants, candidate[0], candidate[1], tick)
+        spool, pressure = work.spool[:n], work.pressure[:n]
+        anchored += spool_response(
+            constants,
+            tables,
+            batch.current[a:b],
+            tick,
+            batch.origin[index] - candidate[3],
+            batch.spool[a:b] - candidate[3],
+            batch.anchor[index],
+            spool,
+            work.nodes,
+            work.node_end[:n],
+        )
+        jack_response(
+            constants,
+            candidate[2],
+            batch.origin[index] - candidate[3],
+            work.nodes,
+            work.node_end[:n],
+            pressure,
+            work.position[:n],
+        )
+        for k in range(n):
+            gap = (batch.spool[a + k] - candidate[3] - spool[k]) * batch.weight[0, a + k]
+            out[0, a + k] = gap if gap == gap else 0.0
+            gap = (batch.pressure[a + k] - candidate[4] - pressure[k]) * batch.weight[1, a + k]
+            out[1, a + k] = gap if gap == gap else 0.0
+    return anchored
+
+
+@kernel
+def costs(
+    batch: Batch,
+    candidates: NDArray[np.float64],
+    cap: float,
+    work: Workspace,
+    gaps: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Summed squared weighted gap of each candidate, each square at most `cap`: out, shape (n,)."""
+    for i in range(candidates.shape[0]):
+        residuals(batch, candidates[i], work, gaps)
+        total = 0.0
+        for channel in range(2):
+            for k in range(gaps.shape[1]):
+                total += min(gaps[channel, k] * gaps[channel, k], cap)
+        out[i] = total
