@@ -15,8 +15,9 @@ from ehadiag.recording import (
 )
 from firmware_iface.busmap import BusMap
 from firmware_iface.decode import Decoded, DecodedTable, decode
-from firmware_iface.episodes import Episode, find_episodes, read_status
+from firmware_iface.episodes import Episode, find_episodes
 from firmware_iface.frames import FrameTable
+from firmware_iface.status import read_status
 from firmware_iface.ticks import TickAxis, place
 
 __all__ = ["assemble"]

@@ -194,7 +194,7 @@ def _parse_dbc(text: bytes, name: str) -> dict[str, DbcMessage]:
 
     try:
         database = cantools.database.load_string(text.decode("cp1252", "replace"), "dbc")
-    except Exception as error:  # noqa: BLE001 - the parser raises whatever a bad file leads it to
+    except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ConfigurationError(f"DBC file {name}: not a valid DBC: {reason}") from None
     if not isinstance(database, Database):

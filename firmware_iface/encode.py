@@ -32,11 +32,12 @@ class Encoder:
 
     def __init__(self, bus_map: BusMap | None = None) -> None:
         self._map = bus_map if bus_map is not None else default_map()
+        self._counters: dict[str, int] = {}
         self._writers = {
             section: tuple(
-                _Writer(item, section, {role.name: role for role in item.roles})
+                _Writer(item, roles, self._counters)
                 for item in self._map.messages.values()
-                if any(role.name.startswith(section + ".") for role in item.roles)
+                for roles in _by_multiplexer(item, section)
             )
             for section in ("channels", "command", "environment", "status", "request")
         }
@@ -142,19 +143,23 @@ class Encoder:
 
 
 class _Writer:
-    """Packs one message; keeps its counter."""
+    """Packs one message; counters are shared by all writers of a message."""
 
-    def __init__(self, message: MessageMap, section: str, roles: Mapping[str, Role]) -> None:
+    def __init__(
+        self, message: MessageMap, roles: Mapping[str, Role], counters: dict[str, int]
+    ) -> None:
         self._message = message
-        self._roles = {name: role for name, role in roles.items() if name.startswith(section + ".")}
+        self._counters = counters
+        self._roles = roles
         self._places = {name: _place(role.signal, message) for name, role in self._roles.items()}
+        # Signals of one frame share their multiplexers.
         self._constant = 0
-        for role in self._roles.values():
-            for selector, values in role.signal.selectors:
-                self._constant |= min(values) << _place(selector, message)[0]
+        for selector, values in next(iter(roles.values())).signal.selectors:
+            shift, big, size = _place(selector, message)
+            pattern = min(values)
+            self._constant |= pattern << shift if big else _swap(pattern, shift, size)
         self._counter_place = _place(message.counter, message) if message.counter else None
         self._header = struct.pack("<H", message.can_id & 0xFFFF)
-        self._next = 0
 
     def raw(self, values: Mapping[str, float]) -> dict[str, int]:
         """Bit patterns of SI values."""
@@ -167,8 +172,10 @@ class _Writer:
         for name, (shift, big, size) in self._places.items():
             word |= raw[name] << shift if big else _swap(raw[name], shift, size)
         if self._counter_place is not None and message.counter is not None:
-            count = (self._next if counter is None else counter) % message.modulus
-            self._next = count + 1
+            if counter is None:
+                counter = self._counters.get(message.name, 0)
+            count = counter % message.modulus
+            self._counters[message.name] = count + 1
             shift, big, size = self._counter_place
             word |= count << shift if big else _swap(count, shift, size)
         data = word.to_bytes(message.length, "big")
@@ -177,6 +184,16 @@ class _Writer:
             check = crc8(self._header + data[:at] + data[at + 1 :])
             data = data[:at] + bytes((check,)) + data[at + 1 :]
         return Frame(time_ns, message.can_id, data, extended=message.extended, fd=message.fd)
+
+
+def _by_multiplexer(message: MessageMap, section: str) -> list[dict[str, Role]]:
+    """Roles of a section by the frame that carries them: one frame per multiplexer setting."""
+    groups: dict[tuple[tuple[str, int], ...], dict[str, Role]] = {}
+    for role in message.roles:
+        if role.name.startswith(section + "."):
+            setting = tuple((item.name, min(values)) for item, values in role.signal.selectors)
+            groups.setdefault(setting, {})[role.name] = role
+    return list(groups.values())
 
 
 def _place(signal: SignalLayout, message: MessageMap) -> tuple[int, bool, int]:

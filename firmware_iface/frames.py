@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_PAYLOAD", "Frame", "FrameTable"]
+__all__ = ["MAX_PAYLOAD", "Frame", "FrameTable", "concatenate"]
 
 MAX_PAYLOAD = 64
 """Bytes of the longest payload (CAN FD)."""
@@ -90,3 +90,24 @@ class FrameTable:
             remote=np.array([row.remote for row in rows], dtype=np.bool_),
             sent=np.array([row.sent for row in rows], dtype=np.bool_),
         )
+
+
+def concatenate(tables: Sequence[FrameTable]) -> FrameTable:
+    """Join tables in the order given; payloads as wide as the widest."""
+    width = max(table.data.shape[1] for table in tables)
+    wide = []
+    for table in tables:
+        data = np.zeros((len(table), width), dtype=np.uint8)
+        data[:, : table.data.shape[1]] = table.data
+        wide.append(data)
+    return FrameTable(
+        time_ns=np.concatenate([table.time_ns for table in tables]),
+        can_id=np.concatenate([table.can_id for table in tables]),
+        length=np.concatenate([table.length for table in tables]),
+        data=np.concatenate(wide),
+        extended=np.concatenate([table.extended for table in tables]),
+        fd=np.concatenate([table.fd for table in tables]),
+        error=np.concatenate([table.error for table in tables]),
+        remote=np.concatenate([table.remote for table in tables]),
+        sent=np.concatenate([table.sent for table in tables]),
+    )

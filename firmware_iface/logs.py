@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from array import array
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, TextIO
 
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitState, Recording
 from firmware_iface.align import assemble
+from firmware_iface.asclines import open_asc
+from firmware_iface.blf import read_blf
 from firmware_iface.busmap import BusMap, default_map
+from firmware_iface.columns import ColumnBuilder
 from firmware_iface.frames import MAX_PAYLOAD, FrameTable
 
 if TYPE_CHECKING:
@@ -95,110 +96,79 @@ def read_frames_noted(path: Path | str) -> tuple[FrameTable, tuple[str, ...]]:
     return _collect(path, suffix)
 
 
-def _reader(path: Path, suffix: str) -> Any:
-    import can  # noqa: PLC0415 - slow to import
-
-    if suffix == ".asc":
-        return can.ASCReader(str(path), relative_timestamp=False)
-    kinds = {".blf": can.BLFReader, ".csv": can.CSVReader, ".trc": can.TRCReader}
-    if suffix in kinds:
-        return kinds[suffix](str(path))
-    try:
-        return can.MF4Reader(str(path))
-    except NotImplementedError:
-        raise InputOutputError(
-            f"log {path}: MF4 needs the extra: pip install ehadiag[mf4]"
-        ) from None
-
-
 def _collect(path: Path, suffix: str) -> tuple[FrameTable, tuple[str, ...]]:
-    columns = _Columns()
-    notes: tuple[str, ...] = ()
-    reader = None
+    columns = ColumnBuilder()
+    trouble = read_blf(path, columns) if suffix == ".blf" else _read_text(path, suffix, columns)
+    if len(columns) == 0:
+        reason = f" ({trouble})" if trouble else ""
+        raise InputOutputError(f"log {path}: no frames in it{reason}")
+    if not trouble:
+        return columns.table(), ()
+    return columns.table(), (f"{trouble} after {len(columns)} frames; the rest is lost",)
+
+
+def _read_text(path: Path, suffix: str, columns: ColumnBuilder) -> str:
+    """Read the other kinds through python-can."""
+    if suffix == ".asc":
+        # A date in a language that python-can does not know fails the file: time then starts at 0.
+        try:
+            return _read_with(path, suffix, columns, dated=True)
+        except InputOutputError:
+            return _read_with(path, suffix, columns, dated=False)
+    return _read_with(path, suffix, columns, dated=True)
+
+
+def _read_with(path: Path, suffix: str, columns: ColumnBuilder, *, dated: bool) -> str:
+    reader: Any = None
     try:
-        reader = _reader(path, suffix)
+        reader = _reader(path, suffix, dated)
         for message in reader:
-            columns.add(message)
+            _add(message, columns)
             if len(columns) > MAX_FRAMES:
                 raise InputOutputError(f"log {path}: more than {MAX_FRAMES} frames; split it")
     except InputOutputError:
         raise
-    except Exception as error:  # noqa: BLE001 - the readers raise whatever a bad file leads them to
+    except Exception as error:  # the readers raise whatever a bad file leads them to
         if len(columns) == 0:
             reason = " ".join(str(error).split())[:160] or type(error).__name__
-            raise InputOutputError(
-                f"log {path}: not a readable {suffix[1:].upper()} log: {reason}"
-            ) from None
-        notes = (f"the log breaks off or is damaged after {len(columns)} frames; the rest is lost",)
+            kind = suffix[1:].upper()
+            raise InputOutputError(f"log {path}: not a readable {kind} log: {reason}") from None
+        return "the log breaks off or is damaged"
     finally:
         if reader is not None:
             reader.stop()
-    if len(columns) == 0:
-        raise InputOutputError(f"log {path}: no frames in it")
-    return columns.table(), notes
+    return ""
 
 
-class _Columns:
-    """Grows columns frame by frame: 40 bytes a frame, no object kept."""
+def _reader(path: Path, suffix: str, dated: bool) -> Any:
+    import can  # noqa: PLC0415 - slow to import
 
-    def __init__(self) -> None:
-        self._time = array("d")
-        self._id = array("L")
-        self._flags = array("B")
-        self._length = array("B")
-        self._data = bytearray()
-        self._width = 8
-
-    def __len__(self) -> int:
-        return len(self._time)
-
-    def add(self, message: Message) -> None:
-        """Append one python-can message."""
-        data = message.data
-        size = len(data)
-        if size > self._width:
-            self._widen()
-        self._time.append(message.timestamp)
-        self._id.append(message.arbitration_id)
-        self._length.append(size)
-        self._flags.append(
-            message.is_extended_id
-            | message.is_fd << 1
-            | message.is_error_frame << 2
-            | message.is_remote_frame << 3
-            | (not message.is_rx) << 4
-        )
-        self._data += data
-        if size < self._width:
-            self._data += bytes(self._width - size)
-
-    def _widen(self) -> None:
-        old = np.frombuffer(bytes(self._data), dtype=np.uint8).reshape(-1, self._width)
-        wide = np.zeros((len(old), MAX_PAYLOAD), dtype=np.uint8)
-        wide[:, : self._width] = old
-        self._data = bytearray(wide.tobytes())
-        self._width = MAX_PAYLOAD
-
-    def table(self) -> FrameTable:
-        """Columns as arrays."""
-        flags = np.frombuffer(self._flags, dtype=np.uint8)
-        seconds = np.frombuffer(self._time, dtype=np.float64)
-        return FrameTable(
-            time_ns=to_ns(seconds),
-            can_id=np.array(self._id, dtype=np.uint32),
-            length=np.frombuffer(self._length, dtype=np.uint8),
-            data=np.frombuffer(self._data, dtype=np.uint8).reshape(-1, self._width),
-            extended=(flags & 1).astype(np.bool_),
-            fd=(flags & 2).astype(np.bool_),
-            error=(flags & 4).astype(np.bool_),
-            remote=(flags & 8).astype(np.bool_),
-            sent=(flags & 16).astype(np.bool_),
-        )
+    if suffix == ".asc":
+        return can.ASCReader(open_asc(path), relative_timestamp=not dated)
+    kinds: dict[str, Any] = {".csv": can.CSVReader, ".trc": can.TRCReader}
+    if suffix in kinds:
+        return kinds[suffix](_text(path))
+    try:
+        return can.MF4Reader(str(path))
+    except NotImplementedError:
+        raise InputOutputError(
+            f"log {path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"
+        ) from None
 
 
-def to_ns(seconds: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Seconds as written by a logger to integer ns; a stamp that is no time becomes 0."""
-    whole = np.floor(np.nan_to_num(seconds, nan=0.0, posinf=0.0, neginf=0.0))
-    whole = np.clip(whole, -9e9, 9e9)
-    part = np.clip(np.nan_to_num(seconds - whole, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
-    return whole.astype(np.int64) * 1_000_000_000 + np.rint(part * 1e9).astype(np.int64)
+def _text(path: Path) -> TextIO:
+    return path.open(encoding="utf-8", errors="replace")
+
+
+def _add(message: Message, columns: ColumnBuilder) -> None:
+    whole = math.floor(message.timestamp)
+    columns.add(
+        whole * 1_000_000_000 + round((message.timestamp - whole) * 1e9),
+        message.arbitration_id & 0xFFFFFFFF,
+        bytes(message.data[:MAX_PAYLOAD]),
+        extended=message.is_extended_id,
+        fd=message.is_fd,
+        error=message.is_error_frame,
+        remote=message.is_remote_frame,
+        sent=not message.is_rx,
+    )

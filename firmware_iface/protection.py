@@ -125,7 +125,7 @@ def _clock_steps(
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Steps of the host clock itself (in ticks, at the differences where they happen)."""
     rebase = np.zeros_like(residue)
-    notes = []
+    notes: list[str] = []
     after = 20
     for place in places:
         size = residue[place]

@@ -85,7 +85,7 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
     position, notes = unwrap(counter[order], time_ns[order], tick_ns, modulus)
     owner = owner[order]
     ticks = {name: position[owner == index] for index, name in enumerate(names)}
-    return TickAxis(ticks, row[order], position, time_ns[order], {name: 1 for name in names}, notes)
+    return TickAxis(ticks, row[order], position, time_ns[order], dict.fromkeys(names, 1), notes)
 
 
 def _anchor_axis(anchor: Decoded, tick_ns: int) -> TickAxis:

@@ -1,0 +1,54 @@
+"""ASC text with its two kinds of time made one, for python-can's reader.
+
+`timestamps relative` means that each stamp counts from the event before it, whatever that event
+is; python-can takes every stamp for an absolute one.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Self, TextIO, cast
+
+__all__ = ["open_asc"]
+
+MAX_LINE = 1 << 16
+HEADER_LINES = 20
+HEADER = re.compile(r"\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNORECASE)
+STAMP = re.compile(r"\s*(\d+\.\d+)(\s.*)", re.DOTALL)
+
+
+class _AbsoluteLines(io.TextIOBase):
+    """Lines of an ASC file with relative stamps, made absolute."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        self._elapsed = 0.0
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> str:
+        line = self._file.readline(MAX_LINE)
+        if not line:
+            raise StopIteration
+        stamp = STAMP.match(line)
+        if stamp is None:
+            return line
+        self._elapsed += float(stamp[1])
+        return f"{self._elapsed:.9f}{stamp[2]}"
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def open_asc(path: Path) -> TextIO:
+    """Open an ASC file for python-can's reader, its stamps absolute (from the start of the log)."""
+    file = path.open(encoding="utf-8", errors="replace")
+    head = [file.readline(MAX_LINE) for _ in range(HEADER_LINES)]
+    file.seek(0)
+    if any(HEADER.match(line) for line in head):
+        return cast(TextIO, _AbsoluteLines(file))
+    return file
