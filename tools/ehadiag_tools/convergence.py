@@ -79,7 +79,7 @@ def table(name: str, faults: Faults, steps_us: Sequence[float], ticks: int | Non
         gap = (answer - reference) / LSB
         rms, largest = np.sqrt((gap**2).mean(axis=1)), np.abs(gap).max(axis=1)
         orders = ["–"] * 3
-        if before is not None:
+        if before is not None and (rms > 0.0).all():
             ratio = np.log(before[1] / rms) / np.log(before[0] / step)
             orders = [f"{value:.2f}" for value in ratio]
         cells = [f"{a:.4f} ({b:.2f})" for a, b in zip(rms, largest, strict=True)]
