@@ -1,0 +1,47 @@
+"""A short stored test, an emulated computer that plays it, and health checks at teardown."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.fcc import FccCore
+
+from ehadiag.actuator import default_actuator
+from ehadiag.storedtest import Line, StoredTest, Windows
+
+CoreFactory = Callable[..., FccCore]
+
+
+@pytest.fixture(scope="session")
+def short_test() -> StoredTest:
+    """0.4 s of current: enough for the handshake, quick to simulate."""
+    span = ((0.0, 0.4),)
+    points = ((0.0, 0.0), (0.1, 2.0), (0.3, -2.0), (0.4, 0.0))
+    return StoredTest(
+        name="short",
+        id=9,
+        mode="current",
+        unit="mA",
+        segment=(Line(points=points),),
+        windows=Windows(FDJ=span, Kintas=span, FSS=span, refinement=span),
+    )
+
+
+@pytest.fixture
+def make_core(short_test: StoredTest) -> CoreFactory:
+    def make(**options: object) -> FccCore:
+        defaults: dict[str, object] = {"faults": Faults(0.3, 0.3, 0.3), "serial": 77, "seed": 5}
+        return FccCore(default_actuator(), [short_test], **(defaults | options))
+
+    return make
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    left = [item.name for item in threading.enumerate() if item not in before and item.is_alive()]
+    assert not left, f"threads left running: {left}"
