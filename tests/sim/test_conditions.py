@@ -44,7 +44,7 @@ def test_faults_scale_as_the_contract_says():
     assert pytest.approx(valve.GQF * 0.6) == valve.AS**2 * valve.GPF / (p.DAMPING - valve.CS)
     assert pytest.approx(2.0 + 0.25 * 58.0) == p.FSS
     assert pytest.approx(p.FSS / 2) == p.FDS
-    assert (p.FDJ, p.FSJ) == pytest.approx((jack.FDJ1, 2 * jack.FDJ1))
+    assert pytest.approx((jack.FDJ1, 2 * jack.FDJ1)) == (p.FDJ, p.FSJ)
 
 
 def test_hot_oil_thins_and_leaks():
@@ -54,7 +54,7 @@ def test_hot_oil_thins_and_leaks():
     thin = 3.5 / 14.5
     assert pytest.approx(cold.CJ * thin) == hot.CJ
     assert pytest.approx(cold.CLK / thin) == hot.CLK
-    assert hot.DAMPING - cold.DAMPING == pytest.approx(actuator.servovalve.CS * (thin - 1.0))
+    assert pytest.approx(actuator.servovalve.CS * (thin - 1.0)) == hot.DAMPING - cold.DAMPING
     assert pytest.approx(1.1 * cold.GM) == hot.GM
     assert (hot.PSR, hot.GP, hot.FORCE) == (cold.PSR, cold.GP, cold.FORCE)
 

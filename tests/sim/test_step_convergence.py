@@ -12,7 +12,7 @@ from ehadiag_tools.stiff_reference import StiffReference
 
 LSB = np.array([[SPOOL.lsb], [PRESSURE.lsb], [POSITION.lsb]])
 STEPS = np.array([8e-6, 4e-6, 2e-6, 1e-6, 0.5e-6])
-TIME = np.arange(150) * 1e-3
+TIME = np.arange(200) * 1e-3
 
 
 def with_data(servovalve=None, jack=None):
@@ -67,7 +67,7 @@ def test_stops_of_flapper_and_spool_converge_with_order_one():
 def test_default_step_is_converged():
     """Of the noise floor of 0.58 LSB the integration takes less than a tenth anywhere."""
     rng = np.random.default_rng(7)
-    drive = np.interp(TIME, TIME[::10], rng.uniform(-10e-3, 10e-3, 15))
+    drive = np.interp(TIME, TIME[::10], rng.uniform(-10e-3, 10e-3, 20))
     rms, _, reference = errors(default_actuator(), drive, Faults(0.5, 0.5, 0.5), [DEFAULT_STEP])
     assert reference.slides[1] >= 5
     assert rms.max() < 0.05
