@@ -17,11 +17,12 @@ from firmware_iface.busmap import BusMap
 from firmware_iface.decode import Decoded, DecodedTable, decode
 from firmware_iface.episodes import Episode, find_episodes
 from firmware_iface.frames import FrameTable
-from firmware_iface.status import read_status
+from firmware_iface.status import read_status, resolve_turns
 from firmware_iface.ticks import TickAxis, place
 
 __all__ = ["assemble"]
 
+STUCK_FRAMES = 20
 CHANNEL_KEYS = ("current", "spool", "pressure", "position")
 FROZEN_TICKS = 100
 FROZEN_LIVELY = 0.2
@@ -43,6 +44,8 @@ def assemble(
     decoded = decode(table, bus_map)
     axis = place(decoded, bus_map.tick_ns)
     status = read_status(decoded, axis, bus_map)
+    if axis is not None and (mended := resolve_turns(axis, status)) is not axis:
+        axis, status = mended, read_status(decoded, mended, bus_map)
     notes += _protection_notes(bus_map)
     if axis is None:
         notes += ("no telemetry in the recording",)
@@ -78,6 +81,7 @@ def _recording(
         samples, extra = _samples(episode, decoded, axis, bus_map)
     elif axis is not None:
         extra = ["no test in the recording"]
+    extra += _stuck_counters(decoded, bus_map, begin, end)
     counts = {
         name: _counts(item, axis, episode, begin, end) for name, item in decoded.messages.items()
     }
@@ -101,6 +105,20 @@ def _recording(
         environment=_environment(decoded, begin, end),
         quality=quality,
     )
+
+
+def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int) -> list[str]:
+    """Notes on counters that often stay while time goes on: repeats of a frame take no time."""
+    notes = []
+    for name, item in decoded.messages.items():
+        inside = slice(*np.searchsorted(item.row, [begin, end]))
+        if item.counter is None or inside.stop - inside.start < STUCK_FRAMES:
+            continue
+        still = np.diff(item.counter[inside]) == 0
+        still &= np.diff(item.time_ns[inside]) > bus_map.tick_ns // 2
+        if still.sum() >= STUCK_FRAMES:
+            notes.append(f"{name}: the counter stands still in {int(still.sum())} frames")
+    return notes
 
 
 def _row_span(episode: Episode, axis: TickAxis | None, rows: int) -> tuple[int, int]:

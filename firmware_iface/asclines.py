@@ -6,10 +6,10 @@ is; python-can takes every stamp for an absolute one.
 
 from __future__ import annotations
 
-import io
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Self, TextIO, cast
+from typing import TextIO, cast
 
 __all__ = ["open_asc"]
 
@@ -19,29 +19,43 @@ HEADER = re.compile(r"\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNOREC
 STAMP = re.compile(r"\s*(\d+\.\d+)(\s.*)", re.DOTALL)
 
 
-class _AbsoluteLines(io.TextIOBase):
-    """Lines of an ASC file with relative stamps, made absolute."""
+class _AbsoluteLines:
+    """Lines of an ASC file with relative stamps, made absolute; a read-only text file."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
         self._elapsed = 0.0
 
-    def __iter__(self) -> Self:
-        return self
+    def __iter__(self) -> Iterator[str]:
+        while line := self.readline():
+            yield line
 
     def __next__(self) -> str:
-        line = self._file.readline(MAX_LINE)
+        line = self.readline()
         if not line:
             raise StopIteration
+        return line
+
+    def readline(self) -> str:
+        """Return the next line; empty at the end."""
+        line = self._file.readline(MAX_LINE)
         stamp = STAMP.match(line)
         if stamp is None:
             return line
         self._elapsed += float(stamp[1])
         return f"{self._elapsed:.9f}{stamp[2]}"
 
+    def read(self, _size: int = -1) -> str:
+        """Return one line: readers go by lines."""
+        return self.readline()
+
+    def write(self, _text: str) -> int:
+        """Refuse: a recording is never changed."""
+        raise OSError("read only")
+
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
-        super().close()
 
 
 def open_asc(path: Path) -> TextIO:

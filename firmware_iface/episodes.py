@@ -203,13 +203,12 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
         notes.append(f"start of the test uncertain by {span.start - low} ticks")
     stop = span.stop
     outcome, final = _outcome(mine, status)
-    if outcome.state is BitState.COMPLETE and final is not None:
-        length = status.elapsed[final]
-        if np.isfinite(length) and length > 0 and span.before != stop:
-            stop = max(stop, first + int(length)) if span.before is None else stop
-            stop = min(stop, first + int(length)) if span.test_id is None else stop
+    if outcome.state is BitState.COMPLETE and final is not None and status.elapsed[final] > 0:
+        stop = first + int(status.elapsed[final])
         if span.before is not None:
-            stop = min(max(stop, first + int(np.nan_to_num(length))), span.before)
+            stop = min(stop, span.before)
+        if span.test_id is not None and abs(stop - span.stop) > 2 and span.before == span.stop:
+            notes.append(f"status and command ids differ by {span.stop - stop} ticks on the end")
     elif span.before is None and axis is not None and limit is None and len(mine) == 0:
         stop = max(stop, int(axis.tick.max()) + 1) if axis.tick.max() - stop < SAME_START else stop
     ticks = stop - first

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.recording import BitState
 from firmware_iface.busmap import BusMap
 from firmware_iface.decode import Decoded, DecodedTable
 from firmware_iface.ticks import TickAxis
 
-__all__ = ["Status", "read_status"]
+__all__ = ["Status", "read_status", "resolve_turns"]
+
+HOLE = 3
+"""Ticks without a frame up to which the next frame still tells the present tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +86,45 @@ def _status_of(item: Decoded | None, axis: TickAxis | None, bus_map: BusMap) -> 
 def _next_tick(axis: TickAxis, item: Decoded, tick_ns: int) -> NDArray[np.int64]:
     """Tick that begins after each status frame; by time where the frames around it are missing."""
     fraction, following = axis.at(item.row, item.time_ns, tick_ns)
-    before = axis.tick[np.maximum(np.searchsorted(axis.row, item.row) - 1, 0)]
+    after = np.searchsorted(axis.row, item.row)
+    before = np.maximum(after - 1, 0)
+    hole = np.abs(following - axis.tick[before]) > HOLE
+    wait = axis.time_ns[np.minimum(after, len(axis.row) - 1)] - item.time_ns
     by_time = np.ceil(fraction).astype(np.int64)
-    hole = (following - before > 3) | (following <= before - 3)
-    return np.where(hole & (item.row > axis.row[0]), by_time, following)
+    return np.where(hole & (after > 0) & (np.abs(wait) > HOLE * tick_ns), by_time, following)
+
+
+def resolve_turns(axis: TickAxis, status: Status) -> TickAxis:
+    """Take back counter turns that the elapsed time of a running test contradicts.
+
+    Host time chooses the turns that a gap hides; a host clock that steps by nearly whole turns
+    looks like a gap. The computer's own elapsed time tells them apart.
+    """
+    running = np.flatnonzero((status.state == BitState.RUNNING) & np.isfinite(status.elapsed))
+    start, elapsed = status.start[running], status.elapsed[running]
+    offset = np.diff(start)
+    turns = np.rint(offset / max(axis.turn, 1))
+    wrong = (turns != 0) & (np.abs(offset - axis.turn * turns) <= HOLE)
+    wrong &= (np.diff(elapsed) >= 0) & (np.diff(status.test_id[running]) == 0)
+    if not axis.turn or not wrong.any():
+        return axis
+    tick = axis.tick.copy()
+    shift_from: list[tuple[int, int]] = []
+    for index in np.flatnonzero(wrong):
+        low, high = np.searchsorted(axis.row, status.row[running[index : index + 2]])
+        low = max(int(low), 1)
+        if high < low:
+            continue
+        jumps = np.diff(axis.tick[low - 1 : high + 1])
+        if len(jumps):
+            place = low + int(np.argmax(np.abs(jumps)))
+            shift_from.append((int(axis.row[place]), int(turns[index]) * axis.turn))
+    ticks = dict(axis.ticks)
+    for row, shift in shift_from:
+        tick[axis.row >= row] -= shift
+        ticks = {
+            name: np.where(axis.rows[name] >= row, values - shift, values)
+            for name, values in ticks.items()
+        }
+    note = "the computer's elapsed time took back a gap that the host clock suggested"
+    return replace(axis, tick=tick, ticks=ticks, notes=(*axis.notes, note))

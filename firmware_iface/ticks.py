@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +28,20 @@ class TickAxis:
     Attributes
     ----------
     ticks: per message, tick of each accepted frame; messages that no tick fits are left out.
+    rows: per message, row of the table of each accepted frame.
     row, tick, time_ns: the frames that define the axis, in order of arrival.
     every: per message, ticks between two frames of one stream.
+    turn: ticks after which the counter repeats; 0 without a counter.
     notes: what a reader should know.
     """
 
     ticks: Mapping[str, Ticks]
+    rows: Mapping[str, NDArray[np.int64]]
     row: NDArray[np.int64]
     tick: Ticks
     time_ns: NDArray[np.int64]
     every: Mapping[str, int]
+    turn: int
     notes: tuple[str, ...]
 
     def at(
@@ -85,13 +89,31 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
     position, notes = unwrap(counter[order], time_ns[order], tick_ns, modulus)
     owner = owner[order]
     ticks = {name: position[owner == index] for index, name in enumerate(names)}
-    return TickAxis(ticks, row[order], position, time_ns[order], dict.fromkeys(names, 1), notes)
+    return TickAxis(
+        ticks=ticks,
+        rows={name: counted[name].row for name in names},
+        row=row[order],
+        tick=position,
+        time_ns=time_ns[order],
+        every=dict.fromkeys(names, 1),
+        turn=modulus,
+        notes=notes,
+    )
 
 
 def _anchor_axis(anchor: Decoded, tick_ns: int) -> TickAxis:
     tick, every, notes = _own_ticks(anchor, tick_ns)
     name = anchor.message.name
-    return TickAxis({name: tick}, anchor.row, tick, anchor.time_ns, {name: every}, notes)
+    return TickAxis(
+        ticks={name: tick},
+        rows={name: anchor.row},
+        row=anchor.row,
+        tick=tick,
+        time_ns=anchor.time_ns,
+        every={name: every},
+        turn=anchor.message.modulus * every,
+        notes=notes,
+    )
 
 
 def _counter(item: Decoded) -> NDArray[np.int64]:
@@ -152,7 +174,7 @@ def _with_others(
     own = ticks.get(anchor.message.name)
     reference = axis
     if own is not None and len(axis.row) != len(own):
-        reference = TickAxis({}, anchor.row, own, anchor.time_ns, {}, ())
+        reference = replace(axis, row=anchor.row, tick=own, time_ns=anchor.time_ns)
     for name, item in messages.items():
         if name in ticks or len(item.row) == 0:
             continue
@@ -172,4 +194,5 @@ def _with_others(
         else:
             ticks[name] = _settle(by_time, spacing)
             notes.append(f"{name}: no counter to place samples by; host time stamps do")
-    return TickAxis(ticks, axis.row, axis.tick, axis.time_ns, every, tuple(notes))
+    rows = {name: messages[name].row for name in ticks}
+    return replace(axis, ticks=ticks, rows=rows, every=every, notes=tuple(notes))

@@ -1,0 +1,25 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from firmware_iface.busmap import default_map
+from firmware_iface.encode import Encoder
+
+LOGS = Path(__file__).parent.parent / "data" / "logs"
+
+
+@pytest.fixture(scope="session")
+def bus_map():
+    return default_map()
+
+
+@pytest.fixture
+def encoder(bus_map):
+    return Encoder(bus_map)
+
+
+@pytest.fixture(scope="session")
+def logs():
+    return LOGS
