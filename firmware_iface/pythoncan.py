@@ -205,8 +205,8 @@ def _open(options: BusOptions, name: str, transmit: bool) -> can.BusABC:
         raise ConfigurationError(f"{name}: wrong option: {_one_line(error)}") from None
     except (can.CanError, OSError) as error:
         raise InputOutputError(
-            f"{name}: cannot open: {_one_line(error)}; is the adapter plugged in, the channel up "
-            "and not in use?"
+            f"{name}: cannot open: {_one_line(error)}; is its driver installed, the adapter "
+            "plugged in, the channel up and not in use?"
         ) from None
     except Exception as error:
         raise InputOutputError(f"{name}: cannot open: {_one_line(error)}") from None
@@ -285,4 +285,4 @@ def _widen_buffer(bus: can.BusABC) -> None:
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__

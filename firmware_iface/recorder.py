@@ -112,7 +112,12 @@ class Recorder:
         with self._guarded():
             if not self._closed:
                 self._closed = True
-                self._writer.stop()
+                try:
+                    self._writer.stop()
+                finally:  # a full disk must not leave the file open
+                    if self._suffix != AT_THE_END:
+                        with contextlib.suppress(OSError):
+                            self._writer.file.close()
 
     def __enter__(self) -> Self:
         return self

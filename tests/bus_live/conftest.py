@@ -6,11 +6,11 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
-from ehadiag_sim.conditions import Faults
-from ehadiag_sim.fcc import FccCore
 
 from ehadiag.actuator import default_actuator
 from ehadiag.storedtest import Line, StoredTest, Windows
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.fcc import FccCore
 
 CoreFactory = Callable[..., FccCore]
 

@@ -1,0 +1,452 @@
+"""One contract, run on every transport: what `Transport` promises, its readers may rely on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ehadiag.errors import BusLostError, ConfigurationError, InputOutputError
+from firmware_iface.frames import Frame, FrameTable
+from firmware_iface.logs import read_frames
+from firmware_iface.pythoncan import BusOptions, PythonCanTransport
+from firmware_iface.recorder import Recorder
+from firmware_iface.replay import ReplayTransport, play
+from firmware_iface.seriallink import SerialTransport
+from firmware_iface.transport import Transport, TransportState
+
+ROOT = Path(__file__).parents[2]
+INSIDE = "EHADIAG_TESTS_IN_LOOPNET"
+COUNT = 500
+
+
+def frame(k: int) -> Frame:
+    return Frame(1_700_000_000_000_000_000 + k * 1_000_000, 0x100 + k % 0x300, k.to_bytes(8, "big"))
+
+
+FRAMES = [frame(k) for k in range(COUNT)]
+
+
+def content(frames: list[Frame]) -> list[tuple[int, bytes]]:
+    return [(item.can_id, item.data) for item in frames]
+
+
+def collect(transport: Transport, count: int) -> list[Frame]:
+    got: list[Frame] = []
+    deadline = time.monotonic() + 10
+    while len(got) < count and time.monotonic() < deadline:
+        item = transport.receive(0.1)
+        if item is not None:
+            got.append(item)
+    return got
+
+
+class Contract:
+    """Subclasses give a pair: a function that sends the frames, and the transport that gets them."""
+
+    @pytest.fixture
+    def receiving(self) -> Iterator[Transport]:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def feed(self) -> Callable[[], None]:
+        raise NotImplementedError
+
+    def test_every_frame_comes_once_and_in_order(
+        self, receiving: Transport, feed: Callable[[], None]
+    ) -> None:
+        feed()
+        got = collect(receiving, COUNT)
+        assert content(got) == content(FRAMES)
+        assert receiving.receive(0.05) is None
+        assert receiving.state is TransportState.OPEN
+        assert receiving.detail == ""
+
+    def test_times_are_whole_nanoseconds_that_do_not_run_backwards(
+        self, receiving: Transport, feed: Callable[[], None]
+    ) -> None:
+        feed()
+        times = [item.time_ns for item in collect(receiving, COUNT)]
+        assert all(type(item) is int for item in times)
+        assert times == sorted(times)
+
+    def test_a_transport_that_listens_only_sends_nothing(self, receiving: Transport) -> None:
+        assert not receiving.transmits
+        with pytest.raises(ConfigurationError, match="listen only"):
+            receiving.send(FRAMES[0])
+        assert receiving.state is TransportState.OPEN
+
+    def test_closing_twice_is_well_and_use_afterwards_is_an_error(
+        self, receiving: Transport
+    ) -> None:
+        receiving.close()
+        receiving.close()
+        assert receiving.state is TransportState.CLOSED
+        with pytest.raises(BusLostError, match="closed"):
+            receiving.receive(0.0)
+        with pytest.raises(BusLostError, match="closed"):
+            receiving.send(FRAMES[0])
+
+    def test_silence_is_none_and_no_end(self, receiving: Transport) -> None:
+        if not receiving.at_end and receiving.real_time:
+            assert receiving.receive(0.0) is None
+            assert receiving.receive(0.02) is None
+            assert receiving.state is TransportState.OPEN
+
+    def test_the_clock_of_time_limits_runs_on(
+        self, receiving: Transport, feed: Callable[[], None]
+    ) -> None:
+        feed()
+        before = receiving.now_ns()
+        collect(receiving, COUNT)
+        assert receiving.now_ns() > before
+
+
+class TwoWay(Contract):
+    """Transports with another end that can be written to, and read."""
+
+    @pytest.fixture
+    def other(self) -> Iterator[Transport]:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def feed(self, other: Transport) -> Callable[[], None]:
+        def send() -> None:
+            for item in FRAMES:
+                other.send(item)
+
+        return send
+
+    def test_own_frames_do_not_come_back(self, receiving: Transport, other: Transport) -> None:
+        for item in FRAMES[:50]:
+            other.send(item)
+        assert len(collect(receiving, 50)) == 50
+        assert other.receive(0.1) is None
+
+    def test_one_thread_sends_while_another_receives(
+        self, receiving: Transport, feed: Callable[[], None]
+    ) -> None:
+        sender = threading.Thread(target=feed)
+        sender.start()
+        got = collect(receiving, COUNT)
+        sender.join()
+        assert content(got) == content(FRAMES)
+
+
+class TestVirtual(TwoWay):
+    @pytest.fixture
+    def options(self) -> BusOptions:
+        return BusOptions("virtual", channel=str(uuid.uuid4()))
+
+    @pytest.fixture
+    def other(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options) as transport:
+            yield transport
+
+
+@pytest.mark.skipif(INSIDE not in os.environ, reason="runs in tools/loopnet.sh, started below")
+class TestMulticast(TwoWay):
+    @pytest.fixture
+    def options(self) -> BusOptions:
+        return BusOptions("udp_multicast")
+
+    @pytest.fixture
+    def other(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options) as transport:
+            yield transport
+
+    @pytest.fixture
+    def feed(self, other: Transport) -> Callable[[], None]:
+        def send() -> None:
+            # A paced log: a multicast socket drops what its reader has no room for.
+            table = FrameTable.from_frames(FRAMES)
+            play(table, other, speed=2.0)
+
+        return send
+
+    def test_what_is_no_frame_degrades_and_does_not_end_the_bus(
+        self, receiving: Transport, other: Transport
+    ) -> None:
+        import socket
+
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"\xff not a frame", ("239.74.163.2", 43113))
+        other.send(FRAMES[0])
+        assert content(collect(receiving, 1)) == content(FRAMES[:1])
+        assert receiving.state is TransportState.DEGRADED
+        assert "1 datagrams" in receiving.detail
+
+
+@pytest.mark.skipif(INSIDE in os.environ, reason="already inside")
+def test_multicast_keeps_the_contract_in_a_namespace_of_its_own() -> None:
+    loopnet = str(ROOT / "tools" / "loopnet.sh")
+    if subprocess.run([loopnet, "true"], capture_output=True, check=False).returncode == 125:
+        pytest.skip("no network namespace can be made here")
+    command = [loopnet, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    done = subprocess.run(
+        [*command, __file__, "-k", "TestMulticast"],
+        env=os.environ | {INSIDE: "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert " passed" in done.stdout
+    assert "skipped" not in done.stdout.splitlines()[-1]
+
+
+@pytest.mark.skipif(INSIDE in os.environ, reason="multicast has its route there")
+def test_multicast_that_would_leave_the_machine_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from firmware_iface import pythoncan
+
+    routes = tmp_path / "route"
+    header = "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
+    default = "eth7 00000000 00000000 0003 0 0 0 00000000 0 0 0\n"
+    loopback = "lo 000000EF 00000000 0001 0 0 0 000000FF 0 0 0\n"
+    if sys.byteorder == "big":
+        pytest.skip("the table above is that of a little-endian machine")
+    monkeypatch.setattr(pythoncan, "ROUTES", routes)
+    for text, why in ((header + default, "through eth7"), (header, "no loopback route")):
+        routes.write_text(text)
+        with pytest.raises(ConfigurationError, match=why):
+            PythonCanTransport(BusOptions("udp_multicast"))
+    routes.write_text(header + default + loopback)
+    with pytest.raises(ConfigurationError, match="no loopback route"):
+        PythonCanTransport(BusOptions("udp_multicast", channel="ff15::1"))
+    with pytest.raises(ConfigurationError, match="not an IP address"):
+        PythonCanTransport(BusOptions("udp_multicast", channel="can0"))
+    assert pythoncan._arguments(BusOptions("udp_multicast"), True)["hop_limit"] == 0
+    allowed = BusOptions("udp_multicast", allow_multicast=True)
+    assert "hop_limit" not in pythoncan._arguments(allowed, True)
+
+
+class TestSerial(TwoWay):
+    @pytest.fixture
+    def wire(self) -> Iterator[tuple[str, str]]:
+        """Two pty pairs, joined in the middle."""
+        if not hasattr(os, "openpty"):
+            pytest.skip("no pseudo-terminals on this system")
+        import select
+        import tty
+
+        (a, a_end), (b, b_end) = os.openpty(), os.openpty()
+        for item in (a, b, a_end, b_end):
+            tty.setraw(item)
+        stop = threading.Event()
+
+        def join() -> None:
+            while not stop.is_set():
+                for source in select.select([a, b], [], [], 0.02)[0]:
+                    os.write(b if source == a else a, os.read(source, 4096))
+
+        thread = threading.Thread(target=join)
+        thread.start()
+        yield os.ttyname(a_end), os.ttyname(b_end)
+        stop.set()
+        thread.join()
+        for item in (a, b, a_end, b_end):
+            os.close(item)
+
+    @pytest.fixture
+    def other(self, wire: tuple[str, str]) -> Iterator[Transport]:
+        with SerialTransport(wire[1], transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, wire: tuple[str, str]) -> Iterator[Transport]:
+        with SerialTransport(wire[0]) as transport:
+            yield transport
+
+    def test_damage_degrades_and_the_next_frame_comes(
+        self, receiving: Transport, other: Transport
+    ) -> None:
+        other.send(FRAMES[0])
+        other._port.write(b"\x03\x41")
+        other._port.write(b"\x00")
+        other.send(FRAMES[1])
+        assert content(collect(receiving, 2)) == content(FRAMES[:2])
+        assert receiving.state is TransportState.DEGRADED
+        assert "1 damaged" in receiving.detail
+
+    def test_times_keep_the_senders_spacing(
+        self, receiving: Transport, feed: Callable[[], None]
+    ) -> None:
+        feed()
+        times = [item.time_ns for item in collect(receiving, COUNT)]
+        assert [item - times[0] for item in times] == [k * 1_000_000 for k in range(COUNT)]
+
+
+def test_a_serial_line_that_goes_away_is_a_lost_bus() -> None:
+    if not hasattr(os, "openpty"):
+        pytest.skip("no pseudo-terminals on this system")
+    far, near = os.openpty()
+    transport = SerialTransport(os.ttyname(near), transmit=True)
+    os.close(near)
+    os.close(far)
+    with pytest.raises(BusLostError):
+        for _ in range(100):
+            transport.receive(0.02)
+    assert transport.state is TransportState.FAILED
+    with pytest.raises(BusLostError):
+        transport.send(FRAMES[0])
+    transport.close()
+
+
+class ReplayContract(Contract):
+    suffix = ""
+
+    @pytest.fixture
+    def receiving(self, tmp_path: Path) -> Iterator[Transport]:
+        path = tmp_path / f"log{self.suffix}"
+        with Recorder(path) as recorder:
+            for item in FRAMES:
+                recorder.write(item)
+        with ReplayTransport(read_frames(path), path.name) as transport:
+            yield transport
+
+    @pytest.fixture
+    def feed(self) -> Callable[[], None]:
+        return lambda: None
+
+    def test_the_end_is_known(self, receiving: Transport) -> None:
+        assert not receiving.at_end
+        collect(receiving, COUNT)
+        assert receiving.at_end
+
+
+class TestBlf(ReplayContract):
+    suffix = ".blf"
+
+
+class TestAsc(ReplayContract):
+    suffix = ".asc"
+
+
+class TestCsv(ReplayContract):
+    suffix = ".csv"
+
+
+class TestTrc(ReplayContract):
+    suffix = ".trc"
+
+
+def test_replay_in_its_own_time_is_not_faster_than_the_log() -> None:
+    table = FrameTable.from_frames([frame(0), frame(100)])
+    with ReplayTransport(table, "log", speed=1.0) as transport:
+        started = time.monotonic()
+        assert len(collect(transport, 2)) == 2
+        assert time.monotonic() - started >= 0.099
+        assert transport.real_time
+
+
+def test_playing_onto_a_bus_keeps_order_skips_errors_and_stops() -> None:
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    log = [*FRAMES[:20], Frame(FRAMES[20].time_ns, 8, b"", error=True), *FRAMES[20:40]]
+    table = FrameTable.from_frames(log)
+    with (
+        PythonCanTransport(options) as listener,
+        PythonCanTransport(options, transmit=True) as bus,
+    ):
+        assert play(table, bus, speed=None) == 40
+        assert content(collect(listener, 40)) == content(FRAMES[:40])
+        stop = threading.Event()
+        stop.set()
+        assert play(table, bus, stop=stop) == 0
+        with pytest.raises(ConfigurationError, match="listen only"):
+            play(table, listener)
+        with pytest.raises(ConfigurationError, match="speed"):
+            play(table, bus, speed=0.0)
+    with pytest.raises(ConfigurationError, match="speed"):
+        ReplayTransport(table, "log", speed=-1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "text"),
+    [
+        (BusOptions("no_such_bus"), ConfigurationError, "unknown, need one of"),
+        (BusOptions("pcan", channel="PCAN_USBBUS1"), InputOutputError, "cannot open"),
+        (BusOptions("vector", channel="0", app_name="x"), ConfigurationError, "missing"),
+        (BusOptions("slcan", channel="/dev/no-such-port"), InputOutputError, "cannot open"),
+        (BusOptions("socketcan", channel="nocan7"), InputOutputError, "cannot open"),
+        (BusOptions("socketcand", channel="can0"), ConfigurationError, "wrong option"),
+    ],
+)
+def test_a_bus_that_cannot_be_opened_is_one_line(
+    options: BusOptions, error: type[Exception], text: str
+) -> None:
+    with pytest.raises(error, match=text) as caught:
+        PythonCanTransport(options)
+    assert "\n" not in str(caught.value)
+    assert options.interface in str(caught.value)
+
+
+def test_a_serial_port_that_cannot_be_opened_is_one_line() -> None:
+    with pytest.raises(InputOutputError, match="cannot open"):
+        SerialTransport("/dev/no-such-port")
+    with pytest.raises(ConfigurationError, match="wrong option"):
+        SerialTransport("nothing://x")
+
+
+def test_adapters_are_silenced_unless_asked_to_transmit() -> None:
+    from firmware_iface.pythoncan import _arguments
+
+    for interface, option in (("slcan", "listen_only"), ("vector", "listen_only")):
+        assert _arguments(BusOptions(interface), False)[option] is True
+        assert option not in _arguments(BusOptions(interface), True)
+    assert _arguments(BusOptions("kvaser"), False)["driver_mode"] is False
+    assert _arguments(BusOptions("pcan"), False)["state"].name == "PASSIVE"
+    assert "state" not in _arguments(BusOptions("pcan"), True)
+
+
+def test_bus_off_ends_the_bus() -> None:
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    with (
+        PythonCanTransport(options) as listener,
+        PythonCanTransport(options, transmit=True) as bus,
+    ):
+        bus.send(Frame(0, 0x004, bytes(8), error=True))
+        item = collect(listener, 1)[0]
+        assert item.error
+        assert listener.state is TransportState.OPEN
+        bus.send(Frame(0, 0x040, bytes(8), error=True))
+        with pytest.raises(BusLostError, match="bus off"):
+            collect(listener, 1)
+        assert listener.state is TransportState.FAILED
+
+
+@pytest.mark.socketcan
+class TestSocketCan(TwoWay):
+    @pytest.fixture
+    def options(self) -> BusOptions:
+        return BusOptions("socketcan", channel="vcan0")
+
+    @pytest.fixture
+    def other(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options) as transport:
+            yield transport
