@@ -18,8 +18,9 @@ NEAR = 16
 """Counter steps up to this are taken at their word when the host's clock contradicts them."""
 SLACK_TICKS = 8.0
 """Host-time jitter that a real gap may show, in ticks."""
-SLACK_RATE = 1e-3
-"""The same as a share of the gap: two clocks drift apart."""
+SLACK_RATE = 2e-4
+"""The same as a share of the gap: two clocks drift apart. Past some ten minutes it covers a whole
+turn, and a step of the host clock that long looks like a gap."""
 
 
 def _table() -> tuple[int, ...]:
