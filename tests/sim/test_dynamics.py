@@ -17,6 +17,7 @@ from ehadiag_sim.kernels import (
     DXJ,
     DXS,
     MOTOR,
+    P12,
     STATES,
     XF,
     XJ,
@@ -84,7 +85,7 @@ def test_spool_breaks_away_just_above_static_friction():
     assert state[XS] > 0.0
 
 
-speeds = st.floats(-1.0, 1.0)
+speeds = st.just(0.0) | st.floats(1e-6, 1.0) | st.floats(-1.0, -1e-6)
 forces = st.floats(-1e4, 1e4)
 
 
@@ -97,7 +98,7 @@ def test_dry_friction_never_drives(velocity, force, damping, static, step):
     rough = velocity_after(mass * velocity, force, step, per_mass, static, 0.5 * static)
     if velocity != 0.0:
         assert rough * velocity >= 0.0
-        assert np.sign(velocity) * (slick - rough) >= -1e-12
+        assert abs(rough) <= abs(slick)
     elif abs(force) <= static:
         assert rough == 0.0
     else:
@@ -155,6 +156,15 @@ def test_hysteresis_is_as_wide_as_it_says():
     np.testing.assert_allclose(falling, 0.5 * 0.05 * 10e-3, atol=1e-15)
 
 
+def test_hysteresis_costs_the_spool_half_its_width():
+    slick = msgspec.structs.replace(
+        ACTUATOR, servovalve=msgspec.structs.replace(ACTUATOR.servovalve, FSS0=0.0)
+    )
+    drive = np.full(200, 4e-3)
+    spool = respond(slick, drive, effects=Effects(hysteresis=0.05), step=COARSE)[0, -1]
+    assert spool == pytest.approx(2.82 * (4e-3 - 0.25e-3) / 74.3, rel=1e-6)
+
+
 def test_backlash_moves_the_steady_spool_by_its_half_width():
     slick = msgspec.structs.replace(
         ACTUATOR, servovalve=msgspec.structs.replace(ACTUATOR.servovalve, FSS0=0.0)
@@ -183,13 +193,23 @@ def test_external_load_below_friction_moves_nothing_above_it_does():
         assert (position < 0.0) == moves
 
 
-def test_jack_driven_back_cannot_exceed_the_supply():
+@pytest.mark.parametrize("speed", [-0.006, -10.0])
+def test_jack_driven_back_cannot_exceed_the_supply(speed):
     p = coefficients(ACTUATOR, Faults(), Effects())
     state = np.zeros(STATES)
-    state[DXJ] = -10.0
+    state[DXJ] = speed
     step_tick(state, p, 0.0, 1e-7, 1)
-    assert state[6] == p.PSR
-    assert -10.0 < state[DXJ] < 0.0
+    assert state[P12] == p.PSR
+    slowed = (p.MJ * speed + 1e-7 * (p.AJ * p.PSR + p.FDJ)) / (p.MJ + 1e-7 * p.CJ)
+    assert state[DXJ] == pytest.approx(slowed, rel=1e-12)
+
+
+def test_spool_stands_at_its_stop():
+    plant = Dynamics(ACTUATOR, effects=Effects(gain_change=0.2), step=COARSE)
+    for _ in range(30):
+        plant.advance(10e-3)
+    state = plant.state
+    assert (state[XS], state[DXS]) == (ACTUATOR.servovalve.XSM, 0.0)
 
 
 def test_flapper_strikes_its_stop_without_bounce():
