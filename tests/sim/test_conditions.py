@@ -53,7 +53,7 @@ def test_hot_oil_thins_and_leaks():
     hot = coefficients(actuator, Faults(), Effects(oil_temperature=100.0, gain_change=0.1))
     thin = 3.5 / 14.5
     assert pytest.approx(cold.CJ * thin) == hot.CJ
-    assert hot.CLK / cold.CLK == pytest.approx(1.0 / thin)
+    assert pytest.approx(1.0 / thin) == hot.CLK / cold.CLK
     assert pytest.approx(actuator.servovalve.CS * (thin - 1.0)) == hot.DAMPING - cold.DAMPING
     assert pytest.approx(1.1 * cold.GM) == hot.GM
     assert (hot.PSR, hot.GP, hot.FORCE) == (cold.PSR, cold.GP, cold.FORCE)
