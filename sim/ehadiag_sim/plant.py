@@ -73,8 +73,10 @@ class Plant:
     def tick(self, command: float, mode: CommandMode) -> NDArray[np.int64]:
         """Advance by one control tick; return the four ADC codes at its end, shape (4,).
 
-        `command` in A (current mode) or m (position mode).
+        `command` in A (current mode) or m (position mode), taken at the bus's resolution.
         """
+        resolution = COMMAND_STEP[mode]
+        command = round(command / resolution) * resolution
         measured = float(POSITION.decode(self._codes[3:])[0])
         self._current = self._controller.current(command, mode, measured)
         self._dynamics.advance(self._current)

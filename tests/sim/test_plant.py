@@ -85,6 +85,15 @@ def test_command_has_the_resolution_of_the_bus():
         assert 0.4 * step < np.abs(command - exact).max() <= 0.5 * step * (1 + 1e-6)
 
 
+def test_a_tick_acts_on_the_command_that_the_bus_can_carry():
+    plant = Plant(ACTUATOR, sensors=NOISELESS, step=COARSE)
+    plant.tick(1.2345678e-3, CommandMode.CURRENT)
+    assert plant.truth[0] == pytest.approx(1.2345e-3, rel=1e-9)
+    plant = Plant(ACTUATOR, sensors=NOISELESS, step=COARSE)
+    plant.tick(1.2347e-3, CommandMode.POSITION)
+    assert plant.truth[0] == pytest.approx(1.7 * 1.234e-3, rel=1e-9)
+
+
 def test_noise_and_quantisation_are_what_the_contract_says():
     result = run("open", seed=3)
     gap = (decoded(result.codes) - truth(result)) / LSB
