@@ -96,7 +96,7 @@ def residuals(
             tables,
             batch.current[a:b],
             tick,
-            batch.origin[index] - candidate[3],
+            batch.origin[index],
             batch.spool[a:b] - candidate[3],
             batch.anchor[index],
             spool,
@@ -106,7 +106,7 @@ def residuals(
         jack_response(
             constants,
             candidate[2],
-            batch.origin[index] - candidate[3],
+            batch.origin[index],
             work.nodes,
             work.node_end[:n],
             pressure,

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
 
-__all__ = ["FINEST", "NODE_COLUMNS", "NODES_PER_TICK", "SpoolTables", "spool_response", "spool_tables"]
+__all__ = [
+    "FINEST",
+    "NODE_COLUMNS",
+    "NODES_PER_TICK",
+    "SpoolTables",
+    "spool_response",
+    "spool_tables",
+]
 
 FINEST = 10
 """Steps are tick / 2^level; events are located to tick / 2^FINEST (1 µs at 1 kHz)."""
@@ -74,9 +81,7 @@ def _transition(rates: NDArray[np.float64], tick: float) -> NDArray[np.float64]:
 
 
 @kernel
-def spool_tables(
-    constants: PlantConstants, kintas: float, fss: float, tick: float
-) -> SpoolTables:
+def spool_tables(constants: PlantConstants, kintas: float, fss: float, tick: float) -> SpoolTables:
     """Transition coefficients for a candidate's `Kintas` and `FSS` (0 … 1), tick in s."""
     c = constants
     flow_gain = c.GQF * (1.0 - 0.8 * kintas)

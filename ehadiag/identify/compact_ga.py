@@ -1,0 +1,134 @@
+"""Real-valued compact genetic algorithm, compiled as a whole.
+
+Mininno, Cupertino, Naso, "Real-Valued Compact Genetic Algorithms for Embedded Microcontroller
+Optimization", IEEE Trans. Evolutionary Computation 12(2), 2008. A probability vector (mean and
+deviation of each gene) stands for the population; each generation draws individuals from it, the
+elite competes with each of them (persistent elitism), and the vector moves towards winners by the
+weight of one individual in a virtual population. Several individuals are drawn a generation, so
+that the model runs on many at once.
+
+The state is the vector, the elite and the random generator: a few numbers, whatever the number of
+generations or the size of the virtual population.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.batch import Batch, Workspace, costs
+from ehadiag.jit import kernel
+
+__all__ = ["compact_ga", "state_bytes"]
+
+REDRAWS = 16
+"""Draws outside the bounds are repeated so often, then clipped (truncated normal density)."""
+
+
+def state_bytes(genes: int) -> int:
+    """Memory of the search itself: mean, deviation and elite of each gene, cost, generator."""
+    return genes * 3 * 8 + 8 + 8
+
+
+@kernel
+def _next_uniform(state: NDArray[np.uint64]) -> float:
+    """Uniform in (0, 1): SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
+    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = state[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return (float(z >> np.uint64(11)) + 0.5) / 9007199254740992.0
+
+
+@kernel
+def _next_normal(state: NDArray[np.uint64]) -> float:
+    """Standard normal: Box and Muller."""
+    radius = math.sqrt(-2.0 * math.log(_next_uniform(state)))
+    return radius * math.cos(2.0 * math.pi * _next_uniform(state))
+
+
+@kernel
+def compact_ga(
+    batch: Batch,
+    work: Workspace,
+    gaps: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    cap: float,
+    start: NDArray[np.float64],
+    deviation: NDArray[np.float64],
+    virtual_population: float,
+    samples: int,
+    budget: int,
+    tolerance: float,
+    seed: int,
+    control: NDArray[np.int64],
+    history: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float, int, int]:
+    """Search from `start`, all genes in 0 … 1.
+
+    Parameters
+    ----------
+    batch, work, gaps, cap: see `ehadiag.identify.batch.costs`.
+    offsets: sensor offsets, held, shape (2,).
+    start, deviation: mean and deviation of the first probability vector, shape (3,).
+    virtual_population: size N_p of the population that the vector stands for.
+    samples: individuals drawn a generation.
+    budget: evaluations at most.
+    tolerance: stop once all deviations are below.
+    control: shape (2,); [0] set to non-zero by another thread stops the search, [1] is the number
+        of evaluations done so far.
+    history: out, best cost after each generation, shape (at least budget / samples,).
+
+    Returns
+    -------
+    Elite, its cost, evaluations, generations.
+    """
+    genes = start.shape[0]
+    state = np.empty(1, dtype=np.uint64)
+    state[0] = np.uint64(seed)
+    mean, spread = start.copy(), deviation.copy()
+    population = np.empty((samples, genes + 2))
+    population[:, genes:] = offsets
+    values = np.empty(samples)
+    population[0, :genes] = start
+    costs(batch, population[:1], cap, work, gaps, values[:1])
+    elite, best = start.copy(), values[0]
+    used, generation = 1, 0
+    while used + samples <= budget and control[0] == 0:
+        for i in range(samples):
+            for g in range(genes):
+                value = 0.0
+                for _ in range(REDRAWS):
+                    value = mean[g] + spread[g] * _next_normal(state)
+                    if 0.0 <= value <= 1.0:
+                        break
+                population[i, g] = min(max(value, 0.0), 1.0)
+        costs(batch, population, cap, work, gaps, values)
+        used += samples
+        for i in range(samples):
+            wins = values[i] < best
+            for g in range(genes):
+                winner = population[i, g] if wins else elite[g]
+                loser = elite[g] if wins else population[i, g]
+                before = mean[g]
+                mean[g] = min(max(before + (winner - loser) / virtual_population, 0.0), 1.0)
+                square = (
+                    spread[g] ** 2
+                    + before**2
+                    - mean[g] ** 2
+                    + (winner**2 - loser**2) / virtual_population
+                )
+                spread[g] = math.sqrt(max(square, (0.25 * tolerance) ** 2))
+                if wins:
+                    elite[g] = population[i, g]
+            if wins:
+                best = values[i]
+        history[generation] = best
+        generation += 1
+        control[1] = used
+        if spread.max() < tolerance:
+            break
+    return elite, best, used, generation

@@ -1,0 +1,133 @@
+"""The servovalve current that was commanded, exactly where that is possible.
+
+Measured current carries the converter's noise; the commanded one is known better. In open loop it
+is the command. In closed loop the control law is repeated on the *digitised* jack position, as the
+flight-control computer saw it (bus.md: the position of the tick before feeds the control law).
+Where that sample is lost, its code follows from the measured current: one code of position is
+many codes of current.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.actuator import Controller
+from ehadiag.channels import CURRENT, POSITION
+from ehadiag.recording import CommandMode, Samples
+from ehadiag.storedtest import StoredTest
+
+__all__ = ["CurrentTrace", "commanded_current"]
+
+FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
+"""A command frame that far (A, m) from the stored test says that another command was played."""
+CONTROL_LAW_LSB = 4.0
+"""Gap (LSB rms) beyond which the control law does not explain the measured current."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurrentTrace:
+    """Commanded current of each tick.
+
+    Attributes
+    ----------
+    current: A, shape (n,).
+    gap_lsb: rms of measured less commanded current, converter steps; NaN without measurement.
+    offset: constant error of the measured current, A.
+    rebuilt: whether control law and command gave it; else it is the measured current.
+    command_gap: largest distance of a command frame from the stored test, A or m.
+    """
+
+    current: NDArray[np.float64]
+    gap_lsb: float
+    offset: float
+    rebuilt: bool
+    command_gap: float
+
+
+def commanded_current(samples: Samples, test: StoredTest, controller: Controller) -> CurrentTrace:
+    """Rebuild the commanded current of a test from its samples."""
+    n = samples.ticks
+    stored = _fit_length(test.command(), n)
+    known = np.isfinite(samples.command)
+    gap = np.abs(samples.command - stored)[known]
+    command_gap = float(gap.max()) if gap.size else 0.0
+    command = np.where(known, samples.command, stored)
+    if samples.mode is CommandMode.CURRENT:
+        current = np.clip(command, -controller.IM, controller.IM)
+    else:
+        current = _control_law(command, samples, controller)
+    finite = np.isfinite(samples.current)
+    difference = samples.current[finite] - current[finite]
+    if difference.size == 0:
+        return CurrentTrace(current, float("nan"), 0.0, True, command_gap)
+    offset = float(np.median(difference))
+    # A handful of ticks may be far off where samples were lost: compare most of them.
+    spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
+    gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
+    rebuilt = gap_lsb < CONTROL_LAW_LSB
+    if not rebuilt:
+        ticks = np.arange(n)
+        current = np.interp(ticks, ticks[finite], samples.current[finite])
+    return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap)
+
+
+def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Cut the stored command to n ticks, or hold its last value."""
+    if len(command) >= n:
+        return command[:n]
+    return np.concatenate([command, np.full(n - len(command), command[-1])])
+
+
+def _control_law(
+    command: NDArray[np.float64], samples: Samples, controller: Controller
+) -> NDArray[np.float64]:
+    """Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt), Err = Com − XJm (model.md section 1)."""
+    seen = _positions_seen(command, samples, controller)
+    error = command - seen
+    period = samples.period_ns * 1e-9
+    demand = controller.GAP * error
+    if controller.GAD:
+        demand += controller.GAD * np.diff(error, prepend=error[0]) / period
+    if not controller.GAI:
+        return np.clip(demand, -controller.IM, controller.IM)
+    out = np.empty_like(demand)
+    integral = 0.0
+    for k in range(len(demand)):
+        trial = integral + error[k] * period
+        wanted = demand[k] + controller.GAI * trial
+        out[k] = min(max(wanted, -controller.IM), controller.IM)
+        # Conditional integration: the integral rests while it would push further into saturation.
+        if wanted == out[k] or (wanted - out[k]) * error[k] < 0.0:
+            integral = trial
+    return out
+
+
+def _positions_seen(
+    command: NDArray[np.float64], samples: Samples, controller: Controller
+) -> NDArray[np.float64]:
+    """Digitised jack position that each tick's control law worked on, m, shape (n,)."""
+    seen = np.concatenate([[np.nan], samples.position[:-1]])
+    lost = np.flatnonzero(np.isnan(seen))
+    if lost.size == 0:
+        return seen
+    ticks = np.arange(len(seen))
+    present = np.isfinite(seen)
+    bridged = np.interp(ticks, ticks[present], seen[present]) if present.any() else 0.0 * command
+    seen = np.where(present, seen, np.round(bridged / POSITION.lsb) * POSITION.lsb)
+    clear = controller.GAP * POSITION.lsb > 6.0 * CURRENT.lsb
+    if not clear or controller.GAI or controller.GAD:
+        return seen
+    linear = np.abs(samples.current) < controller.IM - 3.0 * CURRENT.lsb
+    exact = present & linear
+    offset = 0.0
+    if exact.any():
+        law = controller.GAP * (command - seen)
+        offset = float(np.median(samples.current[exact] - law[exact]))
+    for k in lost:
+        if linear[k]:
+            position = command[k] - (samples.current[k] - offset) / controller.GAP
+            seen[k] = np.round(position / POSITION.lsb) * POSITION.lsb
+    return seen

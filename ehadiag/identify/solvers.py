@@ -1,0 +1,208 @@
+"""Solvers behind one interface: the compact genetic algorithm, and pygad for offline use."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.errors import ConfigurationError
+from ehadiag.identify.compact_ga import compact_ga
+from ehadiag.identify.objective import Objective
+
+__all__ = ["SOLVERS", "CompactGa", "PygadGa", "SearchResult", "Solver", "make_solver"]
+
+Progress = Callable[[int, int], None]
+"""Called with evaluations done and budget."""
+POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchResult:
+    """Outcome of one global search."""
+
+    best: NDArray[np.float64]
+    """Shape (3,)."""
+    cost: float
+    evaluations: int
+    generations: int
+    history: NDArray[np.float64]
+    """Best cost after each generation."""
+
+
+class Solver(Protocol):
+    """Minimises an objective over the unit cube, from a start with a deviation."""
+
+    @property
+    def name(self) -> str:
+        """What results call it."""
+        ...
+
+    def with_budget(self, budget: int) -> Solver:
+        """Return the same solver with another number of evaluations."""
+        ...
+
+    def minimise(
+        self,
+        objective: Objective,
+        start: NDArray[np.float64],
+        deviation: float,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> SearchResult:
+        """Search; the same seed gives the same answer. `start` has shape (3,)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CompactGa:
+    """The compact genetic algorithm, model and all in one compiled call."""
+
+    budget: int = 600
+    """Evaluations at most."""
+    virtual_population: float = 40.0
+    samples: int = 8
+    """Individuals drawn a generation."""
+    tolerance: float = 1e-5
+    """Done when the deviation of every gene is below."""
+    name: str = field(default="cga", init=False)
+
+    def with_budget(self, budget: int) -> CompactGa:
+        """Return the same solver with another number of evaluations."""
+        return replace(self, budget=budget)
+
+    def minimise(
+        self,
+        objective: Objective,
+        start: NDArray[np.float64],
+        deviation: float,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> SearchResult:
+        """Search; Ctrl-C stops it between two generations."""
+        control = np.zeros(2, dtype=np.int64)
+        history = np.empty(self.budget // self.samples + 1)
+        outcome: list[tuple[NDArray[np.float64], float, int, int]] = []
+
+        def work() -> None:
+            outcome.append(
+                compact_ga(
+                    objective.batch,
+                    objective.work,
+                    objective.gaps,
+                    np.array(objective.offsets),
+                    objective.cap,
+                    np.asarray(start, dtype=np.float64),
+                    np.full(len(start), deviation),
+                    self.virtual_population,
+                    self.samples,
+                    self.budget,
+                    self.tolerance,
+                    seed,
+                    control,
+                    history,
+                )
+            )
+
+        if progress is None:
+            work()
+        else:
+            thread = threading.Thread(target=work, name="ehadiag-search")
+            thread.start()
+            try:
+                while thread.is_alive():
+                    thread.join(POLL_S)
+                    progress(int(control[1]), self.budget)
+            except BaseException:
+                control[0] = 1
+                thread.join()
+                raise
+        best, cost, used, generations = outcome[0]
+        objective.evaluations += used
+        return SearchResult(best, float(cost), used, generations, history[:generations].copy())
+
+
+@dataclass(frozen=True, slots=True)
+class PygadGa:
+    """pygad's genetic algorithm on the same objective."""
+
+    budget: int = 1600
+    population: int = 32
+    name: str = field(default="pygad", init=False)
+
+    def with_budget(self, budget: int) -> PygadGa:
+        """Return the same solver with another number of evaluations."""
+        return replace(self, budget=budget)
+
+    def minimise(
+        self,
+        objective: Objective,
+        start: NDArray[np.float64],
+        deviation: float,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> SearchResult:
+        """Search; deterministic for a seed."""
+        import pygad  # noqa: PLC0415 - half a second, only for who asks
+
+        rng = np.random.default_rng(seed)
+        first = np.clip(rng.normal(start, deviation, (self.population, len(start))), 0.0, 1.0)
+        first[0] = start
+        before = objective.evaluations
+        history: list[float] = []
+
+        def fitness(_: Any, solutions: NDArray[np.float64], __: Any) -> NDArray[np.float64]:
+            return -objective(solutions)
+
+        def after(ga: Any) -> None:
+            history.append(-float(np.max(ga.last_generation_fitness)))
+            if progress is not None:
+                progress(objective.evaluations - before, self.budget)
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ga = pygad.GA(
+                num_generations=max(1, self.budget // self.population - 1),
+                num_parents_mating=self.population // 2,
+                initial_population=first,
+                fitness_func=fitness,
+                fitness_batch_size=self.population,
+                gene_space={"low": 0.0, "high": 1.0},
+                parent_selection_type="tournament",
+                keep_elitism=2,
+                crossover_type="uniform",
+                mutation_type="random",
+                mutation_by_replacement=False,
+                mutation_probability=0.5,
+                random_mutation_min_val=-deviation,
+                random_mutation_max_val=deviation,
+                random_seed=seed,
+                suppress_warnings=True,
+                on_generation=after,
+            )
+            ga.run()
+            best, value, _ = ga.best_solution(ga.last_generation_fitness)
+        used = objective.evaluations - before
+        return SearchResult(
+            np.asarray(best, dtype=np.float64), -float(value), used, len(history), np.array(history)
+        )
+
+
+SOLVERS: dict[str, Callable[[], Solver]] = {"cga": CompactGa, "pygad": PygadGa}
+
+
+def make_solver(name: str) -> Solver:
+    """Return the solver of that name.
+
+    Raises
+    ------
+    ConfigurationError: there is none.
+    """
+    if name not in SOLVERS:
+        raise ConfigurationError(f"solver {name!r}: choose one of {', '.join(SOLVERS)}")
+    return SOLVERS[name]()
