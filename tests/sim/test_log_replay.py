@@ -96,6 +96,9 @@ def test_convergence_prints_a_table(capsys):
     assert [row.split("|")[1].strip() for row in rows] == ["step, µs", "---", "8", "4"]
 
 
-def test_convergence_refuses_impossible_faults(capsys):
-    assert convergence.main(["--faults", "2", "0", "0"]) == 2
-    assert "Kintas" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("options", "words"), [(["--faults", "2", "0", "0"], "Kintas"), (["--ticks", "0"], "--ticks")]
+)
+def test_convergence_refuses_impossible_options(capsys, options, words):
+    assert convergence.main(options) == 2
+    assert words in capsys.readouterr().err

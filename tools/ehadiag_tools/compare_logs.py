@@ -92,15 +92,19 @@ def read_truth(path: Path) -> list[Truth]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputOutputError(f"{path}: {error}") from None
+    except OSError as error:
+        raise InputOutputError(f"{path}: {error.strerror or error}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputOutputError(f"{path}: not a table of comma-separated text: {error}") from None
     found = []
     for number, row in enumerate(rows, start=2):
         try:
             faults = Faults(*(float(row[name]) for name in ("Kintas", "FSS", "FDJ")))
             found.append(Truth(row["file"], row["test"], faults))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"{path} line {number}: {error!r}") from None
+        except KeyError as error:
+            raise ConfigurationError(f"{path}: column {error} is missing") from None
+        except (TypeError, ValueError, ConfigurationError) as error:
+            raise ConfigurationError(f"{path} line {number}: {error}") from None
     return found
 
 

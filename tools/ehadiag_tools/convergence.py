@@ -14,7 +14,7 @@ import numpy as np
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import POSITION, PRESSURE, SPOOL
-from ehadiag.errors import EhadiagError
+from ehadiag.errors import ConfigurationError, EhadiagError
 from ehadiag.storedtest import resolve_test
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.dynamics import respond
@@ -45,6 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(argv)
     try:
+        if options.ticks is not None and options.ticks < 1:
+            raise ConfigurationError(f"--ticks {options.ticks}: need at least 1")
         faults = Faults(*options.faults)
         for name in options.test or ("open", "closed"):
             table(name, faults, options.steps, options.ticks)
