@@ -94,6 +94,7 @@ class FccCore:
         self._refused: tuple[BitReason, int] | None = None
         self._since = 0
         self._commands: list[float] = []
+        self._elapsed = 0
         self._mode = CommandMode.POSITION
         self._told: tuple[BitState, int] | None = None
         self._pending: deque[Request] = deque()
@@ -134,10 +135,10 @@ class FccCore:
             elif request.code == "abort":
                 self._abort()
         self._advance()
-        elapsed = self._tick - self._since
         running = self._state is BitState.RUNNING
         if running:
-            command, mode, test_id = self._commands[elapsed], self._mode, self._test_id
+            self._elapsed = self._tick - self._since
+            command, mode, test_id = self._commands[self._elapsed], self._mode, self._test_id
         elif self._state is BitState.ABORTED:
             command, mode, test_id = 0.0, CommandMode.CURRENT, 0
         else:
@@ -145,7 +146,7 @@ class FccCore:
         codes = self._plant.tick(command, mode)
         self._tick += 1
         frames: list[Frame] = []
-        frames += self._status(elapsed)
+        frames += self._status()
         if running or self._idle_telemetry:
             frames += self._encoder.command(mode, command, test_id, 0)
             frames += self._encoder.telemetry(codes.tolist(), 0)
@@ -161,6 +162,7 @@ class FccCore:
         if reason is BitReason.NONE:
             test = self._tests[test_id]
             self._commands = test.command().tolist()
+            self._elapsed = 0
             self._mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
             self._enter(BitState.ARMING, test_id)
         elif self._state in (BitState.ARMING, BitState.RUNNING):
@@ -197,18 +199,20 @@ class FccCore:
             self._plant = self._fresh_plant()
             self._enter(BitState.RUNNING, self._test_id)
         elif self._state is BitState.RUNNING and elapsed >= len(self._commands):
+            self._elapsed = elapsed
             self._enter(BitState.COMPLETE, self._test_id)
         elif (
             self._state in (BitState.COMPLETE, BitState.ABORTED, BitState.REFUSED)
             and elapsed >= HOLD_S * self._rate
         ):
+            self._elapsed = 0
             self._enter(BitState.IDLE, 0)
 
     def _enter(self, state: BitState, test_id: int) -> None:
         self._state, self._test_id = state, test_id
         self._since = self._tick
 
-    def _status(self, elapsed: int) -> tuple[Frame, ...]:
+    def _status(self) -> tuple[Frame, ...]:
         """Status on change and at its rate; the answer to a second request in between."""
         frames: tuple[Frame, ...] = ()
         running = self._state in (BitState.ARMING, BitState.RUNNING)
@@ -225,9 +229,8 @@ class FccCore:
         due = (self._tick - 1) % round(self._rate / STATUS_HZ) == 0
         if due or present != self._told or frames:
             self._told = present
-            shown = min(elapsed, len(self._commands)) / self._rate if self._test_id else 0.0
             frames += self._encoder.status(
-                self._state, reason, self._test_id, shown, self._serial, 0
+                self._state, reason, self._test_id, self._elapsed / self._rate, self._serial, 0
             )
         return frames
 

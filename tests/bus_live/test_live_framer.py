@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import binascii
+import itertools
 import struct
 
 import pytest
@@ -47,11 +48,9 @@ def test_frames_come_through_however_the_bytes_are_cut(sent: list[Frame], cuts: 
     assert framer.bad == 0
     if sent:
         assert got[0].time_ns == sent[0].time_ns
-        apart = [
-            (b.time_ns - a.time_ns) % (2**32 * 1000) for a, b in zip(got, got[1:], strict=False)
-        ]
+        apart = [(b.time_ns - a.time_ns) % (2**32 * 1000) for a, b in itertools.pairwise(got)]
         assert apart == [
-            (b.time_ns - a.time_ns) % (2**32 * 1000) for a, b in zip(sent, sent[1:], strict=False)
+            (b.time_ns - a.time_ns) % (2**32 * 1000) for a, b in itertools.pairwise(sent)
         ]
 
 

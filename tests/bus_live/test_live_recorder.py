@@ -162,11 +162,12 @@ def test_refusals(tmp_path: Path) -> None:
     assert (tmp_path / "there.blf").read_text() == "precious"
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_a_full_disk_is_one_clear_error(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "x.csv")
     recorder._writer.file.close()
-    recorder._writer.file = open("/dev/full", "w", buffering=1 << 20)
+    full = os.open("/dev/full", os.O_WRONLY)
+    recorder._writer.file = os.fdopen(full, "w", buffering=1 << 20)
     with pytest.raises(InputOutputError, match=r"x\.csv: No space left"):
         recorder.write(frame(0))
     with pytest.raises(InputOutputError, match="No space left"):

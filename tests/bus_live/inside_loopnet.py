@@ -1,0 +1,95 @@
+"""Tests on udp_multicast: run by test_live_contract.py inside tools/loopnet.sh, nowhere else."""
+
+from __future__ import annotations
+
+import multiprocessing
+import socket
+from collections.abc import Callable, Iterator
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import pytest
+from test_live_contract import FRAMES, TwoWay, collect, content
+
+from ehadiag.actuator import default_actuator
+from ehadiag.storedtest import bundled_tests
+from ehadiag_sim.emulator import run_emulator
+from ehadiag_sim.fcc import FccCore
+from firmware_iface.frames import FrameTable
+from firmware_iface.logs import read_recording
+from firmware_iface.pythoncan import BusOptions, PythonCanTransport
+from firmware_iface.recorder import Recorder
+from firmware_iface.replay import play
+from firmware_iface.tester import run_test
+from firmware_iface.transport import Transport, TransportState
+
+
+class TestMulticast(TwoWay):
+    @pytest.fixture
+    def options(self) -> BusOptions:
+        return BusOptions("udp_multicast")
+
+    @pytest.fixture
+    def other(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, options: BusOptions) -> Iterator[Transport]:
+        with PythonCanTransport(options) as transport:
+            yield transport
+
+    @pytest.fixture
+    def feed(self, other: Transport) -> Callable[[], None]:
+        def send() -> None:
+            # A paced log: a multicast socket drops what its reader has no room for.
+            table = FrameTable.from_frames(FRAMES)
+            play(table, other, speed=2.0)
+
+        return send
+
+    def test_what_is_no_frame_degrades_and_does_not_end_the_bus(
+        self, receiving: Transport, other: Transport
+    ) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"\xff not a frame", ("239.74.163.2", 43113))
+        other.send(FRAMES[0])
+        assert content(collect(receiving, 1)) == content(FRAMES[:1])
+        assert receiving.state is TransportState.DEGRADED
+        assert "1 datagrams" in receiving.detail
+
+
+def node(stop: Event, ready: Event) -> None:
+    with PythonCanTransport(BusOptions("udp_multicast"), transmit=True) as bus:
+        core = FccCore(default_actuator(), bundled_tests().values(), serial=4711)
+        core.step()  # compiles
+        ready.set()
+        run_emulator(core, bus, stop)
+
+
+def test_a_test_between_two_processes_loses_no_sample(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    stop, ready = context.Event(), context.Event()
+    process = context.Process(target=node, args=(stop, ready))
+    process.start()
+    try:
+        assert ready.wait(60)
+        with PythonCanTransport(BusOptions("udp_multicast"), transmit=True) as bus:
+            outcome = run_test(
+                bus,
+                test_id=1,
+                duration=5.5,
+                transmit=True,
+                recorder=Recorder(tmp_path / "live.blf"),
+            )
+    finally:
+        stop.set()
+        process.join(10)
+    assert outcome.why == ""
+    assert outcome.serial == 4711
+    assert outcome.dropped == 0
+    assert process.exitcode == 0
+    recording = read_recording(tmp_path / "live.blf")
+    assert recording.quality.total("lost") == 0
+    assert recording.samples is not None
+    assert recording.samples.ticks == 5500
