@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitState, CommandMode
 from ehadiag.tomlfile import decode_toml, read_toml
+from firmware_iface.frames import MAX_PAYLOAD
 from firmware_iface.layout import SignalLayout
 from firmware_iface.mapping import MappingFile, Policy, Protection, SignalRef
 from firmware_iface.units import si_factor
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["BusMap", "MessageMap", "Role", "default_map", "load_map"]
 
 MAX_DBC_BYTES = 8 << 20
+MAX_MULTIPLEXERS = 8
+"""Multiplexers of multiplexers."""
 
 DIMENSIONS: dict[str, dict[str, str | None]] = {
     "channels": {
@@ -159,6 +163,9 @@ def resolve(tree: MappingFile, dbc: bytes, where: str, dbc_name: str) -> BusMap:
         other = seen.setdefault((item.can_id, item.extended), item.name)
         if other != item.name:
             raise ConfigurationError(f"{where}: {other} and {item.name} share an identifier")
+    moduli = {item.modulus for item in messages.values() if item.counts_ticks}
+    if len(moduli) > 1:
+        raise ConfigurationError(f"{where}: counters that count ticks must be equally wide")
     modes = {tree.command.modes[key]: CommandMode[key.upper()] for key in tree.command.modes}
     states = {tree.status.states[key]: BitState[key.upper()] for key in tree.status.states}
     return BusMap(
@@ -193,7 +200,11 @@ def _parse_dbc(text: bytes, name: str) -> dict[str, DbcMessage]:
     from cantools.database.can.database import Database  # noqa: PLC0415
 
     try:
-        database = cantools.database.load_string(text.decode("cp1252", "replace"), "dbc")
+        content = text.decode("utf-8")
+    except UnicodeDecodeError:
+        content = text.decode("cp1252", "replace")  # what older tools write
+    try:
+        database = cantools.database.load_string(content, "dbc")
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ConfigurationError(f"DBC file {name}: not a valid DBC: {reason}") from None
@@ -223,22 +234,28 @@ def _role(
     return Role(name, signal, gain * ref.scale, gain * ref.offset + bias)
 
 
-def _layout(message: DbcMessage, name: str, at: str) -> SignalLayout:
+def _layout(message: DbcMessage, name: str, at: str, depth: int = 0) -> SignalLayout:
     found = next((item for item in message.signals if item.name == name), None)
     if found is None:
         raise ConfigurationError(f"{at}: message {message.name!r} has no signal {name!r}")
-    return signal_layout(found, message, at)
+    return signal_layout(found, message, at, depth)
 
 
-def signal_layout(signal: DbcSignal, message: DbcMessage, at: str) -> SignalLayout:
+def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 0) -> SignalLayout:
     """Layout of a cantools signal, with its chain of multiplexers."""
     conversion = signal.conversion
     scale, offset = getattr(conversion, "scale", None), getattr(conversion, "offset", None)
     if scale is None or offset is None or not 1 <= signal.length <= 64:
         raise ConfigurationError(f"{at}: signal {signal.name!r} is not a plain number")
+    if scale == 0 or not math.isfinite(scale) or not math.isfinite(offset):
+        raise ConfigurationError(
+            f"{at}: the DBC gives signal {signal.name!r} a scale of zero or a number without end"
+        )
+    if depth > MAX_MULTIPLEXERS:
+        raise ConfigurationError(f"{at}: the multiplexers of {message.name!r} go in a circle")
     selectors: tuple[tuple[SignalLayout, frozenset[int]], ...] = ()
     if signal.multiplexer_signal is not None and signal.multiplexer_ids:
-        parent = _layout(message, signal.multiplexer_signal, at)
+        parent = _layout(message, signal.multiplexer_signal, at, depth + 1)
         selectors = (*parent.selectors, (parent, frozenset(signal.multiplexer_ids)))
     low, high = signal.minimum, signal.maximum
     ranged = low is not None and high is not None and low < high
@@ -274,6 +291,8 @@ def _message(
         )
     if crc is not None and (crc.length != 8 or crc.lead % 8):
         raise ConfigurationError(f"{at}: check sum {crc.name!r} must fill one byte")
+    if message.length > MAX_PAYLOAD:
+        raise ConfigurationError(f"{where}: message {message.name!r} is longer than a CAN FD frame")
     return MessageMap(
         name=message.name,
         can_id=message.frame_id,
