@@ -183,7 +183,7 @@ class Handshake:
             case Phase.WAITING if waited >= times.wait:
                 self._end(f"no test was started within {times.wait:g} s")
             case Phase.REQUESTED if waited >= times.status:
-                actions = self._abort(f"no status within {times.status:g} s of the request", now)
+                actions = self._abort(f"no answer within {times.status:g} s of the request", now)
             case Phase.ARMING if waited >= times.arming:
                 actions = self._abort(f"still arming after {times.arming:g} s", now)
             case Phase.RUNNING if (now - self._heard) / 1e9 >= times.telemetry:

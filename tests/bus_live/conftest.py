@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 
+import fault_cases
 import pytest
 
 from ehadiag.actuator import default_actuator
-from ehadiag.storedtest import Line, StoredTest, Windows
+from ehadiag.storedtest import StoredTest
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.fcc import FccCore
 
@@ -17,17 +18,7 @@ CoreFactory = Callable[..., FccCore]
 
 @pytest.fixture(scope="session")
 def short_test() -> StoredTest:
-    """0.4 s of current: enough for the handshake, quick to simulate."""
-    span = ((0.0, 0.4),)
-    points = ((0.0, 0.0), (0.1, 2.0), (0.3, -2.0), (0.4, 0.0))
-    return StoredTest(
-        name="short",
-        id=9,
-        mode="current",
-        unit="mA",
-        segment=(Line(points=points),),
-        windows=Windows(FDJ=span, Kintas=span, FSS=span, refinement=span),
-    )
+    return fault_cases.short_test()
 
 
 @pytest.fixture

@@ -116,7 +116,7 @@ def test_no_answer_asks_for_an_abort() -> None:
     driver = Driver().requested().wait(1.0)
     assert Action.ABORT in driver.sent
     driver.hear(IDLE)
-    assert driver.ended() == "no status within 1 s of the request"
+    assert driver.ended() == "no answer within 1 s of the request"
     assert driver.machine.verdict.abort_confirmed is True
 
 

@@ -272,7 +272,7 @@ def test_a_silent_bus_ends_within_its_time_limits(tmp_path: Path) -> None:
             times=times,
             recorder=Recorder(tmp_path / "x.blf"),
         )
-    assert outcome.why == "no status within 0.1 s of the request; the abort was not confirmed"
+    assert outcome.why == "no answer within 0.1 s of the request; the abort was not confirmed"
     assert outcome.frames == 0
     assert read_frames(tmp_path / "x.blf").sent.all()
 
