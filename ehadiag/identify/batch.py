@@ -6,6 +6,7 @@ compiled function serves any number of either.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -114,9 +115,9 @@ def residuals(
         )
         for k in range(n):
             gap = (batch.spool[a + k] - candidate[3] - spool[k]) * batch.weight[0, a + k]
-            out[0, a + k] = gap if gap == gap else 0.0
+            out[0, a + k] = gap if math.isfinite(gap) else 0.0
             gap = (batch.pressure[a + k] - candidate[4] - pressure[k]) * batch.weight[1, a + k]
-            out[1, a + k] = gap if gap == gap else 0.0
+            out[1, a + k] = gap if math.isfinite(gap) else 0.0
     return anchored
 
 

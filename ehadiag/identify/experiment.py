@@ -22,6 +22,8 @@ __all__ = ["Experiment", "Span", "build_experiment", "judge_noise", "make_batch"
 KEPT_SHARE = 0.98
 KEPT_MEAN = 0.75978
 """Mean absolute value of a standard normal variable, the largest 2 % left out."""
+LEAST_REST = 20
+"""Samples at rest from which an offset is taken."""
 QUIET_BLOCK = 100
 """Ticks over which noise is judged."""
 
@@ -36,13 +38,17 @@ class Experiment:
     """s."""
     trace: CurrentTrace
     spool: NDArray[np.float64]
-    """Measured, m; NaN where missing or at the converter's end."""
+    """Measured less its offset, m; NaN where missing or at the converter's end."""
     pressure: NDArray[np.float64]
-    """Measured, Pa; NaN where missing or at the converter's end."""
+    """Measured less its offset, Pa; NaN where missing or at the converter's end."""
     spool_noise: float
     """Standard deviation, m."""
     pressure_noise: float
     """Standard deviation, Pa."""
+    spool_offset: float
+    """Already taken off `spool`, m: its mean while the actuator rests before the test moves it."""
+    pressure_offset: float
+    """Already taken off `pressure`, Pa."""
 
     @property
     def ticks(self) -> int:
@@ -65,16 +71,37 @@ def build_experiment(
     """Prepare a recording for identification."""
     spool = np.where(samples.saturated[1], np.nan, samples.spool)
     pressure = np.where(samples.saturated[2], np.nan, samples.pressure)
+    trace = commanded_current(samples, test, actuator.controller)
+    rest = _ticks_at_rest(trace.current)
+    spool_offset, pressure_offset = _mean(spool[:rest]), _mean(pressure[:rest])
+    spool, pressure = spool - spool_offset, pressure - pressure_offset
     return Experiment(
         test=test,
         constants=plant_constants(actuator, environment),
         tick=samples.period_ns * 1e-9,
-        trace=commanded_current(samples, test, actuator.controller),
+        trace=trace,
         spool=spool,
         pressure=pressure,
         spool_noise=_noise(spool, SPOOL),
         pressure_noise=_noise(pressure, PRESSURE),
+        spool_offset=spool_offset,
+        pressure_offset=pressure_offset,
     )
+
+
+def _ticks_at_rest(current: NDArray[np.float64]) -> int:
+    """How long the current is zero before the test moves the actuator.
+
+    In closed loop the noise of the jack's sensor keeps the spool moving: no rest, no offset yet.
+    """
+    moving = np.flatnonzero(current != 0.0)
+    return int(moving[0]) if moving.size else len(current)
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    """Mean of what is there; 0 of too little."""
+    seen = values[np.isfinite(values)]
+    return float(seen.mean()) if seen.size >= LEAST_REST else 0.0
 
 
 def judge_noise(experiment: Experiment, gaps: NDArray[np.float64]) -> Experiment:

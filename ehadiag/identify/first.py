@@ -14,6 +14,7 @@ the other's value.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -50,7 +51,9 @@ def first_approximation(experiments: Sequence[Experiment]) -> FirstApproximation
     """Search FDJ, then Kintas, then FSS; then Kintas and FSS once more."""
     counter = _Counter()
     jacks = [_JackSearch(experiment) for experiment in experiments]
-    fdj = _search(counter, lambda grid: sum(jack(grid) for jack in jacks), 0.0, 1.0, GRID)
+    fdj = _search(
+        counter, lambda grid: np.sum([jack(grid) for jack in jacks], axis=0), 0.0, 1.0, GRID
+    )
 
     slewing = Objective(
         make_batch(
@@ -177,6 +180,6 @@ def _pressure_costs(
         jack_response(constants, grid[i], before, nodes, node_end, pressure, position)
         for k in range(n):
             gap = (measured[k] - pressure[k]) / noise
-            if gap == gap:
+            if math.isfinite(gap):
                 out[i] += min(gap * gap, cap)
     return out

@@ -20,11 +20,14 @@ class Objective:
     """
 
     def __init__(
-        self, batch: Batch, offsets: tuple[float, float] = (0.0, 0.0), cap: float = SEARCH_CAP
+        self,
+        batch: Batch,
+        offsets: NDArray[np.float64] | None = None,
+        cap: float = SEARCH_CAP,
     ) -> None:
         self.batch = batch
         self.cap = cap
-        self.offsets = offsets
+        self.offsets = np.zeros(2) if offsets is None else offsets
         self.evaluations = 0
         self.work = workspace(batch)
         self.gaps = np.empty((2, len(batch.current)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment, judge_noise, make_batch
 from ehadiag.identify.first import FirstApproximation, first_approximation
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.refine import CAP, Refinement, refine
+from ehadiag.identify.refine import CAP, Refinement, median_offsets, refine
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
@@ -25,10 +25,13 @@ SEARCH_DEVIATION = 0.02
 SEARCH_LEAD_S = 0.1
 RESCUE_DEVIATION = 0.4
 RESCUE_BUDGET = 2000
-ANCHOR_LSB = (1.0, 6.0)
+ANCHOR_LSB = (1.3, 6.0)
 """Re-anchoring of the refinement: filtered and single innovations beyond, LSB."""
 POOR_FIT = 0.05
 """Share of gaps beyond three deviations that sends the search back to the whole cube."""
+JUDGEMENTS = 3
+"""How often at most the noise is judged anew."""
+NOISE_SETTLED = 0.15
 NOT_SHOWN_STD = 0.1
 BOUND = 1e-6
 
@@ -127,19 +130,20 @@ def identify(
     first = first_approximation(experiments)
     searched_at = time.perf_counter()
     windows = [experiment.test.windows.refinement for experiment in experiments]
-    objective = Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S))
+    offsets = median_offsets(make_batch(experiments), np.array(first.values))
+    objective = Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S), offsets)
     found = _search(solver, objective, np.array(first.values), SEARCH_DEVIATION, seed, tell)
     refined_at = time.perf_counter()
     tell("refinement", 0.0)
     candidates = [found.best, np.array(first.values)]
-    refined, experiments, evaluations = _best_refinement(experiments, candidates)
+    refined, experiments, evaluations = _best_refinement(experiments, candidates, offsets)
     evaluations += first.evaluations + found.evaluations
     rescued = _outliers(refined) > POOR_FIT
     if rescued:
         wide = solver.with_budget(RESCUE_BUDGET)
-        again = Objective(make_batch(experiments))
+        again = Objective(make_batch(experiments), offsets)
         second = _search(wide, again, found.best, RESCUE_DEVIATION, seed + 1, tell)
-        other, others, spent = _best_refinement(experiments, [second.best])
+        other, others, spent = _best_refinement(experiments, [second.best], offsets)
         evaluations += second.evaluations + spent
         if other.cost < refined.cost:
             refined, experiments, found = other, others, second
@@ -175,31 +179,42 @@ def _search(
 
 
 def _best_refinement(
-    experiments: Sequence[Experiment], starts: Sequence[NDArray[np.float64]]
+    experiments: Sequence[Experiment],
+    starts: Sequence[NDArray[np.float64]],
+    offsets: NDArray[np.float64],
 ) -> tuple[Refinement, Sequence[Experiment], int]:
     """Refine from each start until one explains the recording, then weigh by the noise it leaves.
 
     Returns the refinement, the experiments with their noise as judged, and evaluations.
     """
-    best = _refine(experiments, starts[0])
+    best = _refine(experiments, starts[0], offsets)
     evaluations = best.evaluations
     for start in starts[1:]:
         if _outliers(best) <= POOR_FIT:
             break
-        other = _refine(experiments, start)
+        other = _refine(experiments, start, offsets)
         evaluations += other.evaluations
         best = min(best, other, key=lambda item: item.cost)
-    judged = [
-        judge_noise(experiment, best.gaps[:, a:b])
-        for experiment, (a, b) in zip(experiments, _bounds(experiments), strict=True)
-    ]
-    final = _refine(judged, best.values)
-    return final, judged, evaluations + final.evaluations
+    for _ in range(JUDGEMENTS):
+        before = [(item.spool_noise, item.pressure_noise) for item in experiments]
+        experiments = [
+            judge_noise(experiment, best.gaps[:, a:b])
+            for experiment, (a, b) in zip(experiments, _bounds(experiments), strict=True)
+        ]
+        best = _refine(experiments, best.values, best.offsets)
+        evaluations += best.evaluations
+        after = [(item.spool_noise, item.pressure_noise) for item in experiments]
+        if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
+            break
+    return best, experiments, evaluations
 
 
-def _refine(experiments: Sequence[Experiment], start: NDArray[np.float64]) -> Refinement:
+def _refine(
+    experiments: Sequence[Experiment], start: NDArray[np.float64], offsets: NDArray[np.float64]
+) -> Refinement:
     batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
-    return refine(batch, start, (experiments[0].spool_noise, experiments[0].pressure_noise))
+    noise = experiments[0].spool_noise, experiments[0].pressure_noise
+    return refine(batch, start, offsets, noise)
 
 
 def _bounds(experiments: Sequence[Experiment]) -> list[tuple[int, int]]:
@@ -249,7 +264,7 @@ def _fit(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
         outliers=_outliers(refined),
         spool_noise=experiments[0].spool_noise,
         pressure_noise=experiments[0].pressure_noise,
-        spool_offset=float(refined.offsets[0]),
-        pressure_offset=float(refined.offsets[1]),
+        spool_offset=experiments[0].spool_offset + float(refined.offsets[0]),
+        pressure_offset=experiments[0].pressure_offset + float(refined.offsets[1]),
         anchored=refined.anchored,
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, Workspace, residuals, workspace
 
-__all__ = ["CAP", "Refinement", "refine"]
+__all__ = ["CAP", "Refinement", "median_offsets", "refine"]
 
 CAP = 9.0
 STEP = 2e-4
@@ -95,13 +95,22 @@ class _Model:
         return out, smooth
 
 
-def refine(batch: Batch, start: NDArray[np.float64], noise: tuple[float, float]) -> Refinement:
-    """Minimise the capped sum of squares from `start`, shape (3,).
+def refine(
+    batch: Batch,
+    start: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    noise: tuple[float, float],
+) -> Refinement:
+    """Minimise the capped sum of squares.
 
-    `noise` is that of spool (m) and pressure (Pa), the unit in which offsets are sought.
+    Parameters
+    ----------
+    start: fault constants, shape (3,).
+    offsets: of spool (m) and pressure (Pa) at the start, shape (2,).
+    noise: that of spool (m) and pressure (Pa), the unit in which offsets are sought.
     """
     model = _Model(batch, noise)
-    x = np.concatenate([np.clip(start, 0.0, 1.0), [0.0, 0.0]])
+    x = np.concatenate([np.clip(start, 0.0, 1.0), offsets / np.array(noise)])
     gaps = model.gaps(x)
     cost = _capped(gaps)
     damping = 1e-5
@@ -154,6 +163,22 @@ def refine(batch: Batch, start: NDArray[np.float64], noise: tuple[float, float])
         converged=converged,
         anchored=anchored,
     )
+
+
+def median_offsets(batch: Batch, faults: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Median gap of spool (m) and pressure (Pa), shape (2,), at fault constants of shape (3,).
+
+    For a batch that runs free: re-anchoring would take most of an offset away.
+    """
+    gaps = np.empty((2, len(batch.current)))
+    residuals(batch, np.concatenate([faults, [0.0, 0.0]]), workspace(batch), gaps)
+    out = np.zeros(2)
+    for channel in range(2):
+        weight = batch.weight[channel]
+        used = weight > 0.0
+        if used.any():
+            out[channel] = float(np.median(gaps[channel, used] / weight[used]))
+    return out
 
 
 def _capped(gaps: NDArray[np.float64]) -> float:

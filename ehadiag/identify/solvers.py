@@ -95,7 +95,7 @@ class CompactGa:
                     objective.batch,
                     objective.work,
                     objective.gaps,
-                    np.array(objective.offsets),
+                    objective.offsets,
                     objective.cap,
                     np.asarray(start, dtype=np.float64),
                     np.full(len(start), deviation),

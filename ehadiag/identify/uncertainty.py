@@ -39,7 +39,7 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     reduced = float((refinement.gaps[refinement.used] ** 2).sum()) / max(count - len(normal), 1)
     curved = inverse * max(reduced / EXPECTED_CAPPED, 1.0)
     sandwich = inverse @ _meat(refinement) @ inverse
-    factor = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(curved), 1.0))
+    factor = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(curved), 1e-300), 1.0))
     out = curved * np.outer(factor, factor)
     return np.asarray(out[:FAULT_COUNT, :FAULT_COUNT])
 

@@ -10,6 +10,7 @@ candidate.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +21,8 @@ from ehadiag.model.constants import PlantConstants
 
 __all__ = [
     "FINEST",
-    "NODE_COLUMNS",
     "NODES_PER_TICK",
+    "NODE_COLUMNS",
     "SpoolTables",
     "spool_response",
     "spool_tables",
@@ -178,9 +179,9 @@ def spool_response(
                         event = 1
                     elif abs(nxs) >= c.XSM and nxs * spool_dir > 0.0:
                         event = 2
-                elif abs(force * xf) > tables.static and abs(xs) < c.XSM:
-                    event = 3
-                elif abs(force * xf) > tables.static and xs * xf < 0.0:
+                elif (abs(force * xf) > tables.static and abs(xs) < c.XSM) or (
+                    abs(force * xf) > tables.static and xs * xf < 0.0
+                ):
                     event = 3
                 if (torque - c.KSF * nxs - c.KF * nxf) * clamp < 0.0:
                     event = 5
@@ -265,7 +266,7 @@ def spool_response(
         node_end[k] = count
         spool[k] = xs
         error = measured[k] - xs
-        if error == error:  # not NaN
+        if math.isfinite(error):
             filtered += anchor[0] * (error - filtered)
             move = 0.0
             if abs(error) > anchor[2]:
