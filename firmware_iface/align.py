@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,9 @@ from firmware_iface.ticks import TickAxis, place
 __all__ = ["assemble"]
 
 STUCK_FRAMES = 20
+MARGIN = 1000
+"""Rows around a test in which late frames of messages without a counter are looked for."""
+
 CHANNEL_KEYS = ("current", "spool", "pressure", "position")
 FROZEN_TICKS = 100
 FROZEN_LIVELY = 0.2
@@ -52,8 +57,9 @@ def assemble(
     else:
         notes += axis.notes
     episodes = find_episodes(decoded, axis, status, bus_map)
+    bounds = _Bounds.of(axis) if axis is not None else None
     return tuple(
-        _recording(item, decoded, axis, bus_map, source, notes, len(table)) for item in episodes
+        _recording(item, decoded, bounds, bus_map, source, notes, len(table)) for item in episodes
     )
 
 
@@ -68,17 +74,21 @@ def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
 def _recording(
     episode: Episode,
     decoded: DecodedTable,
-    axis: TickAxis | None,
+    bounds: _Bounds | None,
     bus_map: BusMap,
     source: str,
     notes: tuple[str, ...],
     rows: int,
 ) -> Recording:
-    begin, end = _row_span(episode, axis, rows)
+    begin, end = 0, rows
+    if bounds is not None and episode.ticks > 0:
+        begin, end = bounds.rows(episode, rows)
+    axis = bounds.axis if bounds is not None else None
     extra: list[str] = []
     samples = None
     if axis is not None and episode.ticks > 0:
-        samples, extra = _samples(episode, decoded, axis, bus_map)
+        grid = _Grid(episode, decoded, axis, bus_map, max(begin - MARGIN, 0), end + MARGIN)
+        samples, extra = _samples(grid)
     elif axis is not None:
         extra = ["no test in the recording"]
     extra += _stuck_counters(decoded, bus_map, begin, end)
@@ -121,71 +131,118 @@ def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int
     return notes
 
 
-def _row_span(episode: Episode, axis: TickAxis | None, rows: int) -> tuple[int, int]:
-    """Rows of the table that belong to a test: from its neighbour before to its neighbour after."""
-    if axis is None or episode.ticks == 0:
-        return 0, rows
-    inside = (axis.tick >= episode.first) & (axis.tick < episode.first + episode.ticks)
-    hits = np.flatnonzero(inside)
-    if len(hits) == 0:
-        return 0, rows
-    first, last = int(hits[0]), int(hits[-1])
-    begin = int(axis.row[first - 1]) + 1 if first > 0 else 0
-    end = int(axis.row[last + 1]) if last + 1 < len(axis.row) else rows
-    return begin, end
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bounds:
+    """Finds the frames of a span of ticks without going through all of them.
+
+    Attributes
+    ----------
+    highest: highest tick up to each axis frame; ascending.
+    lowest: lowest tick from each axis frame on; ascending.
+    """
+
+    axis: TickAxis
+    highest: NDArray[np.int64]
+    lowest: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, axis: TickAxis) -> _Bounds:
+        """Bounds of an axis."""
+        lowest = np.minimum.accumulate(axis.tick[::-1])[::-1]
+        return cls(axis, np.maximum.accumulate(axis.tick), lowest)
+
+    def rows(self, episode: Episode, rows: int) -> tuple[int, int]:
+        """Rows of the table that belong to a test: from neighbour to neighbour."""
+        stop = episode.first + episode.ticks
+        low = int(np.searchsorted(self.highest, episode.first))
+        high = int(np.searchsorted(self.lowest, stop))
+        tick = self.axis.tick[low:high]
+        hits = np.flatnonzero((tick >= episode.first) & (tick < stop))
+        if len(hits) == 0:
+            return 0, rows
+        first, last = low + int(hits[0]), low + int(hits[-1])
+        begin = int(self.axis.row[first - 1]) + 1 if first > 0 else 0
+        end = int(self.axis.row[last + 1]) if last + 1 < len(self.axis.row) else rows
+        return begin, end
 
 
 def _within(rows: NDArray[np.int64], begin: int, end: int) -> int:
     return int(np.searchsorted(rows, end) - np.searchsorted(rows, begin))
 
 
-def _fill(
-    item: Decoded, role: str, tick: NDArray[np.int64], episode: Episode
-) -> NDArray[np.float64]:
-    """Values of a role on the test's grid; of two frames for one tick the first counts."""
-    out = np.full(episode.ticks, np.nan)
-    value = item.values[role]
-    at = tick - episode.first
-    usable = (at >= 0) & (at < episode.ticks) & np.isfinite(value)
-    out[at[usable][::-1]] = value[usable][::-1]
-    return out
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grid:
+    """One test's tick grid, and the rows of the table that can hold its frames."""
+
+    episode: Episode
+    decoded: DecodedTable
+    axis: TickAxis
+    bus_map: BusMap
+    begin: int
+    end: int
+
+    def fill(self, role: str) -> _Filled | None:
+        """Put the values of a role on the grid; of two frames for one tick the first counts.
+
+        None without a frame of the role's message.
+        """
+        found = self.bus_map.find(role)
+        tick = self.axis.ticks.get(found[0].name) if found is not None else None
+        if found is None or tick is None or len(tick) == 0:
+            return None
+        item = self.decoded.messages[found[0].name]
+        near = slice(*np.searchsorted(item.row, [self.begin, self.end]))
+        at = tick[near] - self.episode.first
+        value = item.values[role][near]
+        usable = np.flatnonzero((at >= 0) & (at < self.episode.ticks) & np.isfinite(value))[::-1]
+        at = at[usable]
+        out = np.full(self.episode.ticks, np.nan)
+        out[at] = value[usable]
+        host = np.full(self.episode.ticks, -1, dtype=np.int64)
+        host[at] = item.time_ns[near][usable]
+        saturated = np.zeros(self.episode.ticks, dtype=np.bool_)
+        if role in item.saturated:
+            saturated[at] = item.saturated[role][near][usable]
+        return _Filled(out, saturated, host)
 
 
-def _samples(
-    episode: Episode, decoded: DecodedTable, axis: TickAxis, bus_map: BusMap
-) -> tuple[Samples, list[str]]:
-    columns, saturated = [], np.zeros((len(CHANNEL_KEYS), episode.ticks), dtype=np.bool_)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Filled:
+    """A role on the grid; NaN, False and -1 where no frame brought it."""
+
+    value: NDArray[np.float64]
+    saturated: NDArray[np.bool_]
+    host_ns: NDArray[np.int64]
+
+
+def _samples(grid: _Grid) -> tuple[Samples, list[str]]:
+    ticks, period = grid.episode.ticks, grid.bus_map.tick_ns
+    nothing = _Filled(
+        np.full(ticks, np.nan), np.zeros(ticks, dtype=np.bool_), np.full(ticks, -1, dtype=np.int64)
+    )
     notes: list[str] = []
-    host = np.full(episode.ticks, -1, dtype=np.int64)
-    for index, key in enumerate(CHANNEL_KEYS):
-        role = f"channels.{key}"
-        item = next(m for m in decoded.messages.values() if role in m.values)
-        tick = axis.ticks.get(item.message.name)
-        if tick is None:
-            columns.append(np.full(episode.ticks, np.nan))
-            notes.append(f"no {item.message.name} for the {key}")
+    filled: dict[str, _Filled] = {}
+    for key in CHANNEL_KEYS:
+        found = grid.fill(f"channels.{key}")
+        filled[key] = found or nothing
+        if found is None:
+            notes.append(f"no frame brings the {key}")
             continue
-        columns.append(_fill(item, role, tick, episode))
-        at = tick - episode.first
-        usable = (at >= 0) & (at < episode.ticks) & np.isfinite(item.values[role])
-        saturated[index, at[usable][::-1]] = item.saturated[role][usable][::-1]
-        if key == "spool":
-            host[at[usable][::-1]] = item.time_ns[usable][::-1]
-        frozen = _frozen(columns[-1], saturated[index])
+        frozen = _frozen(found.value, found.saturated)
         if frozen:
-            seconds = frozen * bus_map.tick_ns * 1e-9
+            seconds = frozen * period * 1e-9
             notes.append(f"{key} stood at one code for {seconds:.3g} s though it moves elsewhere")
-    mode, command, said = _command(episode, decoded, axis, bus_map)
+    mode, command, said = _command(grid)
     samples = Samples(
-        period_ns=bus_map.tick_ns,
+        period_ns=period,
         mode=mode,
-        current=columns[0],
-        spool=columns[1],
-        pressure=columns[2],
-        position=columns[3],
+        current=filled["current"].value,
+        spool=filled["spool"].value,
+        pressure=filled["pressure"].value,
+        position=filled["position"].value,
         command=command,
-        saturated=saturated,
-        host_ns=host,
+        saturated=np.stack([filled[key].saturated for key in CHANNEL_KEYS]),
+        host_ns=filled["spool"].host_ns,
     )
     return samples, notes + said
 
@@ -206,15 +263,14 @@ def _frozen(value: NDArray[np.float64], saturated: NDArray[np.bool_]) -> int:
     return span if run >= FROZEN_TICKS and lively else 0
 
 
-def _command(
-    episode: Episode, decoded: DecodedTable, axis: TickAxis, bus_map: BusMap
-) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
+def _command(grid: _Grid) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
     """Mode and command of a test; NaN where no frame said, or where it said another mode."""
     notes: list[str] = []
+    bus_map = grid.bus_map
     mode = bus_map.fixed_mode
-    modes = _role_on_grid("command.mode", episode, decoded, axis, bus_map)
+    modes = grid.fill("command.mode")
     if modes is not None:
-        numbers = modes[np.isfinite(modes)].astype(np.int64)
+        numbers = modes.value[np.isfinite(modes.value)].astype(np.int64)
         known = numbers[np.isin(numbers, list(bus_map.modes))]
         if len(known):
             values, count = np.unique(known, return_counts=True)
@@ -222,29 +278,17 @@ def _command(
     if mode is None:
         mode = CommandMode.CURRENT
         notes.append("no command says its mode; taken as a current")
-    command = _role_on_grid(f"command.{mode.name.lower()}", episode, decoded, axis, bus_map)
+    command = grid.fill(f"command.{mode.name.lower()}")
     if command is None:
-        return mode, np.full(episode.ticks, np.nan), [*notes, "no command frames"]
+        return mode, np.full(grid.episode.ticks, np.nan), [*notes, "no command frames"]
+    value = command.value
     if modes is not None:
         wanted = [number for number, meaning in bus_map.modes.items() if meaning is mode]
-        other = np.isfinite(modes) & ~np.isin(modes, wanted)
+        other = np.isfinite(modes.value) & ~np.isin(modes.value, wanted)
         if other.any():
             notes.append(f"{int(other.sum())} commands of another mode left out")
-            command[other] = np.nan
-    return mode, command, notes
-
-
-def _role_on_grid(
-    role: str, episode: Episode, decoded: DecodedTable, axis: TickAxis, bus_map: BusMap
-) -> NDArray[np.float64] | None:
-    found = bus_map.find(role)
-    if found is None:
-        return None
-    name = found[0].name
-    tick = axis.ticks.get(name)
-    if tick is None or len(tick) == 0:
-        return None
-    return _fill(decoded.messages[name], role, tick, episode)
+            value[other] = np.nan
+    return mode, value, notes
 
 
 def _counts(

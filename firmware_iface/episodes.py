@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ehadiag.recording import BitReason, BitState, Outcome
 from firmware_iface.busmap import BusMap
 from firmware_iface.decode import DecodedTable
+from firmware_iface.protection import OUTSIDE
 from firmware_iface.status import Status
 from firmware_iface.ticks import TickAxis
 
@@ -90,7 +91,7 @@ def _spans_by_id(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> list
         return []
     item = decoded.messages[found[0].name]
     tick, value = axis.ticks[found[0].name], item.values["command.test_id"]
-    known = np.isfinite(value)
+    known = np.isfinite(value) & (tick > OUTSIDE // 2)
     order = np.argsort(tick[known], kind="stable")
     tick, ids = tick[known][order], value[known][order].astype(np.int64)
     runs = _runs(ids)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CRC_KINDS", "crc8", "crc8_rows", "unwrap"]
+__all__ = ["CRC_KINDS", "OUTSIDE", "crc8", "crc8_rows", "unwrap"]
 
 POLYNOMIAL = 0x1D
 INITIAL = 0xFF
@@ -21,6 +21,10 @@ SLACK_TICKS = 8.0
 SLACK_RATE = 2e-4
 """The same as a share of the gap: two clocks drift apart. Past some ten minutes it covers a whole
 turn, and a step of the host clock that long looks like a gap."""
+
+
+OUTSIDE = -(1 << 62)
+"""Position of a frame that has none."""
 
 
 def _table() -> tuple[int, ...]:
@@ -89,11 +93,54 @@ def unwrap(
 
     Returns
     -------
-    Position of each frame, congruent with its counter, the first one its counter value; and notes
-    on the host's clock.
+    Position of each frame, congruent with its counter, the first one its counter value; OUTSIDE
+    for a single frame out of line with its neighbours (a corrupt counter); and notes.
     """
     if len(counter) == 0:
         return np.empty(0, dtype=np.int64), ()
+    jump, residue, ticks, trusted = _steps(counter, time_ns, period_ns, modulus)
+    astray = _astray(jump, residue, modulus)
+    if astray.any():
+        position = np.full(len(counter), OUTSIDE, dtype=np.int64)
+        sound = ~astray
+        position[sound], notes = unwrap(counter[sound], time_ns[sound], period_ns, modulus)
+        return position, (*notes, f"{int(astray.sum())} frames with a counter out of line")
+    rebase, notes = _clock_steps(np.flatnonzero(trusted), ticks, jump, residue, period_ns)
+    lateness = np.concatenate(([0.0], np.cumsum(residue - rebase)))
+    position = np.concatenate(([0], np.cumsum(jump)))
+    breaks = np.flatnonzero(np.abs(jump) > NEAR) + 1
+    if len(breaks):
+        # A stretch between large gaps that stays late or early by whole turns was placed wrongly.
+        starts = np.concatenate(([0], breaks))
+        earliest = np.minimum.reduceat(lateness, starts)
+        turns = np.cumsum(np.rint(np.diff(earliest) / modulus).astype(np.int64))
+        # A counter that starts again goes on: no stretch lies before the one that it follows.
+        back = position[breaks] - position[breaks - 1] + modulus * np.diff(turns, prepend=0)
+        turns += np.cumsum(np.maximum(-((back + NEAR) // modulus), 0))
+        lengths = np.diff(np.concatenate((starts, [len(counter)])))
+        position += modulus * np.repeat(np.concatenate(([0], turns)), lengths)
+    return position + int(counter[0]), notes
+
+
+def _astray(
+    jump: NDArray[np.int64], residue: NDArray[np.float64], modulus: int
+) -> NDArray[np.bool_]:
+    """Single frames whose counter leaps and leaps back, against the host's time."""
+    astray = np.zeros(len(jump) + 1, dtype=np.bool_)
+    leap = np.abs(jump) > NEAR // 2
+    both = (jump[:-1] + jump[1:] + modulus // 2) % modulus - modulus // 2
+    astray[1:-1] = leap[:-1] & leap[1:] & (np.abs(both) <= NEAR)
+    astray[1:-1] &= np.abs(residue[:-1]) > SLACK_TICKS
+    # Of two in a row only the first is judged now: without it the second may be in line.
+    astray[1:] &= ~astray[:-1]
+    return astray
+
+
+def _steps(
+    counter: NDArray[np.int64], time_ns: NDArray[np.int64], period_ns: int, modulus: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Counts from each frame to the next, host time beyond that, host time, and where the counter
+    was taken at its word against the host's time."""
     step = np.diff(counter) % modulus
     ticks = np.diff(time_ns) / period_ns
     jump = step + modulus * np.rint((ticks - step) / modulus).astype(np.int64)
@@ -102,19 +149,7 @@ def unwrap(
     strange = np.abs(residue) > SLACK_TICKS + SLACK_RATE * np.abs(ticks)
     trusted = strange & (np.abs(signed) <= NEAR)
     jump[trusted] = signed[trusted]
-    residue = ticks - jump
-    rebase, notes = _clock_steps(np.flatnonzero(trusted), ticks, jump, residue, period_ns)
-    lateness = np.concatenate(([0.0], np.cumsum(residue - rebase)))
-    position = np.concatenate(([0], np.cumsum(jump)))
-    # A stretch between large gaps that stays late or early by whole turns was placed wrongly.
-    breaks = np.flatnonzero(np.abs(jump) > NEAR) + 1
-    if len(breaks):
-        starts = np.concatenate(([0], breaks))
-        earliest = np.minimum.reduceat(lateness, starts)
-        turns = np.cumsum(np.rint(np.diff(earliest) / modulus).astype(np.int64))
-        lengths = np.diff(np.concatenate((starts, [len(counter)])))
-        position += modulus * np.repeat(np.concatenate(([0], turns)), lengths)
-    return position + int(counter[0]), notes
+    return jump, ticks - jump, ticks, trusted
 
 
 def _clock_steps(

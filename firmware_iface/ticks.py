@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.decode import Decoded, DecodedTable
-from firmware_iface.protection import unwrap
+from firmware_iface.protection import OUTSIDE, unwrap
 
 __all__ = ["TickAxis", "place"]
 
@@ -27,7 +27,8 @@ class TickAxis:
 
     Attributes
     ----------
-    ticks: per message, tick of each accepted frame; messages that no tick fits are left out.
+    ticks: per message, tick of each accepted frame, far below zero for one out of line; messages
+        that no tick fits are left out.
     rows: per message, row of the table of each accepted frame.
     row, tick, time_ns: the frames that define the axis, in order of arrival.
     every: per message, ticks between two frames of one stream.
@@ -87,14 +88,15 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
     order = np.argsort(row, kind="stable")
     modulus = counted[names[0]].message.modulus
     position, notes = unwrap(counter[order], time_ns[order], tick_ns, modulus)
-    owner = owner[order]
+    owner, row, time_ns = owner[order], row[order], time_ns[order]
+    sound = position != OUTSIDE
     ticks = {name: position[owner == index] for index, name in enumerate(names)}
     return TickAxis(
         ticks=ticks,
         rows={name: counted[name].row for name in names},
-        row=row[order],
-        tick=position,
-        time_ns=time_ns[order],
+        row=row[sound],
+        tick=position[sound],
+        time_ns=time_ns[sound],
         every=dict.fromkeys(names, 1),
         turn=modulus,
         notes=notes,
@@ -107,9 +109,9 @@ def _anchor_axis(anchor: Decoded, tick_ns: int) -> TickAxis:
     return TickAxis(
         ticks={name: tick},
         rows={name: anchor.row},
-        row=anchor.row,
-        tick=tick,
-        time_ns=anchor.time_ns,
+        row=anchor.row[tick > OUTSIDE // 2],
+        tick=tick[tick > OUTSIDE // 2],
+        time_ns=anchor.time_ns[tick > OUTSIDE // 2],
         every={name: every},
         turn=anchor.message.modulus * every,
         notes=notes,
@@ -129,7 +131,8 @@ def _own_ticks(item: Decoded, tick_ns: int) -> tuple[Ticks, int, tuple[str, ...]
     every = _frame_spacing(item, tick_ns)
     if item.counter is not None and every >= 1:
         count, notes = unwrap(item.counter, item.time_ns, every * tick_ns, item.message.modulus)
-        return (count - count[0]) * every, every, notes
+        begin = int(count[count != OUTSIDE][0])
+        return np.where(count == OUTSIDE, OUTSIDE, (count - begin) * every), every, notes
     note = f"{item.message.name}: no counter to place samples by; host time stamps do"
     since = (item.time_ns - item.time_ns[0]) / tick_ns
     return _settle(np.rint(since - _phase(since)).astype(np.int64), every), max(every, 1), (note,)
@@ -174,7 +177,10 @@ def _with_others(
     own = ticks.get(anchor.message.name)
     reference = axis
     if own is not None and len(axis.row) != len(own):
-        reference = replace(axis, row=anchor.row, tick=own, time_ns=anchor.time_ns)
+        sound = own > OUTSIDE // 2
+        reference = replace(
+            axis, row=anchor.row[sound], tick=own[sound], time_ns=anchor.time_ns[sound]
+        )
     for name, item in messages.items():
         if name in ticks or len(item.row) == 0:
             continue
@@ -190,7 +196,8 @@ def _with_others(
         alone, spacing, _ = _own_ticks(item, tick_ns)
         every[name] = max(spacing, 1)
         if item.counter is not None and spacing >= 1:
-            ticks[name] = alone + int(np.rint(np.median(by_time - alone)))
+            sound = alone != OUTSIDE
+            ticks[name] = alone + int(np.rint(np.median((by_time - alone)[sound])))
         else:
             ticks[name] = _settle(by_time, spacing)
             notes.append(f"{name}: no counter to place samples by; host time stamps do")
