@@ -228,8 +228,12 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
 
 
 def _status_rows(span: _Span, limit: int | None, status: Status) -> NDArray[np.int64]:
-    end = status.following < limit if limit is not None else np.ones(len(status.row), dtype=bool)
-    return np.flatnonzero((status.following >= span.start - SAME_START) & end)
+    """Status frames of a test; its end may be told right before the first tick of the next."""
+    mine = status.following >= span.start - SAME_START
+    if limit is not None:
+        ended = (status.following == limit) & (status.state != BitState.RUNNING)
+        mine &= (status.following < limit) | ended
+    return np.flatnonzero(mine)
 
 
 def _outcome(mine: NDArray[np.int64], status: Status) -> tuple[Outcome, int | None]:

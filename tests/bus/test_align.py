@@ -357,6 +357,17 @@ def test_the_same_test_twice_without_idle_frames_between(encoder, bus_map):
     assert_truthful(two.samples, second)
 
 
+def test_two_tests_back_to_back_with_counters_that_start_again(encoder, bus_map):
+    first, second = make_truth(600, 1), make_truth(600, 2)
+    frames = play(encoder, first) + play(encoder, second, start_ns=START + 600 * TICK)
+    one_, two = recordings(frames, bus_map)
+    assert_truthful(one_.samples, first)
+    assert_truthful(two.samples, second)
+    for recording in (one_, two):
+        assert recording.outcome.state is BitState.COMPLETE
+        assert recording.quality.total("lost") == recording.quality.total("repeated") == 0
+
+
 def test_aborted_test(encoder, bus_map, truth):
     frames = play(encoder, truth, end=BitState.ABORTED, idle_after=50)
     recording = one(frames, bus_map)
