@@ -155,7 +155,8 @@ def frame_of(message: can.Message) -> Frame:
     """Turn a python-can message into a frame.
 
     Times are rounded to whole microseconds: python-can's float seconds carry no more, and only so
-    a recorded frame reads back with the very stamp it had on the bus.
+    a recorded frame reads back with the very stamp it had on the bus. Its mark for sent frames is
+    left out: SocketCAN sets it on the frames of every program of this machine.
     """
     limit = 0x1FFFFFFF if message.is_extended_id else 0x7FF
     return Frame(
@@ -166,7 +167,6 @@ def frame_of(message: can.Message) -> Frame:
         fd=message.is_fd,
         error=message.is_error_frame,
         remote=message.is_remote_frame,
-        sent=not message.is_rx,
     )
 
 
@@ -215,6 +215,11 @@ def _open(options: BusOptions, name: str, transmit: bool) -> can.BusABC:
 
 
 def _arguments(options: BusOptions, transmit: bool) -> dict[str, Any]:
+    if options.extra.get("receive_own_messages"):
+        raise ConfigurationError(
+            f"{options.interface}: receive_own_messages is not supported: own requests are "
+            "recorded as they are sent, and an echo would look like another tester's"
+        )
     arguments: dict[str, Any] = {"interface": options.interface, "ignore_config": True}
     for key in ("channel", "bitrate", "data_bitrate", "app_name"):
         value = getattr(options, key)

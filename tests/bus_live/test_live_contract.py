@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
@@ -64,6 +65,7 @@ class Contract:
         feed()
         got = collect(receiving, COUNT)
         assert content(got) == content(FRAMES)
+        assert not any(item.sent for item in got)
         assert receiving.receive(0.05) is None
         assert receiving.state is TransportState.OPEN
         assert receiving.detail == ""
@@ -199,33 +201,34 @@ def test_multicast_that_would_leave_the_machine_is_refused(
     assert "hop_limit" not in pythoncan._arguments(allowed, True)
 
 
+@pytest.fixture
+def wire() -> Iterator[tuple[str, str]]:
+    """Two pty pairs, joined in the middle."""
+    if not hasattr(os, "openpty"):
+        pytest.skip("no pseudo-terminals on this system")
+    import select
+    import tty
+
+    (a, a_end), (b, b_end) = os.openpty(), os.openpty()
+    for item in (a, b, a_end, b_end):
+        tty.setraw(item)
+    stop = threading.Event()
+
+    def join() -> None:
+        while not stop.is_set():
+            for source in select.select([a, b], [], [], 0.02)[0]:
+                os.write(b if source == a else a, os.read(source, 4096))
+
+    thread = threading.Thread(target=join)
+    thread.start()
+    yield os.ttyname(a_end), os.ttyname(b_end)
+    stop.set()
+    thread.join()
+    for item in (a, b, a_end, b_end):
+        os.close(item)
+
+
 class TestSerial(TwoWay):
-    @pytest.fixture
-    def wire(self) -> Iterator[tuple[str, str]]:
-        """Two pty pairs, joined in the middle."""
-        if not hasattr(os, "openpty"):
-            pytest.skip("no pseudo-terminals on this system")
-        import select
-        import tty
-
-        (a, a_end), (b, b_end) = os.openpty(), os.openpty()
-        for item in (a, b, a_end, b_end):
-            tty.setraw(item)
-        stop = threading.Event()
-
-        def join() -> None:
-            while not stop.is_set():
-                for source in select.select([a, b], [], [], 0.02)[0]:
-                    os.write(b if source == a else a, os.read(source, 4096))
-
-        thread = threading.Thread(target=join)
-        thread.start()
-        yield os.ttyname(a_end), os.ttyname(b_end)
-        stop.set()
-        thread.join()
-        for item in (a, b, a_end, b_end):
-            os.close(item)
-
     @pytest.fixture
     def other(self, wire: tuple[str, str]) -> Iterator[Transport]:
         with SerialTransport(wire[1], transmit=True) as transport:
@@ -253,6 +256,24 @@ class TestSerial(TwoWay):
         feed()
         times = [item.time_ns for item in collect(receiving, COUNT)]
         assert [item - times[0] for item in times] == [k * 1_000_000 for k in range(COUNT)]
+
+
+class TestSlcan(TwoWay):
+    """Two SLCAN ends on one line: each takes the other for its adapter."""
+
+    quick: ClassVar[dict[str, float]] = {"sleep_after_open": 0.0}
+
+    @pytest.fixture
+    def other(self, wire: tuple[str, str]) -> Iterator[Transport]:
+        options = BusOptions("slcan", channel=wire[1], extra=self.quick)
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    @pytest.fixture
+    def receiving(self, wire: tuple[str, str]) -> Iterator[Transport]:
+        options = BusOptions("slcan", channel=wire[0], extra=self.quick)
+        with PythonCanTransport(options) as transport:
+            yield transport
 
 
 def test_a_serial_line_that_goes_away_is_a_lost_bus() -> None:
@@ -308,6 +329,14 @@ class TestTrc(ReplayContract):
     suffix = ".trc"
 
 
+class TestMf4(ReplayContract):
+    suffix = ".mf4"
+
+    @pytest.fixture(autouse=True)
+    def _library(self) -> None:
+        pytest.importorskip("asammdf", reason="MF4 needs the extra ehadiag[mf4]")
+
+
 def test_replay_in_its_own_time_is_not_faster_than_the_log() -> None:
     table = FrameTable.from_frames([frame(0), frame(100)])
     with ReplayTransport(table, "log", speed=1.0) as transport:
@@ -347,6 +376,11 @@ def test_playing_onto_a_bus_keeps_order_skips_errors_and_stops() -> None:
         (BusOptions("slcan", channel="/dev/no-such-port"), InputOutputError, "cannot open"),
         (BusOptions("socketcan", channel="nocan7"), InputOutputError, "cannot open"),
         (BusOptions("socketcand", channel="can0"), ConfigurationError, "wrong option"),
+        (
+            BusOptions("virtual", extra={"receive_own_messages": True}),
+            ConfigurationError,
+            "not supported",
+        ),
     ],
 )
 def test_a_bus_that_cannot_be_opened_is_one_line(

@@ -10,6 +10,7 @@ import textwrap
 import threading
 import uuid
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -231,34 +232,71 @@ def virtual(channel: str, *, transmit: bool) -> Transport:
     return PythonCanTransport(BusOptions("virtual", channel=channel), transmit=transmit)
 
 
-def test_in_real_time_over_a_virtual_bus(
-    make_core: CoreFactory, short_test: StoredTest, tmp_path: Path
-) -> None:
-    channel = str(uuid.uuid4())
-    core, stop = make_core(), threading.Event()
+def session_on(
+    options: BusOptions, core: FccCore, path: Path, *, listener: bool = False
+) -> tuple[tester.TesterOutcome, tester.TesterOutcome | None]:
+    """Run the short test in real time, the computer in a thread; maybe a listener beside it."""
+    stop = threading.Event()
+    heard: list[tester.TesterOutcome] = []
     core.step()
-    with virtual(channel, transmit=True) as bus, virtual(channel, transmit=True) as ours:
-        thread = threading.Thread(target=run_emulator, args=(core, bus, stop))
-        thread.start()
+    with ExitStack() as stack:
+        bus = stack.enter_context(PythonCanTransport(options, transmit=True))
+        ours = stack.enter_context(PythonCanTransport(options, transmit=True))
+        threads = [threading.Thread(target=run_emulator, args=(core, bus, stop))]
+        if listener:
+            third = stack.enter_context(PythonCanTransport(options))
+
+            def listen() -> None:
+                times = TimeLimits(wait=10.0)
+                heard.append(run_test(third, test_id=None, duration=0.4, times=times))
+
+            threads.append(threading.Thread(target=listen))
+        for item in threads:
+            item.start()
         try:
             outcome = run_test(
-                ours,
-                test_id=9,
-                duration=0.4,
-                transmit=True,
-                recorder=Recorder(tmp_path / "live.blf"),
+                ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
             )
+            for item in threads[1:]:
+                item.join()
         finally:
             stop.set()
-            thread.join()
+            threads[0].join()
+    return outcome, heard[0] if heard else None
+
+
+def assert_whole(path: Path, test: StoredTest) -> None:
+    recording = read_recording(path)
+    assert recording.quality.total("lost") == 0
+    assert recording.samples is not None
+    assert recording.samples.ticks == test.ticks
+    assert recording.samples.mode is CommandMode.CURRENT
+
+
+def test_in_real_time_over_a_virtual_bus_with_a_listener(
+    make_core: CoreFactory, short_test: StoredTest, tmp_path: Path
+) -> None:
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    path = tmp_path / "live.blf"
+    outcome, heard = session_on(options, make_core(), path, listener=True)
     assert outcome.why == ""
     assert outcome.dropped == 0
-    recording = read_recording(tmp_path / "live.blf")
-    assert recording.quality.total("lost") == 0
-    samples = recording.samples
-    assert samples is not None
-    assert samples.ticks == short_test.ticks
-    assert samples.mode is CommandMode.CURRENT
+    assert heard is not None
+    assert (heard.why, heard.test_id, heard.serial) == ("", 9, 77)
+    assert_whole(path, short_test)
+
+
+@pytest.mark.socketcan
+def test_in_real_time_over_socketcan_with_a_listener(
+    make_core: CoreFactory, short_test: StoredTest, tmp_path: Path
+) -> None:
+    options = BusOptions("socketcan", channel="vcan0")
+    path = tmp_path / "live.blf"
+    outcome, heard = session_on(options, make_core(), path, listener=True)
+    assert outcome.why == ""
+    assert heard is not None
+    assert heard.why == ""
+    assert_whole(path, short_test)
 
 
 def test_a_silent_bus_ends_within_its_time_limits(tmp_path: Path) -> None:
