@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from ehadiag.recording import (
     CommandMode,
     Environment,
-    MessageCounts,
     Quality,
     Recording,
     Samples,
 )
 from firmware_iface.busmap import BusMap
-from firmware_iface.decode import Decoded, DecodedTable, decode
+from firmware_iface.counts import count_frames, within
+from firmware_iface.decode import DecodedTable, decode
 from firmware_iface.episodes import Episode, find_episodes
 from firmware_iface.frames import FrameTable
 from firmware_iface.status import read_status, resolve_turns
@@ -93,7 +93,8 @@ def _recording(
         extra = ["no test in the recording"]
     extra += _stuck_counters(decoded, bus_map, begin, end)
     counts = {
-        name: _counts(item, axis, episode, begin, end) for name, item in decoded.messages.items()
+        name: count_frames(item, axis, episode, begin, end)
+        for name, item in decoded.messages.items()
     }
     if bus_map.policy.crc == "refuse" and any(item.crc_errors for item in counts.values()):
         samples, extra = None, [*extra, "frames with a wrong check sum: refused by the policy"]
@@ -102,8 +103,8 @@ def _recording(
     quality = Quality(
         messages=counts,
         saturated=_saturated(samples),
-        foreign=_within(decoded.foreign, begin, end),
-        error_frames=_within(decoded.errors, begin, end),
+        foreign=within(decoded.foreign, begin, end),
+        error_frames=within(decoded.errors, begin, end),
         notes=(*notes, *episode.notes, *extra),
     )
     return Recording(
@@ -164,10 +165,6 @@ class _Bounds:
         begin = int(self.axis.row[first - 1]) + 1 if first > 0 else 0
         end = int(self.axis.row[last + 1]) if last + 1 < len(self.axis.row) else rows
         return begin, end
-
-
-def _within(rows: NDArray[np.int64], begin: int, end: int) -> int:
-    return int(np.searchsorted(rows, end) - np.searchsorted(rows, begin))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,70 +286,6 @@ def _command(grid: _Grid) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
             notes.append(f"{int(other.sum())} commands of another mode left out")
             value[other] = np.nan
     return mode, value, notes
-
-
-def _counts(
-    item: Decoded, axis: TickAxis | None, episode: Episode, begin: int, end: int
-) -> MessageCounts:
-    received = _within(item.received, begin, end)
-    crc_errors = _within(item.crc_bad, begin, end)
-    length_errors = _within(item.length_bad, begin, end)
-    range_errors = _within(item.range_bad, begin, end)
-    tick = axis.ticks.get(item.message.name) if axis is not None else None
-    inside = slice(*np.searchsorted(item.row, [begin, end]))
-    if tick is not None and axis is not None and episode.ticks > 0:
-        at = tick[inside]
-        at = at - episode.first
-        stream = item.stream[inside]
-        keep = (at >= 0) & (at < episode.ticks)
-        at, stream = at[keep], stream[keep]
-        expected = _expected(at, stream, episode.ticks, axis.every.get(item.message.name, 1))
-        position = at * (int(stream.max()) + 1 if len(stream) else 1) + stream
-    elif item.counter is not None:
-        position = _sequence(item.counter[inside], item.message.modulus)
-        expected = int(position.max() - position.min()) + 1 if len(position) else 0
-    else:
-        position = np.arange(inside.stop - inside.start)
-        expected = len(position) + crc_errors + length_errors
-    accepted = len(np.unique(position))
-    return MessageCounts(
-        received=received,
-        accepted=accepted,
-        lost=max(expected - accepted - crc_errors - length_errors, 0),
-        repeated=len(position) - accepted,
-        out_of_order=_late(position),
-        crc_errors=crc_errors,
-        length_errors=length_errors,
-        range_errors=range_errors,
-    )
-
-
-def _expected(at: NDArray[np.int64], stream: NDArray[np.int64], ticks: int, every: int) -> int:
-    """Frames that a test of that length holds."""
-    if len(at) == 0:
-        return -(-ticks // every)
-    return sum(
-        len(range(int(at[stream == item].min() % every), ticks, every))
-        for item in np.unique(stream)
-    )
-
-
-def _sequence(counter: NDArray[np.int64], modulus: int) -> NDArray[np.int64]:
-    """Continue the counter of a message that is sent on event: the nearest number counts."""
-    if len(counter) == 0:
-        return counter
-    step = np.diff(counter) % modulus
-    step = np.where(step > modulus // 2, step - modulus, step)
-    return np.concatenate(([0], np.cumsum(step)))
-
-
-def _late(position: NDArray[np.int64]) -> int:
-    """Frames that came after a later one, repeats aside."""
-    if len(position) == 0:
-        return 0
-    first = np.unique(position, return_index=True)[1]
-    once = position[np.sort(first)]
-    return int(np.count_nonzero(once < np.maximum.accumulate(once)))
 
 
 def _saturated(samples: Samples | None) -> dict[str, int]:
