@@ -200,6 +200,11 @@ class Handshake:
                 actions = [Action.ABORT]
         return actions
 
+    def excuse(self, gap_ns: int) -> None:
+        """Take out a time in which the reader itself did not run: what came then still waits."""
+        self._since += gap_ns
+        self._heard += gap_ns
+
     def on_status(self, now: int, status: BitStatus) -> list[Action]:
         """Take a valid status message."""
         match self.phase:

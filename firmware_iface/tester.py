@@ -31,6 +31,8 @@ __all__ = ["Progress", "TesterOutcome", "run_test"]
 
 POLL = 0.02
 """s; longest wait for a frame before the time limits are looked at."""
+STALL_NS = 100_000_000
+"""A wait so much longer than POLL: this process did not run, which is no silence of the bus."""
 PROGRESS_NS = 100_000_000
 """Between two progress reports."""
 
@@ -168,9 +170,12 @@ class _Session:
 
     def _loop(self, source: FrameSource, stop: threading.Event) -> None:
         machine = self._machine
+        now = source.now_ns()
         while machine.phase is not Phase.DONE:
             frame = source.receive(POLL)
-            now = source.now_ns()
+            before, now = now, source.now_ns()
+            if self._transport.real_time and now - before > STALL_NS:
+                machine.excuse(now - before)
             if stop.is_set():
                 self._act(machine.stop(now, "stopped by the user"))
             if frame is not None:

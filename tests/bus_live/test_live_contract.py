@@ -201,33 +201,6 @@ def test_multicast_that_would_leave_the_machine_is_refused(
     assert "hop_limit" not in pythoncan._arguments(allowed, True)
 
 
-@pytest.fixture
-def wire() -> Iterator[tuple[str, str]]:
-    """Two pty pairs, joined in the middle."""
-    if not hasattr(os, "openpty"):
-        pytest.skip("no pseudo-terminals on this system")
-    import select
-    import tty
-
-    (a, a_end), (b, b_end) = os.openpty(), os.openpty()
-    for item in (a, b, a_end, b_end):
-        tty.setraw(item)
-    stop = threading.Event()
-
-    def join() -> None:
-        while not stop.is_set():
-            for source in select.select([a, b], [], [], 0.02)[0]:
-                os.write(b if source == a else a, os.read(source, 4096))
-
-    thread = threading.Thread(target=join)
-    thread.start()
-    yield os.ttyname(a_end), os.ttyname(b_end)
-    stop.set()
-    thread.join()
-    for item in (a, b, a_end, b_end):
-        os.close(item)
-
-
 class TestSerial(TwoWay):
     @pytest.fixture
     def other(self, wire: tuple[str, str]) -> Iterator[Transport]:

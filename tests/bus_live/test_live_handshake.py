@@ -144,6 +144,15 @@ def test_a_short_pause_of_the_telemetry_is_none_of_the_handshakes_business() -> 
     assert driver.machine.phase is Phase.RUNNING
 
 
+def test_time_in_which_the_reader_did_not_run_is_no_silence() -> None:
+    driver = Driver().running().wait(0.1)
+    driver.now += 400 * MS
+    driver.machine.excuse(400 * MS)
+    driver.sent += driver.machine.on_time(driver.now)
+    assert driver.machine.phase is Phase.RUNNING
+    assert driver.wait(0.3, telemetry=False).sent == [Action.START, Action.ABORT]
+
+
 def test_a_test_that_never_ends_is_aborted() -> None:
     driver = Driver().running().wait(2.05)
     assert driver.sent == [Action.START, Action.ABORT]

@@ -33,6 +33,7 @@ from firmware_iface.logs import read_frames, read_recording
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 from firmware_iface.recorder import Recorder
 from firmware_iface.replay import ReplayTransport
+from firmware_iface.seriallink import SerialTransport
 from firmware_iface.tester import Progress, run_test
 from firmware_iface.transport import Transport
 
@@ -233,36 +234,34 @@ def virtual(channel: str, *, transmit: bool) -> Transport:
 
 
 def session_on(
-    options: BusOptions, core: FccCore, path: Path, *, listener: bool = False
-) -> tuple[tester.TesterOutcome, tester.TesterOutcome | None]:
-    """Run the short test in real time, the computer in a thread; maybe a listener beside it."""
+    options: BusOptions, core: FccCore, path: Path
+) -> tuple[tester.TesterOutcome, tester.TesterOutcome]:
+    """Run the short test in real time, the computer and a listener in threads beside it."""
     stop = threading.Event()
     heard: list[tester.TesterOutcome] = []
     core.step()
     with ExitStack() as stack:
         bus = stack.enter_context(PythonCanTransport(options, transmit=True))
         ours = stack.enter_context(PythonCanTransport(options, transmit=True))
-        threads = [threading.Thread(target=run_emulator, args=(core, bus, stop))]
-        if listener:
-            third = stack.enter_context(PythonCanTransport(options))
+        third = stack.enter_context(PythonCanTransport(options))
 
-            def listen() -> None:
-                times = TimeLimits(wait=10.0)
-                heard.append(run_test(third, test_id=None, duration=0.4, times=times))
+        def listen() -> None:
+            times = TimeLimits(wait=10.0)
+            heard.append(run_test(third, test_id=None, duration=0.4, times=times))
 
-            threads.append(threading.Thread(target=listen))
+        node = threading.Thread(target=run_emulator, args=(core, bus, stop))
+        threads = [node, threading.Thread(target=listen)]
         for item in threads:
             item.start()
         try:
             outcome = run_test(
                 ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
             )
-            for item in threads[1:]:
-                item.join()
+            threads[1].join()
         finally:
             stop.set()
-            threads[0].join()
-    return outcome, heard[0] if heard else None
+            node.join()
+    return outcome, heard[0]
 
 
 def assert_whole(path: Path, test: StoredTest) -> None:
@@ -278,10 +277,9 @@ def test_in_real_time_over_a_virtual_bus_with_a_listener(
 ) -> None:
     options = BusOptions("virtual", channel=str(uuid.uuid4()))
     path = tmp_path / "live.blf"
-    outcome, heard = session_on(options, make_core(), path, listener=True)
+    outcome, heard = session_on(options, make_core(), path)
     assert outcome.why == ""
     assert outcome.dropped == 0
-    assert heard is not None
     assert (heard.why, heard.test_id, heard.serial) == ("", 9, 77)
     assert_whole(path, short_test)
 
@@ -292,10 +290,33 @@ def test_in_real_time_over_socketcan_with_a_listener(
 ) -> None:
     options = BusOptions("socketcan", channel="vcan0")
     path = tmp_path / "live.blf"
-    outcome, heard = session_on(options, make_core(), path, listener=True)
+    outcome, heard = session_on(options, make_core(), path)
     assert outcome.why == ""
-    assert heard is not None
     assert heard.why == ""
+    assert_whole(path, short_test)
+
+
+def test_in_real_time_over_the_serial_link(
+    make_core: CoreFactory, short_test: StoredTest, wire: tuple[str, str], tmp_path: Path
+) -> None:
+    core, stop = make_core(), threading.Event()
+    core.step()
+    path = tmp_path / "live.blf"
+    with (
+        SerialTransport(wire[0], transmit=True) as bus,
+        SerialTransport(wire[1], transmit=True) as ours,
+    ):
+        node = threading.Thread(target=run_emulator, args=(core, bus, stop))
+        node.start()
+        try:
+            outcome = run_test(
+                ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
+            )
+        finally:
+            stop.set()
+            node.join()
+    assert outcome.why == ""
+    assert outcome.degraded == ""
     assert_whole(path, short_test)
 
 
