@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numba.core import caching
 
-__all__ = ["cache_folder", "kernel"]
+__all__ = ["cache_folder", "cache_is_cold", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -57,6 +57,11 @@ def cache_folder() -> Path:
         if _usable(folder / leaf):
             return folder / leaf
     return Path(tempfile.mkdtemp(prefix="ehadiag-"))
+
+
+def cache_is_cold() -> bool:
+    """Whether no kernel of this version has been compiled here yet."""
+    return not any(cache_folder().glob("*.nbi"))
 
 
 def _usable(folder: Path) -> bool:

@@ -13,19 +13,22 @@ __all__ = ["FAULTS", "FAULT_NAMES", "Parameter"]
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One scalar that an estimate has: name, bounds, unit, one-line meaning."""
+    """One scalar that an estimate has: name, bounds, unit, meaning in two words and in one line."""
 
     name: str
     lower: float
     upper: float
     unit: str
+    short: str
     meaning: str
 
 
 FAULTS: tuple[Parameter, ...] = (
-    Parameter("Kintas", 0.0, 1.0, "1", "clogging of the servovalve first-stage filter"),
-    Parameter("FSS", 0.0, 1.0, "1", "dry friction between spool and sleeve"),
-    Parameter("FDJ", 0.0, 1.0, "1", "dry friction between jack and cylinder"),
+    Parameter(
+        "Kintas", 0.0, 1.0, "1", "filter clogging", "clogging of the valve's first-stage filter"
+    ),
+    Parameter("FSS", 0.0, 1.0, "1", "spool friction", "dry friction between spool and sleeve"),
+    Parameter("FDJ", 0.0, 1.0, "1", "jack friction", "dry friction between jack and cylinder"),
 )
 """The progressive faults of the paper (model.md section 3); 0 as new, 1 limit of damage."""
 

@@ -23,6 +23,8 @@ __all__ = ["CurrentTrace", "commanded_current"]
 
 FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
 """A command frame that far (A, m) from the stored test says that another command was played."""
+LEAST_LEVELS = 100
+"""Values sent that it takes to know their resolution."""
 CONTROL_LAW_LSB = 4.0
 """Gap (LSB rms) beyond which the control law does not explain the measured current."""
 
@@ -54,7 +56,7 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     known = np.isfinite(samples.command)
     gap = np.abs(samples.command - stored)[known]
     command_gap = float(gap.max()) if gap.size else 0.0
-    command = np.where(known, samples.command, stored)
+    command = np.where(known, samples.command, _as_sent(stored, samples.command[known]))
     if samples.mode is CommandMode.CURRENT:
         current = np.clip(command, -controller.IM, controller.IM)
     else:
@@ -79,6 +81,19 @@ def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     if len(command) >= n:
         return command[:n]
     return np.concatenate([command, np.full(n - len(command), command[-1])])
+
+
+def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round the stored command to the resolution of the command frames.
+
+    The flight-control computer acts on what the frame says; the resolution is the smallest
+    distance between two values sent.
+    """
+    levels = np.unique(sent)
+    if levels.size < LEAST_LEVELS:
+        return stored
+    resolution = float(np.diff(levels).min())
+    return np.asarray(np.round(stored / resolution) * resolution)
 
 
 def _control_law(

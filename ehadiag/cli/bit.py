@@ -1,0 +1,176 @@
+"""`ehadiag bit`: requests a built-in test, records it, diagnoses it."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from ehadiag.actuator import Actuator
+from ehadiag.cli import options
+from ehadiag.cli.interrupt import stop_on_signals
+from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
+from ehadiag.errors import ConfigurationError
+from ehadiag.recording import Environment, Outcome, Quality, Recording
+from ehadiag.storedtest import StoredTest, resolve_test
+from ehadiag.verdict import Levels
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "bit",
+        help="request a built-in test on a bus, record and diagnose it",
+        description="Request a built-in test on a bus, record it to disk while it runs, diagnose"
+        " it. The request makes the surface move. Ctrl-C requests an abort.",
+    )
+    parser.add_argument(
+        "--test",
+        required=True,
+        metavar="open|closed|FILE",
+        help="stored test by name, or a test file",
+    )
+    parser.add_argument(
+        "--simulate",
+        action="store_true",
+        help="run the emulated flight-control computer for it; without"
+        " --interface on a virtual bus of this process",
+    )
+    parser.add_argument(
+        "--listen",
+        action="store_true",
+        help="send nothing: wait for the test that somebody else starts",
+    )
+    parser.add_argument(
+        "--record",
+        metavar="FILE",
+        help="recording, .blf .asc .csv .trc (default: in the output folder)",
+    )
+    parser.add_argument(
+        "--out",
+        default="ehadiag-out",
+        metavar="DIR",
+        help="recording, JSON and picture go here (default ehadiag-out)",
+    )
+    parser.add_argument("--max-position", type=float, metavar="mm", help="abort beyond")
+    parser.add_argument("--max-pressure", type=float, metavar="MPa", help="abort beyond")
+    parser.add_argument("--max-current", type=float, metavar="mA", help="abort beyond")
+    options.add_actuator_options(parser)
+    options.add_mapping_options(parser)
+    options.add_diagnosis_options(parser)
+    options.add_bus_options(parser)
+    options.add_fault_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the test and print the verdict."""
+    actuator = options.the_actuator(arguments)
+    test = resolve_test(arguments.test)
+    levels = Levels(arguments.advisory, arguments.limit)
+    if arguments.simulate and arguments.listen:
+        raise ConfigurationError("--simulate and --listen exclude each other")
+    folder = make_folder(arguments.out)
+    say_if_compiling()
+    from ehadiag.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
+    from ehadiag.identify.solvers import make_solver  # noqa: PLC0415
+    from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
+
+    # Before the test: a verdict must not wait for the compiler.
+    warm_up(actuator, test)
+    begin = time.perf_counter()
+    recording, why, stem = _acquire(arguments, actuator, test, folder)
+    read_s = time.perf_counter() - begin
+    if why:
+        result = not_tested(recording, actuator, [why])
+    else:
+        with progress_bar() as progress:
+            result = diagnose(
+                [recording],
+                actuator,
+                [test],
+                levels=levels,
+                solver=make_solver(arguments.solver),
+                seed=arguments.seed,
+                progress=progress,
+            )
+    show(result, arguments, read_s)
+    write_report(result, stem, arguments, read_s)
+    return int(result.verdict)
+
+
+def _acquire(
+    arguments: argparse.Namespace, actuator: Actuator, test: StoredTest, folder: Path
+) -> tuple[Recording, str, Path]:
+    """Run the test on the bus; return the recording, why it is not one, and the files' stem."""
+    from firmware_iface.assembler import Assembler  # noqa: PLC0415 - loads python-can
+    from firmware_iface.handshake import Limits  # noqa: PLC0415
+    from firmware_iface.recorder import Recorder  # noqa: PLC0415
+    from firmware_iface.tester import Progress, run_test  # noqa: PLC0415
+
+    bus_map = options.the_bus_map(arguments)
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
+    with ExitStack() as stack:
+        if arguments.simulate and not options.has_bus(arguments):
+            arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
+        if arguments.simulate:
+            from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415
+
+            core = make_core(arguments, actuator, [test], bus_map)
+            theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
+        ours = stack.enter_context(options.open_transport(arguments, transmit=not arguments.listen))
+        recorder = Recorder(path)
+        if arguments.simulate:
+            stack.enter_context(emulator_beside(core, theirs))
+        stop = stack.enter_context(stop_on_signals())
+        display = stack.enter_context(progress_bar())
+        say(f"test {test.name!r} on {ours.name}, recording to {path}")
+
+        def tell(progress: Progress) -> None:
+            display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
+
+        assembler = Assembler(str(path), bus_map)
+        outcome = run_test(
+            ours,
+            test_id=test.id,
+            duration=test.duration,
+            transmit=not arguments.listen,
+            recorder=recorder,
+            bus_map=bus_map,
+            limits=Limits(
+                position=_scaled(arguments.max_position, 1e-3),
+                pressure=_scaled(arguments.max_pressure, 1e6),
+                current=_scaled(arguments.max_current, 1e-3),
+            ),
+            on_frame=assembler.add,
+            stop=stop,
+            progress=tell,
+        )
+        recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
+        if outcome.degraded:
+            say(outcome.degraded)
+    why = "" if outcome.complete else outcome.why
+    return recording, why, path.with_suffix("") if not arguments.record else folder / path.stem
+
+
+def _unused(folder: Path, test: str, stamp: str) -> Path:
+    """Return a file name for the recording that does not exist yet."""
+    number = 1
+    while True:
+        suffix = f"-{number}" if number > 1 else ""
+        path = folder / f"{stamp}-{Path(test).name}{suffix}.blf"
+        if not path.exists():
+            return path
+        number += 1
+
+
+def _empty(path: Path, outcome: Outcome) -> Recording:
+    return Recording(str(path), None, None, None, outcome, Environment(), Quality())
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor

@@ -1,0 +1,58 @@
+"""Command line `ehadiag`: one parser, one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from ehadiag.cli import bit, checkbus, diagnose, replay, sim, tests, warmup
+from ehadiag.errors import EhadiagError
+
+__all__ = ["main"]
+
+EPILOG = """\
+exit codes: 0 healthy, 10 degraded, 20 fault, 30 not tested (reason given),
+2 wrong usage or configuration, 3 input/output failure; several logs: the worst."""
+BROKEN_PIPE = 3
+INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        code = arguments.run(arguments)
+        sys.stdout.flush()
+        return int(code)
+    except EhadiagError as error:
+        print(f"ehadiag: {error}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:
+        # Whoever read our output has gone; what is left of it must not raise again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except KeyboardInterrupt:
+        print("ehadiag: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ehadiag",
+        description="Diagnosis of electrohydraulic actuators: clogging of the first-stage filter"
+        " (Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (limit).",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"ehadiag {version('ehadiag')}")
+    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    for command in (bit, diagnose, sim, tests, checkbus, replay, warmup):
+        command.add_parser(subparsers)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

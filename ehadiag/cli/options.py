@@ -1,0 +1,265 @@
+"""Options that several commands share, and what they stand for."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import TYPE_CHECKING, Any
+
+from ehadiag.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.errors import ConfigurationError
+from ehadiag.storedtest import StoredTest, bundled_tests, load_test
+
+if TYPE_CHECKING:
+    from firmware_iface.busmap import BusMap
+    from firmware_iface.transport import Transport
+
+__all__ = [
+    "add_actuator_options",
+    "add_bus_options",
+    "add_diagnosis_options",
+    "add_fault_options",
+    "add_mapping_options",
+    "has_bus",
+    "known_tests",
+    "open_transport",
+    "the_actuator",
+    "the_bus_map",
+]
+
+DEFAULT_BAUD = 921600
+
+
+def add_actuator_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--actuator`."""
+    parser.add_argument(
+        "--actuator", metavar="FILE", help="actuator data, TOML (default: the reference actuator)"
+    )
+
+
+def add_mapping_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--mapping` and `--dbc`."""
+    parser.add_argument(
+        "--mapping",
+        metavar="FILE",
+        help="which signals of a DBC are which channels, TOML (default: the FCC's own bus)",
+    )
+    parser.add_argument("--dbc", metavar="FILE", help="DBC to use instead of the mapping's own")
+
+
+def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
+    """Add solver, seed, levels and output."""
+    parser.add_argument(
+        "--solver",
+        choices=("cga", "pygad"),
+        default="cga",
+        help="search: compact GA (default) or pygad",
+    )
+    parser.add_argument(
+        "--seed",
+        type=_seed,
+        default=0,
+        metavar="N",
+        help="seed of the search (default 0); the same seed, the same answer",
+    )
+    parser.add_argument(
+        "--advisory",
+        type=float,
+        default=0.25,
+        metavar="K",
+        help="DEGRADED at or above this fault constant (default 0.25)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=0.75,
+        metavar="K",
+        help="FAULT at or above this fault constant (default 0.75)",
+    )
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print one JSON object a line to standard output, nothing else there",
+    )
+
+
+def add_bus_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a bus, named as in python-can's own tools."""
+    group = parser.add_argument_group("bus", "options as in python-can's tools")
+    group.add_argument(
+        "-i",
+        "--interface",
+        default=os.environ.get("CAN_INTERFACE"),
+        help="socketcan, virtual, udp_multicast, slcan, pcan, kvaser, vector, …"
+        " (default: CAN_INTERFACE)",
+    )
+    group.add_argument(
+        "-c",
+        "--channel",
+        default=os.environ.get("CAN_CHANNEL"),
+        help="channel as the interface names it (default: CAN_CHANNEL)",
+    )
+    group.add_argument("-b", "--bitrate", type=int, help="bit/s")
+    group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
+    group.add_argument("--data-bitrate", "--data_bitrate", type=int, help="bit/s of CAN FD data")
+    group.add_argument("--app-name", help="application name (Vector)")
+    group.add_argument(
+        "--bus-kwargs",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="further options of the interface",
+    )
+    group.add_argument(
+        "--serial",
+        metavar="URL",
+        help="the project's serial link on this port or pyserial URL instead of CAN",
+    )
+    group.add_argument(
+        "--baud",
+        type=int,
+        default=DEFAULT_BAUD,
+        help=f"of the serial link (default {DEFAULT_BAUD})",
+    )
+    group.add_argument(
+        "--allow-multicast", action="store_true", help="let udp_multicast send beyond this machine"
+    )
+
+
+def add_fault_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the simulated actuator."""
+    group = parser.add_argument_group("simulated actuator")
+    for name, meaning in (
+        ("Kintas", "clogging of the first-stage filter"),
+        ("FSS", "spool-sleeve friction"),
+        ("FDJ", "jack-cylinder friction"),
+    ):
+        group.add_argument(
+            f"--{name}",
+            f"--{name.lower()}",
+            dest=name,
+            type=float,
+            default=0.0,
+            metavar="K",
+            help=f"{meaning}, 0 … 1 (default 0)",
+        )
+    group.add_argument(
+        "--noise",
+        type=float,
+        default=0.5,
+        metavar="LSB",
+        help="rms noise of the converters (default 0.5)",
+    )
+    group.add_argument(
+        "--offsets",
+        type=float,
+        nargs=4,
+        default=(0.0, 0.0, 0.0, 0.0),
+        metavar="LSB",
+        help="offsets of current, spool, pressure, position",
+    )
+    group.add_argument(
+        "--oil-temperature", type=float, default=40.0, metavar="degC", help="(default 40)"
+    )
+    group.add_argument(
+        "--supply",
+        type=float,
+        default=20.7,
+        metavar="MPa",
+        help="supply pressure (default 20.7; return 0.7)",
+    )
+    group.add_argument(
+        "--simulator-seed",
+        type=_seed,
+        default=1,
+        metavar="N",
+        help="seed of the simulated noise (default 1)",
+    )
+    group.add_argument(
+        "--serial-number",
+        type=int,
+        default=1,
+        metavar="N",
+        help="of the simulated actuator (default 1)",
+    )
+
+
+def the_actuator(arguments: argparse.Namespace) -> Actuator:
+    """Return the actuator that was asked for."""
+    return load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+
+
+def the_bus_map(arguments: argparse.Namespace) -> BusMap:
+    """Return the meaning of the bus's frames."""
+    from firmware_iface.busmap import default_map, load_map  # noqa: PLC0415
+
+    if arguments.mapping:
+        return load_map(arguments.mapping, arguments.dbc)
+    if arguments.dbc:
+        raise ConfigurationError("--dbc: needs --mapping, which names the signals")
+    return default_map()
+
+
+def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
+    """Return the bundled tests and those of the named files; a file's number wins."""
+    tests = {test.id: test for test in bundled_tests().values()}
+    for name in files:
+        test = bundled_tests().get(name) or load_test(name)
+        tests[test.id] = test
+    return tuple(tests.values())
+
+
+def has_bus(arguments: argparse.Namespace) -> bool:
+    """Whether a bus or a serial port was named."""
+    return bool(arguments.interface or arguments.serial)
+
+
+def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transport:
+    """Open the bus or serial port that was named."""
+    if arguments.serial:
+        from firmware_iface.seriallink import SerialTransport  # noqa: PLC0415
+
+        return SerialTransport(arguments.serial, baudrate=arguments.baud, transmit=transmit)
+    if not arguments.interface:
+        raise ConfigurationError("no bus named: give --interface and --channel, or --serial")
+    from firmware_iface.pythoncan import BusOptions, PythonCanTransport  # noqa: PLC0415
+
+    options = BusOptions(
+        interface=arguments.interface,
+        channel=arguments.channel,
+        bitrate=arguments.bitrate,
+        data_bitrate=arguments.data_bitrate,
+        fd=arguments.fd,
+        app_name=arguments.app_name,
+        extra=_extra(arguments.bus_kwargs),
+        allow_multicast=arguments.allow_multicast,
+    )
+    return PythonCanTransport(options, transmit=transmit)
+
+
+def _extra(pairs: list[str]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for pair in pairs:
+        key, separator, text = pair.partition("=")
+        if not separator or not key.isidentifier():
+            raise ConfigurationError(f"--bus-kwargs {pair}: need KEY=VALUE")
+        out[key] = _value(text)
+    return out
+
+
+def _value(text: str) -> bool | int | float | str:
+    if text in ("True", "true", "False", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 1 << 32:
+        raise argparse.ArgumentTypeError("a seed is 0 … 4294967295")
+    return value

@@ -1,0 +1,55 @@
+"""`ehadiag replay`: plays a recording onto a bus."""
+
+from __future__ import annotations
+
+import argparse
+
+from ehadiag.cli import options
+from ehadiag.cli.interrupt import stop_on_signals
+from ehadiag.cli.output import progress_bar, say
+from ehadiag.errors import ConfigurationError
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "replay",
+        help="play a recording onto a bus",
+        description="Play a recording onto a bus in its own rhythm. This transmits.",
+    )
+    parser.add_argument("log", metavar="LOG")
+    parser.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="times its own rhythm (default 1); 0: as fast as the bus takes it",
+    )
+    options.add_bus_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Play the log."""
+    if arguments.speed < 0.0:
+        raise ConfigurationError(f"--speed {arguments.speed:g}: need 0 or more")
+    from firmware_iface.logs import read_frames  # noqa: PLC0415 - loads python-can
+    from firmware_iface.replay import play  # noqa: PLC0415
+
+    table = read_frames(arguments.log)
+    with (
+        options.open_transport(arguments, transmit=True) as transport,
+        stop_on_signals() as stop,
+        progress_bar() as display,
+    ):
+        sent = play(
+            table,
+            transport,
+            speed=arguments.speed or None,
+            stop=stop,
+            progress=lambda done: display("replay", done / max(len(table), 1)),
+        )
+        say(f"sent {sent} of {len(table)} frames on {transport.name}")
+    return 0

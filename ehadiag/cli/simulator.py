@@ -1,0 +1,70 @@
+"""The emulated flight-control computer, for commands that run it."""
+
+from __future__ import annotations
+
+import argparse
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+from ehadiag.actuator import Actuator
+from ehadiag.errors import EhadiagError
+from ehadiag.storedtest import StoredTest
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.emulator import run_emulator
+from ehadiag_sim.fcc import FccCore
+from firmware_iface.busmap import BusMap
+from firmware_iface.transport import Transport
+
+__all__ = ["emulator_beside", "make_core"]
+
+
+def make_core(
+    arguments: argparse.Namespace,
+    actuator: Actuator,
+    tests: Iterable[StoredTest],
+    bus_map: BusMap,
+) -> FccCore:
+    """Return the computer with the actuator that the options describe, its kernels loaded."""
+    core = FccCore(
+        actuator,
+        tests,
+        faults=Faults(arguments.Kintas, arguments.FSS, arguments.FDJ),
+        effects=Effects(
+            oil_temperature=arguments.oil_temperature, supply_pressure=arguments.supply * 1e6
+        ),
+        sensors=Sensors(arguments.noise, tuple(arguments.offsets)),
+        seed=arguments.simulator_seed,
+        serial=arguments.serial_number,
+        bus_map=bus_map,
+    )
+    core.step()
+    return core
+
+
+@contextmanager
+def emulator_beside(core: FccCore, transport: Transport) -> Iterator[None]:
+    """Run the computer on a bus in a thread of its own while the block runs.
+
+    Raises
+    ------
+    EhadiagError: the emulator's bus failed meanwhile.
+    """
+    stop = threading.Event()
+    failure: list[EhadiagError] = []
+
+    def work() -> None:
+        try:
+            run_emulator(core, transport, stop)
+        except EhadiagError as error:
+            failure.append(error)
+
+    thread = threading.Thread(target=work, name="ehadiag-emulator", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    if failure:
+        raise failure[0]

@@ -1,0 +1,38 @@
+"""`ehadiag warmup`: compiles every kernel now rather than at the first diagnosis."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from ehadiag.actuator import default_actuator
+from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.jit import cache_folder
+from ehadiag.storedtest import bundled_tests
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "warmup",
+        help="compile the kernels now",
+        description="Compile the model's kernels into the cache folder (EHADIAG_CACHE_DIR, else"
+        " the user's cache), so that the first diagnosis does not wait for it.",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(_arguments: argparse.Namespace) -> int:
+    """Compile."""
+    say_if_compiling()
+    begin = time.perf_counter()
+    from ehadiag.identify.warmup import warm_up  # noqa: PLC0415 - loads numba
+    from ehadiag_sim.plant import Plant  # noqa: PLC0415
+
+    for test in bundled_tests().values():
+        warm_up(default_actuator(), test)
+    Plant(default_actuator())
+    say(f"kernels ready in {cache_folder()} after {time.perf_counter() - begin:.1f} s")
+    return 0

@@ -1,0 +1,141 @@
+"""Whether a recording, and what was identified from it, can carry a verdict at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ehadiag.actuator import Actuator
+from ehadiag.identify.current import CONTROL_LAW_LSB, FRAME_TOLERANCE
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.pipeline import Identification
+from ehadiag.recording import BitState, CommandMode, Environment, Recording, Samples
+from ehadiag.storedtest import StoredTest
+
+__all__ = ["objections_to_estimate", "objections_to_experiment", "objections_to_recording"]
+
+MOST_LOST = 0.25
+"""Share of samples of a channel that may be missing."""
+LONGEST_GAP_S = 0.25
+"""Longest span without a sample."""
+MOST_SATURATED = 0.02
+"""Share of samples at a converter's end."""
+TEMPERATURES = (-54.0, 135.0)
+"""degC; the range in which the oil's law is used."""
+LEAST_SUPPLY = 0.5
+"""Share of the actuator's own supply pressure."""
+SAME_RATE = 1e-6
+MOST_OUTLIERS = 0.015
+MOST_RMS = 1.25
+
+
+def objections_to_recording(
+    recording: Recording, test: StoredTest | None, actuator: Actuator
+) -> list[str]:
+    """Why a recording cannot be diagnosed; empty if it can."""
+    if recording.outcome.state is BitState.REFUSED:
+        return [f"refused by the flight-control computer: {_words(recording.outcome.reason.name)}"]
+    if recording.outcome.state is BitState.ABORTED:
+        return ["the test was aborted"]
+    samples = recording.samples
+    if samples is None:
+        return ["no telemetry of a test in the recording"]
+    if test is None:
+        return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
+    return [
+        *_unlike_the_test(samples, test, actuator),
+        *_gaps(samples, test),
+        *_out_of_range(recording.environment, samples, actuator),
+    ]
+
+
+def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
+    out = []
+    if samples.mode is not (CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT):
+        out.append(
+            f"the command is a {samples.mode.name.lower()}, test {test.name!r} needs another"
+        )
+    if abs(samples.period_ns * 1e-9 * test.rate - 1.0) > SAME_RATE:
+        out.append(f"telemetry every {samples.period_ns / 1e6:g} ms, test at {test.rate:g} Hz")
+    elif abs(actuator.controller.rate / test.rate - 1.0) > SAME_RATE:
+        out.append(f"controller at {actuator.controller.rate:g} Hz, test at {test.rate:g} Hz")
+    return out
+
+
+def _gaps(samples: Samples, test: StoredTest) -> list[str]:
+    out = []
+    for name, values in (("spool", samples.spool), ("pressure", samples.pressure)):
+        present = np.flatnonzero(np.isfinite(values[: test.ticks]))
+        share = 1.0 - len(present) / test.ticks
+        edges = np.concatenate([[-1], present, [test.ticks]])
+        gap = float(np.diff(edges).max() - 1) / test.rate
+        if share > MOST_LOST:
+            out.append(f"{share:.0%} of the {name} samples are missing (limit {MOST_LOST:.0%})")
+        elif gap > LONGEST_GAP_S:
+            out.append(f"no {name} sample for {gap:.2f} s (limit {LONGEST_GAP_S:g} s)")
+    return out
+
+
+def _out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
+    out = []
+    for index, name in ((1, "spool"), (2, "pressure")):
+        share = float(np.mean(samples.saturated[index]))
+        if share > MOST_SATURATED:
+            out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
+    temperature = environment.oil_temperature
+    if temperature is not None and not TEMPERATURES[0] <= temperature <= TEMPERATURES[1]:
+        out.append(
+            f"oil at {temperature:g} degC, outside {TEMPERATURES[0]:g} … {TEMPERATURES[1]:g}"
+        )
+    if environment.supply_pressure is not None and environment.return_pressure is not None:
+        supply = environment.supply_pressure - environment.return_pressure
+        if supply < LEAST_SUPPLY * actuator.servovalve.PSR:
+            out.append(
+                f"supply {supply / 1e6:.1f} MPa above return, "
+                f"the actuator's data say {actuator.servovalve.PSR / 1e6:.1f} MPa"
+            )
+    return out
+
+
+def objections_to_experiment(experiment: Experiment) -> list[str]:
+    """Why the inputs of a test are not what they should be; empty if they are."""
+    out = []
+    trace, test = experiment.trace, experiment.test
+    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+    if trace.command_gap > FRAME_TOLERANCE[mode]:
+        scale, unit = (1e3, "mm") if test.closed_loop else (1e3, "mA")
+        out.append(
+            f"the command differs from test {test.name!r} by up to "
+            f"{trace.command_gap * scale:.3g} {unit}: another test was played"
+        )
+    if not trace.rebuilt:
+        out.append(
+            f"servovalve current {trace.gap_lsb:.1f} LSB rms from what the "
+            f"{'control law' if test.closed_loop else 'command'} gives (limit "
+            f"{CONTROL_LAW_LSB:g}): controller data wrong, or the current driver failed"
+        )
+    for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
+        seen = values[np.isfinite(values)]
+        if seen.size and float(np.ptp(seen)) == 0.0:
+            out.append(f"the {name} signal is frozen")
+    return out
+
+
+def objections_to_estimate(identification: Identification) -> list[str]:
+    """Why estimates cannot carry a verdict; empty if they can."""
+    fit = identification.fit
+    out = []
+    rms = max(fit.spool_rms, fit.pressure_rms)
+    if fit.outliers > MOST_OUTLIERS or not rms <= MOST_RMS:
+        out.append(
+            f"the model does not explain the recording: {fit.outliers:.1%} of the gaps beyond "
+            f"three times the noise (limit {MOST_OUTLIERS:.1%}), rms gap {rms:.2f} (limit "
+            f"{MOST_RMS:g}): other actuator data, or an effect that the three faults leave out"
+        )
+    hidden = [item.name for item in identification.estimates if not item.shown]
+    if hidden:
+        out.append(f"the test does not show {', '.join(hidden)}")
+    return out
+
+
+def _words(name: str) -> str:
+    return name.lower().replace("_", " ")

@@ -1,0 +1,44 @@
+"""Loads, or compiles, every kernel that an identification runs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ehadiag.actuator import Actuator
+from ehadiag.identify.experiment import build_experiment
+from ehadiag.identify.pipeline import identify
+from ehadiag.identify.solvers import CompactGa
+from ehadiag.recording import CommandMode, Environment, Samples
+from ehadiag.storedtest import Line, StoredTest, Windows
+
+__all__ = ["warm_up"]
+
+
+def warm_up(actuator: Actuator, test: StoredTest) -> None:
+    """Identify from a fraction of a second of nothing, in the loop that the test closes."""
+    ticks = 200
+    rest = np.zeros(ticks)
+    samples = Samples(
+        period_ns=round(1e9 / test.rate),
+        mode=CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT,
+        current=rest,
+        spool=rest,
+        pressure=rest,
+        position=rest,
+        command=rest,
+        saturated=np.zeros((4, ticks), dtype=np.bool_),
+        host_ns=np.arange(ticks),
+    )
+    length = ticks / test.rate
+    whole = ((0.0, length),)
+    silence = StoredTest(
+        name="silence",
+        id=test.id,
+        mode=test.mode,
+        unit=test.unit,
+        rate=test.rate,
+        segment=(Line(((0.0, 0.0), (length, 0.0))),),
+        windows=Windows(whole, whole, whole, whole),
+    )
+    experiment = build_experiment(samples, Environment(), silence, actuator)
+    identify([experiment], solver=CompactGa(budget=20))

@@ -1,0 +1,106 @@
+"""The picture of a diagnosis: measured against modelled response, and what is left over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ehadiag.diagnosis import Diagnosis
+from ehadiag.errors import InputOutputError
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.pipeline import Identification
+from ehadiag.model.monitoring import respond
+from ehadiag.report.jsonline import source_name
+
+__all__ = ["draw_diagnosis"]
+
+MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
+
+
+def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
+    """Write a PNG: one column for each recording; current, spool, pressure and their gaps.
+
+    Raises
+    ------
+    InputOutputError: the file cannot be written.
+    """
+    found = diagnosis.identification
+    if found is None:
+        raise ValueError("nothing was identified, so there is no modelled response to draw")
+    columns = len(diagnosis.experiments)
+    figure = Figure(figsize=(9.0 * columns, 9.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(
+        5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
+    )
+    for column, experiment in enumerate(diagnosis.experiments):
+        _draw_column([axes[column] for axes in grid], experiment, found)
+    constants = ",  ".join(
+        f"{item.name} = {item.value:.4f} ± {1.96 * item.std:.4f}" for item in found.estimates
+    )
+    figure.suptitle(
+        f"{diagnosis.verdict.name.replace('_', ' ')}: {constants}\n{source_name(diagnosis)}",
+        fontsize=11,
+    )
+    try:
+        figure.savefig(path, dpi=110)
+    except OSError as error:
+        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+
+
+def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:
+    time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
+    faults = np.array([item.value for item in found.estimates])
+    model = respond(experiment.constants, faults, experiment.trace.current, experiment.tick)
+    axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
+    axes[0].set_ylabel("current, mA")
+    axes[0].set_title(f"test {experiment.test.name!r}", fontsize=10)
+    _pair(axes[1], axes[2], time, experiment.spool * 1e3, model.spool * 1e3, "spool, mm", "µm", 1e3)
+    _pair(
+        axes[3],
+        axes[4],
+        time,
+        experiment.pressure * 1e-6,
+        model.pressure * 1e-6,
+        "differential pressure, MPa",
+        "kPa",
+        1e3,
+    )
+    axes[1].legend(loc="upper right", fontsize=8, ncols=2)
+    for start, end in experiment.test.windows.refinement:
+        for item in axes:
+            item.axvspan(start, end, color="#fef3c7", zorder=0)
+    axes[0].text(
+        experiment.test.windows.refinement[0][0],
+        0.97,
+        " part for the search",
+        transform=axes[0].get_xaxis_transform(),
+        va="top",
+        fontsize=8,
+    )
+    axes[4].set_xlabel("time, s")
+    axes[4].set_xlim(0.0, time[-1])
+
+
+def _pair(
+    upper: Axes,
+    lower: Axes,
+    time: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    modelled: NDArray[np.float64],
+    label: str,
+    gap_unit: str,
+    gap_scale: float,
+) -> None:
+    upper.plot(time, measured, ".", color=MEASURED, ms=2.5, label="measured")
+    upper.plot(time, modelled, color=MODELLED, lw=0.8, label="modelled")
+    upper.set_ylabel(label)
+    lower.plot(time, (measured - modelled) * gap_scale, color=GAP, lw=0.5)
+    lower.set_ylabel(f"gap, {gap_unit}")
+    spread = np.nanpercentile(np.abs(measured - modelled), 99.5) * gap_scale
+    lower.set_ylim(-2.0 * spread, 2.0 * spread)
