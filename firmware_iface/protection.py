@@ -114,8 +114,9 @@ def unwrap(
         starts = np.concatenate(([0], breaks))
         earliest = np.minimum.reduceat(lateness, starts)
         turns = np.cumsum(np.rint(np.diff(earliest) / modulus).astype(np.int64))
-        # A counter that starts again goes on: no stretch lies before the one that it follows.
+        # A counter that starts again goes on; frames out of order go back, and so do their stamps.
         back = position[breaks] - position[breaks - 1] + modulus * np.diff(turns, prepend=0)
+        back[np.abs(residue[breaks - 1]) <= SLACK_TICKS] = 0
         turns += np.cumsum(np.maximum(-((back + NEAR) // modulus), 0))
         lengths = np.diff(np.concatenate((starts, [len(counter)])))
         position += modulus * np.repeat(np.concatenate(([0], turns)), lengths)

@@ -156,3 +156,9 @@ def test_counter_that_starts_again_goes_on(restart):
     assert np.diff(got).min() == 1 or restart in range(28, 44)
     assert (got % 256 == counter).all()
     assert got[300] >= got[299] - 16
+
+
+def test_frames_that_change_places_across_a_gap():
+    """Stamps that go back with the counter tell disorder from a restart."""
+    position = np.concatenate((np.arange(300), [500], [300], np.arange(501, 800)))
+    assert follow(position, position * TICK)[0] == position.tolist()
