@@ -1,0 +1,110 @@
+#include "frames.h"
+
+#include "check.h"
+
+/* Every message of this bus has its counter in byte 6 and its check sum in byte 7. */
+static void seal(struct fcc_frame *frame, uint16_t id, uint8_t *counter)
+{
+    frame->id = id;
+    frame->data[6] = (*counter)++;
+    frame->data[7] = fcc_crc8(id, frame->data);
+}
+
+void fcc_pack_telemetry(struct fcc_frame *frame, const uint16_t codes[4], uint8_t *counter)
+{
+    struct eha_fcc_servo_telemetry_t message = {0};
+
+    message.servo_current = codes[0];
+    message.spool_position = codes[1];
+    message.diff_pressure = codes[2];
+    message.jack_position = codes[3];
+    (void)eha_fcc_servo_telemetry_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_SERVO_TELEMETRY_FRAME_ID, counter);
+}
+
+void fcc_pack_command(struct fcc_frame *frame, uint8_t mode, int16_t value, uint8_t test_id,
+                      uint8_t *counter)
+{
+    struct eha_fcc_servo_command_t message = {0};
+
+    message.command_mode = mode;
+    message.command_test_id = test_id;
+    if (mode == EHA_FCC_SERVO_COMMAND_COMMAND_MODE_CURRENT_CHOICE) {
+        message.current_command = value;
+    } else {
+        message.position_command = value;
+    }
+    (void)eha_fcc_servo_command_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_SERVO_COMMAND_FRAME_ID, counter);
+}
+
+void fcc_pack_environment(struct fcc_frame *frame, uint16_t supply, uint16_t ret, uint16_t oil,
+                          uint8_t *counter)
+{
+    struct eha_fcc_environment_t message = {0};
+
+    message.supply_pressure = supply;
+    message.return_pressure = ret;
+    message.oil_temperature = oil;
+    (void)eha_fcc_environment_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_ENVIRONMENT_FRAME_ID, counter);
+}
+
+void fcc_pack_status(struct fcc_frame *frame, uint8_t state, uint8_t reason, uint8_t test_id,
+                     uint16_t elapsed, uint16_t serial, uint8_t *counter)
+{
+    struct eha_fcc_bit_status_t message = {0};
+
+    message.bit_state = state;
+    message.bit_reason = reason;
+    message.status_test_id = test_id;
+    message.elapsed_time = elapsed;
+    message.actuator_serial = serial;
+    (void)eha_fcc_bit_status_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_BIT_STATUS_FRAME_ID, counter);
+}
+
+void fcc_pack_request(struct fcc_frame *frame, uint8_t code, uint8_t test_id, uint8_t *counter)
+{
+    struct eha_fcc_bit_request_t message = {0};
+
+    message.request_code = code;
+    message.request_test_id = test_id;
+    (void)eha_fcc_bit_request_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_BIT_REQUEST_FRAME_ID, counter);
+}
+
+bool fcc_intact(const struct fcc_frame *frame)
+{
+    return fcc_crc8(frame->id, frame->data) == frame->data[7];
+}
+
+bool fcc_unpack_telemetry(const struct fcc_frame *frame, struct eha_fcc_servo_telemetry_t *out)
+{
+    return frame->id == EHA_FCC_SERVO_TELEMETRY_FRAME_ID && fcc_intact(frame) &&
+           eha_fcc_servo_telemetry_unpack(out, frame->data, sizeof frame->data) == 0;
+}
+
+bool fcc_unpack_command(const struct fcc_frame *frame, struct eha_fcc_servo_command_t *out)
+{
+    return frame->id == EHA_FCC_SERVO_COMMAND_FRAME_ID && fcc_intact(frame) &&
+           eha_fcc_servo_command_unpack(out, frame->data, sizeof frame->data) == 0;
+}
+
+bool fcc_unpack_environment(const struct fcc_frame *frame, struct eha_fcc_environment_t *out)
+{
+    return frame->id == EHA_FCC_ENVIRONMENT_FRAME_ID && fcc_intact(frame) &&
+           eha_fcc_environment_unpack(out, frame->data, sizeof frame->data) == 0;
+}
+
+bool fcc_unpack_status(const struct fcc_frame *frame, struct eha_fcc_bit_status_t *out)
+{
+    return frame->id == EHA_FCC_BIT_STATUS_FRAME_ID && fcc_intact(frame) &&
+           eha_fcc_bit_status_unpack(out, frame->data, sizeof frame->data) == 0;
+}
+
+bool fcc_unpack_request(const struct fcc_frame *frame, struct eha_fcc_bit_request_t *out)
+{
+    return frame->id == EHA_FCC_BIT_REQUEST_FRAME_ID && fcc_intact(frame) &&
+           eha_fcc_bit_request_unpack(out, frame->data, sizeof frame->data) == 0;
+}
