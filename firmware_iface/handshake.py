@@ -13,14 +13,13 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from ehadiag.recording import BitReason, BitState
+from firmware_iface.livemessages import BitStatus, Sample
 
 __all__ = [
     "Action",
-    "BitStatus",
     "Handshake",
     "Limits",
     "Phase",
-    "Sample",
     "TimeLimits",
     "Verdict",
 ]
@@ -57,28 +56,6 @@ class Action(Enum):
 
     START = "start"
     ABORT = "abort"
-
-
-@dataclass(frozen=True, slots=True)
-class BitStatus:
-    """One valid `BitStatus` message."""
-
-    state: BitState
-    reason: BitReason = BitReason.NONE
-    test_id: int = 0
-    elapsed: float = 0.0
-    """s."""
-    serial: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One valid telemetry message: A, m, Pa, m."""
-
-    current: float
-    spool: float
-    pressure: float
-    position: float
 
 
 @dataclass(frozen=True, slots=True)

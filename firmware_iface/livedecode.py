@@ -8,28 +8,19 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from ehadiag.recording import BitReason, BitState
 from firmware_iface.busmap import BusMap, MessageMap, Role, default_map
 from firmware_iface.frames import Frame
-from firmware_iface.handshake import BitStatus, Sample
 from firmware_iface.layout import SignalLayout
+from firmware_iface.livemessages import BitStatus, Request, Sample
 from firmware_iface.protection import crc8
 
-__all__ = ["LiveDecoder", "Request"]
+__all__ = ["LiveDecoder"]
 
 FLOAT_FORMATS = {2: "<e", 4: "<f", 8: "<d"}
 REASONS = frozenset(BitReason)
 CHANNELS = ("channels.current", "channels.spool", "channels.pressure", "channels.position")
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """One valid `BitRequest` message; code `start`, `abort`, or empty for an unknown number."""
-
-    code: str
-    test_id: int
 
 
 class LiveDecoder:

@@ -40,6 +40,8 @@ LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
     "kvaser": {"driver_mode": False},
 }
 """Options that silence an adapter. PCAN and Systec take a bus state instead."""
+OWN_OPTIONS = frozenset(("interface", "channel", "bitrate", "data_bitrate", "fd", "app_name"))
+"""Options that may not hide among the further arguments: what is checked must be what is opened."""
 PASSIVE_STATE = ("pcan", "systec")
 SOCKETCAN_ERRORS = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames carry SocketCAN's error class as identifier."""
@@ -220,7 +222,10 @@ def _arguments(options: BusOptions, transmit: bool) -> dict[str, Any]:
             f"{options.interface}: receive_own_messages is not supported: own requests are "
             "recorded as they are sent, and an echo would look like another tester's"
         )
-    arguments: dict[str, Any] = {"interface": options.interface, "ignore_config": True}
+    for key in OWN_OPTIONS & options.extra.keys():
+        raise ConfigurationError(f"{options.interface}: give {key} as an option of its own")
+    arguments: dict[str, Any] = dict(options.extra)
+    arguments |= {"interface": options.interface, "ignore_config": True}
     for key in ("channel", "bitrate", "data_bitrate", "app_name"):
         value = getattr(options, key)
         if value is not None:
@@ -233,7 +238,7 @@ def _arguments(options: BusOptions, transmit: bool) -> dict[str, Any]:
         arguments |= LISTEN_ONLY.get(options.interface, {})
         if options.interface in PASSIVE_STATE:
             arguments["state"] = importlib.import_module("can").BusState.PASSIVE
-    return arguments | dict(options.extra)
+    return arguments
 
 
 def _multicast(options: BusOptions) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from ehadiag_sim.plant import Plant
 from firmware_iface.busmap import BusMap, default_map
 from firmware_iface.encode import Encoder
 from firmware_iface.frames import Frame
-from firmware_iface.livedecode import LiveDecoder, Request
+from firmware_iface.livedecode import LiveDecoder
+from firmware_iface.livemessages import Request
 
 __all__ = ["FccCore", "Preconditions"]
 

@@ -354,6 +354,11 @@ def test_playing_onto_a_bus_keeps_order_skips_errors_and_stops() -> None:
             ConfigurationError,
             "not supported",
         ),
+        (
+            BusOptions("udp_multicast", extra={"channel": "239.1.1.1"}),
+            ConfigurationError,
+            "an option of its own",
+        ),
     ],
 )
 def test_a_bus_that_cannot_be_opened_is_one_line(
@@ -378,6 +383,8 @@ def test_adapters_are_silenced_unless_asked_to_transmit() -> None:
     for interface, option in (("slcan", "listen_only"), ("vector", "listen_only")):
         assert _arguments(BusOptions(interface), False)[option] is True
         assert option not in _arguments(BusOptions(interface), True)
+    loud = BusOptions("slcan", extra={"listen_only": False})
+    assert _arguments(loud, False)["listen_only"] is True
     assert _arguments(BusOptions("kvaser"), False)["driver_mode"] is False
     assert _arguments(BusOptions("pcan"), False)["state"].name == "PASSIVE"
     assert "state" not in _arguments(BusOptions("pcan"), True)

@@ -20,8 +20,8 @@ from firmware_iface.align import assemble
 from firmware_iface.busmap import default_map
 from firmware_iface.encode import Encoder
 from firmware_iface.frames import Frame, FrameTable
-from firmware_iface.handshake import BitStatus, Sample
 from firmware_iface.livedecode import LiveDecoder
+from firmware_iface.livemessages import BitStatus, Sample
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 
 CoreFactory = Callable[..., FccCore]

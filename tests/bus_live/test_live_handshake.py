@@ -7,15 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ehadiag.recording import BitReason, BitState
-from firmware_iface.handshake import (
-    Action,
-    BitStatus,
-    Handshake,
-    Limits,
-    Phase,
-    Sample,
-    TimeLimits,
-)
+from firmware_iface.handshake import Action, Handshake, Limits, Phase, TimeLimits
+from firmware_iface.livemessages import BitStatus, Sample
 
 MS = 1_000_000
 QUIET = Sample(0.0, 0.0, 0.0, 0.0)

@@ -1,0 +1,39 @@
+"""Single messages that a running test is steered by, decoded and checked, in SI."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ehadiag.recording import BitReason, BitState
+
+__all__ = ["BitStatus", "Request", "Sample"]
+
+
+@dataclass(frozen=True, slots=True)
+class BitStatus:
+    """One valid `BitStatus` message."""
+
+    state: BitState
+    reason: BitReason = BitReason.NONE
+    test_id: int = 0
+    elapsed: float = 0.0
+    """s."""
+    serial: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One valid telemetry message: A, m, Pa, m."""
+
+    current: float
+    spool: float
+    pressure: float
+    position: float
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One valid `BitRequest` message; code `start`, `abort`, or empty for an unknown number."""
+
+    code: str
+    test_id: int
