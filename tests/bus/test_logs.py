@@ -93,8 +93,11 @@ def test_counts_of_the_lossy_recording():
     assert np.isfinite(recording.samples.command).sum() == 5370
 
 
-@pytest.mark.parametrize("suffix", [".blf", ".asc", ".csv", ".trc"])
+@pytest.mark.filterwarnings("default")  # asammdf's own
+@pytest.mark.parametrize("suffix", [".blf", ".asc", ".csv", ".trc", ".mf4"])
 def test_one_recording_in_every_format(tmp_path, encoder, suffix):
+    if suffix == ".mf4":
+        pytest.importorskip("asammdf", reason="MF4 needs the extra ehadiag[mf4]")
     truth = make_truth(400)
     frames = play(encoder, truth)
     path = write(tmp_path / f"log{suffix}", frames)
