@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numba.core import caching
 
-__all__ = ["cache_folder", "cache_is_cold", "kernel"]
+__all__ = ["cache_folder", "cache_is_cold", "inlined", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -34,6 +34,11 @@ def kernel(function: F) -> F:
     if hasattr(dispatcher, "enable_caching"):  # absent with NUMBA_DISABLE_JIT=1
         dispatcher._cache = _KernelCache(function)
     return dispatcher
+
+
+def inlined(function: F) -> F:
+    """Compile as a part of the kernels that call it: named tuples cost nothing to hand over."""
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
 
 
 @cache

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import kernel
+from ehadiag.jit import inlined, kernel
 from ehadiag.model.constants import PlantConstants
 
 __all__ = ["jack_response"]
@@ -32,7 +32,7 @@ DRIFT = -0.45
 """Fastest fall of tau that the parabola serves (its second coefficient grows beyond bounds)."""
 
 
-@kernel
+@inlined
 def _valve(constants: PlantConstants, spool: float) -> tuple[float, float, float, float]:
     """Second stage at a spool position (m), leakage solved for.
 
@@ -52,7 +52,7 @@ def _valve(constants: PlantConstants, spool: float) -> tuple[float, float, float
     return share * pressure, share * resistance, -pressure * c.CLK * slope, slope
 
 
-@kernel
+@inlined
 def _parts(origin: float, target: float, rise0: float, rise1: float) -> int:
     """Into how many parts a piece is cut: short ones where the orifice is almost closed."""
     travel = abs(target - origin)
@@ -63,7 +63,7 @@ def _parts(origin: float, target: float, rise0: float, rise1: float) -> int:
     return min(MOST_PARTS, 1 + int(max(by_travel, by_bend)))
 
 
-@kernel
+@inlined
 def _sign_change(c0: float, c1: float, c2: float, excess: float, rate: float, span: float) -> float:
     """First time in 0 … span where c0 + c1 t + c2 t² + excess exp(-rate t) changes sign, s."""
     low, high = 0.0, span
@@ -75,6 +75,53 @@ def _sign_change(c0: float, c1: float, c2: float, excess: float, rate: float, sp
         else:
             high = t
     return high
+
+
+@inlined
+def _path(
+    x: float, origin: float, target: float, rise0: float, rise1: float
+) -> tuple[float, float]:
+    """Position, and its derivative by x, at the share x of a piece of the spool's path."""
+    y = 1.0 - x
+    place = origin + x * x * (3.0 - 2.0 * x) * (target - origin) + x * y * (y * rise0 - x * rise1)
+    slope = 6.0 * x * y * (target - origin) + y * (1.0 - 3.0 * x) * rise0
+    return place, slope + x * (3.0 * x - 2.0) * rise1
+
+
+@inlined
+def _approach(
+    c: PlantConstants,
+    load: float,
+    span: float,
+    velocity: float,
+    supply: float,
+    resistance: float,
+    end_supply: float,
+    end_resistance: float,
+    end_supply_rate: float,
+    end_resistance_rate: float,
+) -> tuple[float, float, float, float, float]:
+    """How the velocity of the moving jack goes over a part of a piece.
+
+    The steady velocity s is taken as a parabola that ends with the slope of the spool's path, tau
+    as a straight line: tau v' + v = s is then met by a parabola p0 + p1 t + p2 t² exactly, and the
+    rest of the velocity decays. Returns p0, p1, p2, that rest at the start, and its decay rate.
+    """
+    area2 = c.AJ * c.AJ
+    ease0 = 1.0 / (area2 * resistance + c.CJ)
+    ease1 = 1.0 / (area2 * end_resistance + c.CJ)
+    steady0 = (c.AJ * supply - load) * ease0
+    steady1 = (c.AJ * end_supply - load) * ease1
+    slope1 = (c.AJ * end_supply_rate - steady1 * area2 * end_resistance_rate) * ease1
+    mean = (steady1 - steady0) / span
+    bend = (slope1 - mean) / span
+    tau = c.MJ * ease0
+    drift = max((c.MJ * ease1 - tau) / span, DRIFT)
+    p2 = bend / (1.0 + 2.0 * drift)
+    p1 = (2.0 * mean - slope1 - 2.0 * p2 * tau) / (1.0 + drift)
+    p0 = steady0 - tau * p1
+    rate = (0.5 * area2 * (resistance + end_resistance) + c.CJ) / c.MJ
+    return p0, p1, p2, velocity - p0, rate
 
 
 @kernel
@@ -102,30 +149,18 @@ def jack_response(
     static = 2.0 * dynamic
     velocity, place, direction = 0.0, 0.0, 0.0
     spool = origin
-    area2 = c.AJ * c.AJ
     supply, resistance, _, _ = _valve(c, spool)
     node = 0
     for k in range(node_end.shape[0]):
         while node < node_end[k]:
             span = nodes[node, 0]
-            origin, target = spool, nodes[node, 1]
+            start, target = spool, nodes[node, 1]
             rise0, rise1 = span * nodes[node, 2], span * nodes[node, 3]
-            parts = _parts(origin, target, rise0, rise1)
+            parts = _parts(start, target, rise0, rise1)
             for part in range(1, parts + 1):
                 left = span / parts
-                x = part / parts
-                y = 1.0 - x
-                end_spool = (
-                    origin
-                    + x * x * (3.0 - 2.0 * x) * (target - origin)
-                    + x * y * (y * rise0 - x * rise1)
-                )
-                end_rate = (
-                    6.0 * x * y * (target - origin)
-                    + y * (1.0 - 3.0 * x) * rise0
-                    + x * (3.0 * x - 2.0) * rise1
-                ) / span
-                end_supply, end_resistance, gain_supply, gain_resistance = _valve(c, end_spool)
+                end_spool, rise = _path(part / parts, start, target, rise0, rise1)
+                end_supply, end_resistance, gain, gain_resistance = _valve(c, end_spool)
                 while left > SHORTEST:
                     if direction == 0.0:
                         push0 = c.AJ * supply - c.FR
@@ -140,25 +175,18 @@ def jack_response(
                             supply, resistance, _, _ = _valve(c, spool)
                             left -= wait * left
                         continue
-                    # Over a part the steady velocity s is a parabola that ends with the slope of
-                    # the spool's path, tau a straight line: tau v' + v = s is then met by another
-                    # parabola p exactly, and v - p decays.
-                    load = c.FR + direction * dynamic
-                    ease0 = 1.0 / (area2 * resistance + c.CJ)
-                    ease1 = 1.0 / (area2 * end_resistance + c.CJ)
-                    steady0 = (c.AJ * supply - load) * ease0
-                    steady1 = (c.AJ * end_supply - load) * ease1
-                    slope1 = (c.AJ * gain_supply - steady1 * area2 * gain_resistance) * ease1
-                    slope1 *= end_rate
-                    mean = (steady1 - steady0) / left
-                    bend = (slope1 - mean) / left
-                    tau = c.MJ * ease0
-                    drift = max((c.MJ * ease1 - tau) / left, DRIFT)
-                    p2 = bend / (1.0 + 2.0 * drift)
-                    p1 = (2.0 * mean - slope1 - 2.0 * p2 * tau) / (1.0 + drift)
-                    p0 = steady0 - tau * p1
-                    excess = velocity - p0
-                    rate = (0.5 * area2 * (resistance + end_resistance) + c.CJ) / c.MJ
+                    p0, p1, p2, excess, rate = _approach(
+                        c,
+                        c.FR + direction * dynamic,
+                        left,
+                        velocity,
+                        supply,
+                        resistance,
+                        end_supply,
+                        end_resistance,
+                        gain * rise / span,
+                        gain_resistance * rise / span,
+                    )
                     fade = math.exp(-left * rate)
                     end_velocity = p0 + left * (p1 + left * p2) + excess * fade
                     if end_velocity * direction > 0.0:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.jack import jack_response
-from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response, spool_tables
+from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
+from ehadiag.model.transition import spool_tables
 
 __all__ = ["FREE_RUN", "Anchor", "Response", "respond"]
 

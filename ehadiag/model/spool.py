@@ -5,106 +5,133 @@ section 1, the current being held over a tick), so the state moves by a transiti
 error. Events switch the equations: the flapper meets or leaves a stop; the spool sticks, breaks
 away or meets a stop. A step that contains an event is halved until the event is located.
 Coefficients depend on one fault constant only, `Kintas`, so the matrices are made once for each
-candidate.
+candidate (`ehadiag.model.transition`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import kernel
+from ehadiag.jit import inlined, kernel
 from ehadiag.model.constants import PlantConstants
+from ehadiag.model.transition import FINEST, SpoolScalars, SpoolTables
 
-__all__ = [
-    "FINEST",
-    "NODES_PER_TICK",
-    "NODE_COLUMNS",
-    "SpoolTables",
-    "spool_response",
-    "spool_tables",
-]
+__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "spool_response"]
 
-FINEST = 10
-"""Steps are tick / 2^level; events are located to tick / 2^FINEST (1 µs at 1 kHz)."""
 BASE = 3
 """Level of the ordinary step: tick / 8."""
+WHOLE = 1 << FINEST
+"""A tick in units of the finest step."""
 NODE_LEVEL = 5
 """Away from events a node is written only at multiples of tick / 2^NODE_LEVEL."""
 NODES_PER_TICK = 128
 """Room for nodes of one tick."""
+NODE_COLUMNS = 5
 BEND = 0.02e-6
 """A node is written where the path bends away from its chord by about this much, m."""
-NODE_COLUMNS = 5
 
-TAYLOR_ORDER = 12
-TAYLOR_HALVINGS = 3
-
-
-class SpoolTables(NamedTuple):
-    """Transition coefficients of one candidate, one row a level.
-
-    moving: shape (FINEST + 1, 4, 4), flapper free, spool moving; state (XF, DXF, XS, DXS).
-    stuck: shape (FINEST + 1, 2, 2), flapper free, spool at rest; state (XF, DXF).
-    decay: shape (FINEST + 1,), exp(-h / tau) of the spool velocity with the flapper on a stop.
-    damping: viscous coefficient of the moving spool, N s/m.
-    static, dynamic: dry friction of the spool, N.
-    """
-
-    moving: NDArray[np.float64]
-    stuck: NDArray[np.float64]
-    decay: NDArray[np.float64]
-    damping: float
-    static: float
-    dynamic: float
+NOTHING = 0
+UNSURE = -1
+"""An event may hide inside the step: halve it, but it is none if it is still unsure at the end."""
+REVERSAL = 1
+SPOOL_STOP = 2
+BREAKAWAY = 3
+FLAPPER_STOP = 4
+RELEASE = 5
 
 
-@kernel
-def _transition(rates: NDArray[np.float64], tick: float) -> NDArray[np.float64]:
-    """exp(rates h) for h = tick / 2^level, level 0 … FINEST: Taylor at a small h, then squaring."""
-    n = rates.shape[0]
-    levels = FINEST + TAYLOR_HALVINGS
-    scaled = rates * (tick / 2.0**levels)
-    term = np.eye(n)
-    power = np.eye(n)
-    for order in range(1, TAYLOR_ORDER + 1):
-        term = np.dot(term, scaled) / order
-        power = power + term
-    out = np.empty((FINEST + 1, n, n))
-    for level in range(levels, -1, -1):
-        if level <= FINEST:
-            out[level] = power
-        power = np.dot(power, power)
-    return out
+@inlined
+def _held(c: PlantConstants, t: SpoolScalars, xf: float, xs: float) -> bool:
+    """Whether a spool at rest stays: friction holds it, or its stop does."""
+    return abs(xf) <= t.breakaway or (abs(xs) >= c.XSM and xs * xf > 0.0)
 
 
-@kernel
-def spool_tables(constants: PlantConstants, kintas: float, fss: float, tick: float) -> SpoolTables:
-    """Transition coefficients for a candidate's `Kintas` and `FSS` (0 … 1), tick in s."""
-    c = constants
-    flow_gain = c.GQF * (1.0 - 0.8 * kintas)
-    damping = c.GPF / flow_gain * c.AS * c.AS + c.CS
-    static = c.FSS0 + fss * (c.FSS1 - c.FSS0)
-    rates = np.zeros((4, 4))
-    rates[0, 1] = 1.0
-    rates[1, 0] = -c.KF / c.JF
-    rates[1, 1] = -c.CF / c.JF
-    rates[1, 2] = -c.KSF / c.JF
-    rates[2, 3] = 1.0
-    rates[3, 0] = c.AS * c.GPF / c.MS
-    rates[3, 3] = -damping / c.MS
-    decay = np.exp(-(tick * damping / c.MS) / 2.0 ** np.arange(FINEST + 1))
-    return SpoolTables(
-        moving=_transition(rates, tick),
-        stuck=_transition(rates[:2, :2].copy(), tick),
-        decay=decay,
-        damping=damping,
-        static=static,
-        dynamic=0.5 * static,
-    )
+@inlined
+def _clamped_event(
+    c: PlantConstants,
+    t: SpoolScalars,
+    torque: float,
+    xf: float,
+    xs: float,
+    vs: float,
+    direction: int,
+) -> int:
+    """What ends a step with the flapper on its stop, which it leaves when the torque turns."""
+    if (torque - c.KSF * xs - c.KF * xf) * xf < 0.0:
+        return RELEASE
+    if direction == 0:
+        return NOTHING if _held(c, t, xf, xs) else BREAKAWAY
+    if vs * direction <= 0.0:
+        return REVERSAL
+    return SPOOL_STOP if abs(xs) >= c.XSM and xs * direction > 0.0 else NOTHING
+
+
+@inlined
+def _moving_event(
+    c: PlantConstants,
+    t: SpoolScalars,
+    h: float,
+    before_xf: float,
+    before_wf: float,
+    xf: float,
+    wf: float,
+    xs: float,
+    vs: float,
+    direction: int,
+) -> int:
+    """What ends a step with flapper free and spool moving."""
+    if vs * direction <= 0.0:
+        return REVERSAL
+    if abs(xs) >= c.XSM and xs * direction > 0.0:
+        return SPOOL_STOP
+    if abs(xf) >= c.XFM:
+        return FLAPPER_STOP
+    if before_wf * wf < 0.0:
+        # An extreme of the flapper lies inside: the spool may stop there, or the flapper touch.
+        swing = 0.25 * h * max(abs(before_wf), abs(wf))
+        lowest = min(before_xf * direction, xf * direction) - t.dynamic / t.force - swing
+        if lowest <= 0.0 or max(abs(before_xf), abs(xf)) + swing >= c.XFM:
+            return UNSURE
+    return NOTHING
+
+
+@inlined
+def _stuck_event(
+    c: PlantConstants,
+    t: SpoolScalars,
+    h: float,
+    before_xf: float,
+    before_wf: float,
+    xf: float,
+    wf: float,
+    xs: float,
+) -> int:
+    """What ends a step with flapper free and spool at rest."""
+    if not _held(c, t, xf, xs):
+        return BREAKAWAY
+    if abs(xf) >= c.XFM:
+        return FLAPPER_STOP
+    if before_wf * wf < 0.0:
+        swing = 0.25 * h * max(abs(before_wf), abs(wf))
+        if max(abs(before_xf), abs(xf)) + swing > min(t.breakaway, c.XFM):
+            return UNSURE
+    return NOTHING
+
+
+@inlined
+def _rests(
+    c: PlantConstants, t: SpoolScalars, torque: float, xf: float, wf: float, xs: float
+) -> bool:
+    """Whether a spool at rest stays so while this torque lasts: the flapper rings too little."""
+    if t.ring_rate <= 0.0:
+        return False
+    rest_xf = (torque - c.KSF * xs) / c.KF
+    a = xf - rest_xf
+    b = (wf + t.ring_damping * a) / t.ring_rate
+    return abs(rest_xf) + math.sqrt(a * a + b * b) < min(t.breakaway, c.XFM)
 
 
 @kernel
@@ -141,141 +168,109 @@ def spool_response(
     -------
     How many times the model was re-anchored.
     """
-    c = constants
-    force = c.AS * c.GPF
-    breakaway = tables.static / force
+    c, t = constants, tables.scalars
+    moving, stuck, decay = tables.moving, tables.stuck, tables.decay
     xs = min(max(origin, -c.XSM), c.XSM)
     xf = (c.GM * current[0] - c.KSF * xs) / c.KF
-    xf = min(max(xf, -breakaway), breakaway)
+    xf = min(max(xf, -t.breakaway), t.breakaway)
     wf, vs = 0.0, 0.0
-    spool_dir = 0  # direction of motion, 0 at rest
-    clamp = 0  # flapper on its stop: +1, -1; free: 0
-    whole = 1 << FINEST
-    count = 0
-    filtered = 0.0
-    anchored = 0
-    begin, slowest, fastest = 0.0, 0.0, 0.0  # velocity at the start of the piece, its range
+    direction = 0  # of the spool's motion, +1 or -1; 0 at rest
+    clamped = False  # flapper on its stop
+    count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
         torque = c.GM * current[k]
-        position = 0
-        level = BASE
-        since = 0
-        first = count
-        while position < whole:
-            while (whole >> level) > whole - position:
+        full = count + NODES_PER_TICK - 1
+        done, since, level = 0, 0, BASE
+        if direction == 0 and not clamped and _rests(c, t, torque, xf, wf, xs):
+            level = 0
+        begin, slowest, fastest = vs, vs, vs
+        while done < WHOLE:
+            while (WHOLE >> level) > WHOLE - done:
                 level += 1
-            span = whole >> level
             h = tick / (1 << level)
-            event = 0
-            nxf, nwf, nxs, nvs = xf, wf, xs, vs
-            if clamp != 0:
-                # Flapper on its stop; it leaves when the torque on it turns.
-                if spool_dir != 0:
-                    steady = (force * xf - tables.dynamic * spool_dir) / tables.damping
-                    fade = tables.decay[level]
-                    nvs = steady + (vs - steady) * fade
-                    nxs = xs + steady * h + (vs - steady) * (1.0 - fade) * c.MS / tables.damping
-                    if nvs * spool_dir <= 0.0:
-                        event = 1
-                    elif abs(nxs) >= c.XSM and nxs * spool_dir > 0.0:
-                        event = 2
-                elif (abs(force * xf) > tables.static and abs(xs) < c.XSM) or (
-                    abs(force * xf) > tables.static and xs * xf < 0.0
-                ):
-                    event = 3
-                if (torque - c.KSF * nxs - c.KF * nxf) * clamp < 0.0:
-                    event = 5
-            elif spool_dir != 0:
-                m = tables.moving[level]
-                exf = tables.dynamic * spool_dir / force
-                exs = (torque - c.KF * exf) / c.KSF
-                a, b = xf - exf, xs - exs
-                nxf = exf + m[0, 0] * a + m[0, 1] * wf + m[0, 2] * b + m[0, 3] * vs
-                nwf = m[1, 0] * a + m[1, 1] * wf + m[1, 2] * b + m[1, 3] * vs
-                nxs = exs + m[2, 0] * a + m[2, 1] * wf + m[2, 2] * b + m[2, 3] * vs
-                nvs = m[3, 0] * a + m[3, 1] * wf + m[3, 2] * b + m[3, 3] * vs
-                if nvs * spool_dir <= 0.0:
-                    event = 1
-                elif abs(nxs) >= c.XSM and nxs * spool_dir > 0.0:
-                    event = 2
-                elif abs(nxf) >= c.XFM:
-                    event = 4
-                elif wf * nwf < 0.0:
-                    # An extreme of the flapper lies inside: the spool may stop there, or the
-                    # flapper touch. Bound both by the motion at the larger of the end rates.
-                    swing = 0.25 * h * max(abs(wf), abs(nwf))
-                    low = min((xf - exf) * spool_dir, (nxf - exf) * spool_dir) - swing
-                    high = max(abs(xf), abs(nxf)) + swing
-                    if low <= 0.0 or high >= c.XFM:
-                        event = -1
+            new_xf, new_wf, new_xs, new_vs = xf, wf, xs, vs
+            if clamped:
+                if direction != 0:
+                    steady = (t.force * xf - t.dynamic * direction) / t.damping
+                    fade = decay[level]
+                    new_xs += steady * h + (vs - steady) * (1.0 - fade) * c.MS / t.damping
+                    new_vs = steady + (vs - steady) * fade
+                event = _clamped_event(c, t, torque, xf, new_xs, new_vs, direction)
+            elif direction != 0:
+                # About the point where both would rest.
+                rest_xf = t.dynamic * direction / t.force
+                rest_xs = (torque - c.KF * rest_xf) / c.KSF
+                a, b = xf - rest_xf, xs - rest_xs
+                m = moving[level]
+                new_xf = rest_xf + m[0, 0] * a + m[0, 1] * wf + m[0, 2] * b + m[0, 3] * vs
+                new_wf = m[1, 0] * a + m[1, 1] * wf + m[1, 2] * b + m[1, 3] * vs
+                new_xs = rest_xs + m[2, 0] * a + m[2, 1] * wf + m[2, 2] * b + m[2, 3] * vs
+                new_vs = m[3, 0] * a + m[3, 1] * wf + m[3, 2] * b + m[3, 3] * vs
+                event = _moving_event(c, t, h, xf, wf, new_xf, new_wf, new_xs, new_vs, direction)
             else:
-                m = tables.stuck[level]
-                exf = (torque - c.KSF * xs) / c.KF
-                a = xf - exf
-                nxf = exf + m[0, 0] * a + m[0, 1] * wf
-                nwf = m[1, 0] * a + m[1, 1] * wf
-                inward = abs(xs) < c.XSM or nxf * xs < 0.0
-                if abs(nxf) > breakaway and inward:
-                    event = 3
-                elif abs(nxf) >= c.XFM:
-                    event = 4
-                elif wf * nwf < 0.0:
-                    swing = 0.25 * h * max(abs(wf), abs(nwf))
-                    if max(abs(xf), abs(nxf)) + swing > min(breakaway, c.XFM):
-                        event = -1
-            if event != 0 and level < FINEST:
+                rest_xf = (torque - c.KSF * xs) / c.KF
+                a = xf - rest_xf
+                n = stuck[level]
+                new_xf = rest_xf + n[0, 0] * a + n[0, 1] * wf
+                new_wf = n[1, 0] * a + n[1, 1] * wf
+                event = _stuck_event(c, t, h, xf, wf, new_xf, new_wf, xs)
+            if level == 0:
+                event = NOTHING  # `_rests` has looked
+            if event != NOTHING and level < FINEST:
                 level += 1
                 continue
-            xf, wf, xs, vs = nxf, nwf, nxs, nvs
+            xf, wf, xs, vs = new_xf, new_wf, new_xs, new_vs
             end = vs
-            if event == 1:
+            if event == REVERSAL:
                 vs = 0.0
-                spool_dir = 0
-                if abs(force * xf) > tables.static:
-                    spool_dir = 1 if xf > 0.0 else -1
-            elif event == 2:
-                xs = c.XSM * spool_dir
+                direction = 0
+                if abs(xf) > t.breakaway:
+                    direction = 1 if xf > 0.0 else -1
+            elif event == SPOOL_STOP:
+                xs = math.copysign(c.XSM, xs)
                 vs = 0.0
-                spool_dir = 0
-            elif event == 3:
-                spool_dir = 1 if xf > 0.0 else -1
-            elif event == 4:
-                clamp = 1 if xf > 0.0 else -1
-                xf = c.XFM * clamp
+                direction = 0
+            elif event == BREAKAWAY:
+                direction = 1 if xf > 0.0 else -1
+            elif event == FLAPPER_STOP:
+                xf = math.copysign(c.XFM, xf)
                 wf = 0.0
-            elif event == 5:
-                clamp = 0
-            position += span
-            since += span
+                clamped = True
+            elif event == RELEASE:
+                clamped = False
+            done += WHOLE >> level
+            since += WHOLE >> level
             slowest, fastest = min(slowest, end), max(fastest, end)
-            wanted = event > 0 or (
-                position & ((whole >> NODE_LEVEL) - 1) == 0
-                and 0.125 * (fastest - slowest) * (tick * since / whole) > BEND
+            span = tick * since / WHOLE
+            wanted = event > NOTHING or (
+                done & ((WHOLE >> NODE_LEVEL) - 1) == 0
+                and 0.125 * (fastest - slowest) * span > BEND
             )
-            if position == whole or (wanted and count - first < NODES_PER_TICK - 1):
-                nodes[count, 0] = tick * since / whole
+            if done == WHOLE or (wanted and count < full):
+                nodes[count, 0] = span
                 nodes[count, 1] = xs
                 nodes[count, 2] = begin
                 nodes[count, 3] = end
                 nodes[count, 4] = 0.0
-                begin, slowest, fastest = vs, vs, vs
                 count += 1
+                begin, slowest, fastest = vs, vs, vs
                 since = 0
-            if level > BASE and position & ((whole >> (level - 1)) - 1) == 0:
+            if level > BASE and done & ((WHOLE >> (level - 1)) - 1) == 0:
                 level -= 1
         node_end[k] = count
         spool[k] = xs
         error = measured[k] - xs
-        if math.isfinite(error):
-            filtered += anchor[0] * (error - filtered)
-            move = 0.0
-            if abs(error) > anchor[2]:
-                move = error
-            elif abs(filtered) > anchor[1]:
-                move = filtered
-            if move != 0.0:
-                xs = min(max(xs + move, -c.XSM), c.XSM)
-                nodes[count - 1, 4] = xs - spool[k]
-                filtered = 0.0
-                anchored += 1
+        if not math.isfinite(error):
+            continue
+        filtered += anchor[0] * (error - filtered)
+        move = 0.0
+        if abs(error) > anchor[2]:
+            move = error
+        elif abs(filtered) > anchor[1]:
+            move = filtered
+        if move != 0.0:
+            xs = min(max(xs + move, -c.XSM), c.XSM)
+            nodes[count - 1, 4] = xs - spool[k]
+            filtered = 0.0
+            anchored += 1
     return anchored
