@@ -44,6 +44,7 @@ def diagnose(
     actuator: Actuator,
     tests: Iterable[StoredTest],
     *,
+    default: StoredTest | None = None,
     levels: Levels | None = None,
     solver: Solver | None = None,
     seed: int = 0,
@@ -53,12 +54,12 @@ def diagnose(
 
     Parameters
     ----------
-    tests: the tests that a recording may be of, told apart by number; a single test is taken for
-        recordings without a number too.
+    tests: the tests that a recording may be of, told apart by number.
+    default: test of recordings whose bus does not carry a number.
     """
     begin = time.perf_counter()
     known = tuple(tests)
-    matched = tuple(_match(recording, known) for recording in recordings)
+    matched = tuple(_match(recording, known, default) for recording in recordings)
 
     def result(
         verdict: Verdict,
@@ -97,11 +98,13 @@ def diagnose(
     return result(verdict, why, identification, tuple(experiments))
 
 
-def not_tested(recording: Recording, actuator: Actuator, reasons: Sequence[str]) -> Diagnosis:
+def not_tested(
+    recording: Recording, test: StoredTest, actuator: Actuator, reasons: Sequence[str]
+) -> Diagnosis:
     """Return the verdict NOT TESTED for a test that did not come about."""
     return Diagnosis(
         recordings=(recording,),
-        tests=(None,),
+        tests=(test,),
         actuator=actuator,
         verdict=Verdict.NOT_TESTED,
         reasons=tuple(reasons),
@@ -111,8 +114,10 @@ def not_tested(recording: Recording, actuator: Actuator, reasons: Sequence[str])
     )
 
 
-def _match(recording: Recording, tests: Sequence[StoredTest]) -> StoredTest | None:
+def _match(
+    recording: Recording, tests: Sequence[StoredTest], default: StoredTest | None
+) -> StoredTest | None:
     """Find the test that a recording is of."""
     if recording.test_id is None:
-        return tests[0] if len(tests) == 1 else None
+        return default
     return next((test for test in tests if test.id == recording.test_id), None)

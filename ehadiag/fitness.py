@@ -39,6 +39,8 @@ def objections_to_recording(
     samples = recording.samples
     if samples is None:
         return ["no telemetry of a test in the recording"]
+    if test is None and recording.test_id is None:
+        return ["the recording does not say which test it is of: name the test by --test"]
     if test is None:
         return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
     return [

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from ehadiag.errors import ConfigurationError
-from ehadiag.identify.pipeline import Identification
+
+if TYPE_CHECKING:  # the command line needs levels and codes long before it loads the compiler
+    from ehadiag.identify.pipeline import Identification
 
 __all__ = ["Levels", "Verdict", "judge"]
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ehadiag.actuator import Actuator
 from ehadiag.cli import options
@@ -15,6 +17,12 @@ from ehadiag.errors import ConfigurationError
 from ehadiag.recording import Environment, Outcome, Quality, Recording
 from ehadiag.storedtest import StoredTest, resolve_test
 from ehadiag.verdict import Levels
+
+if TYPE_CHECKING:
+    from firmware_iface.busmap import BusMap
+    from firmware_iface.recorder import Recorder
+    from firmware_iface.tester import Progress
+    from firmware_iface.transport import Transport
 
 __all__ = ["add_parser", "run"]
 
@@ -26,6 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="request a built-in test on a bus, record and diagnose it",
         description="Request a built-in test on a bus, record it to disk while it runs, diagnose"
         " it. The request makes the surface move. Ctrl-C requests an abort.",
+        allow_abbrev=False,
     )
     parser.add_argument(
         "--test",
@@ -40,14 +49,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         " --interface on a virtual bus of this process",
     )
     parser.add_argument(
+        "--fast",
+        action="store_true",
+        help="with --simulate: simulated time and no bus between, as fast as it goes",
+    )
+    parser.add_argument(
         "--listen",
         action="store_true",
-        help="send nothing: wait for the test that somebody else starts",
+        help="send nothing: wait up to a minute for the test that somebody else starts",
     )
     parser.add_argument(
         "--record",
         metavar="FILE",
-        help="recording, .blf .asc .csv .trc (default: in the output folder)",
+        help="recording, .blf .asc .csv .trc .mf4 (default: a BLF in the output folder)",
     )
     parser.add_argument(
         "--out",
@@ -55,9 +69,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="DIR",
         help="recording, JSON and picture go here (default ehadiag-out)",
     )
-    parser.add_argument("--max-position", type=float, metavar="mm", help="abort beyond")
-    parser.add_argument("--max-pressure", type=float, metavar="MPa", help="abort beyond")
-    parser.add_argument("--max-current", type=float, metavar="mA", help="abort beyond")
+    for name, unit, what in (
+        ("position", "mm", "jack position"),
+        ("pressure", "MPa", "differential pressure"),
+        ("current", "mA", "servovalve current"),
+    ):
+        parser.add_argument(
+            f"--max-{name}",
+            type=options.positive,
+            metavar=unit,
+            help=f"abort the test when the {what} goes beyond ±{unit} (default: not watched)",
+        )
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_diagnosis_options(parser)
@@ -71,10 +93,10 @@ def run(arguments: argparse.Namespace) -> int:
     actuator = options.the_actuator(arguments)
     test = resolve_test(arguments.test)
     levels = Levels(arguments.advisory, arguments.limit)
-    if arguments.simulate and arguments.listen:
-        raise ConfigurationError("--simulate and --listen exclude each other")
+    bus_map = options.the_bus_map(arguments)
+    _refuse_contradictions(arguments)
     folder = make_folder(arguments.out)
-    say_if_compiling()
+    say_if_compiling(simulation=arguments.simulate)
     from ehadiag.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
     from ehadiag.identify.solvers import make_solver  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
@@ -82,16 +104,17 @@ def run(arguments: argparse.Namespace) -> int:
     # Before the test: a verdict must not wait for the compiler.
     warm_up(actuator, test)
     begin = time.perf_counter()
-    recording, why, stem = _acquire(arguments, actuator, test, folder)
+    recording, why, stem = _acquire(arguments, actuator, test, bus_map, folder)
     read_s = time.perf_counter() - begin
     if why:
-        result = not_tested(recording, actuator, [why])
+        result = not_tested(recording, test, actuator, [why])
     else:
         with progress_bar() as progress:
             result = diagnose(
                 [recording],
                 actuator,
                 [test],
+                default=test,
                 levels=levels,
                 solver=make_solver(arguments.solver),
                 seed=arguments.seed,
@@ -102,30 +125,35 @@ def run(arguments: argparse.Namespace) -> int:
     return int(result.verdict)
 
 
+def _refuse_contradictions(arguments: argparse.Namespace) -> None:
+    if arguments.simulate and arguments.listen:
+        raise ConfigurationError("--simulate and --listen exclude each other")
+    if arguments.fast and not arguments.simulate:
+        raise ConfigurationError("--fast: only the simulated actuator can hurry, add --simulate")
+    if arguments.fast and options.has_bus(arguments):
+        raise ConfigurationError("--fast: a bus has its own time, leave --interface out")
+    if not arguments.simulate and not options.has_bus(arguments):
+        raise ConfigurationError(
+            "no bus named: give --interface and --channel, or --serial, or --simulate"
+        )
+
+
 def _acquire(
-    arguments: argparse.Namespace, actuator: Actuator, test: StoredTest, folder: Path
+    arguments: argparse.Namespace,
+    actuator: Actuator,
+    test: StoredTest,
+    bus_map: BusMap,
+    folder: Path,
 ) -> tuple[Recording, str, Path]:
     """Run the test on the bus; return the recording, why it is not one, and the files' stem."""
     from firmware_iface.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.handshake import Limits  # noqa: PLC0415
-    from firmware_iface.recorder import Recorder  # noqa: PLC0415
-    from firmware_iface.tester import Progress, run_test  # noqa: PLC0415
+    from firmware_iface.tester import run_test  # noqa: PLC0415
 
-    bus_map = options.the_bus_map(arguments)
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
     with ExitStack() as stack:
-        if arguments.simulate and not options.has_bus(arguments):
-            arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
-        if arguments.simulate:
-            from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415
-
-            core = make_core(arguments, actuator, [test], bus_map)
-            theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
-        ours = stack.enter_context(options.open_transport(arguments, transmit=not arguments.listen))
-        recorder = Recorder(path)
-        if arguments.simulate:
-            stack.enter_context(emulator_beside(core, theirs))
+        ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
         stop = stack.enter_context(stop_on_signals())
         display = stack.enter_context(progress_bar())
         say(f"test {test.name!r} on {ours.name}, recording to {path}")
@@ -134,6 +162,7 @@ def _acquire(
             display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
 
         assembler = Assembler(str(path), bus_map)
+        began = time.monotonic()
         outcome = run_test(
             ours,
             test_id=test.id,
@@ -150,11 +179,56 @@ def _acquire(
             stop=stop,
             progress=tell,
         )
-        recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
-        if outcome.degraded:
-            say(outcome.degraded)
-    why = "" if outcome.complete else outcome.why
+        listened = time.monotonic() - began
+    recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
+    if recording.serial is None:
+        recording = replace(recording, serial=outcome.serial)
+    if outcome.degraded:
+        say(outcome.degraded)
+    why = "" if outcome.complete else outcome.why + _what_was_heard(recording, ours.name, listened)
     return recording, why, path.with_suffix("") if not arguments.record else folder / path.stem
+
+
+def _connect(
+    arguments: argparse.Namespace,
+    actuator: Actuator,
+    test: StoredTest,
+    bus_map: BusMap,
+    path: Path,
+    stack: ExitStack,
+) -> tuple[Transport, Recorder]:
+    """Open the bus and the recording; begin the emulated computer if it was asked for."""
+    from firmware_iface.recorder import Recorder  # noqa: PLC0415 - loads python-can
+
+    if not arguments.simulate:
+        ours = options.open_transport(arguments, transmit=not arguments.listen)
+        return stack.enter_context(ours), Recorder(path)
+    from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415 - loads numba
+    from ehadiag_sim.emulator import EmulatorTransport  # noqa: PLC0415
+
+    core = make_core(arguments, actuator, [test], bus_map)
+    if arguments.fast:
+        return stack.enter_context(EmulatorTransport(core)), Recorder(path)
+    if not options.has_bus(arguments):
+        arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
+    theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
+    ours = stack.enter_context(options.open_transport(arguments, transmit=True))
+    recorder = Recorder(path)
+    stack.enter_context(emulator_beside(core, theirs))
+    return ours, recorder
+
+
+def _what_was_heard(recording: Recording, bus: str, listened: float) -> str:
+    """Add to a failure what would else have to be guessed: a silent bus, or a foreign one."""
+    quality = recording.quality
+    if quality.total("received"):
+        return ""
+    if not quality.foreign:
+        return f"; {bus} was silent for {listened:.1f} s"
+    return (
+        f"; {quality.foreign} frames heard on {bus} in {listened:.1f} s, none that the mapping "
+        "knows: see ehadiag check-bus"
+    )
 
 
 def _unused(folder: Path, test: str, stamp: str) -> Path:

@@ -23,10 +23,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Listen to a bus (or read a recording) without sending anything, and report"
         " what maps, what is missing, rates, gaps, and the range use of each channel."
         " Exit code 30 where something stands in the way of a diagnosis.",
+        allow_abbrev=False,
     )
     parser.add_argument("--log", metavar="LOG", help="check a recording instead of a bus")
     parser.add_argument(
-        "--duration", type=float, default=3.0, metavar="S", help="how long to listen (default 3)"
+        "--duration",
+        type=options.positive,
+        default=3.0,
+        metavar="S",
+        help="how long to listen (default 3)",
     )
     options.add_mapping_options(parser)
     options.add_bus_options(parser)
@@ -43,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.log:
         table = read_frames(arguments.log)
+        print(f"log {arguments.log}")
     else:
         with (
             options.open_transport(arguments, transmit=False) as transport,
@@ -57,7 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
                 if frame is not None:
                     collected.add(frame)
                 display("listening", (time.monotonic() - begin) / arguments.duration)
+            listened = time.monotonic() - begin
         table = collected.table()
+        print(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
     report = report_bus(table, bus_map)
     print(render(report))
     return NOT_USABLE if report.problems else 0

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ehadiag.cli import options
 from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
-from ehadiag.diagnosis import Diagnosis, diagnose
 from ehadiag.errors import EhadiagError
-from ehadiag.identify.solvers import make_solver
-from ehadiag.recording import Recording
+from ehadiag.storedtest import resolve_test
 from ehadiag.verdict import Levels
+
+if TYPE_CHECKING:
+    from ehadiag.recording import Recording
 
 __all__ = ["add_parser", "run"]
 
@@ -24,6 +27,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "diagnose",
         help="diagnose recordings (BLF, ASC, CSV, TRC, MF4)",
         description="Diagnose actuators from recordings of their bus.",
+        allow_abbrev=False,
     )
     parser.add_argument(
         "logs",
@@ -36,7 +40,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="append",
         default=[],
         metavar="FILE",
-        help="test file that a log may be of, besides the stored ones; repeatable",
+        help="test (file) that a log may be of, besides the stored ones; repeatable."
+        " Given once, it also stands for logs that carry no test number",
     )
     parser.add_argument(
         "--joint",
@@ -53,52 +58,80 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose each log; return the worst exit code."""
-    actuator = options.the_actuator(arguments)
-    tests = options.known_tests(arguments.test)
-    levels = Levels(arguments.advisory, arguments.limit)
-    bus_map = options.the_bus_map(arguments)
-    solver = make_solver(arguments.solver)
-    folder = make_folder(arguments.out) if arguments.out else None
-    say_if_compiling()
-    from firmware_iface.logs import choose, read_recordings  # noqa: PLC0415 - loads python-can
-
-    worst = 0
-    groups: list[tuple[list[Recording], float]] = []
-
-    def finish(recordings: Sequence[Recording], read_s: float, name: str) -> None:
-        nonlocal worst
-        with progress_bar() as progress:
-            result: Diagnosis = diagnose(
-                recordings,
-                actuator,
-                tests,
-                levels=levels,
-                solver=solver,
-                seed=arguments.seed,
-                progress=progress,
-            )
-        show(result, arguments, read_s)
-        if folder is not None:
-            write_report(result, folder / name, arguments, read_s)
-        worst = max(worst, int(result.verdict))
-
+    # What is wrong with the options is said before anything slow is loaded.
+    diagnosis = _Diagnosis(arguments)
+    codes = [0]
+    together: list[Recording] = []
+    spent = 0.0
     for log in arguments.logs:
         begin = time.perf_counter()
         try:
-            found = read_recordings(log, bus_map)
+            found = diagnosis.read(log)
         except EhadiagError as error:
             say(str(error))
-            worst = max(worst, error.exit_code)
+            codes.append(error.exit_code)
             continue
-        chosen = list(found) if arguments.all else [choose(found)]
         read_s = time.perf_counter() - begin
         if arguments.joint:
-            groups.append((chosen, read_s))
+            together += found
+            spent += read_s
             continue
-        for number, recording in enumerate(chosen, start=1):
-            suffix = f"-{number}" if len(chosen) > 1 else ""
-            finish([recording], read_s, Path(log).stem + suffix)
-    if groups:
-        together = [recording for chosen, _ in groups for recording in chosen]
-        finish(together, sum(read_s for _, read_s in groups), "joint")
-    return worst
+        for number, recording in enumerate(found, start=1):
+            suffix = f"-{number}" if len(found) > 1 else ""
+            codes.append(diagnosis.finish([recording], read_s, Path(log).stem + suffix))
+    if arguments.joint and max(codes) > 0:
+        say("no joint estimate: not all of the logs could be read")
+    elif arguments.joint:
+        codes.append(diagnosis.finish(together, spent, "joint"))
+    return max(codes)
+
+
+class _Diagnosis:
+    """What all logs of one call have in common."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._actuator = options.the_actuator(arguments)
+        self._tests = options.known_tests(arguments.test)
+        only = arguments.test[0] if len(arguments.test) == 1 else None
+        self._default = resolve_test(only) if only else None
+        self._levels = Levels(arguments.advisory, arguments.limit)
+        self._bus_map = options.the_bus_map(arguments)
+        self._folder = make_folder(arguments.out) if arguments.out else None
+        self._names: set[str] = set()
+        say_if_compiling()
+
+    def read(self, log: str) -> list[Recording]:
+        """Read what is to be diagnosed of one log."""
+        from firmware_iface.logs import choose, read_recordings  # noqa: PLC0415 - loads cantools
+
+        found = read_recordings(log, self._bus_map)
+        return list(found) if self._arguments.all else [choose(found)]
+
+    def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
+        """Diagnose, print and write one result; return its exit code."""
+        from ehadiag.diagnosis import diagnose  # noqa: PLC0415 - loads numba
+        from ehadiag.identify.solvers import make_solver  # noqa: PLC0415
+
+        with progress_bar() as progress:
+            result = diagnose(
+                recordings,
+                self._actuator,
+                self._tests,
+                default=self._default,
+                levels=self._levels,
+                solver=make_solver(self._arguments.solver),
+                seed=self._arguments.seed,
+                progress=progress,
+            )
+        show(result, self._arguments, read_s)
+        if self._folder is not None:
+            write_report(result, self._folder / self._unused(name), self._arguments, read_s)
+        return int(result.verdict)
+
+    def _unused(self, name: str) -> str:
+        """Return a name that no other log of this call has: folders may hold equal file names."""
+        candidates = (name if n == 1 else f"{name}-{n}" for n in itertools.count(1))
+        free = next(item for item in candidates if item not in self._names)
+        self._names.add(free)
+        return free

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import NoReturn
 
 from ehadiag.cli import bit, checkbus, diagnose, replay, sim, tests, warmup
 from ehadiag.errors import EhadiagError
@@ -20,8 +21,22 @@ BROKEN_PIPE = 3
 INTERRUPTED = 130
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, and where to read on."""
+
+    def error(self, message: str) -> NoReturn:
+        command = self.prog.partition(" ")[2]
+        where = f"{command}: " if command else ""
+        self.exit(2, f"ehadiag: {where}{message}; see {self.prog} --help\n")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
+    """Run the command line; return the exit code.
+
+    Raises
+    ------
+    SystemExit: wrong usage (code 2), `--help` and `--version`.
+    """
     arguments = _parser().parse_args(argv)
     try:
         code = arguments.run(arguments)
@@ -40,12 +55,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="ehadiag",
-        description="Diagnosis of electrohydraulic actuators: clogging of the first-stage filter"
-        " (Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (limit).",
+        description="Diagnosis of electrohydraulic actuators: clogging of the first-stage filter\n"
+        "(Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (limit).",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"ehadiag {version('ehadiag')}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.errors import ConfigurationError
-from ehadiag.storedtest import StoredTest, bundled_tests, load_test
+from ehadiag.storedtest import StoredTest, bundled_tests, resolve_test
 
 if TYPE_CHECKING:
     from firmware_iface.busmap import BusMap
@@ -23,6 +24,7 @@ __all__ = [
     "has_bus",
     "known_tests",
     "open_transport",
+    "positive",
     "the_actuator",
     "the_bus_map",
 ]
@@ -89,6 +91,7 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "-i",
         "--interface",
+        metavar="NAME",
         default=os.environ.get("CAN_INTERFACE"),
         help="socketcan, virtual, udp_multicast, slcan, pcan, kvaser, vector, …"
         " (default: CAN_INTERFACE)",
@@ -96,13 +99,16 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "-c",
         "--channel",
+        metavar="NAME",
         default=os.environ.get("CAN_CHANNEL"),
         help="channel as the interface names it (default: CAN_CHANNEL)",
     )
-    group.add_argument("-b", "--bitrate", type=int, help="bit/s")
+    group.add_argument("-b", "--bitrate", type=_count, metavar="N", help="bit/s")
     group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
-    group.add_argument("--data-bitrate", "--data_bitrate", type=int, help="bit/s of CAN FD data")
-    group.add_argument("--app-name", help="application name (Vector)")
+    group.add_argument(
+        "--data-bitrate", "--data_bitrate", type=_count, metavar="N", help="bit/s of CAN FD data"
+    )
+    group.add_argument("--app-name", metavar="NAME", help="application name (Vector)")
     group.add_argument(
         "--bus-kwargs",
         nargs="*",
@@ -117,7 +123,8 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--baud",
-        type=int,
+        type=_count,
+        metavar="N",
         default=DEFAULT_BAUD,
         help=f"of the serial link (default {DEFAULT_BAUD})",
     )
@@ -204,7 +211,7 @@ def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
     """Return the bundled tests and those of the named files; a file's number wins."""
     tests = {test.id: test for test in bundled_tests().values()}
     for name in files:
-        test = bundled_tests().get(name) or load_test(name)
+        test = resolve_test(name)
         tests[test.id] = test
     return tuple(tests.values())
 
@@ -258,8 +265,24 @@ def _value(text: str) -> bool | int | float | str:
     return text
 
 
-def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 1 << 32:
-        raise argparse.ArgumentTypeError("a seed is 0 … 4294967295")
+def positive(text: str) -> float:
+    """Read a number above zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a number above 0")
     return value
+
+
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdigit()) or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:
+        raise argparse.ArgumentTypeError(f"{text!r}: a seed is a whole number, 0 … 4294967295")
+    return int(text)

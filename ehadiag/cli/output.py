@@ -7,15 +7,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-from ehadiag.diagnosis import Diagnosis
 from ehadiag.errors import InputOutputError
-from ehadiag.jit import cache_is_cold
-from ehadiag.report.jsonline import json_line
-from ehadiag.report.table import print_diagnosis
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ehadiag.diagnosis import Diagnosis
 
 __all__ = [
     "make_folder",
@@ -28,6 +27,9 @@ __all__ = [
 ]
 
 LEAST_WIDTH = 100
+PIPE_WIDTH = 200
+IDENTIFICATION, SIMULATION = "identify", "ehadiag_sim"
+"""Folders of kernels, as the names of their cache files end in them."""
 
 
 def say(text: str) -> None:
@@ -35,26 +37,40 @@ def say(text: str) -> None:
     print(f"ehadiag: {text}", file=sys.stderr, flush=True)
 
 
-def say_if_compiling() -> None:
-    """Tell that the first run takes longer."""
-    if cache_is_cold():
+def say_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:
+    """Tell that the first run takes longer, where what it needs is not in the cache."""
+    from ehadiag.jit import cache_folder  # noqa: PLC0415 - loads numba
+
+    needed = [SIMULATION] * simulation + [IDENTIFICATION] * identification
+    if not all(any(cache_folder().glob(f"*-{kind}-*.nbi")) for kind in needed):
         say("compiling the model's kernels, once for this installation (up to half a minute)")
 
 
 def wide_console() -> Console:
-    """Standard output at least as wide as our tables: a pipe must not cut them."""
-    return Console(highlight=False, width=max(Console().width, LEAST_WIDTH))
+    """Standard output wide enough for our tables: a pipe must not cut them."""
+    from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
+
+    console = Console(highlight=False)
+    width = max(console.width, LEAST_WIDTH) if console.is_terminal else PIPE_WIDTH
+    return Console(highlight=False, width=width)
 
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None]]:
     """Show stage and share done on standard error, where that is a terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not sys.stderr.isatty():
         yield lambda _stage, _share: None
         return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import (  # noqa: PLC0415
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True) as display:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as display:
         task = display.add_task("", total=1.0)
         yield lambda stage, share: display.update(task, description=stage, completed=share)
 
@@ -62,8 +78,12 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 def show(diagnosis: Diagnosis, arguments: argparse.Namespace, read_s: float) -> None:
     """Print a diagnosis as JSON or as a table."""
     if arguments.json:
+        from ehadiag.report.jsonline import json_line  # noqa: PLC0415
+
         print(json_line(diagnosis, read_s, arguments.solver, arguments.seed), flush=True)
     else:
+        from ehadiag.report.table import print_diagnosis  # noqa: PLC0415
+
         print_diagnosis(diagnosis, wide_console())
 
 
@@ -85,7 +105,14 @@ def make_folder(name: str) -> Path:
 def write_report(
     diagnosis: Diagnosis, stem: Path, arguments: argparse.Namespace, read_s: float
 ) -> None:
-    """Write `stem`.json and, where a model was fitted, `stem`.png."""
+    """Write `stem`.json and, where a model was fitted, `stem`.png.
+
+    Raises
+    ------
+    InputOutputError: one of them cannot be written.
+    """
+    from ehadiag.report.jsonline import json_line  # noqa: PLC0415
+
     line = json_line(diagnosis, read_s, arguments.solver, arguments.seed)
     path = stem.with_name(stem.name + ".json")
     try:

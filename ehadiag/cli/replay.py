@@ -7,7 +7,6 @@ import argparse
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import progress_bar, say
-from ehadiag.errors import ConfigurationError
 
 __all__ = ["add_parser", "run"]
 
@@ -18,11 +17,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "replay",
         help="play a recording onto a bus",
         description="Play a recording onto a bus in its own rhythm. This transmits.",
+        allow_abbrev=False,
     )
     parser.add_argument("log", metavar="LOG")
     parser.add_argument(
         "--speed",
-        type=float,
+        type=_speed,
         default=1.0,
         metavar="X",
         help="times its own rhythm (default 1); 0: as fast as the bus takes it",
@@ -33,8 +33,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the log."""
-    if arguments.speed < 0.0:
-        raise ConfigurationError(f"--speed {arguments.speed:g}: need 0 or more")
     from firmware_iface.logs import read_frames  # noqa: PLC0415 - loads python-can
     from firmware_iface.replay import play  # noqa: PLC0415
 
@@ -53,3 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         say(f"sent {sent} of {len(table)} frames on {transport.name}")
     return 0
+
+
+def _speed(text: str) -> float:
+    return 0.0 if text.strip() in ("0", "0.0") else options.positive(text)

@@ -18,6 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="run the emulated flight-control computer on a bus",
         description="Run the emulated flight-control computer and its actuator on a bus until"
         " Ctrl-C, SIGTERM or --duration.",
+        allow_abbrev=False,
     )
     parser.add_argument(
         "--test",
@@ -26,7 +27,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="FILE",
         help="further test file that the computer stores; repeatable",
     )
-    parser.add_argument("--duration", type=float, metavar="S", help="stop after so many seconds")
+    parser.add_argument(
+        "--duration", type=options.positive, metavar="S", help="stop after so many seconds"
+    )
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_bus_options(parser)
@@ -39,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     actuator = options.the_actuator(arguments)
     tests = options.known_tests(arguments.test)
     bus_map = options.the_bus_map(arguments)
-    say_if_compiling()
+    say_if_compiling(simulation=True, identification=False)
     from ehadiag.cli.simulator import make_core  # noqa: PLC0415 - loads numba
     from ehadiag_sim.emulator import run_emulator  # noqa: PLC0415
 

@@ -6,8 +6,6 @@ import argparse
 import csv
 import sys
 
-from rich.table import Table
-
 from ehadiag.cli.output import wide_console
 from ehadiag.storedtest import UNITS, bundled_tests, resolve_test
 
@@ -20,6 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "tests",
         help="list the stored tests",
         description="List the stored tests; --csv prints time and command of one.",
+        allow_abbrev=False,
     )
     parser.add_argument("--csv", metavar="NAME", help="test (or test file) to print as CSV")
     parser.set_defaults(run=run)
@@ -33,14 +32,13 @@ def run(arguments: argparse.Namespace) -> int:
         writer.writerow(["time_s", f"command_{test.unit}"])
         scale = UNITS[test.mode][test.unit]
         for time, value in zip(test.time(), test.command() / scale, strict=True):
-            writer.writerow([f"{time:.6g}", f"{value:.9g}"])
+            writer.writerow([f"{time:.9g}", f"{value:.9g}"])
         return 0
+    from rich.table import Table  # noqa: PLC0415 - not for CSV
+
     table = Table(box=None, pad_edge=False)
-    for name, side in (
-        ("id", "right"), ("name", "left"), ("command", "left"), ("length", "right"),
-        ("rate", "right"), ("description", "left"),
-    ):  # fmt: skip
-        table.add_column(name, justify="right" if side == "right" else "left")
+    for name in ("id", "name", "command", "length", "rate", "description"):
+        table.add_column(name, justify="right" if name in ("id", "length", "rate") else "left")
     for test in sorted(bundled_tests().values(), key=lambda item: item.id):
         table.add_row(
             str(test.id),

@@ -7,7 +7,6 @@ import time
 
 from ehadiag.actuator import default_actuator
 from ehadiag.cli.output import say, say_if_compiling
-from ehadiag.jit import cache_folder
 from ehadiag.storedtest import bundled_tests
 
 __all__ = ["add_parser", "run"]
@@ -20,15 +19,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="compile the kernels now",
         description="Compile the model's kernels into the cache folder (EHADIAG_CACHE_DIR, else"
         " the user's cache), so that the first diagnosis does not wait for it.",
+        allow_abbrev=False,
     )
     parser.set_defaults(run=run)
 
 
 def run(_arguments: argparse.Namespace) -> int:
     """Compile."""
-    say_if_compiling()
+    say_if_compiling(simulation=True)
     begin = time.perf_counter()
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415 - loads numba
+    from ehadiag.jit import cache_folder  # noqa: PLC0415
     from ehadiag_sim.plant import Plant  # noqa: PLC0415
 
     for test in bundled_tests().values():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ehadiag.diagnosis import Diagnosis
 from ehadiag.parameters import FAULT_NAMES
+
+if TYPE_CHECKING:
+    from ehadiag.diagnosis import Diagnosis
 
 __all__ = ["SCHEMA", "json_line", "source_name", "test_name"]
 

@@ -15,7 +15,6 @@ from ehadiag.errors import InputOutputError
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.pipeline import Identification
 from ehadiag.model.monitoring import respond
-from ehadiag.report.jsonline import source_name
 
 __all__ = ["draw_diagnosis"]
 
@@ -33,7 +32,7 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     if found is None:
         raise ValueError("nothing was identified, so there is no modelled response to draw")
     columns = len(diagnosis.experiments)
-    figure = Figure(figsize=(9.0 * columns, 9.0), layout="constrained")
+    figure = Figure(figsize=(9.5 * columns, 9.0), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(
         5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
@@ -41,11 +40,12 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     for column, experiment in enumerate(diagnosis.experiments):
         _draw_column([axes[column] for axes in grid], experiment, found)
     constants = ",  ".join(
-        f"{item.name} = {item.value:.4f} ± {1.96 * item.std:.4f}" for item in found.estimates
+        f"{item.name} {item.value:.5f} ({item.interval95[0]:.5f} … {item.interval95[1]:.5f})"
+        for item in found.estimates
     )
+    names = " + ".join(Path(recording.source).name for recording in diagnosis.recordings)
     figure.suptitle(
-        f"{diagnosis.verdict.name.replace('_', ' ')}: {constants}\n{source_name(diagnosis)}",
-        fontsize=11,
+        f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}", fontsize=11
     )
     try:
         figure.savefig(path, dpi=110)
@@ -71,7 +71,7 @@ def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification
         "kPa",
         1e3,
     )
-    axes[1].legend(loc="upper right", fontsize=8, ncols=2)
+    axes[1].legend(loc="lower left", fontsize=8, framealpha=1.0, borderaxespad=0.2, markerscale=3)
     for start, end in experiment.test.windows.refinement:
         for item in axes:
             item.axvspan(start, end, color="#fef3c7", zorder=0)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ehadiag.diagnosis import Diagnosis
 from ehadiag.parameters import FAULTS
 from ehadiag.report.jsonline import source_name, test_name
 from ehadiag.verdict import Verdict
+
+if TYPE_CHECKING:
+    from ehadiag.diagnosis import Diagnosis
 
 __all__ = ["print_diagnosis"]
 
