@@ -9,6 +9,7 @@ from typing import Any
 
 from firmware_iface.frames import Frame
 
+SOURCES = Path(__file__).parents[2] / "firmware_iface" / "c"
 FRAMES_PER_TICK = 5
 NODE_WORDS = 512
 """Room for `struct fcc_node` in words of 8 bytes, several times its size."""
@@ -174,4 +175,4 @@ def link_packet(library: Any, frame: Frame, time_us: int) -> bytes:
     return bytes(packet)
 
 
-__all__ = ["CRig", "Link", "Node", "c_frame", "link_packet", "load", "pack", "unpack"]
+__all__ = ["SOURCES", "CRig", "Link", "Node", "c_frame", "link_packet", "load", "pack", "unpack"]

@@ -14,8 +14,6 @@ from typing import Any
 import c_side
 import pytest
 
-SOURCES = Path(__file__).parents[2] / "firmware_iface" / "c"
-
 
 @pytest.fixture(scope="session")
 def c_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -25,7 +23,7 @@ def c_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
             pytest.skip(f"no {program} on this machine")
     folder = tmp_path_factory.mktemp("c")
     done = subprocess.run(
-        ["make", "-C", str(SOURCES), f"OUT={folder}", "CC=cc"],
+        ["make", "-C", str(c_side.SOURCES), f"OUT={folder}", "CC=cc"],
         capture_output=True,
         text=True,
         check=False,

@@ -14,7 +14,7 @@ from typing import Any
 
 import c_side
 import pytest
-from conftest import SOURCES
+from c_side import SOURCES
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 

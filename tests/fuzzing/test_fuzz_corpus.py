@@ -1,0 +1,64 @@
+"""The kept inputs of the fuzzer, and what its targets must be able to notice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from firmware_iface import busmap, seriallink
+from firmware_iface.frames import Frame
+from fuzz import targets
+
+CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
+
+
+def keep_dbc_parser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A target puts a cache before it; take that away again."""
+    monkeypatch.setattr(busmap, "_parse_dbc", busmap._parse_dbc)
+
+
+@pytest.mark.parametrize("name", targets.TARGETS)
+def test_kept_inputs_still_pass(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    keep_dbc_parser(monkeypatch)
+    inputs = sorted((CORPUS / name).iterdir())
+    assert inputs
+    check = targets.target(name)
+    for path in inputs:
+        check(path.read_bytes())
+    check(b"")
+
+
+def test_the_seeds_reach_the_readers() -> None:
+    frames = targets._frames_of((CORPUS / "frames" / "test").read_bytes())
+    assert {item.can_id for item in frames} == {0x110, 0x111, 0x120, 0x201}
+    packets = seriallink.Framer().feed((CORPUS / "serial" / "packets").read_bytes())
+    assert len(packets) == 6
+
+
+@pytest.mark.parametrize("name", ["logs", "mappings"])
+def test_an_error_that_no_user_may_see_is_a_finding(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise IndexError
+
+    where = {"logs": (targets, "read_recordings"), "mappings": (busmap, "resolve")}[name]
+    keep_dbc_parser(monkeypatch)
+    monkeypatch.setattr(*where, broken)
+    check = targets.target(name)
+    with pytest.raises(IndexError):
+        check(b"\1data")
+
+
+def test_a_framer_that_depends_on_the_pieces_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    feed: Callable[[seriallink.Framer, bytes], list[Frame]] = seriallink.Framer.feed
+
+    def forgetful(self: seriallink.Framer, chunk: bytes) -> list[Frame]:
+        self._partial = b""
+        return feed(self, chunk)
+
+    monkeypatch.setattr(seriallink.Framer, "feed", forgetful)
+    with pytest.raises(AssertionError, match="depends"):
+        targets.target("serial")((CORPUS / "serial" / "packets").read_bytes())

@@ -1,0 +1,32 @@
+"""Fuzz one target with atheris: `python tools/fuzz/run.py TARGET [FOLDER...] [-option...]`.
+
+Options are libFuzzer's; docs/how-to/fuzz.md says how to start it and what to do with a finding.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import atheris
+
+NAMES = ("frames", "serial", "logs", "mappings")
+SEEN = ("firmware_iface", "ehadiag", "cantools", "textparser", "tomllib", "can")
+"""Packages whose branches guide the search."""
+HANG_S = 5
+MEMORY_MB = 2048
+
+
+def main() -> None:
+    """Run until a finding, or until what the options say."""
+    if len(sys.argv) < 2 or sys.argv[1] not in NAMES:
+        raise SystemExit(f"usage: run.py {'|'.join(NAMES)} [FOLDER...] [-option...]")
+    name = sys.argv.pop(1)
+    with atheris.instrument_imports(include=list(SEEN)):
+        import targets  # noqa: PLC0415 - the fuzzer must see its imports
+    options = [f"-timeout={HANG_S}", f"-rss_limit_mb={MEMORY_MB}", *sys.argv[1:]]
+    atheris.Setup([sys.argv[0], *options], targets.target(name))
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

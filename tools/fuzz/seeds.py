@@ -1,0 +1,75 @@
+"""Write the first inputs of each target: `python tools/fuzz/seeds.py tests/data/fuzz`."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from importlib import resources
+from pathlib import Path
+
+from targets import KINDS, RECORD, SEALED
+
+from firmware_iface.encode import Encoder
+from firmware_iface.frames import Frame
+from firmware_iface.recorder import Recorder
+from firmware_iface.seriallink import packet_of
+
+
+def _bus(ticks: int) -> list[Frame]:
+    """A short test as the computer sends it."""
+    encoder = Encoder()
+    frames: list[Frame] = []
+    for tick in range(ticks):
+        now = tick * 1_000_000
+        if tick % 20 == 0:
+            frames += encoder.status(2, 0, 1, tick / 1000, 7, now)
+        frames += encoder.command(1, 1e-6 * tick, 1, now + 130_000)
+        frames += encoder.telemetry((2048 + tick, 2048, 2000, 2050), now + 260_000)
+    frames += encoder.environment(20.7e6, 0.7e6, 40.0, ticks * 1_000_000)
+    frames += encoder.status(3, 0, 1, ticks / 1000, 7, ticks * 1_000_000 + 130_000)
+    return frames
+
+
+def _records(frames: list[Frame]) -> bytes:
+    places = {0x110: 0, 0x111: 1, 0x120: 2, 0x200: 3, 0x201: 4}
+    out, last = b"", 0
+    for frame in frames:
+        step = (frame.time_ns - last) // 1000
+        out += RECORD.pack(SEALED, places[frame.can_id], step, 8, frame.data)
+        last = frame.time_ns
+    return out
+
+
+def _log(suffix: str, frames: list[Frame]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"log{suffix}"
+        with Recorder(path) as recorder:
+            for frame in frames:
+                recorder.write(frame)
+        return path.read_bytes()
+
+
+def main() -> None:
+    """Write the files."""
+    root = Path(sys.argv[1])
+    frames = _bus(12)
+    data = resources.files("firmware_iface").joinpath("data")
+    inputs = {
+        "frames/test": _records(frames),
+        "frames/one": _records(frames[1:2]),
+        "serial/packets": b"".join(packet_of(frame) for frame in frames[:6]),
+        "serial/torn": packet_of(frames[0])[5:] + packet_of(frames[1]),
+        "mappings/mapping": b"\0" + data.joinpath("eha_fcc.toml").read_bytes(),
+        "mappings/dbc": b"\1" + data.joinpath("eha_fcc.dbc").read_bytes(),
+    }
+    for number, suffix in enumerate(KINDS):
+        if suffix.startswith("."):
+            inputs[f"logs/{suffix[1:]}"] = bytes((number,)) + _log(suffix, frames)
+    for name, content in inputs.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+if __name__ == "__main__":
+    main()
