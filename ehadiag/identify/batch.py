@@ -18,7 +18,7 @@ from ehadiag.model.jack import jack_response
 from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
 from ehadiag.model.transition import spool_tables
 
-__all__ = ["Batch", "Workspace", "costs", "residuals", "workspace"]
+__all__ = ["Batch", "Workspace", "costs", "residuals", "spool_rates", "workspace"]
 
 
 class Batch(NamedTuple):
@@ -28,6 +28,7 @@ class Batch(NamedTuple):
     tick: s, shape (m,).
     start: first tick of each span in the flat arrays, then N, shape (m + 1,).
     origin: spool position before the first tick of each span, m, shape (m,).
+    current_before: current before the first tick of each span, A, shape (m,).
     current: A, shape (N,).
     spool, pressure: measured, m and Pa, shape (N,), NaN where missing.
     weight: reciprocal noise of spool and pressure, 0 where not used, shape (2, N).
@@ -38,6 +39,7 @@ class Batch(NamedTuple):
     tick: NDArray[np.float64]
     start: NDArray[np.int64]
     origin: NDArray[np.float64]
+    current_before: NDArray[np.float64]
     current: NDArray[np.float64]
     spool: NDArray[np.float64]
     pressure: NDArray[np.float64]
@@ -77,6 +79,27 @@ def _constants(row: NDArray[np.float64]) -> PlantConstants:
 
 
 @kernel
+def _run_spool(batch: Batch, candidate: NDArray[np.float64], work: Workspace, index: int) -> int:
+    """Spool's path of one span into the workspace; returns how often it was re-anchored."""
+    a, b = batch.start[index], batch.start[index + 1]
+    constants = _constants(batch.constants[index])
+    tick = batch.tick[index]
+    return spool_response(
+        constants,
+        spool_tables(constants, candidate[0], candidate[1], tick),
+        batch.current[a:b],
+        tick,
+        batch.origin[index],
+        batch.current_before[index],
+        batch.spool[a:b] - candidate[3],
+        batch.anchor[index],
+        work.spool[: b - a],
+        work.nodes,
+        work.node_end[: b - a],
+    )
+
+
+@kernel
 def residuals(
     batch: Batch, candidate: NDArray[np.float64], work: Workspace, out: NDArray[np.float64]
 ) -> int:
@@ -89,37 +112,34 @@ def residuals(
     for index in range(batch.tick.shape[0]):
         a, b = batch.start[index], batch.start[index + 1]
         n = b - a
-        constants = _constants(batch.constants[index])
-        tick = batch.tick[index]
-        tables = spool_tables(constants, candidate[0], candidate[1], tick)
-        spool, pressure = work.spool[:n], work.pressure[:n]
-        anchored += spool_response(
-            constants,
-            tables,
-            batch.current[a:b],
-            tick,
-            batch.origin[index],
-            batch.spool[a:b] - candidate[3],
-            batch.anchor[index],
-            spool,
-            work.nodes,
-            work.node_end[:n],
-        )
+        anchored += _run_spool(batch, candidate, work, index)
         jack_response(
-            constants,
+            _constants(batch.constants[index]),
             candidate[2],
             batch.origin[index],
             work.nodes,
             work.node_end[:n],
-            pressure,
+            work.pressure[:n],
             work.position[:n],
         )
         for k in range(n):
-            gap = (batch.spool[a + k] - candidate[3] - spool[k]) * batch.weight[0, a + k]
+            gap = (batch.spool[a + k] - candidate[3] - work.spool[k]) * batch.weight[0, a + k]
             out[0, a + k] = gap if math.isfinite(gap) else 0.0
-            gap = (batch.pressure[a + k] - candidate[4] - pressure[k]) * batch.weight[1, a + k]
+            gap = (batch.pressure[a + k] - candidate[4] - work.pressure[k]) * batch.weight[1, a + k]
             out[1, a + k] = gap if math.isfinite(gap) else 0.0
     return anchored
+
+
+@kernel
+def spool_rates(
+    batch: Batch, candidate: NDArray[np.float64], work: Workspace, out: NDArray[np.float64]
+) -> None:
+    """Velocity of the modelled spool at the end of each tick: out, m/s, shape (N,)."""
+    for index in range(batch.tick.shape[0]):
+        _run_spool(batch, candidate, work, index)
+        a = batch.start[index]
+        for k in range(batch.start[index + 1] - a):
+            out[a + k] = work.nodes[work.node_end[k] - 1, 3]
 
 
 @kernel

@@ -171,6 +171,7 @@ def make_batch(
         tick=np.array([part[0].tick for part in parts]),
         start=np.concatenate([[0], np.cumsum([b - first for _, first, _, b in parts])]),
         origin=np.array(origins),
+        current_before=np.array([e.trace.current[i - 1] if i else 0.0 for e, i, _, _ in parts]),
         current=np.concatenate([e.trace.current[i:b] for e, i, _, b in parts]),
         spool=np.concatenate([e.spool[i:b] for e, i, _, b in parts]),
         pressure=np.concatenate([e.pressure[i:b] for e, i, _, b in parts]),

@@ -20,15 +20,35 @@ from ehadiag.parameters import FAULTS
 
 __all__ = ["Estimate", "Fit", "Identification", "Timing", "identify"]
 
-SEARCH_DEVIATION = 0.02
-"""Deviation of the genetic search about the first approximation."""
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How one attempt searches.
+
+    deviation: of the genetic search about its start, fault constants.
+    budget: in budgets of the solver.
+    median_offsets: take the median gap at the start for constant errors of the sensors; else take
+        only what the actuator at rest showed.
+    """
+
+    deviation: float
+    budget: float = 1.0
+    median_offsets: bool = False
+
+
+PLANS = (
+    Plan(0.02),
+    Plan(0.02, median_offsets=True),
+    Plan(0.1, budget=2.0),
+    Plan(0.1, budget=2.0, median_offsets=True),
+    Plan(0.4, budget=3.0),
+)
+"""One after the other until the model explains the recording."""
 SEARCH_LEAD_S = 0.1
-RESCUE_DEVIATION = 0.4
-RESCUE_BUDGET = 2000
 ANCHOR_LSB = (1.3, 6.0)
 """Re-anchoring of the refinement: filtered and single innovations beyond, LSB."""
-POOR_FIT = 0.05
-"""Share of gaps beyond three deviations that sends the search back to the whole cube."""
+POOR_FIT = 0.01
+"""Share of gaps beyond three deviations that asks for another attempt."""
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
@@ -107,9 +127,14 @@ class Identification:
     search_cost: float
     cost: float
     converged: bool
-    rescued: bool
-    """Whether the search had to go back to the whole cube."""
+    attempts: int
+    """Searches that it took; more than one where the first did not explain the recording."""
     timing: Timing
+
+    @property
+    def rescued(self) -> bool:
+        """Whether the first search did not explain the recording."""
+        return self.attempts > 1
 
 
 def identify(
@@ -128,73 +153,71 @@ def identify(
     begin = time.perf_counter()
     tell("first approximation", 0.0)
     first = first_approximation(experiments)
+    start, zero = np.array(first.values), np.zeros(2)
     searched_at = time.perf_counter()
-    windows = [experiment.test.windows.refinement for experiment in experiments]
-    offsets = median_offsets(make_batch(experiments), np.array(first.values))
-    objective = Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S), offsets)
-    found = _search(solver, objective, np.array(first.values), SEARCH_DEVIATION, seed, tell)
-    refined_at = time.perf_counter()
-    tell("refinement", 0.0)
-    candidates = [found.best, np.array(first.values)]
-    refined, experiments, evaluations = _best_refinement(experiments, candidates, offsets)
-    evaluations += first.evaluations + found.evaluations
-    rescued = _outliers(refined) > POOR_FIT
-    if rescued:
-        wide = solver.with_budget(RESCUE_BUDGET)
-        again = Objective(make_batch(experiments), offsets)
-        second = _search(wide, again, found.best, RESCUE_DEVIATION, seed + 1, tell)
-        other, others, spent = _best_refinement(experiments, [second.best], offsets)
-        evaluations += second.evaluations + spent
-        if other.cost < refined.cost:
-            refined, experiments, found = other, others, second
+    search_s = 0.0
+    evaluations = first.evaluations
+    best: _Attempt | None = None
+    for number, plan in enumerate(PLANS):
+        before = time.perf_counter()
+        offsets = zero
+        if plan.median_offsets:
+            offsets = median_offsets(make_batch(experiments), start)
+        windows = [experiment.test.windows.refinement for experiment in experiments]
+        found = solver.with_budget(round(solver.budget * plan.budget)).minimise(
+            Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S), offsets),
+            start,
+            plan.deviation,
+            seed + number,
+            lambda done, budget: tell("search", done / budget),
+        )
+        search_s += time.perf_counter() - before
+        tell("refinement", 0.0)
+        attempt = _attempt(experiments, found)
+        evaluations += found.evaluations + attempt.evaluations
+        if best is None or attempt.score < best.score:
+            best = attempt
+        if _outliers(best.refined) <= POOR_FIT:
+            break
+        start = best.refined.values
+    assert best is not None
     end = time.perf_counter()
-    spread = covariance(refined)
+    spread = covariance(best.refined)
     return Identification(
-        estimates=_estimates(first, found, refined, spread),
+        estimates=_estimates(first, best.found, best.refined, spread),
         covariance=spread,
-        fit=_fit(refined, experiments),
+        fit=_fit(best.refined, best.experiments),
         solver=solver.name,
         seed=seed,
         evaluations=evaluations,
-        generations=found.generations,
-        search_cost=found.cost,
-        cost=refined.cost,
-        converged=refined.converged,
-        rescued=rescued,
-        timing=Timing(searched_at - begin, refined_at - searched_at, end - refined_at),
+        generations=best.found.generations,
+        search_cost=best.found.cost,
+        cost=best.refined.cost,
+        converged=best.refined.converged,
+        attempts=number + 1,
+        timing=Timing(searched_at - begin, search_s, end - searched_at - search_s),
     )
 
 
-def _search(
-    solver: Solver,
-    objective: Objective,
-    start: NDArray[np.float64],
-    deviation: float,
-    seed: int,
-    tell: Progress,
-) -> SearchResult:
-    return solver.minimise(
-        objective, start, deviation, seed, lambda done, budget: tell("search", done / budget)
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class _Attempt:
+    """One search and its refinement."""
+
+    found: SearchResult
+    refined: Refinement
+    experiments: Sequence[Experiment]
+    """With their noise as judged."""
+    evaluations: int
+    """Of the refinement."""
+    score: float
+    """Twice the negative logarithm of the likelihood: comparable where the noise differs."""
 
 
-def _best_refinement(
-    experiments: Sequence[Experiment],
-    starts: Sequence[NDArray[np.float64]],
-    offsets: NDArray[np.float64],
-) -> tuple[Refinement, Sequence[Experiment], int]:
-    """Refine from each start until one explains the recording, then weigh by the noise it leaves.
-
-    Returns the refinement, the experiments with their noise as judged, and evaluations.
-    """
-    best = _refine(experiments, starts[0], offsets)
+def _attempt(experiments: Sequence[Experiment], found: SearchResult) -> _Attempt:
+    """Refine the optimum of a search, weighing by the noise that the gaps show."""
+    offsets = median_offsets(make_batch(experiments), found.best)
+    best = _refine(experiments, found.best, offsets)
     evaluations = best.evaluations
-    for start in starts[1:]:
-        if _outliers(best) <= POOR_FIT:
-            break
-        other = _refine(experiments, start, offsets)
-        evaluations += other.evaluations
-        best = min(best, other, key=lambda item: item.cost)
     for _ in range(JUDGEMENTS):
         before = [(item.spool_noise, item.pressure_noise) for item in experiments]
         experiments = [
@@ -206,7 +229,9 @@ def _best_refinement(
         after = [(item.spool_noise, item.pressure_noise) for item in experiments]
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
-    return best, experiments, evaluations
+    weight = make_batch(experiments).weight
+    score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())
+    return _Attempt(found, best, experiments, evaluations, score)
 
 
 def _refine(

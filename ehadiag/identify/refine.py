@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch, Workspace, residuals, workspace
+from ehadiag.identify.batch import Batch, Workspace, residuals, spool_rates, workspace
 
 __all__ = ["CAP", "Refinement", "median_offsets", "refine"]
 
@@ -40,6 +40,8 @@ class Refinement:
     gaps: weighted gaps there, shape (2, N), 0 where no sample.
     jacobian: derivative of the gaps by the fault constants and, scaled by the noise, by the
         offsets; 0 in rows left out; shape (5, 2, N).
+    spool_rate: velocity of the modelled spool at the end of each tick, weighted like its gap, 1/s,
+        shape (N,).
     used: rows that took part, shape (2, N).
     weighted: rows that have a sample, shape (2, N).
     evaluations: runs of the model.
@@ -52,6 +54,7 @@ class Refinement:
     cost: float
     gaps: NDArray[np.float64]
     jacobian: NDArray[np.float64]
+    spool_rate: NDArray[np.float64]
     used: NDArray[np.bool_]
     weighted: NDArray[np.bool_]
     evaluations: int
@@ -75,6 +78,12 @@ class _Model:
         self.anchored = residuals(self.batch, x * self.scale, self.work, out)
         self.evaluations += 1
         return out
+
+    def spool_rate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weighted velocity of the spool at the end of each tick, 1/s, shape (N,)."""
+        out = np.empty(len(self.batch.current))
+        spool_rates(self.batch, x * self.scale, self.work, out)
+        return out * self.batch.weight[0]
 
     def jacobian(
         self, x: NDArray[np.float64], gaps: NDArray[np.float64]
@@ -157,6 +166,7 @@ def refine(
         cost=cost,
         gaps=gaps,
         jacobian=jacobian,
+        spool_rate=model.spool_rate(x),
         used=used,
         weighted=weighted,
         evaluations=model.evaluations,

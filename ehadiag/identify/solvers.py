@@ -43,6 +43,11 @@ class Solver(Protocol):
         """What results call it."""
         ...
 
+    @property
+    def budget(self) -> int:
+        """Evaluations at most."""
+        ...
+
     def with_budget(self, budget: int) -> Solver:
         """Return the same solver with another number of evaluations."""
         ...

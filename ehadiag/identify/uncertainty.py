@@ -12,6 +12,8 @@ __all__ = ["covariance", "interval95", "normal_matrix"]
 
 LAGS = 20
 """Ticks over which gaps are held to be correlated."""
+TIMING_STD = 0.15e-6
+"""s; half a step of a plant that is integrated at 0.25 µs is of this size."""
 UNIFORM_STD = 1.0 / np.sqrt(12.0)
 """Standard deviation of a constant of which nothing is known but 0 … 1."""
 
@@ -28,7 +30,9 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     The larger of two, constant by constant: the inverse curvature times the reduced sum of squares
     (never below 1), and the sandwich estimate with gaps correlated over some ticks (Newey and
     West, Econometrica 55(3), 1987), which grows with what the model does not explain.
-    A constant that the test does not show has the variance of a uniform density.
+    A constant that the test does not show has the variance of a uniform density. On top comes what
+    the unknown instant of sampling does: where the converters read `TIMING_STD` earlier or later
+    than the model holds, the estimate moves in proportion.
     """
     normal = normal_matrix(refinement)
     # A weak prior keeps a constant that nothing shows finite: uniform on 0 … 1.
@@ -40,12 +44,19 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     curved = inverse * max(reduced / EXPECTED_CAPPED, 1.0)
     sandwich = inverse @ _meat(refinement) @ inverse
     factor = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(curved), 1e-300), 1.0))
-    out = curved * np.outer(factor, factor)
+    shift = inverse @ _late(refinement) * TIMING_STD
+    out = curved * np.outer(factor, factor) + np.outer(shift, shift)
     return np.asarray(out[:FAULT_COUNT, :FAULT_COUNT])
 
 
 EXPECTED_CAPPED = float(norm.expect(lambda x: x * x, lb=-3.0, ub=3.0, conditional=True))
 """Mean square of a normal variable of which values beyond three deviations are left out."""
+
+
+def _late(refinement: Refinement) -> NDArray[np.float64]:
+    """Gradient that sampling 1 s later adds, shape (5,); from the spool, which moves fastest."""
+    used = refinement.used[0]
+    return np.asarray(refinement.jacobian[:, 0, used] @ refinement.spool_rate[used])
 
 
 def _meat(refinement: Refinement) -> NDArray[np.float64]:

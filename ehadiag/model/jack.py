@@ -22,7 +22,7 @@ SHORTEST = 1e-9
 """Pieces shorter than this (s) are taken as no time at all."""
 TRAVEL = 1.0e-6
 """Spool travel (m) within one part of a piece, near the closed orifice."""
-RATIO = 0.15
+RATIO = 0.08
 """The same as a share of the spool's distance from the middle, elsewhere."""
 BEND = 0.1e-6
 """Largest distance (m) between a part's path and its chord."""
@@ -115,12 +115,14 @@ def _approach(
     slope1 = (c.AJ * end_supply_rate - steady1 * area2 * end_resistance_rate) * ease1
     mean = (steady1 - steady0) / span
     bend = (slope1 - mean) / span
-    tau = c.MJ * ease0
-    drift = max((c.MJ * ease1 - tau) / span, DRIFT)
+    tau, end_tau = c.MJ * ease0, c.MJ * ease1
+    drift = max((end_tau - tau) / span, DRIFT)
     p2 = bend / (1.0 + 2.0 * drift)
     p1 = (2.0 * mean - slope1 - 2.0 * p2 * tau) / (1.0 + drift)
     p0 = steady0 - tau * p1
-    rate = (0.5 * area2 * (resistance + end_resistance) + c.CJ) / c.MJ
+    # Mean of 1/tau by Simpson's rule.
+    rate = (area2 * (resistance + end_resistance) + 2.0 * c.CJ) / (6.0 * c.MJ)
+    rate += 4.0 / (3.0 * (tau + end_tau))
     return p0, p1, p2, velocity - p0, rate
 
 

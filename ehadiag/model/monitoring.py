@@ -59,6 +59,7 @@ def respond(
     tick: float,
     *,
     origin: float = 0.0,
+    current_before: float = 0.0,
     measured: NDArray[np.float64] | None = None,
     anchor: Anchor = FREE_RUN,
 ) -> Response:
@@ -70,6 +71,7 @@ def respond(
     current: servovalve current of each tick, A, shape (n,).
     tick: length of a tick, s.
     origin: spool position before the first tick, m.
+    current_before: current before the first tick, A.
     measured: spool position to re-anchor on, m, shape (n,), NaN where missing.
     """
     n = len(current)
@@ -84,6 +86,7 @@ def respond(
         current,
         tick,
         origin,
+        current_before,
         reference,
         anchor.as_array(),
         spool,

@@ -30,7 +30,10 @@ NODE_LEVEL = 5
 NODES_PER_TICK = 128
 """Room for nodes of one tick."""
 NODE_COLUMNS = 5
-BEND = 0.02e-6
+LAST = WHOLE - (WHOLE >> BASE)
+"""Start of the last ordinary step: pressure at the end of a tick hangs on the last piece most."""
+LAST_BEND = 0.002e-6
+BEND = 0.05e-6
 """A node is written where the path bends away from its chord by about this much, m."""
 
 NOTHING = 0
@@ -141,6 +144,7 @@ def spool_response(
     current: NDArray[np.float64],
     tick: float,
     origin: float,
+    current_before: float,
     measured: NDArray[np.float64],
     anchor: NDArray[np.float64],
     spool: NDArray[np.float64],
@@ -153,7 +157,8 @@ def spool_response(
     ----------
     current: servovalve current of each tick, A, shape (n,).
     tick: s.
-    origin: spool position before the first tick, m; the flapper is in equilibrium there.
+    origin: spool position before the first tick, m.
+    current_before: current before the first tick, A; the flapper is in equilibrium with both.
     measured: measured spool position, m, shape (n,), NaN where missing; used only to re-anchor.
     anchor: (gain, small, large): after each tick the innovation e is filtered, f += gain (e - f);
         where abs(e) > large the model is moved by e, where abs(f) > small by f. All m but gain.
@@ -171,7 +176,7 @@ def spool_response(
     c, t = constants, tables.scalars
     moving, stuck, decay = tables.moving, tables.stuck, tables.decay
     xs = min(max(origin, -c.XSM), c.XSM)
-    xf = (c.GM * current[0] - c.KSF * xs) / c.KF
+    xf = (c.GM * current_before - c.KSF * xs) / c.KF
     xf = min(max(xf, -t.breakaway), t.breakaway)
     wf, vs = 0.0, 0.0
     direction = 0  # of the spool's motion, +1 or -1; 0 at rest
@@ -242,9 +247,10 @@ def spool_response(
             since += WHOLE >> level
             slowest, fastest = min(slowest, end), max(fastest, end)
             span = tick * since / WHOLE
+            bend = 0.125 * (fastest - slowest) * span
             wanted = event > NOTHING or (
                 done & ((WHOLE >> NODE_LEVEL) - 1) == 0
-                and 0.125 * (fastest - slowest) * span > BEND
+                and (bend > BEND or (done == LAST and bend > LAST_BEND))
             )
             if done == WHOLE or (wanted and count < full):
                 nodes[count, 0] = span
