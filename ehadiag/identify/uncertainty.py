@@ -14,6 +14,8 @@ LAGS = 20
 """Ticks over which gaps are held to be correlated."""
 TIMING_STD = 0.15e-6
 """s; half a step of a plant that is integrated at 0.25 µs is of this size."""
+DISCREPANCY_STD = 2.5e-5
+"""Fault constant; what estimates from a plant integrated by other means differ by beyond noise."""
 UNIFORM_STD = 1.0 / np.sqrt(12.0)
 """Standard deviation of a constant of which nothing is known but 0 … 1."""
 
@@ -32,7 +34,8 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     West, Econometrica 55(3), 1987), which grows with what the model does not explain.
     A constant that the test does not show has the variance of a uniform density. On top comes what
     the unknown instant of sampling does: where the converters read `TIMING_STD` earlier or later
-    than the model holds, the estimate moves in proportion.
+    than the model holds, the estimate moves in proportion; and `DISCREPANCY_STD`, for what either
+    side's integration is off.
     """
     normal = normal_matrix(refinement)
     # A weak prior keeps a constant that nothing shows finite: uniform on 0 … 1.
@@ -46,6 +49,7 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     factor = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(curved), 1e-300), 1.0))
     shift = inverse @ _late(refinement) * TIMING_STD
     out = curved * np.outer(factor, factor) + np.outer(shift, shift)
+    out += DISCREPANCY_STD**2 * np.eye(len(out))
     return np.asarray(out[:FAULT_COUNT, :FAULT_COUNT])
 
 

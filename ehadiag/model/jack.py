@@ -22,7 +22,7 @@ SHORTEST = 1e-9
 """Pieces shorter than this (s) are taken as no time at all."""
 TRAVEL = 1.0e-6
 """Spool travel (m) within one part of a piece, near the closed orifice."""
-RATIO = 0.08
+RATIO = 0.05
 """The same as a share of the spool's distance from the middle, elsewhere."""
 BEND = 0.1e-6
 """Largest distance (m) between a part's path and its chord."""
