@@ -19,12 +19,10 @@ from ehadiag.identify.batch import Batch, Workspace, residuals, spool_rates, wor
 __all__ = ["CAP", "Refinement", "median_offsets", "refine"]
 
 CAP = 9.0
-STEP = 2e-4
+STEP = 5e-5
 """Half-width of the differences, fault constants."""
 KINK = 0.3
 """Two-sided differences that disagree by more (in units of noise) mark a break-away."""
-STEEP = 1.0
-"""So does a change by more than this over the differences: a jump that both sides share."""
 ITERATIONS = 20
 CONVERGED = 1e-6
 FAULT_COUNT = 3
@@ -101,7 +99,6 @@ class _Model:
             out[j] = (high - low) / (above[j] - below[j])
             straight = low + out[j] * (x[j] - below[j])
             smooth &= np.abs(gaps - straight) < KINK
-            smooth &= np.abs(high - low) < STEEP
         out[3, 0] = -self.batch.weight[0] * self.scale[3]
         out[4, 1] = -self.batch.weight[1] * self.scale[4]
         return out, smooth

@@ -14,7 +14,7 @@ LAGS = 20
 """Ticks over which gaps are held to be correlated."""
 TIMING_STD = 0.15e-6
 """s; half a step of a plant that is integrated at 0.25 µs is of this size."""
-DISCREPANCY_STD = 2.5e-5
+DISCREPANCY_STD = 3e-5
 """Fault constant; what estimates from a plant integrated by other means differ by beyond noise."""
 UNIFORM_STD = 1.0 / np.sqrt(12.0)
 """Standard deviation of a constant of which nothing is known but 0 … 1."""
