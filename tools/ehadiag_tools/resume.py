@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -76,6 +77,9 @@ def _work(
             keep(key, worker(run))
             advance()
         return
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        # The workers inherit it: one thread each, they already fill the cores.
+        os.environ.setdefault(name, "1")
     # "spawn": a fork of a process that shows progress in a thread may hang.
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         futures = {pool.submit(worker, run): key for key, run in waiting.items()}
