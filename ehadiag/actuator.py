@@ -109,7 +109,7 @@ def load_actuator(path: Path | str) -> Actuator:
     InputOutputError: the file cannot be read.
     ConfigurationError: not TOML, a key unknown or missing, a value out of its range.
     """
-    return _checked(read_toml(Path(path), Actuator, "actuator file"), str(path))
+    return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
 
 
 def default_actuator() -> Actuator:

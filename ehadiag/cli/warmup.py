@@ -7,6 +7,7 @@ import time
 
 from ehadiag.actuator import default_actuator
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.recording import CommandMode
 from ehadiag.storedtest import bundled_tests
 
 __all__ = ["add_parser", "run"]
@@ -34,6 +35,6 @@ def run(_arguments: argparse.Namespace) -> int:
 
     for test in bundled_tests().values():
         warm_up(default_actuator(), test)
-    Plant(default_actuator())
+    Plant(default_actuator()).tick(0.0, CommandMode.CURRENT)
     say(f"kernels ready in {cache_folder()} after {time.perf_counter() - begin:.1f} s")
     return 0

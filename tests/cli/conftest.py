@@ -1,0 +1,42 @@
+"""The command line in this process: exit code, standard output, standard error."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from cli_result import Result, Run
+
+from ehadiag.cli.main import main
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled() -> None:
+    """No test shall see, or wait for, the compiler."""
+    assert main(["warmup"]) == 0
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Call `ehadiag` in an empty folder, without a bus in the environment."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("CAN_INTERFACE", "CAN_CHANNEL"):
+        monkeypatch.delenv(name, raising=False)
+
+    def call(*arguments: object) -> Result:
+        capsys.readouterr()
+        try:
+            code = main([str(item) for item in arguments])
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        captured = capsys.readouterr()
+        return Result(code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def environment() -> dict[str, str]:
+    """Environment of a child process, without a bus."""
+    return {key: value for key, value in os.environ.items() if not key.startswith("CAN_")}
