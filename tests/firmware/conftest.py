@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import shutil
@@ -47,12 +48,21 @@ def wire() -> Iterator[tuple[str, str]]:
     (a, a_end), (b, b_end) = os.openpty(), os.openpty()
     for item in (a, b, a_end, b_end):
         tty.setraw(item)
+    for item in (a, b):
+        os.set_blocking(item, False)
     stop = threading.Event()
+
+    def forward(target: int, data: bytes) -> None:
+        # An end that nobody reads fills up: its writer must not hang for ever.
+        while data and not stop.is_set():
+            if select.select([], [target], [], 0.02)[1]:
+                with contextlib.suppress(BlockingIOError):
+                    data = data[os.write(target, data) :]
 
     def join() -> None:
         while not stop.is_set():
             for source in select.select([a, b], [], [], 0.02)[0]:
-                os.write(b if source == a else a, os.read(source, 4096))
+                forward(b if source == a else a, os.read(source, 4096))
 
     thread = threading.Thread(target=join)
     thread.start()
