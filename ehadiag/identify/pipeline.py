@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment, judge_noise, make_batch
 from ehadiag.identify.first import FirstApproximation, first_approximation
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.refine import CAP, Refinement, median_offsets, refine
+from ehadiag.identify.refine import CAP, Refinement, describe, median_offsets, refine
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
@@ -47,6 +47,8 @@ PLANS = (
 SEARCH_LEAD_S = 0.1
 ANCHOR_LSB = (1.3, 6.0)
 """Re-anchoring of the refinement: filtered and single innovations beyond, LSB."""
+POLISH = CompactGa(budget=241, virtual_population=30.0, tolerance=1e-7)
+POLISH_DEVIATION = 3e-4
 POOR_FIT = 0.01
 """Share of gaps beyond three deviations that asks for another attempt."""
 JUDGEMENTS = 3
@@ -229,9 +231,27 @@ def _attempt(experiments: Sequence[Experiment], found: SearchResult) -> _Attempt
         after = [(item.spool_noise, item.pressure_noise) for item in experiments]
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
+    if best.jagged:
+        best = _polish(experiments, best)
+        evaluations += best.evaluations
     weight = make_batch(experiments).weight
     score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())
     return _Attempt(found, best, experiments, evaluations, score)
+
+
+def _polish(experiments: Sequence[Experiment], best: Refinement) -> Refinement:
+    """Search the neighbourhood where steps in the cost may have held up the descent.
+
+    The seed is fixed: the answer depends on the recording, not on the search before.
+    """
+    batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
+    objective = Objective(batch, best.offsets, cap=CAP)
+    found = POLISH.minimise(objective, best.values, POLISH_DEVIATION, seed=0)
+    if found.cost >= best.cost:
+        return best
+    noise = experiments[0].spool_noise, experiments[0].pressure_noise
+    other = describe(batch, found.best, best.offsets, noise)
+    return replace(other, evaluations=other.evaluations + found.evaluations)
 
 
 def _refine(
