@@ -12,7 +12,7 @@ import atheris
 NAMES = ("frames", "serial", "logs", "mappings")
 SEEN = ("firmware_iface", "ehadiag", "cantools", "textparser", "tomllib", "can")
 """Packages whose branches guide the search."""
-HANG_S = 5
+HANG_S = 20
 MEMORY_MB = 2048
 
 
