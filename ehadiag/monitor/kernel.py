@@ -1,0 +1,214 @@
+"""One tick of the monitoring model from a state carried between calls: kernel of the monitor.
+
+The same steps, events and closed forms as `ehadiag.model.spool` and `ehadiag.model.jack`, of which
+it takes the parts without arrays; a test holds it to their answer.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.jit import kernel
+from ehadiag.model.constants import PlantConstants
+from ehadiag.model.transition import SpoolScalars
+from ehadiag.monitor.jacktick import jack_tick
+from ehadiag.monitor.layout import (
+    ANCHOR_GAIN,
+    ANCHOR_LARGE,
+    ANCHOR_SMALL,
+    CLOSED,
+    CODE_POSITION,
+    COMMAND,
+    CUSUM,
+    DEVIATION,
+    ERROR_BEFORE,
+    FILTERED,
+    GAD,
+    GAI,
+    GAP,
+    IM,
+    INTEGRAL,
+    INVERTIBLE,
+    JACK_POSITION,
+    LIMIT,
+    LINEAR,
+    LOST,
+    OFFSETS,
+    PREDICTED,
+    REFERENCE,
+    RESIDUAL,
+    SCALARS,
+    SEEN,
+    SLOPE,
+    STARTED,
+    THRESHOLD,
+    TICK,
+    WEIGHTS,
+    XS,
+)
+from ehadiag.monitor.spooltick import spool_tick
+
+__all__ = ["push_tick"]
+
+Vector = NDArray[np.float64]
+
+LONGEST = 5.0
+"""Ticks that a lost command is taken to go on straight; then it stands."""
+
+
+@kernel
+def _plant(p: Vector) -> PlantConstants:
+    return PlantConstants(
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11], p[12],
+        p[13], p[14], p[15], p[16], p[17], p[18], p[19], p[20], p[21], p[22], p[23], p[24],
+    )  # fmt: skip
+
+
+@kernel
+def _scalars(p: Vector) -> SpoolScalars:
+    a = SCALARS
+    return SpoolScalars(p[a], p[a + 1], p[a + 2], p[a + 3], p[a + 4], p[a + 5])
+
+
+@kernel
+def _followed(s: Vector, command: float) -> tuple[float, bool]:
+    """Command of the tick, and whether it is known: a lost one goes on straight for some ticks."""
+    if math.isfinite(command):
+        s[SLOPE] = command - s[COMMAND] if s[LOST] == 0.0 else 0.0
+        s[COMMAND], s[LOST] = command, 0.0
+        return command, True
+    s[LOST] += 1.0
+    if s[LOST] <= LONGEST:
+        s[COMMAND] += s[SLOPE]
+    return float(s[COMMAND]), False
+
+
+@kernel
+def _position_seen(p: Vector, s: Vector, command: float, current: float) -> float:
+    """Digitised jack position that the control law of this tick worked on, m."""
+    if math.isfinite(s[SEEN]):
+        return float(s[SEEN])
+    if not math.isfinite(current) or p[GAP] <= 0.0:
+        return float(command - s[ERROR_BEFORE])
+    place = command - current / p[GAP]
+    if p[INVERTIBLE] != 0.0 and abs(current) < p[LINEAR]:
+        # One code of position is many codes of current.
+        return float(np.round(place / p[CODE_POSITION]) * p[CODE_POSITION])
+    return float(place)
+
+
+@kernel
+def _control_law(p: Vector, s: Vector, error: float) -> float:
+    """Demanded current, A, unlimited by the converter; as `ehadiag.identify.current` has it."""
+    wanted = p[GAP] * error
+    if s[STARTED] != 0.0:
+        wanted += p[GAD] * (error - s[ERROR_BEFORE]) / p[TICK]
+    trial = s[INTEGRAL] + error * p[TICK]
+    wanted += p[GAI] * trial
+    out = min(max(wanted, -p[IM]), p[IM])
+    # Conditional integration: the integral rests while it would push further into saturation.
+    if wanted == out or (wanted - out) * error < 0.0:
+        s[INTEGRAL] = trial
+    s[ERROR_BEFORE] = error
+    s[STARTED] = 1.0
+    return float(out)
+
+
+@kernel
+def _commanded(p: Vector, s: Vector, command: float, current: float, position: float) -> float:
+    """Servovalve current of the tick, A.
+
+    The measured one carries noise: it stands in only where the command is lost and does not go on
+    as it was.
+    """
+    followed, known = _followed(s, command)
+    if p[CLOSED] == 0.0:
+        out = min(max(followed, -p[IM]), p[IM])
+    else:
+        out = _control_law(p, s, followed - _position_seen(p, s, followed, current))
+    if not known and abs(current - out) > p[DEVIATION]:
+        out = min(max(current, -p[IM]), p[IM])
+        if p[CLOSED] == 0.0:
+            s[COMMAND], s[SLOPE] = out, 0.0
+    s[SEEN] = position
+    return float(out)
+
+
+@kernel
+def _re_anchor(p: Vector, s: Vector, bound: float, error: float) -> float:
+    """Move the modelled spool as `ehadiag.model.monitoring.Anchor` says; returns by how much, m."""
+    if not math.isfinite(error):
+        return 0.0
+    s[FILTERED] += p[ANCHOR_GAIN] * (error - s[FILTERED])
+    move = 0.0
+    if abs(error) > p[ANCHOR_LARGE]:
+        move = error
+    elif abs(s[FILTERED]) > p[ANCHOR_SMALL]:
+        move = s[FILTERED]
+    if move == 0.0:
+        return 0.0
+    before = s[XS]
+    s[XS] = min(max(before + move, -bound), bound)
+    s[FILTERED] = 0.0
+    return float(s[XS] - before)
+
+
+@kernel
+def _accumulate(p: Vector, s: Vector, alarmed: NDArray[np.bool_], channel: int) -> None:
+    """Advance both sums of a channel; a sum that gives alarm begins anew, a lost sample rests."""
+    z = s[RESIDUAL + channel]
+    for side in range(2):
+        alarmed[channel, side] = False
+        if not math.isfinite(z):
+            continue
+        at = CUSUM + 2 * channel + side
+        step = min(max(z, -p[LIMIT]), p[LIMIT])
+        if side == 1:
+            step = -step
+        s[at] = max(0.0, s[at] + step - p[REFERENCE])
+        if s[at] > p[THRESHOLD]:
+            alarmed[channel, side] = True
+            s[at] = 0.0
+
+
+@kernel
+def push_tick(
+    parameters: Vector,
+    moving: Vector,
+    stuck: Vector,
+    decay: Vector,
+    state: Vector,
+    nodes: Vector,
+    alarmed: NDArray[np.bool_],
+    command: float,
+    current: float,
+    spool: float,
+    pressure: float,
+    position: float,
+) -> None:
+    """Advance model and sums by one tick, in place.
+
+    Parameters
+    ----------
+    parameters, state: see `ehadiag.monitor.layout`.
+    moving, stuck, decay: see `ehadiag.model.transition.SpoolTables`.
+    nodes: scratch, shape (NODES_PER_TICK, NODE_COLUMNS).
+    alarmed: out, shape (2, 2), rows spool and pressure, columns upper and lower sum.
+    command, current, spool, pressure, position: the tick's sample, SI, NaN where lost.
+    """
+    p, s = parameters, state
+    c = _plant(p)
+    torque = c.GM * _commanded(p, s, command, current, position)
+    count = spool_tick(c, _scalars(p), moving, stuck, decay, torque, p[TICK], s, nodes)
+    s[PREDICTED] = s[XS]
+    gap = spool - p[OFFSETS] - s[XS]
+    s[RESIDUAL] = gap * p[WEIGHTS]
+    jump = _re_anchor(p, s, c.XSM, gap)
+    s[PREDICTED + 1] = jack_tick(c, p, nodes, count, jump, s)
+    s[PREDICTED + 2] = s[JACK_POSITION]
+    s[RESIDUAL + 1] = (pressure - p[OFFSETS + 1] - s[PREDICTED + 1]) * p[WEIGHTS + 1]
+    _accumulate(p, s, alarmed, 0)
+    _accumulate(p, s, alarmed, 1)

@@ -1,0 +1,219 @@
+"""The streaming monitor: one sample a tick in, residuals and their cumulative sums out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.actuator import Actuator, Controller
+from ehadiag.channels import CURRENT, POSITION, PRESSURE, SPOOL
+from ehadiag.errors import ConfigurationError
+from ehadiag.model.constants import plant_constants
+from ehadiag.model.monitoring import Anchor
+from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK
+from ehadiag.model.transition import spool_tables
+from ehadiag.monitor import layout
+from ehadiag.monitor.cusum import CusumDesign, design_cusum
+from ehadiag.monitor.kernel import push_tick
+from ehadiag.recording import CommandMode, Environment
+
+__all__ = ["Monitor", "Reading", "Tick"]
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+NOISE_LSB = math.sqrt(0.5**2 + 1.0 / 12.0)
+"""Noise of a channel of the contract (bus.md), its converter's rounding included."""
+ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
+RESIDUAL_LIMIT = 4.0
+"""Noise; a residual beyond counts no more: one break-away at another tick gives no alarm."""
+DEVIATION_LSB = 4.0
+"""A lost command did not go on as it was where the measured current is further off."""
+TICKS_S = (1e-5, 0.1)
+
+
+class Tick(NamedTuple):
+    """What the bus says of one control tick; SI, NaN where lost or at the converter's end."""
+
+    command: float
+    """A or m, active during the tick."""
+    current: float
+    """A, as measured at the end of the tick, like the rest."""
+    spool: float
+    """m."""
+    pressure: float
+    """Pa."""
+    position: float
+    """m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What the monitor holds after a push; the arrays are its own and change with the next one.
+
+    Attributes
+    ----------
+    predicted: spool (m), pressure (Pa), position (m; from 0 at the start), shape (3,).
+    residual: measured less modelled spool and pressure, in units of noise, shape (2,); NaN where
+        the sample is lost.
+    cusum: upper and lower sum (columns) of spool and pressure (rows), in units of noise; a sum
+        that gave alarm is back at 0.
+    alarmed: which sums gave alarm at this tick, shape (2, 2).
+    """
+
+    predicted: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    cusum: NDArray[np.float64]
+    alarmed: NDArray[np.bool_]
+
+    def copy(self) -> Reading:
+        """Return a reading that stays."""
+        return Reading(
+            self.predicted.copy(), self.residual.copy(), self.cusum.copy(), self.alarmed.copy()
+        )
+
+
+class Monitor:
+    """Follows an actuator tick by tick.
+
+    `push` takes constant memory, no lock, and releases the interpreter lock in its kernel: call it
+    from the thread that receives, and from one thread only. It is compiled when the monitor is
+    made, never in `push`.
+
+    Parameters
+    ----------
+    actuator: data of the actuator.
+    faults: (Kintas, FSS, FDJ), each 0 … 1, as last identified.
+    environment: oil and supply; None: as the actuator's data say.
+    mode: what commands are.
+    hours: mean time between false alarms of the monitor as a whole, on white noise, h.
+    shift: of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
+    noise: standard deviation of spool (m) and pressure (Pa), white; None: the contract's.
+    offsets: constant errors of spool (m) and pressure sensor (Pa).
+    anchor: how the modelled spool is kept on the measured one.
+
+    Raises
+    ------
+    ConfigurationError: a value out of its range.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        faults: Sequence[float] | NDArray[np.float64],
+        environment: Environment | None = None,
+        *,
+        mode: CommandMode = CommandMode.CURRENT,
+        hours: float = 100.0,
+        shift: float = 1.0,
+        noise: tuple[float, float] | None = None,
+        offsets: tuple[float, float] = (0.0, 0.0),
+        anchor: Anchor = ANCHOR,
+    ) -> None:
+        tick = 1.0 / actuator.controller.rate
+        noise = noise or (NOISE_LSB * SPOOL.lsb, NOISE_LSB * PRESSURE.lsb)
+        values = _checked(faults, noise, offsets, tick)
+        constants = plant_constants(actuator, environment)
+        tables = spool_tables(constants, values[0], values[1], tick)
+        self.design: CusumDesign = design_cusum(hours, tick, shift)
+        """Reference value and threshold of the sums."""
+        p = np.zeros(layout.PARAMETERS)
+        p[: layout.SCALARS] = constants
+        p[layout.SCALARS : layout.TICK] = tables.scalars
+        p[layout.TICK] = tick
+        p[layout.DYNAMIC] = constants.FDJ0 + values[2] * (constants.FDJ1 - constants.FDJ0)
+        p[layout.IM : layout.CODE_POSITION + 1] = _control(actuator.controller, mode)
+        p[layout.ANCHOR_GAIN : layout.OFFSETS] = anchor.as_array()
+        p[layout.OFFSETS : layout.WEIGHTS] = offsets
+        p[layout.WEIGHTS : layout.REFERENCE] = 1.0 / noise[0], 1.0 / noise[1]
+        p[layout.REFERENCE] = self.design.reference
+        p[layout.THRESHOLD] = self.design.threshold
+        p[layout.LIMIT] = RESIDUAL_LIMIT
+        p[layout.DEVIATION] = DEVIATION_LSB * CURRENT.lsb
+        self._parameters = p
+        self._tables = tables.moving, tables.stuck, tables.decay
+        self._state = np.zeros(layout.STATES)
+        self._nodes = np.empty((NODES_PER_TICK, NODE_COLUMNS))
+        self._alarmed = np.zeros((2, 2), dtype=np.bool_)
+        self._fixed = p, *self._tables, self._state, self._nodes, self._alarmed
+        self.reading: Reading = Reading(
+            _view(self._state[layout.PREDICTED : layout.RESIDUAL]),
+            _view(self._state[layout.RESIDUAL : layout.CUSUM]),
+            _view(self._state[layout.CUSUM :].reshape(2, 2)),
+            _view(self._alarmed),
+        )
+        """What the last push left."""
+        self.push(Tick(0.0, 0.0, 0.0, 0.0, 0.0))
+        self.reset()
+
+    def push(self, sample: Tick) -> Reading:
+        """Advance by one tick; returns `reading`, always the same object.
+
+        Call it for every tick: a tick that did not arrive is `Tick` of five NaN.
+        """
+        command, current, spool, pressure, position = sample
+        push_tick(
+            *self._fixed,
+            float(command),
+            float(current),
+            float(spool),
+            float(pressure),
+            float(position),
+        )
+        return self.reading
+
+    def reset(self, spool: float = 0.0) -> None:
+        """Begin anew, from rest with the spool there (m), as a stored test begins."""
+        constants, scalars = self._parameters, layout.SCALARS
+        bound, breakaway = constants[11], constants[scalars + 3]
+        stiffness, wire = constants[3], constants[4]
+        self._state[:] = 0.0
+        self._alarmed[:] = False
+        xs = min(max(spool, -bound), bound)
+        self._state[layout.XS] = self._state[layout.JACK_SPOOL] = xs
+        self._state[layout.XF] = min(max(-wire * xs / stiffness, -breakaway), breakaway)
+        self._state[layout.SEEN] = math.nan
+
+
+def _checked(
+    faults: Sequence[float] | NDArray[np.float64],
+    noise: tuple[float, float],
+    offsets: tuple[float, float],
+    tick: float,
+) -> tuple[float, ...]:
+    values = tuple(float(value) for value in faults)
+    if len(values) != 3 or not all(0.0 <= value <= 1.0 for value in values):
+        raise ConfigurationError(f"fault constants {values}: need Kintas, FSS, FDJ, each 0 … 1")
+    if not all(0.0 < value < math.inf for value in noise):
+        raise ConfigurationError(f"noise {noise}: need two positive numbers, m and Pa")
+    if not all(math.isfinite(value) for value in offsets):
+        raise ConfigurationError(f"offsets {offsets}: need two numbers, m and Pa")
+    if not TICKS_S[0] <= tick <= TICKS_S[1]:
+        raise ConfigurationError(f"controller.rate {1.0 / tick:g} Hz: need 10 … 1e5 Hz")
+    return values
+
+
+def _control(law: Controller, mode: CommandMode) -> tuple[float, ...]:
+    """Parameters IM … CODE_POSITION of the layout."""
+    clear = law.GAP * POSITION.lsb > 6.0 * CURRENT.lsb
+    return (
+        law.IM,
+        law.GAP,
+        law.GAI,
+        law.GAD,
+        float(mode is CommandMode.POSITION),
+        float(clear and not law.GAI and not law.GAD),
+        law.IM - 3.0 * CURRENT.lsb,
+        POSITION.lsb,
+    )
+
+
+def _view(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,264 @@
+"""The streaming monitor against the model run on whole records, and what it does with defects."""
+
+import threading
+import tracemalloc
+from functools import lru_cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ehadiag.actuator import default_actuator
+from ehadiag.channels import PRESSURE, SPOOL
+from ehadiag.errors import ConfigurationError
+from ehadiag.identify.experiment import build_experiment
+from ehadiag.model.constants import plant_constants
+from ehadiag.model.monitoring import FREE_RUN, Anchor, respond
+from ehadiag.monitor import Monitor, Tick
+from ehadiag.recording import CommandMode
+from ehadiag.storedtest import resolve_test
+from firmware_iface.logs import read_recording
+
+LOGS = Path(__file__).parent.parent / "data" / "logs"
+MATCHED = {
+    "healthy-open.blf": (0.0, 0.0, 0.0),
+    "paper-open-2.blf": (0.3, 0.6, 0.3),
+    "paper-open-4.blf": (0.6, 0.6, 0.6),
+    "paper-closed-1.blf": (0.3, 0.3, 0.3),
+    "paper-closed-4.blf": (0.6, 0.6, 0.6),
+    "hot-worn-closed.asc": (0.2, 0.5, 0.1),
+}
+"""Recordings of the contract and their true constants (truth.csv)."""
+ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
+NAN = float("nan")
+NOTHING = Tick(NAN, NAN, NAN, NAN, NAN)
+
+
+@lru_cache(maxsize=8)
+def recorded(file):
+    recording = read_recording(LOGS / file)
+    s = recording.samples
+    rows = zip(s.command, s.current, s.spool, s.pressure, s.position, strict=True)
+    return recording, [Tick(*map(float, row)) for row in rows]
+
+
+def monitor_for(file, faults, **options):
+    recording, ticks = recorded(file)
+    monitor = Monitor(
+        default_actuator(),
+        faults,
+        recording.environment,
+        mode=recording.samples.mode,
+        **options,
+    )
+    return monitor, ticks
+
+
+def run(monitor, ticks):
+    """Predictions (n, 3), residuals (n, 2), alarms (n, 2, 2)."""
+    readings = [monitor.push(tick).copy() for tick in ticks]
+    return tuple(np.array([getattr(r, f) for r in readings]) for f in FIELDS)
+
+
+FIELDS = ("predicted", "residual", "alarmed")
+
+
+@pytest.mark.parametrize("anchor", [FREE_RUN, ANCHOR], ids=["free", "anchored"])
+@pytest.mark.parametrize("file", sorted(MATCHED))
+def test_tick_by_tick_equals_the_whole_record(file, anchor):
+    """With constants that are off, so that the model is re-anchored, and sticks elsewhere."""
+    faults = np.clip(np.add(MATCHED[file], (0.05, 0.1, -0.1)), 0.0, 1.0)
+    monitor, ticks = monitor_for(file, faults, anchor=anchor)
+    recording, _ = recorded(file)
+    name = "closed" if recording.samples.mode is CommandMode.POSITION else "open"
+    experiment = build_experiment(
+        recording.samples, recording.environment, resolve_test(name), default_actuator()
+    )
+    whole = respond(
+        experiment.constants,
+        faults,
+        experiment.trace.current,
+        experiment.tick,
+        measured=recording.samples.spool,
+        anchor=anchor,
+    )
+    predicted, residual, _ = run(monitor, ticks)
+    assert (whole.anchored > 0) == (anchor is ANCHOR)
+    for column, values in enumerate((whole.spool, whole.pressure, whole.position)):
+        scale = np.abs(values).max()
+        np.testing.assert_allclose(predicted[:, column], values, rtol=0.0, atol=1e-12 * scale)
+    noise = np.sqrt(0.5**2 + 1 / 12) * np.array([SPOOL.lsb, PRESSURE.lsb])
+    seen = np.column_stack([recording.samples.spool, recording.samples.pressure])
+    np.testing.assert_allclose(residual, (seen - predicted[:, :2]) / noise, atol=1e-9)
+
+
+def test_the_control_law_has_integral_and_derivative():
+    """An actuator with a full PID: the current is what the law gives on the recorded position."""
+    actuator = default_actuator()
+    law = msgspec.structs.replace(actuator.controller, GAI=3.0, GAD=1e-3)
+    actuator = msgspec.structs.replace(actuator, controller=law)
+    rng = np.random.default_rng(0)
+    command = np.repeat(rng.uniform(-8e-3, 8e-3, 20), 10)
+    place = np.cumsum(rng.normal(0.0, 3e-5, 200))
+    currents, integral, before = [], 0.0, None
+    for k, target in enumerate(command):
+        error = target - (place[k - 1] if k else target)
+        slope = 0.0 if before is None else (error - before) / 1e-3
+        trial, before = integral + error * 1e-3, error
+        wanted = law.GAP * error + law.GAI * trial + law.GAD * slope
+        out = np.clip(wanted, -law.IM, law.IM)
+        if wanted == out or (wanted - out) * error < 0.0:
+            integral = trial
+        currents.append(out)
+    monitor = Monitor(actuator, (0, 0, 0), mode=CommandMode.POSITION, anchor=FREE_RUN)
+    ticks = [Tick(c, NAN, NAN, NAN, x) for c, x in zip(command, place, strict=True)]
+    predicted, _, _ = run(monitor, ticks)
+    whole = respond(plant_constants(actuator), np.zeros(3), np.array(currents), 1e-3)
+    assert 0.1 < np.mean(np.abs(currents) == law.IM) < 0.9
+    np.testing.assert_allclose(predicted[:, 0], whole.spool, atol=1e-15)
+
+
+@pytest.mark.parametrize("file", sorted(MATCHED))
+def test_a_matched_recording_gives_no_alarm(file):
+    """A false alarm in 100 h: none in 5.5 s, though the actuator is not the monitoring model."""
+    monitor, ticks = monitor_for(file, MATCHED[file])
+    _, residual, alarmed = run(monitor, ticks)
+    assert not alarmed.any()
+    assert np.all(np.sqrt(np.mean(residual**2, axis=0)) < 1.25)
+
+
+@pytest.mark.parametrize(
+    ("file", "wrong", "channel", "within"),
+    [
+        ("paper-open-4.blf", (0.7, 0.6, 0.6), 0, 2600),
+        ("paper-open-4.blf", (0.6, 0.7, 0.6), 0, 1000),
+        ("paper-open-4.blf", (0.6, 0.6, 0.7), 1, 1000),
+        ("paper-closed-4.blf", (0.7, 0.6, 0.6), 0, 1000),
+        ("paper-closed-4.blf", (0.6, 0.7, 0.6), 0, 1000),
+        ("paper-closed-4.blf", (0.6, 0.6, 0.7), 1, 1000),
+    ],
+)
+def test_a_wrong_constant_gives_alarm(file, wrong, channel, within):
+    monitor, ticks = monitor_for(file, wrong)
+    _, _, alarmed = run(monitor, ticks)
+    first = int(np.flatnonzero(alarmed[:, channel].any(axis=1))[0])
+    assert first < within
+
+
+def test_lost_samples_change_no_verdict():
+    """Two per cent of the frames are lost: the residuals keep their size, no alarm."""
+    monitor, ticks = monitor_for("lossy-open.blf", (0.4, 0.2, 0.5))
+    lost = sum(np.isnan(tick).any() for tick in ticks)
+    _, residual, alarmed = run(monitor, ticks)
+    assert lost > 100
+    assert not alarmed.any()
+    assert np.all(np.sqrt(np.nanmean(residual**2, axis=0)) < 1.25)
+    np.testing.assert_array_equal(np.isnan(residual[:, 0]), [np.isnan(t.spool) for t in ticks])
+
+
+@pytest.mark.parametrize("file", ["paper-open-2.blf", "paper-closed-4.blf"])
+def test_whole_ticks_may_be_lost(file):
+    """A single tick of nothing, every 50 ticks."""
+    monitor, ticks = monitor_for(file, MATCHED[file])
+    holed = [NOTHING if k % 50 == 25 else tick for k, tick in enumerate(ticks)]
+    _, residual, _ = run(monitor, holed)
+    assert np.isnan(residual[25::50]).all()
+    assert np.all(np.nanmedian(np.abs(residual), axis=0) < 0.8)
+
+
+def test_a_lost_sample_leaves_the_sums():
+    monitor, ticks = monitor_for("healthy-open.blf", (0.0, 0.0, 0.0))
+    for tick in ticks[:500]:
+        before = monitor.push(tick).copy()
+    after = monitor.push(NOTHING)
+    assert before.cusum.any()
+    np.testing.assert_array_equal(after.cusum, before.cusum)
+
+
+values = st.one_of(
+    st.floats(-1e9, 1e9), st.just(NAN), st.just(np.inf), st.just(-np.inf), st.integers(-9, 9)
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(values, values, values, values, values), max_size=40),
+    st.sampled_from(CommandMode),
+)
+def test_no_sample_breaks_the_model(samples, mode):
+    actuator = default_actuator()
+    monitor = Monitor(actuator, (0.2, 0.4, 0.6), mode=mode)
+    for sample in samples:
+        reading = monitor.push(Tick(*sample))
+        assert np.isfinite(reading.predicted).all()
+        assert np.isfinite(reading.cusum).all()
+        assert (reading.cusum >= 0.0).all()
+        assert abs(reading.predicted[0]) <= actuator.servovalve.XSM
+        assert abs(reading.predicted[1]) <= actuator.servovalve.PSR
+
+
+def test_push_keeps_no_memory():
+    monitor, ticks = monitor_for("paper-open-2.blf", MATCHED["paper-open-2.blf"])
+    pushed = ticks * 19
+    assert len(pushed) > 100_000
+    for tick in ticks:
+        monitor.push(tick)
+    tracemalloc.start()
+    try:
+        for tick in pushed[:100]:
+            monitor.push(tick)
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        for tick in pushed:
+            monitor.push(tick)
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert abs(after - before) < 512
+    # What one call's arguments take while it lasts; nothing that grows.
+    assert peak - before < 2048
+
+
+def test_another_thread_may_push():
+    """The receive thread pushes while this one runs Python: the answer is the same."""
+    monitor, ticks = monitor_for("paper-closed-1.blf", MATCHED["paper-closed-1.blf"])
+    alone, _, _ = run(monitor, ticks)
+    monitor.reset()
+    out = []
+    thread = threading.Thread(target=lambda: out.append(run(monitor, ticks)))
+    thread.start()
+    while thread.is_alive():
+        sum(range(1000))
+    thread.join()
+    np.testing.assert_array_equal(out[0][0], alone)
+
+
+def test_readings_cannot_be_written():
+    monitor, ticks = monitor_for("healthy-open.blf", (0.0, 0.0, 0.0))
+    reading = monitor.push(ticks[0])
+    assert reading is monitor.reading
+    with pytest.raises(ValueError, match="read-only"):
+        reading.cusum[0, 0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"faults": (0.1, 0.2)}, "Kintas"),
+        ({"faults": (0.1, 0.2, 1.1)}, "Kintas"),
+        ({"faults": (0.1, 0.2, NAN)}, "Kintas"),
+        ({"noise": (0.0, 1.0)}, "noise"),
+        ({"offsets": (NAN, 0.0)}, "offsets"),
+        ({"hours": 0.0}, "hours"),
+        ({"shift": 99.0}, "shift"),
+    ],
+)
+def test_bad_values_are_told(options, word):
+    options = {"faults": (0.1, 0.2, 0.3), **options}
+    faults = options.pop("faults")
+    with pytest.raises(ConfigurationError, match=word) as caught:
+        Monitor(default_actuator(), faults, **options)
+    assert "\n" not in str(caught.value)
