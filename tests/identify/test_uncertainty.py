@@ -1,15 +1,27 @@
 """Stated deviations against what happens, on linear problems whose answer is known."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from identify_cases import NOISE, own_experiment
 
-from ehadiag.identify.refine import Refinement
+from ehadiag.identify.experiment import make_batch
+from ehadiag.identify.refine import refine
 from ehadiag.identify.uncertainty import covariance, interval95, normal_matrix
 
 N = 400
 TRUTH = np.array([0.4, 0.5, 0.6])
+
+
+@cache
+def template():
+    """Any refinement: only its figures are replaced."""
+    faults = np.array([0.3, 0.6, 0.3])
+    return refine(make_batch([own_experiment(faults)]), faults, np.zeros(2), NOISE)
 
 
 def linear_problem(seed, noise):
@@ -20,10 +32,9 @@ def linear_problem(seed, noise):
     step = np.linalg.solve(rows @ rows.T, rows @ noise.ravel())
     gaps = (noise.ravel() - step @ rows).reshape(2, N)
     used = np.ones((2, N), dtype=np.bool_)
-    return Refinement(
-        values=TRUTH + step[:3], offsets=step[3:], cost=0.0, gaps=gaps, jacobian=jacobian,
-        spool_rate=np.zeros(N),
-        used=used, weighted=used, evaluations=0, converged=True, anchored=0,
+    return replace(
+        template(), values=TRUTH + step[:3], offsets=step[3:], gaps=gaps, jacobian=jacobian,
+        spool_rate=np.zeros(N), used=used, weighted=used,
     )  # fmt: skip
 
 
