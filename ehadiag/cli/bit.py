@@ -132,6 +132,10 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         raise ConfigurationError("--fast: only the simulated actuator can hurry, add --simulate")
     if arguments.fast and options.has_bus(arguments):
         raise ConfigurationError("--fast: a bus has its own time, leave --interface out")
+    if arguments.simulate and arguments.serial:
+        raise ConfigurationError(
+            "--simulate: a serial link has two ends, run ehadiag sim on the other one"
+        )
     if not arguments.simulate and not options.has_bus(arguments):
         raise ConfigurationError(
             "no bus named: give --interface and --channel, or --serial, or --simulate"

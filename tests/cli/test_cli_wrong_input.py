@@ -164,6 +164,7 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
         (["--test", "open", "-i", "udp_multicast", "-c", "x"], 2, "x: not an IP address; need"),
         (["--test", "open", "--simulate", "--listen"], 2, "--simulate and --listen exclude"),
         (["--test", "open", "--fast"], 2, "add --simulate"),
+        (["--test", "open", "--simulate", "--serial", "loop://"], 2, "a serial link has two ends"),
         (["--test", "open", "--simulate", "--fast", "-i", "virtual"], 2, "leave --interface out"),
         (["--test", "open", "--simulate", "--Kintas", "1.5"], 2, "fault Kintas: 1.5 is outside 0"),
         (["--test", "open", "--simulate", "--FSS", "nan"], 2, "fault FSS: nan is outside 0 … 1"),
