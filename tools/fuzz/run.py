@@ -6,6 +6,7 @@ Options are libFuzzer's; docs/how-to/fuzz.md says how to start it and what to do
 
 from __future__ import annotations
 
+import os
 import sys
 
 import atheris
@@ -13,15 +14,19 @@ import atheris
 NAMES = ("frames", "serial", "logs", "mappings")
 SEEN = ("firmware_iface", "ehadiag", "cantools", "textparser", "tomllib", "can")
 """Packages whose branches guide the search."""
+AGAIN = "EHADIAG_FUZZ_TARGET"
 HANG_S = 20
 MEMORY_MB = 2048
 
 
 def main() -> None:
     """Run until a finding, or until what the options say."""
-    if len(sys.argv) < 2 or sys.argv[1] not in NAMES:
+    # libFuzzer starts this program again for a merge, without the target among the options.
+    if len(sys.argv) > 1 and sys.argv[1] in NAMES:
+        os.environ[AGAIN] = sys.argv.pop(1)
+    name = os.environ.get(AGAIN)
+    if name not in NAMES:
         raise SystemExit(f"usage: run.py {'|'.join(NAMES)} [FOLDER...] [-option...]")
-    name = sys.argv.pop(1)
     with atheris.instrument_imports(include=list(SEEN)):
         import targets  # noqa: PLC0415 - the fuzzer must see its imports
     options = [f"-timeout={HANG_S}", f"-rss_limit_mb={MEMORY_MB}", *sys.argv[1:]]
