@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment, judge_noise, make_batch
 from ehadiag.identify.first import FirstApproximation, first_approximation
+from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.refine import CAP, Refinement, describe, median_offsets, refine
+from ehadiag.identify.refine import Refinement, describe, median_offsets, refine
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
@@ -247,10 +248,9 @@ def _polish(experiments: Sequence[Experiment], best: Refinement) -> Refinement:
     batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
     objective = Objective(batch, best.offsets, cap=CAP)
     found = POLISH.minimise(objective, best.values, POLISH_DEVIATION, seed=0)
-    if found.cost >= best.cost:
-        return best
     noise = experiments[0].spool_noise, experiments[0].pressure_noise
-    other = describe(batch, found.best, best.offsets, noise)
+    start = found.best if found.cost < best.cost else best.values
+    other = describe(batch, start, best.offsets, noise)
     return replace(other, evaluations=other.evaluations + found.evaluations)
 
 

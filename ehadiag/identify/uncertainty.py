@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ehadiag.identify.refine import FAULT_COUNT, Refinement
+from ehadiag.identify.gapmodel import FAULT_COUNT
+from ehadiag.identify.refine import Refinement
 
 __all__ = ["covariance", "interval95", "normal_matrix"]
 
