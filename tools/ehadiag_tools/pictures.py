@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment, make_batch
+from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import SEARCH_CAP, Objective
 from ehadiag.identify.pipeline import ANCHOR_LSB
-from ehadiag.identify.gapmodel import CAP
 from ehadiag.model.monitoring import respond
 from ehadiag.parameters import FAULT_NAMES
 from ehadiag_tools.figures import percent_errors
