@@ -159,8 +159,8 @@ def _acquire(
     with ExitStack() as stack:
         ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
         stop = stack.enter_context(stop_on_signals())
-        display = stack.enter_context(progress_bar())
         say(f"test {test.name!r} on {ours.name}, recording to {path}")
+        display = stack.enter_context(progress_bar())
 
         def tell(progress: Progress) -> None:
             display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))

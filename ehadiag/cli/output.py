@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -121,6 +122,10 @@ def write_report(
         raise InputOutputError(f"result {path}: {error.strerror or error}") from None
     written = [path]
     if diagnosis.identification is not None:
+        from ehadiag.jit import cache_folder  # noqa: PLC0415 - loads numba
+
+        # Its own folder cannot be written without a home, which it would say at length.
+        os.environ.setdefault("MPLCONFIGDIR", str(cache_folder().parent / "matplotlib"))
         from ehadiag.report.picture import draw_diagnosis  # noqa: PLC0415 - matplotlib is slow
 
         picture = stem.with_name(stem.name + ".png")

@@ -151,7 +151,7 @@ def installed_copy(folder: Path) -> Path:
 def without_home(
     site: Path, temporary: Path, arguments: list[str], environment: dict[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    gone = ("HOME", "XDG_CACHE_HOME", "EHADIAG_CACHE_DIR", "NUMBA_CACHE_DIR")
+    gone = ("HOME", "XDG_CACHE_HOME", "EHADIAG_CACHE_DIR", "NUMBA_CACHE_DIR", "MPLCONFIGDIR")
     kept = {key: value for key, value in environment.items() if key not in gone}
     kept |= {"PYTHONPATH": str(site), "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
     # As root the lack of rights hinders nobody, so what was written is looked at afterwards.
@@ -184,8 +184,11 @@ def test_read_only_installation_without_home(
         ours = cache_folder()
         shutil.copytree(ours, temporary / f"ehadiag-{os.getuid()}" / ours.name)
     log = str(LOGS / "healthy-open.blf")
-    done = without_home(site, temporary, ["diagnose", "--json", log], environment)
+    arguments = ["diagnose", "--json", "--out", "reports", log]
+    done = without_home(site, temporary, arguments, environment)
     assert done.returncode == 0, done.stderr
+    said = [line for line in done.stderr.splitlines() if "font cache" not in line]
+    assert [line.partition(":")[0] for line in said] == ["ehadiag"] * (1 if warm else 2)
     assert json.loads(done.stdout)["verdict"] == "HEALTHY"
     assert sorted(site.rglob("*")) == before
     told = "compiling the model's kernels, once for this installation" in done.stderr
