@@ -1,0 +1,61 @@
+"""The benchmark runs through, with tiny sizes; no figure is judged."""
+
+import json
+
+import pytest
+
+from ehadiag_tools import bench, bench_c_model
+from ehadiag_tools.bench_decode import tiled
+from firmware_iface.logs import read_frames
+
+TINY = ["--repeats", "1", "--ticks", "5", "--seeds", "1", "--budget", "50", "--pushes", "50"]
+TINY += ["--seconds", "0.02", "--frames", "2000"]
+
+
+@pytest.mark.parametrize("section", ["kernel", "search", "estimate", "push", "decode"])
+def test_each_section_gives_figures(section, capsys):
+    assert bench.main(["--only", section, "--json", "-", *TINY]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["machine"]
+    assert len(told["figures"]) >= 4
+    for figure in told["figures"]:
+        assert figure["section"] == section
+        assert figure["value"] is None or figure["value"] >= 0.0
+        assert figure["value"] is not None or "left out" in figure["remark"]
+
+
+def test_c_and_numba_are_the_same_algorithm(capsys):
+    """Else their times could not be compared."""
+    assert bench.main(["--only", "kernel", "--json", "-", *TINY]) == 0
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    gap = next(item for item in figures if item["name"] == "largest gap between both")
+    assert gap["value"] < 1e-3
+
+
+def test_without_a_compiler_c_is_left_out(monkeypatch, capsys):
+    monkeypatch.setattr(bench_c_model.shutil, "which", lambda _: None)
+    assert bench.main(["--only", "kernel", *TINY]) == 0
+    assert "left out: no cc on the path" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_whole_processes(tmp_path):
+    target = tmp_path / "figures.json"
+    assert bench.main(["--only", "process", "--json", str(target), *TINY]) == 0
+    assert "says that it compiles" in target.read_text()
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--only", "nothing"], ["--repeats", "0"], ["--logs", "no-such-folder"]]
+)
+def test_wrong_options_are_told_in_a_line(arguments, capsys):
+    assert bench.main(arguments) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_tiling_keeps_frames_in_order_of_time():
+    table = read_frames(bench.LOGS / "paper-open-2.blf")
+    long = tiled(table, 2 * len(table) + 5)
+    assert len(long) == 2 * len(table) + 5
+    assert (long.time_ns[1:] >= long.time_ns[:-1]).all()
+    assert (long.data[len(table) :][:5] == table.data[:5]).all()

@@ -1,0 +1,333 @@
+/* The monitoring model in C, to measure the project's kernels against.
+ *
+ * The same algorithm as ehadiag/model/spool.py and ehadiag/model/jack.py, run free: spool and
+ * flapper by transition matrices with events located by halving, the jack by closed forms.
+ * Build: cc -O3 -march=native -shared -fPIC model.c -lm
+ */
+#include <math.h>
+
+enum { FINEST = 10, BASE = 3, WHOLE = 1 << FINEST, NODE_LEVEL = 5, ROOM = 128, COLUMNS = 4 };
+enum { LAST = WHOLE - (WHOLE >> BASE), MOST_PARTS = 32, BISECTIONS = 30 };
+enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELEASE };
+
+static const double BEND = 0.05e-6, LAST_BEND = 0.002e-6;
+static const double SHORTEST = 1e-9, TRAVEL = 1.0e-6, RATIO = 0.05, PART_BEND = 0.1e-6;
+static const double DRIFT = -0.45;
+
+/* In the order of ehadiag.model.constants.PlantConstants. */
+typedef struct {
+    double GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
+    double AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
+} Plant;
+
+/* In the order of ehadiag.model.transition.SpoolScalars. */
+typedef struct {
+    double force, damping, dynamic, breakaway, ring_damping, ring_rate;
+} Scalars;
+
+typedef struct {
+    double xf, wf, xs, vs;
+    int direction, clamped;
+} Spool;
+
+typedef struct {
+    double supply, resistance, gain, gain_resistance;
+} Valve;
+
+typedef struct {
+    double p0, p1, p2, excess, rate;
+} Approach;
+
+static int held(const Plant *c, const Scalars *t, double xf, double xs)
+{
+    return fabs(xf) <= t->breakaway || (fabs(xs) >= c->XSM && xs * xf > 0.0);
+}
+
+static int clamped_event(const Plant *c, const Scalars *t, double torque, const Spool *s)
+{
+    if ((torque - c->KSF * s->xs - c->KF * s->xf) * s->xf < 0.0)
+        return RELEASE;
+    if (s->direction == 0)
+        return held(c, t, s->xf, s->xs) ? NOTHING : BREAKAWAY;
+    if (s->vs * s->direction <= 0.0)
+        return REVERSAL;
+    return fabs(s->xs) >= c->XSM && s->xs * s->direction > 0.0 ? SPOOL_STOP : NOTHING;
+}
+
+static int moving_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
+{
+    if (b->vs * a->direction <= 0.0)
+        return REVERSAL;
+    if (fabs(b->xs) >= c->XSM && b->xs * a->direction > 0.0)
+        return SPOOL_STOP;
+    if (fabs(b->xf) >= c->XFM)
+        return FLAPPER_STOP;
+    if (a->wf * b->wf < 0.0) {
+        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
+        double lowest = fmin(a->xf * a->direction, b->xf * a->direction);
+        if (lowest - t->dynamic / t->force - swing <= 0.0
+            || fmax(fabs(a->xf), fabs(b->xf)) + swing >= c->XFM)
+            return UNSURE;
+    }
+    return NOTHING;
+}
+
+static int stuck_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
+{
+    if (!held(c, t, b->xf, a->xs))
+        return BREAKAWAY;
+    if (fabs(b->xf) >= c->XFM)
+        return FLAPPER_STOP;
+    if (a->wf * b->wf < 0.0) {
+        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
+        if (fmax(fabs(a->xf), fabs(b->xf)) + swing > fmin(t->breakaway, c->XFM))
+            return UNSURE;
+    }
+    return NOTHING;
+}
+
+static int rests(const Plant *c, const Scalars *t, double torque, const Spool *s)
+{
+    if (t->ring_rate <= 0.0)
+        return 0;
+    double rest = (torque - c->KSF * s->xs) / c->KF;
+    double a = s->xf - rest;
+    double b = (s->wf + t->ring_damping * a) / t->ring_rate;
+    return fabs(rest) + sqrt(a * a + b * b) < fmin(t->breakaway, c->XFM);
+}
+
+static void change(const Plant *c, const Scalars *t, int event, Spool *s)
+{
+    switch (event) {
+    case REVERSAL:
+        s->vs = 0.0;
+        s->direction = 0;
+        if (fabs(s->xf) > t->breakaway)
+            s->direction = s->xf > 0.0 ? 1 : -1;
+        break;
+    case SPOOL_STOP:
+        s->xs = copysign(c->XSM, s->xs);
+        s->vs = 0.0;
+        s->direction = 0;
+        break;
+    case BREAKAWAY:
+        s->direction = s->xf > 0.0 ? 1 : -1;
+        break;
+    case FLAPPER_STOP:
+        s->xf = copysign(c->XFM, s->xf);
+        s->wf = 0.0;
+        s->clamped = 1;
+        break;
+    case RELEASE:
+        s->clamped = 0;
+        break;
+    default:
+        break;
+    }
+}
+
+/* One tick of the spool; returns the number of nodes (span, place, rise at both ends). */
+static int spool_tick(const Plant *c, const Scalars *t, const double (*moving)[4][4],
+                      const double (*stuck)[2][2], const double *decay, double torque, double tick,
+                      Spool *s, double (*nodes)[COLUMNS])
+{
+    int count = 0, done = 0, since = 0, level = BASE;
+    if (s->direction == 0 && !s->clamped && rests(c, t, torque, s))
+        level = 0;
+    double begin = s->vs, slowest = s->vs, fastest = s->vs;
+    while (done < WHOLE) {
+        while ((WHOLE >> level) > WHOLE - done)
+            level++;
+        double h = tick / (1 << level);
+        Spool n = *s;
+        int event;
+        if (s->clamped) {
+            if (s->direction != 0) {
+                double steady = (t->force * s->xf - t->dynamic * s->direction) / t->damping;
+                double fade = decay[level];
+                n.xs += steady * h + (s->vs - steady) * (1.0 - fade) * c->MS / t->damping;
+                n.vs = steady + (s->vs - steady) * fade;
+            }
+            event = clamped_event(c, t, torque, &n);
+        } else if (s->direction != 0) {
+            double rest_xf = t->dynamic * s->direction / t->force;
+            double rest_xs = (torque - c->KF * rest_xf) / c->KSF;
+            double a = s->xf - rest_xf, b = s->xs - rest_xs;
+            const double(*m)[4] = moving[level];
+            n.xf = rest_xf + m[0][0] * a + m[0][1] * s->wf + m[0][2] * b + m[0][3] * s->vs;
+            n.wf = m[1][0] * a + m[1][1] * s->wf + m[1][2] * b + m[1][3] * s->vs;
+            n.xs = rest_xs + m[2][0] * a + m[2][1] * s->wf + m[2][2] * b + m[2][3] * s->vs;
+            n.vs = m[3][0] * a + m[3][1] * s->wf + m[3][2] * b + m[3][3] * s->vs;
+            event = moving_event(c, t, h, s, &n);
+        } else {
+            double rest_xf = (torque - c->KSF * s->xs) / c->KF;
+            double a = s->xf - rest_xf;
+            const double(*m)[2] = stuck[level];
+            n.xf = rest_xf + m[0][0] * a + m[0][1] * s->wf;
+            n.wf = m[1][0] * a + m[1][1] * s->wf;
+            event = stuck_event(c, t, h, s, &n);
+        }
+        if (level == 0)
+            event = NOTHING;
+        if (event != NOTHING && level < FINEST) {
+            level++;
+            continue;
+        }
+        *s = n;
+        double end = s->vs;
+        change(c, t, event, s);
+        done += WHOLE >> level;
+        since += WHOLE >> level;
+        slowest = fmin(slowest, end);
+        fastest = fmax(fastest, end);
+        double span = tick * since / WHOLE;
+        double bend = 0.125 * (fastest - slowest) * span;
+        int wanted = event > NOTHING
+                     || ((done & ((WHOLE >> NODE_LEVEL) - 1)) == 0
+                         && (bend > BEND || (done == LAST && bend > LAST_BEND)));
+        if (done == WHOLE || (wanted && count < ROOM - 1)) {
+            nodes[count][0] = span;
+            nodes[count][1] = s->xs;
+            nodes[count][2] = begin;
+            nodes[count][3] = end;
+            count++;
+            begin = slowest = fastest = s->vs;
+            since = 0;
+        }
+        if (level > BASE && (done & ((WHOLE >> (level - 1)) - 1)) == 0)
+            level--;
+    }
+    return count;
+}
+
+static Valve valve(const Plant *c, double spool)
+{
+    double pressure = c->GP * spool;
+    if (fabs(pressure) <= c->PSR) {
+        double resistance = c->GP / c->GQ;
+        double share = 1.0 / (1.0 + resistance * c->CLK);
+        return (Valve){share * pressure, share * resistance, share * c->GP, 0.0};
+    }
+    double inverse = 1.0 / spool;
+    pressure = copysign(c->PSR, spool);
+    double resistance = pressure * inverse / c->GQ;
+    double share = 1.0 / (1.0 + resistance * c->CLK);
+    double slope = -share * share * resistance * inverse;
+    return (Valve){share * pressure, share * resistance, -pressure * c->CLK * slope, slope};
+}
+
+static int parts_of(double origin, double target, double rise0, double rise1)
+{
+    double nearest = origin * target <= 0.0 ? 0.0 : fmin(fabs(origin), fabs(target));
+    double by_travel = fabs(target - origin) / fmax(TRAVEL, RATIO * nearest);
+    double by_bend = sqrt(0.125 * fabs(rise1 - rise0) / PART_BEND);
+    double parts = 1.0 + floor(fmax(by_travel, by_bend));
+    return parts < MOST_PARTS ? (int)parts : MOST_PARTS;
+}
+
+static double sign_change(const Approach *p, double span)
+{
+    double low = 0.0, high = span, sign = p->p0 + p->excess > 0.0 ? 1.0 : -1.0;
+    for (int i = 0; i < BISECTIONS; i++) {
+        double t = 0.5 * (low + high);
+        if (sign * (p->p0 + t * (p->p1 + t * p->p2) + p->excess * exp(-p->rate * t)) > 0.0)
+            low = t;
+        else
+            high = t;
+    }
+    return high;
+}
+
+static Approach approach(const Plant *c, double load, double span, double velocity,
+                         const Valve *from, const Valve *to, double rise)
+{
+    double area2 = c->AJ * c->AJ;
+    double ease0 = 1.0 / (area2 * from->resistance + c->CJ);
+    double ease1 = 1.0 / (area2 * to->resistance + c->CJ);
+    double steady0 = (c->AJ * from->supply - load) * ease0;
+    double steady1 = (c->AJ * to->supply - load) * ease1;
+    double slope1 =
+        (c->AJ * to->gain * rise - steady1 * area2 * to->gain_resistance * rise) * ease1;
+    double mean = (steady1 - steady0) / span;
+    double bend = (slope1 - mean) / span;
+    double tau = c->MJ * ease0, end_tau = c->MJ * ease1;
+    double drift = fmax((end_tau - tau) / span, DRIFT);
+    Approach p;
+    p.p2 = bend / (1.0 + 2.0 * drift);
+    p.p1 = (2.0 * mean - slope1 - 2.0 * p.p2 * tau) / (1.0 + drift);
+    p.p0 = steady0 - tau * p.p1;
+    p.excess = velocity - p.p0;
+    p.rate = (area2 * (from->resistance + to->resistance) + 2.0 * c->CJ) / (6.0 * c->MJ)
+             + 4.0 / (3.0 * (tau + end_tau));
+    return p;
+}
+
+/* Run the model from rest over n ticks; fdj is the fault constant. */
+void eha_respond(const Plant *c, const Scalars *t, const double (*moving)[4][4],
+                 const double (*stuck)[2][2], const double *decay, double fdj,
+                 const double *current, long n, double tick, double *spool_out,
+                 double *pressure_out, double *position_out)
+{
+    double nodes[ROOM][COLUMNS];
+    Spool s = {0};
+    double dynamic = c->FDJ0 + fdj * (c->FDJ1 - c->FDJ0), fixed = 2.0 * dynamic;
+    double velocity = 0.0, place = 0.0, direction = 0.0, spool = 0.0;
+    Valve now = valve(c, spool);
+    for (long k = 0; k < n; k++) {
+        int count = spool_tick(c, t, moving, stuck, decay, c->GM * current[k], tick, &s, nodes);
+        spool_out[k] = s.xs;
+        for (int node = 0; node < count; node++) {
+            double span = nodes[node][0], start = spool, target = nodes[node][1];
+            double rise0 = span * nodes[node][2], rise1 = span * nodes[node][3];
+            int parts = parts_of(start, target, rise0, rise1);
+            for (int part = 1; part <= parts; part++) {
+                double left = span / parts, x = (double)part / parts, y = 1.0 - x;
+                double end_spool = start + x * x * (3.0 - 2.0 * x) * (target - start)
+                                   + x * y * (y * rise0 - x * rise1);
+                double rise = 6.0 * x * y * (target - start) + y * (1.0 - 3.0 * x) * rise0
+                              + x * (3.0 * x - 2.0) * rise1;
+                Valve end = valve(c, end_spool);
+                while (left > SHORTEST) {
+                    if (direction == 0.0) {
+                        double push0 = c->AJ * now.supply - c->FR;
+                        double push1 = c->AJ * end.supply - c->FR;
+                        if (fabs(push1) <= fixed || (fabs(place) >= c->XJM && place * push1 > 0.0))
+                            break;
+                        direction = push1 > 0.0 ? 1.0 : -1.0;
+                        if (push0 * direction <= fixed) {
+                            double wait = (fixed * direction - push0) / (push1 - push0);
+                            spool += wait * (end_spool - spool);
+                            now = valve(c, spool);
+                            left -= wait * left;
+                        }
+                        continue;
+                    }
+                    Approach p = approach(c, c->FR + direction * dynamic, left, velocity, &now,
+                                          &end, rise / span);
+                    double fade = exp(-left * p.rate);
+                    double end_velocity = p.p0 + left * (p.p1 + left * p.p2) + p.excess * fade;
+                    if (end_velocity * direction > 0.0) {
+                        place += left * (p.p0 + left * (0.5 * p.p1 + left * p.p2 / 3.0));
+                        place += p.excess * (1.0 - fade) / p.rate;
+                        velocity = end_velocity;
+                        if (fabs(place) >= c->XJM && place * velocity > 0.0) {
+                            place = copysign(c->XJM, place);
+                            velocity = direction = 0.0;
+                        }
+                        break;
+                    }
+                    double moved = sign_change(&p, left);
+                    spool += moved / left * (end_spool - spool);
+                    now = valve(c, spool);
+                    left -= moved;
+                    velocity = direction = 0.0;
+                }
+                spool = end_spool;
+                now = end;
+            }
+        }
+        double p12 = now.supply - now.resistance * c->AJ * velocity;
+        pressure_out[k] = fmin(fmax(p12, -c->PSR), c->PSR);
+        position_out[k] = place;
+    }
+}

@@ -1,0 +1,48 @@
+"""What the sections of the benchmark share: sizes, figures, clocks."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Figure", "Sizes", "cpu_median"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """How much is measured."""
+
+    logs: Path
+    repeats: int = 15
+    ticks: int = 300
+    seeds: int = 5
+    budget: int = 6000
+    pushes: int = 200_000
+    seconds: float = 20.0
+    frames: int = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One row of the table."""
+
+    section: str
+    name: str
+    value: float | None
+    """None: not measured; the remark says why."""
+    unit: str
+    remark: str = ""
+
+
+def cpu_median(work: Callable[[], object], repeats: int) -> float:
+    """Median CPU time (s) of this thread for a call, after one that does not count."""
+    work()
+    spent = []
+    for _ in range(repeats):
+        begin = time.thread_time()
+        work()
+        spent.append(time.thread_time() - begin)
+    return statistics.median(spent)

@@ -1,0 +1,51 @@
+"""The recordings that the benchmark works on."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from ehadiag.actuator import default_actuator
+from ehadiag.identify.batch import Batch
+from ehadiag.identify.experiment import Experiment, build_experiment, make_batch
+from ehadiag.identify.pipeline import SEARCH_LEAD_S
+from ehadiag.recording import Recording, Samples
+from ehadiag.storedtest import resolve_test
+from firmware_iface.logs import read_recording
+
+__all__ = ["LOG", "TRUTH", "experiment", "recording", "samples", "search_window", "whole_test"]
+
+LOG = "paper-open-2.blf"
+TRUTH = (0.3, 0.6, 0.3)
+"""Of that recording."""
+
+
+@lru_cache(maxsize=1)
+def recording(logs: Path) -> Recording:
+    """Return the recording, an open-loop test of 5.5 s."""
+    return read_recording(logs / LOG)
+
+
+def samples(logs: Path) -> Samples:
+    """Return its samples."""
+    found = recording(logs).samples
+    assert found is not None
+    return found
+
+
+def experiment(logs: Path) -> Experiment:
+    """Prepare it for the identification."""
+    return build_experiment(
+        samples(logs), recording(logs).environment, resolve_test("open"), default_actuator()
+    )
+
+
+def whole_test(logs: Path, tests: int) -> Batch:
+    """Lay it out so many times, all of the test."""
+    return make_batch([experiment(logs)] * tests)
+
+
+def search_window(logs: Path) -> Batch:
+    """Lay out the window on which the genetic search works."""
+    item = experiment(logs)
+    return make_batch([item], [item.test.windows.refinement], lead=SEARCH_LEAD_S)
