@@ -29,6 +29,12 @@ MULTICAST_GROUP = "239.74.163.2"
 ROUTES = Path("/proc/net/route")
 RECEIVE_BUFFER = 4 << 20
 """Bytes asked of the kernel for a socket's receive buffer: a second of a full bus and more."""
+SO_MEMINFO = 55
+"""Linux: counts of a socket (linux/sock_diag.h); Python's socket module does not name it."""
+MEMINFO_DROPS = 8
+"""Place of the number of dropped frames among them."""
+DROP_CHECK = 1024
+"""Calls between two looks at that number while the bus is busy."""
 SEND_TIMEOUT = 0.5
 """s; a bus that takes no frame for so long is lost."""
 BUS_OFF = 0x40
@@ -94,6 +100,13 @@ class PythonCanTransport(Transport):
         self._bus_closed = False
         self._damaged = 0
         self._echoes = _EchoFilter() if options.interface in ECHOES else None
+        self._received = 0
+        self._dropped = 0
+
+    @property
+    def dropped(self) -> int | None:
+        """Frames that the kernel dropped because its buffer was full; None if it cannot say."""
+        return _kernel_drops(self._bus)
 
     def _receive(self, timeout: float) -> Frame | None:
         try:
@@ -105,6 +118,9 @@ class PythonCanTransport(Transport):
                 return None
             # Drivers raise what they like; all of it means that this bus gives no more frames.
             raise self._fail(_one_line(error)) from None
+        self._received += 1
+        if message is None or self._received % DROP_CHECK == 0:
+            self._look_for_drops()
         if message is None:
             return None
         frame = frame_of(message)
@@ -122,6 +138,13 @@ class PythonCanTransport(Transport):
             self._bus.send(message_of(frame), timeout=SEND_TIMEOUT)
         except Exception as error:
             raise self._fail(f"cannot send: {_one_line(error)}") from None
+
+    def _look_for_drops(self) -> None:
+        """Say it when frames were lost between kernel and reader: no error tells of it."""
+        dropped = self.dropped or 0
+        if dropped > self._dropped:
+            self._dropped = dropped
+            self._degrade(f"{dropped} frames dropped by the kernel, the reader was too slow")
 
     def _close(self) -> None:
         if not self._bus_closed:
@@ -292,6 +315,17 @@ def _widen_buffer(bus: can.BusABC) -> None:
             twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     except (NotImplementedError, OSError, AttributeError):
         return  # no socket behind this interface
+
+
+def _kernel_drops(bus: can.BusABC) -> int | None:
+    """Frames that found no room in the socket's buffer; None where that cannot be told."""
+    try:
+        with socket.socket(fileno=os.dup(bus.fileno())) as twin:
+            info = twin.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (MEMINFO_DROPS + 1))
+    except (NotImplementedError, OSError, AttributeError, TypeError):
+        return None
+    words = memoryview(info).cast("I")
+    return words[MEMINFO_DROPS] if len(words) > MEMINFO_DROPS else None
 
 
 def _one_line(error: BaseException) -> str:

@@ -165,6 +165,7 @@ class FccCore:
             self._commands = test.command().tolist()
             self._elapsed = 0
             self._mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+            self._refused = None  # an earlier refusal may still stand on the bus
             self._enter(BitState.ARMING, test_id)
         elif self._state in (BitState.ARMING, BitState.RUNNING):
             self._refused = (reason, test_id)  # said once; the running test goes on

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -421,3 +422,29 @@ class TestSocketCan(TwoWay):
     def receiving(self, options: BusOptions) -> Iterator[Transport]:
         with PythonCanTransport(options) as transport:
             yield transport
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux tells what a socket dropped")
+def test_frames_that_the_kernel_drops_degrade_the_transport(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    with (
+        PythonCanTransport(options) as listener,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as full,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        assert listener.dropped is None  # no socket behind it
+        full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        full.bind(("127.0.0.1", 0))
+        monkeypatch.setattr(listener._bus, "fileno", full.fileno)
+        assert listener.dropped == 0
+        assert listener.receive(0.0) is None
+        assert listener.state is TransportState.OPEN
+        for _ in range(1000):
+            sender.sendto(bytes(16), full.getsockname())
+        assert listener.receive(0.0) is None
+        assert listener.state is TransportState.DEGRADED
+        assert listener.dropped is not None
+        assert 0 < listener.dropped < 1000
+        assert listener.detail.startswith(f"{listener.dropped} frames dropped by the kernel")

@@ -105,6 +105,17 @@ def test_the_samples_of_a_test_reach_the_decoder_whole(
     assert recording.environment.oil_temperature == pytest.approx(40.0)
 
 
+def test_a_start_after_a_refusal_is_answered_by_the_start_alone(make_core: CoreFactory) -> None:
+    core = make_core()
+    core.take(request(test_id=3))
+    assert states(run(core, 100)) == [BitState.REFUSED]
+    core.take(request())
+    answers = statuses(run(core, 300))
+    assert {item.state for item in answers} == {BitState.ARMING, BitState.RUNNING}
+    assert {item.reason for item in answers} == {BitReason.NONE}
+    assert {item.test_id for item in answers} == {9}
+
+
 @pytest.mark.parametrize("idle_ticks", [5, 777])
 def test_a_run_depends_on_seed_and_number_not_on_the_time_before(
     make_core: CoreFactory, idle_ticks: int
