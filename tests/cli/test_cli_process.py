@@ -63,7 +63,7 @@ def test_two_processes_on_multicast(
     )
     if done.returncode == NO_NAMESPACE:
         pytest.skip(f"no network namespace: {done.stderr.strip()}")
-    assert done.returncode == 10, done.stderr
+    assert done.returncode == 10, done.stdout + done.stderr
     assert "sim ended with 0" in done.stderr
     assert ", 1 tests started" in done.stderr
     found = json.loads(done.stdout)
