@@ -17,11 +17,16 @@ from ehadiag.model.monitoring import FREE_RUN, Anchor
 from ehadiag.recording import Environment, Samples
 from ehadiag.storedtest import StoredTest, Window
 
-__all__ = ["Experiment", "Span", "build_experiment", "judge_noise", "make_batch"]
+__all__ = ["ANCHOR_LSB", "Experiment", "Span", "build_experiment", "judge_noise", "make_batch"]
 
 KEPT_SHARE = 0.98
 KEPT_MEAN = 0.75978
 """Mean absolute value of a standard normal variable, the largest 2 % left out."""
+TYPICAL_NOISE_LSB = float(np.sqrt(0.5**2 + 1.0 / 12.0))
+"""Noise of a 12-bit channel of the contract, LSB: thresholds in LSB are meant at this noise."""
+ANCHOR_GAIN = 0.3
+ANCHOR_LSB = (1.3, 6.0)
+"""Filtered and single innovations beyond which the model is put back on the spool, LSB."""
 LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 QUIET_BLOCK = 100
@@ -178,11 +183,6 @@ def make_batch(
         weight=np.hstack(weight),
         anchor=np.array(anchors),
     )
-
-
-TYPICAL_NOISE_LSB = float(np.sqrt(0.5**2 + 1.0 / 12.0))
-"""Noise of a 12-bit channel of the contract, LSB: thresholds in LSB are meant at this noise."""
-ANCHOR_GAIN = 0.3
 
 
 def _origin(experiment: Experiment, first: int) -> float:

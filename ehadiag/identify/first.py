@@ -6,14 +6,17 @@ Each works on the windows of the test and the signal that its fault shows most:
   spool, so neither of the other faults enters.
 - Kintas on the path of the spool while it slews as fast as the first stage can feed it (maximum
   velocity, overshoot).
-- FSS on the path of the spool on slow ramps (break-away, hysteresis, limit cycle).
+- FSS on the path of the spool on slow ramps (break-away, hysteresis, limit cycle), the model put
+  back on the measured spool where it left it: so each break-away counts once, and one that comes at
+  another tick does not spoil the rest of the ramp.
 
-Friction slows the slewing spool a little, so the last two searches are repeated once, each with
-the other's value.
+Friction slows the slewing spool a little, so the last two searches are repeated in ever smaller
+ranges, each with the other's value.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from ehadiag.identify.experiment import Experiment, make_batch
+from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
 from ehadiag.identify.objective import Objective
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
@@ -32,10 +35,13 @@ __all__ = ["FirstApproximation", "first_approximation"]
 
 GRID = 25
 """Points of the coarse search over 0 … 1."""
-SECOND_HALF_WIDTH = 0.2
-SECOND_GRID = 9
+RANGES = ((0.2, 0.06), (0.05, 0.02))
+"""Half-widths of the repeated searches, Kintas and FSS."""
+FINER_GRID = 11
 TOLERANCE = 2e-4
 LEAD_S = 0.05
+CREEP_CAP = 100.0
+"""A stick-slip jump at another tick counts no more than ten times the noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +54,7 @@ class FirstApproximation:
 
 
 def first_approximation(experiments: Sequence[Experiment]) -> FirstApproximation:
-    """Search FDJ, then Kintas, then FSS; then Kintas and FSS once more."""
+    """Search FDJ, then Kintas, then FSS; then Kintas and FSS twice more."""
     counter = _Counter()
     jacks = [_JackSearch(experiment) for experiment in experiments]
     fdj = _search(
@@ -70,6 +76,7 @@ def first_approximation(experiments: Sequence[Experiment]) -> FirstApproximation
             [experiment.test.windows.FSS for experiment in experiments],
             lead=LEAD_S,
             channels=(True, False),
+            anchor_lsb=ANCHOR_LSB,
         ),
         cap=CREEP_CAP,
     )
@@ -82,15 +89,22 @@ def first_approximation(experiments: Sequence[Experiment]) -> FirstApproximation
 
     kintas = _search(counter, lambda grid: kintas_cost(grid, 0.0), 0.0, 1.0, GRID)
     fss = _search(counter, lambda grid: fss_cost(grid, kintas), 0.0, 1.0, GRID)
-    near = kintas - SECOND_HALF_WIDTH, kintas + SECOND_HALF_WIDTH
-    kintas = _search(counter, lambda grid: kintas_cost(grid, fss), *near, SECOND_GRID)
-    near = fss - SECOND_HALF_WIDTH, fss + SECOND_HALF_WIDTH
-    fss = _search(counter, lambda grid: fss_cost(grid, kintas), *near, SECOND_GRID)
+    for kintas_range, fss_range in RANGES:
+        kintas = _search(
+            counter,
+            functools.partial(kintas_cost, fss=fss),
+            kintas - kintas_range,
+            kintas + kintas_range,
+            FINER_GRID,
+        )
+        fss = _search(
+            counter,
+            functools.partial(fss_cost, kintas=kintas),
+            fss - fss_range,
+            fss + fss_range,
+            FINER_GRID,
+        )
     return FirstApproximation((kintas, fss, fdj), counter.count)
-
-
-CREEP_CAP = 400.0
-"""A stick-slip jump at another tick counts no more than 20 times the noise."""
 
 
 class _Counter:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.experiment import Experiment, judge_noise, make_batch
+from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, judge_noise, make_batch
 from ehadiag.identify.first import FirstApproximation, first_approximation
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import Objective
@@ -38,16 +38,16 @@ class Plan:
 
 
 PLANS = (
-    Plan(0.02),
+    Plan(0.004, budget=0.5),
     Plan(0.02, median_offsets=True),
     Plan(0.1, budget=2.0),
     Plan(0.1, budget=2.0, median_offsets=True),
     Plan(0.4, budget=3.0),
 )
 """One after the other until the model explains the recording."""
+DEVIATION_SHARE = np.array([1.0, 1.0, 0.2])
+"""The first approximation knows FDJ best."""
 SEARCH_LEAD_S = 0.1
-ANCHOR_LSB = (1.3, 6.0)
-"""Re-anchoring of the refinement: filtered and single innovations beyond, LSB."""
 POLISH = CompactGa(budget=241, virtual_population=30.0, tolerance=1e-7)
 POLISH_DEVIATION = 3e-4
 POOR_FIT = 0.01
@@ -170,7 +170,7 @@ def identify(
         found = solver.with_budget(round(solver.budget * plan.budget)).minimise(
             Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S), offsets),
             start,
-            plan.deviation,
+            plan.deviation * DEVIATION_SHARE,
             seed + number,
             lambda done, budget: tell("search", done / budget),
         )

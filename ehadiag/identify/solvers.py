@@ -56,11 +56,14 @@ class Solver(Protocol):
         self,
         objective: Objective,
         start: NDArray[np.float64],
-        deviation: float,
+        deviation: NDArray[np.float64] | float,
         seed: int,
         progress: Progress | None = None,
     ) -> SearchResult:
-        """Search; the same seed gives the same answer. `start` has shape (3,)."""
+        """Search; the same seed gives the same answer.
+
+        `start` has shape (3,), `deviation` about it too, or is one for all genes.
+        """
         ...
 
 
@@ -85,7 +88,7 @@ class CompactGa:
         self,
         objective: Objective,
         start: NDArray[np.float64],
-        deviation: float,
+        deviation: NDArray[np.float64] | float,
         seed: int,
         progress: Progress | None = None,
     ) -> SearchResult:
@@ -103,7 +106,7 @@ class CompactGa:
                     objective.offsets,
                     objective.cap,
                     np.asarray(start, dtype=np.float64),
-                    np.full(len(start), deviation),
+                    np.broadcast_to(np.asarray(deviation, np.float64), len(start)).copy(),
                     self.virtual_population,
                     self.samples,
                     self.budget,
@@ -148,13 +151,14 @@ class PygadGa:
         self,
         objective: Objective,
         start: NDArray[np.float64],
-        deviation: float,
+        deviation: NDArray[np.float64] | float,
         seed: int,
         progress: Progress | None = None,
     ) -> SearchResult:
         """Search; deterministic for a seed."""
         import pygad  # noqa: PLC0415 - half a second, only for who asks
 
+        widest = float(np.max(deviation))
         rng = np.random.default_rng(seed)
         first = np.clip(rng.normal(start, deviation, (self.population, len(start))), 0.0, 1.0)
         first[0] = start
@@ -184,8 +188,8 @@ class PygadGa:
                 mutation_type="random",
                 mutation_by_replacement=False,
                 mutation_probability=0.5,
-                random_mutation_min_val=-deviation,
-                random_mutation_max_val=deviation,
+                random_mutation_min_val=-widest,
+                random_mutation_max_val=widest,
                 random_seed=seed,
                 suppress_warnings=True,
                 on_generation=after,
