@@ -11,10 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ehadiag.identify.experiment import Experiment, make_batch
+from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import SEARCH_CAP, Objective
-from ehadiag.identify.pipeline import ANCHOR_LSB
 from ehadiag.model.monitoring import respond
 from ehadiag.parameters import FAULT_NAMES
 from ehadiag_tools.figures import percent_errors
