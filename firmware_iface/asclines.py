@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO, cast
 
-__all__ = ["open_asc"]
+__all__ = ["open_asc", "open_text"]
 
 MAX_LINE = 1 << 16
 HEADER_LINES = 20
@@ -19,12 +19,11 @@ HEADER = re.compile(r"\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNOREC
 STAMP = re.compile(r"\s*(\d+\.\d+)(\s.*)", re.DOTALL)
 
 
-class _AbsoluteLines:
-    """Lines of an ASC file with relative stamps, made absolute; a read-only text file."""
+class _BoundedLines:
+    """Lines of a read-only text file, none longer than a log can have: noise has no line ends."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
-        self._elapsed = 0.0
 
     def __iter__(self) -> Iterator[str]:
         while line := self.readline():
@@ -37,13 +36,8 @@ class _AbsoluteLines:
         return line
 
     def readline(self) -> str:
-        """Return the next line; empty at the end."""
-        line = self._file.readline(MAX_LINE)
-        stamp = STAMP.match(line)
-        if stamp is None:
-            return line
-        self._elapsed += float(stamp[1])
-        return f"{self._elapsed:.9f}{stamp[2]}"
+        """Return the next line, or a piece of one; empty at the end."""
+        return self._file.readline(MAX_LINE)
 
     def read(self, _size: int = -1) -> str:
         """Return one line: readers go by lines."""
@@ -58,6 +52,29 @@ class _AbsoluteLines:
         self._file.close()
 
 
+class _AbsoluteLines(_BoundedLines):
+    """Lines of an ASC file with relative stamps, made absolute."""
+
+    def __init__(self, file: TextIO) -> None:
+        super().__init__(file)
+        self._elapsed = 0.0
+
+    def readline(self) -> str:
+        """Return the next line; empty at the end."""
+        line = super().readline()
+        stamp = STAMP.match(line)
+        if stamp is None:
+            return line
+        self._elapsed += float(stamp[1])
+        return f"{self._elapsed:.9f}{stamp[2]}"
+
+
+def open_text(path: Path) -> TextIO:
+    """Open a text log for one of python-can's readers."""
+    file = path.open(encoding="utf-8", errors="replace")
+    return cast(TextIO, _BoundedLines(file))
+
+
 def open_asc(path: Path) -> TextIO:
     """Open an ASC file for python-can's reader, its stamps absolute (from the start of the log)."""
     file = path.open(encoding="utf-8", errors="replace")
@@ -65,4 +82,4 @@ def open_asc(path: Path) -> TextIO:
     file.seek(0)
     if any(HEADER.match(line) for line in head):
         return cast(TextIO, _AbsoluteLines(file))
-    return file
+    return cast(TextIO, _BoundedLines(file))

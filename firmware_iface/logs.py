@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitState, Recording
 from firmware_iface.align import assemble
-from firmware_iface.asclines import open_asc
+from firmware_iface.asclines import open_asc, open_text
 from firmware_iface.blf import read_blf
 from firmware_iface.busmap import BusMap, default_map
 from firmware_iface.columns import ColumnBuilder
@@ -147,17 +147,13 @@ def _reader(path: Path, suffix: str, dated: bool) -> Any:
         return can.ASCReader(open_asc(path), relative_timestamp=not dated)
     kinds: dict[str, Any] = {".csv": can.CSVReader, ".trc": can.TRCReader}
     if suffix in kinds:
-        return kinds[suffix](_text(path))
+        return kinds[suffix](open_text(path))
     try:
         return can.MF4Reader(str(path))
     except NotImplementedError:
         raise InputOutputError(
             f"log {path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"
         ) from None
-
-
-def _text(path: Path) -> TextIO:
-    return path.open(encoding="utf-8", errors="replace")
 
 
 def _add(message: Message, columns: ColumnBuilder) -> None:

@@ -16,6 +16,10 @@ next byte, and the payload without the check sum's own byte (bus.md)."""
 
 NEAR = 16
 """Counter steps up to this are taken at their word when the host's clock contradicts them."""
+LONGEST_RUN = 8
+"""Frames in a row that may be out of line; more of them are a counter that started again."""
+MOST_ROUNDS = 50
+"""How often frames out of line are looked for: noise could go on until nothing is left."""
 SLACK_TICKS = 8.0
 """Host-time jitter that a real gap may show, in ticks."""
 SLACK_RATE = 2e-4
@@ -94,17 +98,20 @@ def unwrap(
     Returns
     -------
     Position of each frame, congruent with its counter, the first one its counter value; OUTSIDE
-    for a single frame out of line with its neighbours (a corrupt counter); and notes.
+    for a few frames out of line with their neighbours (corrupt counters, frames that come much too
+    late); and notes.
     """
     if len(counter) == 0:
         return np.empty(0, dtype=np.int64), ()
-    jump, residue, ticks, trusted = _steps(counter, time_ns, period_ns, modulus)
-    astray = _astray(jump, residue, modulus)
-    if astray.any():
-        position = np.full(len(counter), OUTSIDE, dtype=np.int64)
-        sound = ~astray
-        position[sound], notes = unwrap(counter[sound], time_ns[sound], period_ns, modulus)
-        return position, (*notes, f"{int(astray.sum())} frames with a counter out of line")
+    sound, rounds = np.arange(len(counter)), 0
+    while True:
+        inline, stamps = counter[sound], time_ns[sound]
+        jump, residue, ticks, trusted = _steps(inline, stamps, period_ns, modulus)
+        astray = _astray(jump, residue, modulus)
+        rounds += 1
+        if rounds > MOST_ROUNDS or not astray.any():
+            break
+        sound = sound[~astray]
     rebase, notes = _clock_steps(np.flatnonzero(trusted), ticks, jump, residue, period_ns)
     lateness = np.concatenate(([0.0], np.cumsum(residue - rebase)))
     position = np.concatenate(([0], np.cumsum(jump)))
@@ -118,23 +125,43 @@ def unwrap(
         back = position[breaks] - position[breaks - 1] + modulus * np.diff(turns, prepend=0)
         back[np.abs(residue[breaks - 1]) <= SLACK_TICKS] = 0
         turns += np.cumsum(np.maximum(-((back + NEAR) // modulus), 0))
-        lengths = np.diff(np.concatenate((starts, [len(counter)])))
+        lengths = np.diff(np.concatenate((starts, [len(position)])))
         position += modulus * np.repeat(np.concatenate(([0], turns)), lengths)
-    return position + int(counter[0]), notes
+    position += int(inline[0])
+    if len(sound) == len(counter):
+        return position, notes
+    placed = np.full(len(counter), OUTSIDE, dtype=np.int64)
+    placed[sound] = position
+    return placed, (*notes, f"{len(counter) - len(sound)} frames with a counter out of line")
 
 
 def _astray(
     jump: NDArray[np.int64], residue: NDArray[np.float64], modulus: int
 ) -> NDArray[np.bool_]:
-    """Single frames whose counter leaps and leaps back, against the host's time."""
+    """Frames, one or a few, whose counter leaps and leaps back, against the host's time."""
     astray = np.zeros(len(jump) + 1, dtype=np.bool_)
+    strange = np.abs(residue) > SLACK_TICKS
     leap = np.abs(jump) > NEAR // 2
     both = (jump[:-1] + jump[1:] + modulus // 2) % modulus - modulus // 2
-    astray[1:-1] = leap[:-1] & leap[1:] & (np.abs(both) <= NEAR)
-    astray[1:-1] &= np.abs(residue[:-1]) > SLACK_TICKS
+    astray[1:-1] = leap[:-1] & leap[1:] & (np.abs(both) <= NEAR) & strange[:-1]
     # Of two in a row only the first is judged now: without it the second may be in line.
     astray[1:] &= ~astray[:-1]
+    if not astray.any():
+        _mark_runs(astray, jump, np.flatnonzero(leap & strange), modulus)
     return astray
+
+
+def _mark_runs(
+    astray: NDArray[np.bool_], jump: NDArray[np.int64], leaps: NDArray[np.int64], modulus: int
+) -> None:
+    """Mark the frames between a leap and the leap back that soon follows."""
+    position = np.concatenate(([0], np.cumsum(jump)))
+    begin, end = leaps[:-1], leaps[1:]
+    net = (position[end + 1] - position[begin] + modulus // 2) % modulus - modulus // 2
+    back = (end - begin <= LONGEST_RUN) & (np.abs(net) <= NEAR)
+    back[1:] &= ~back[:-1]
+    for first, last in zip(begin[back], end[back], strict=True):
+        astray[first + 1 : last + 1] = True
 
 
 def _steps(

@@ -85,10 +85,11 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
     owner = np.concatenate([np.full(len(counted[name].row), i) for i, name in enumerate(names)])
     counter = np.concatenate([_counter(counted[name]) for name in names])
     time_ns = np.concatenate([counted[name].time_ns for name in names])
+    moving = np.concatenate([~_standing(counted[name], tick_ns) for name in names])
     order = np.argsort(row, kind="stable")
     modulus = counted[names[0]].message.modulus
-    position, notes = unwrap(counter[order], time_ns[order], tick_ns, modulus)
     owner, row, time_ns = owner[order], row[order], time_ns[order]
+    position, notes = _unwrap(counter[order], time_ns, moving[order], tick_ns, modulus)
     sound = position != OUTSIDE
     ticks = {name: position[owner == index] for index, name in enumerate(names)}
     return TickAxis(
@@ -118,6 +119,39 @@ def _anchor_axis(anchor: Decoded, tick_ns: int) -> TickAxis:
     )
 
 
+def _standing(item: Decoded, period_ns: int) -> NDArray[np.bool_]:
+    """Frames whose counter has not moved since the frame before, though time has.
+
+    Nothing tells which tick they are of: once a turn such a counter even looks right. A repeat of a
+    frame takes no time; a gap of a whole turn takes a whole turn.
+    """
+    standing = np.zeros(len(item.row), dtype=np.bool_)
+    if item.counter is None:
+        return standing
+    for stream in np.unique(item.stream):
+        mine = np.flatnonzero(item.stream == stream)
+        waited = np.diff(item.time_ns[mine])
+        still = np.diff(item.counter[mine]) == 0
+        still &= (waited > period_ns // 2) & (waited < item.message.modulus * period_ns // 2)
+        standing[mine[1:][still]] = True
+    return standing
+
+
+def _unwrap(
+    counter: NDArray[np.int64],
+    time_ns: NDArray[np.int64],
+    moving: NDArray[np.bool_],
+    period_ns: int,
+    modulus: int,
+) -> tuple[Ticks, tuple[str, ...]]:
+    """`unwrap` of the frames whose counter moves; the others have no position."""
+    if moving.all():
+        return unwrap(counter, time_ns, period_ns, modulus)
+    position = np.full(len(counter), OUTSIDE, dtype=np.int64)
+    position[moving], notes = unwrap(counter[moving], time_ns[moving], period_ns, modulus)
+    return position, notes
+
+
 def _counter(item: Decoded) -> NDArray[np.int64]:
     if item.counter is None:
         raise AssertionError("a message that counts ticks has a counter")
@@ -130,7 +164,10 @@ def _own_ticks(item: Decoded, tick_ns: int) -> tuple[Ticks, int, tuple[str, ...]
         return np.zeros(len(item.row), dtype=np.int64), 1, ()
     every = _frame_spacing(item, tick_ns)
     if item.counter is not None and every >= 1:
-        count, notes = unwrap(item.counter, item.time_ns, every * tick_ns, item.message.modulus)
+        moving = ~_standing(item, every * tick_ns)
+        count, notes = _unwrap(
+            item.counter, item.time_ns, moving, every * tick_ns, item.message.modulus
+        )
         begin = int(count[count != OUTSIDE][0])
         return np.where(count == OUTSIDE, OUTSIDE, (count - begin) * every), every, notes
     note = f"{item.message.name}: no counter to place samples by; host time stamps do"

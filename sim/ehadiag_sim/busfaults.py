@@ -5,6 +5,7 @@ Seeded, so that a run can be repeated. Each fault turns one frame into none, one
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -194,15 +195,16 @@ class ErrorFrames:
 
 @dataclass(slots=True)
 class StuckCounter:
-    """The counter of one message stands still, with valid check sums, from a time on."""
+    """The counter of one message stands still for a time, with valid check sums."""
 
     can_id: int
     start: float
+    end: float = math.inf
     _value: int | None = None
 
     def __call__(self, frame: Frame, at: Moment) -> Iterable[Frame]:
         """Write the old counter."""
-        if frame.can_id != self.can_id or at.since < self.start:
+        if frame.can_id != self.can_id or not self.start <= at.since < self.end:
             return (frame,)
         if self._value is None:
             self._value = frame.data[COUNTER_BYTE]

@@ -24,6 +24,7 @@ def item(
         time_ns=np.rint(np.array(time_ms) * MS).astype(np.int64),
         counter=None if counter is None else np.array(counter),
         message=SimpleNamespace(name="M", modulus=modulus),
+        stream=np.zeros(len(time_ms), dtype=np.int64),
     )
 
 
