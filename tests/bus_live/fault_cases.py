@@ -31,23 +31,34 @@ MIDDLE = 0.3
 """s after the first frame: the test has run for some 0.14 s."""
 
 
+Faulting = Callable[[float], Sequence[bf.Fault]]
+"""Faults for a run; the argument is the time when those strike that strike once."""
+
+
+def nothing(_: float) -> Sequence[bf.Fault]:
+    """A sound harness."""
+    return ()
+
+
 @dataclass(frozen=True)
 class Case:
     """One fault and its stated outcome.
 
     why: what NOT TESTED must say; empty: the test is complete.
+    unfit: what NOT TESTED must say though the stored test was completed; empty: the same estimates.
     least: share of the samples that must be there, all of them equal to those of a sound bus.
     counts: counts of the quality that must not be zero.
     wrong: share of the samples that may differ: damage that no receiver can see.
     """
 
     name: str
-    received: Callable[[], Sequence[bf.Fault]] = tuple
-    sent: Callable[[], Sequence[bf.Fault]] = tuple
+    received: Faulting = nothing
+    sent: Faulting = nothing
     core: dict[str, object] = field(default_factory=dict)
     limits: Limits = field(default_factory=Limits)
-    restart: float | None = None
+    restart: bool = False
     why: str = ""
+    unfit: str = ""
     least: float = 1.0
     counts: tuple[str, ...] = ()
     wrong: float = 0.0
@@ -60,6 +71,7 @@ class Run:
     outcome: tester.TesterOutcome
     recording: Recording
     simulated_s: float
+    frames: list[Frame]
 
 
 class Restarting:
@@ -98,31 +110,30 @@ def short_test() -> StoredTest:
     )
 
 
-def run(case: Case, seed: int = 1) -> Run:
-    """Run the short test under a fault."""
+def run(case: Case, seed: int = 1, test: StoredTest | None = None, at: float = MIDDLE) -> Run:
+    """Run a test (the short one) under a fault that strikes `at` s after the first frame."""
+    test = test or short_test()
 
     def make(start_ns: int) -> FccCore:
         options: dict[str, object] = {"faults": Faults(0.3, 0.3, 0.3), "serial": 77}
-        return FccCore(
-            default_actuator(), [short_test()], start_ns=start_ns, **(options | case.core)
-        )
+        return FccCore(default_actuator(), [test], start_ns=start_ns, **(options | case.core))
 
-    core = make(0) if case.restart is None else Restarting(make, case.restart)
+    core = Restarting(make, at) if case.restart else make(0)
     frames: list[Frame] = []
     with FaultyTransport(
-        EmulatorTransport(core), case.received(), sent=case.sent(), seed=seed
+        EmulatorTransport(core), case.received(at), sent=case.sent(at), seed=seed
     ) as bus:
         outcome = tester.run_test(
             bus,
-            test_id=NUMBER,
-            duration=DURATION,
+            test_id=test.id,
+            duration=test.duration,
             transmit=True,
             limits=case.limits,
             on_frame=frames.append,
         )
         simulated = bus.now_ns() / 1e9
     recording = assemble(FrameTable.from_frames(frames), default_map(), case.name)
-    return Run(outcome, recording[-1], simulated)
+    return Run(outcome, recording[-1], simulated, frames)
 
 
 def right_and_wrong(sound: Recording, faulty: Recording) -> tuple[float, float]:
@@ -153,80 +164,111 @@ def foreign_status() -> Frame:
 LOST = ("lost",)
 CASES = (
     Case("sound bus"),
-    Case("loss of 1 %", lambda: [bf.Loss(0.01)], least=0.97, counts=LOST),
-    Case("loss of 5 %", lambda: [bf.Loss(0.05)], least=0.92, counts=LOST),
-    Case("loss of 10 %", lambda: [bf.Loss(0.1)], least=0.86, counts=LOST),
-    Case("loss of 20 %", lambda: [bf.Loss(0.2)], least=0.74, counts=LOST),
-    Case("loss of telemetry alone, 10 %", lambda: [bf.Loss(0.1, TELEMETRY)], least=0.86),
-    Case("loss in bursts of 20 frames", lambda: [bf.Bursts(20, 300.0)], least=0.85, counts=LOST),
-    Case("loss in bursts of 200 frames", lambda: [bf.Bursts(200, 400.0)], least=0.4, counts=LOST),
-    Case("frames twice, 10 %", lambda: [bf.Duplicates(0.1)], counts=("repeated",)),
-    Case("all frames twice", lambda: [bf.Duplicates(1.0)], counts=("repeated",)),
-    Case("frames 4 places late, 5 %", lambda: [bf.Reordering(0.05, 4)], counts=("out_of_order",)),
-    Case("frames 40 places late, 5 %", lambda: [bf.Reordering(0.05, 40)], least=0.9),
-    Case("bit flips, 1 %", lambda: [bf.BitFlips(0.01)], least=0.97, counts=("crc_errors",)),
-    Case("bit flips, 20 %", lambda: [bf.BitFlips(0.2)], least=0.74, counts=("crc_errors",)),
+    Case("loss of 1 %", lambda _: [bf.Loss(0.01)], least=0.97, counts=LOST),
+    Case("loss of 5 %", lambda _: [bf.Loss(0.05)], least=0.92, counts=LOST),
+    Case("loss of 10 %", lambda _: [bf.Loss(0.1)], least=0.86, counts=LOST),
+    Case("loss of 20 %", lambda _: [bf.Loss(0.2)], least=0.74, counts=LOST),
+    Case("loss of telemetry alone, 10 %", lambda _: [bf.Loss(0.1, TELEMETRY)], least=0.86),
+    Case("loss in bursts of 20 frames", lambda _: [bf.Bursts(20, 300.0)], least=0.85, counts=LOST),
     Case(
-        "bit flips with a valid CRC, 1 %", lambda: [bf.BitFlips(0.01, True)], least=0.9, wrong=0.05
+        "loss in bursts of 200 frames",
+        lambda _: [bf.Bursts(200, 400.0)],
+        least=0.4,
+        counts=LOST,
+        unfit="samples are missing",
+    ),
+    Case("frames twice, 10 %", lambda _: [bf.Duplicates(0.1)], counts=("repeated",)),
+    Case("all frames twice", lambda _: [bf.Duplicates(1.0)], counts=("repeated",)),
+    Case("frames 4 places late, 5 %", lambda _: [bf.Reordering(0.05, 4)], counts=("out_of_order",)),
+    Case("frames 40 places late, 5 %", lambda _: [bf.Reordering(0.05, 40)], least=0.9),
+    Case("bit flips, 1 %", lambda _: [bf.BitFlips(0.01)], least=0.97, counts=("crc_errors",)),
+    Case("bit flips, 20 %", lambda _: [bf.BitFlips(0.2)], least=0.74, counts=("crc_errors",)),
+    Case(
+        "bit flips with a valid CRC, 1 %",
+        lambda _: [bf.BitFlips(0.01, True)],
+        least=0.9,
+        wrong=0.05,
+        unfit="the command differs from test",
     ),
     Case(
-        "wrong length, 5 %", lambda: [bf.WrongLength(0.05)], least=0.92, counts=("length_errors",)
+        "wrong length, 5 %", lambda _: [bf.WrongLength(0.05)], least=0.92, counts=("length_errors",)
     ),
-    Case("foreign frames, 5 beside each of ours", lambda: [bf.Foreign(5)]),
-    Case("foreign frames and loss of 5 %", lambda: [bf.Loss(0.05), bf.Foreign(3)], least=0.92),
+    Case("foreign frames, 5 beside each of ours", lambda _: [bf.Foreign(5)]),
+    Case("foreign frames at full load, 50 beside each of ours", lambda _: [bf.Foreign(50)]),
+    Case("foreign frames and loss of 5 %", lambda _: [bf.Loss(0.05), bf.Foreign(3)], least=0.92),
     Case(
         "noise under our identifiers, 5 beside each of ours",
-        lambda: [bf.Noise(5)],
+        lambda _: [bf.Noise(5)],
         counts=("crc_errors",),
     ),
-    Case("error frames, 10 %", lambda: [bf.ErrorFrames(0.1)]),
-    # The frame whose true counter is the one that it is stuck at comes once every 256 ticks.
+    Case("error frames, 10 %", lambda _: [bf.ErrorFrames(0.1)]),
     Case(
         "telemetry counter stuck",
-        lambda: [bf.StuckCounter(TELEMETRY, MIDDLE)],
+        lambda at: [bf.StuckCounter(TELEMETRY, at)],
         least=0.3,
-        counts=("lost", "repeated"),
-        wrong=0.005,
+        counts=LOST,
+        unfit="samples are missing",
     ),
-    Case("status counter stuck", lambda: [bf.StuckCounter(STATUS, 0.0)]),
-    Case("host clock set back by 2 s", lambda: [bf.ClockStep(MIDDLE, -2.0)]),
-    Case("host clock set forward by 2 s", lambda: [bf.ClockStep(MIDDLE, 2.0)]),
-    Case("host clock set back by 0.1 s", lambda: [bf.ClockStep(MIDDLE, -0.1)]),
-    Case("stamps late by up to 5 ms", lambda: [bf.Jitter(5e-3)]),
-    Case("pause of 0.1 s, frames lost", lambda: [bf.Pause(MIDDLE, 0.1)], least=0.7, counts=LOST),
-    Case("pause of 0.1 s, frames in a burst", lambda: [bf.Pause(MIDDLE, 0.1, True)]),
-    Case("pause of 0.3 s", lambda: [bf.Pause(0.2, 0.3)], why="telemetry lost for 0.25 s"),
-    Case("pause of 5 s", lambda: [bf.Pause(MIDDLE, 5.0)], why="telemetry lost for 0.25 s"),
-    Case("telemetry never comes", lambda: [bf.Silence(TELEMETRY)], why="telemetry lost"),
-    Case("telemetry without command", lambda: [bf.Silence(COMMAND)]),
-    Case("no environment", lambda: [bf.Silence(ENVIRONMENT)]),
-    Case("status never comes", lambda: [bf.Silence(STATUS)], why="no answer within 1 s"),
-    Case("status ends while running", lambda: [bf.Silence(STATUS, MIDDLE)], why="not complete 1 s"),
-    Case("bus off", lambda: [bf.Failure(MIDDLE, "bus off")], why="bus lost: .*bus off"),
-    Case("adapter unplugged", lambda: [bf.Failure(0.02, "unplugged")], why="bus lost: .*unplugged"),
-    Case("request lost", sent=lambda: [bf.Loss(1.0)], why="no answer within 1 s"),
+    Case(
+        "telemetry counter stuck for 0.1 s",
+        lambda at: [bf.StuckCounter(TELEMETRY, at, at + 0.1)],
+        least=0.7,
+        counts=LOST,
+    ),
+    Case(
+        "counters of telemetry and command stuck",
+        lambda at: [bf.StuckCounter(TELEMETRY, at), bf.StuckCounter(COMMAND, at)],
+        least=0.3,
+        unfit="samples are missing",
+    ),
+    Case("status counter stuck", lambda _: [bf.StuckCounter(STATUS, 0.0)]),
+    Case("host clock set back by 2 s", lambda at: [bf.ClockStep(at, -2.0)]),
+    Case("host clock set forward by 2 s", lambda at: [bf.ClockStep(at, 2.0)]),
+    Case("host clock set back by 0.1 s", lambda at: [bf.ClockStep(at, -0.1)]),
+    Case("stamps late by up to 50 ms", lambda _: [bf.Jitter(50e-3)]),
+    Case("stamps late by up to 5 ms", lambda _: [bf.Jitter(5e-3)]),
+    Case("pause of 0.1 s, frames lost", lambda at: [bf.Pause(at, 0.1)], least=0.7, counts=LOST),
+    Case("pause of 0.1 s, frames in a burst", lambda at: [bf.Pause(at, 0.1, True)]),
+    Case("pause of 0.3 s", lambda _: [bf.Pause(0.2, 0.3)], why="telemetry lost for 0.25 s"),
+    Case("pause of 1 s", lambda at: [bf.Pause(at, 1.0)], why="telemetry lost for 0.25 s"),
+    Case(
+        "pause of 0.3 s, frames in a burst",
+        lambda _: [bf.Pause(0.2, 0.3, True)],
+        why="telemetry lost for 0.25 s",
+    ),
+    Case("pause of 5 s", lambda at: [bf.Pause(at, 5.0)], why="telemetry lost for 0.25 s"),
+    Case("telemetry never comes", lambda _: [bf.Silence(TELEMETRY)], why="telemetry lost"),
+    Case("telemetry without command", lambda _: [bf.Silence(COMMAND)]),
+    Case("no environment", lambda _: [bf.Silence(ENVIRONMENT)]),
+    Case("status never comes", lambda _: [bf.Silence(STATUS)], why="no answer within 1 s"),
+    Case("status ends while running", lambda at: [bf.Silence(STATUS, at)], why="not complete 1 s"),
+    Case("bus off", lambda at: [bf.Failure(at, "bus off")], why="bus lost: .*bus off"),
+    Case(
+        "adapter unplugged", lambda _: [bf.Failure(0.02, "unplugged")], why="bus lost: .*unplugged"
+    ),
+    Case("request lost", sent=lambda _: [bf.Loss(1.0)], why="no answer within 1 s"),
     Case(
         "first abort lost",
-        sent=lambda: [bf.Pause(0.1, 0.3)],
+        sent=lambda _: [bf.Pause(0.1, 0.3)],
         limits=Limits(current=1.5e-3),
         why="current beyond its limit$",
     ),
     Case(
         "second tester before the request",
-        lambda: [bf.Inserted(0.02, [foreign_request()])],
+        lambda _: [bf.Inserted(0.02, [foreign_request()])],
         why="another tester is on the bus",
     ),
     Case(
         "second tester while the test runs",
-        lambda: [bf.Inserted(MIDDLE, [foreign_request()])],
+        lambda at: [bf.Inserted(at, [foreign_request()])],
         why="another tester is on the bus",
     ),
     Case(
         "status of another test",
-        lambda: [bf.Inserted(MIDDLE, [foreign_status()])],
+        lambda at: [bf.Inserted(at, [foreign_status()])],
         why="changed to test 3",
     ),
-    Case("computer restarts", restart=MIDDLE, why="fell back to idle"),
+    Case("computer restarts", restart=True, why="fell back to idle"),
     Case(
         "refused: oil too cold",
         core={"effects": Effects(oil_temperature=-40.0)},
@@ -257,19 +299,44 @@ def stated(case: Case) -> str:
     return "; ".join(parts)
 
 
+def concluded(case: Case) -> str:
+    """The outcome of a whole stored test in words."""
+    if case.why:
+        return "NOT TESTED, for that reason"
+    return f"NOT TESTED: {case.unfit}" if case.unfit else "same estimates, same verdict"
+
+
 def table() -> str:
-    """The table of the docs."""
-    rows = "".join(f"| {case.name} | {stated(case)} |\n" for case in CASES)
+    """The tables of the docs."""
+    from fault_logs import LOG_CASES  # builds upon this module
+
+    rows = "".join(f"| {item.name} | {stated(item)} | {concluded(item)} |\n" for item in CASES)
+    logs = "".join(f"| {item.name} | {item.stated} |\n" for item in LOG_CASES)
     return f"""# What a damaged harness does to a test
 
-Each fault is injected between an emulated computer and the tester while a short test runs
-(`tests/bus_live/fault_cases.py`, from which this table is printed; `test_live_faults.py` checks
-each line). \u201cSamples\u201d are those of the sound bus to the last bit: none is ever made up.
-Whether what came is enough for a verdict is decided later, by the limits of the data quality.
+Each fault is injected between an emulated computer and the tester
+(`tests/bus_live/fault_cases.py`, from which these tables are printed by
+`python tests/bus_live/fault_cases.py`).
 
-| fault | stated outcome |
+*Handshake and samples*: a test of 0.4 s, each line checked by `test_live_faults.py`. The samples
+are those of the sound bus to the last bit: none is ever made up.
+
+*Diagnosis*: the whole stored test `open` from its request to the verdict, each line checked by
+`test_live_diagnosis.py`; faults that strike once strike amidst the steps that show the filter.
+Same: the verdict of the sound bus, and each estimate within twice its stated error (95 %
+interval) of that of the sound bus.
+
+| fault | handshake and samples | diagnosis |
+| --- | --- | --- |
+{rows}
+## What a damaged log does to a diagnosis
+
+The recording of the same test, damaged, and read as `ehadiag diagnose` reads it
+(`tests/bus_live/fault_logs.py`, checked by `test_live_diagnosis.py`).
+
+| log | diagnosis |
 | --- | --- |
-{rows}"""
+{logs}"""
 
 
 if __name__ == "__main__":
