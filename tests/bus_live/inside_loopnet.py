@@ -25,6 +25,8 @@ from firmware_iface.transport import Transport, TransportState
 
 
 class TestMulticast(TwoWay):
+    speed = 2.0
+
     @pytest.fixture
     def options(self) -> BusOptions:
         return BusOptions("udp_multicast")

@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+import stored_test
+from fault_diagnosis import content as judged_by
 
 from ehadiag.errors import BusLostError, ConfigurationError, InputOutputError
+from ehadiag.verdict import Verdict
 from firmware_iface.frames import Frame, FrameTable
 from firmware_iface.logs import read_frames
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
@@ -59,6 +62,23 @@ class Contract:
     @pytest.fixture
     def feed(self) -> Callable[[], None]:
         raise NotImplementedError
+
+    @pytest.fixture
+    def carried(self) -> list[Frame]:
+        """Return the frames of a stored test as they came through the transport."""
+        raise NotImplementedError
+
+    def test_a_stored_test_comes_with_the_same_samples(self, carried: list[Frame]) -> None:
+        sound = stored_test.recording(stored_test.frames())
+        came = stored_test.recording(carried)
+        assert judged_by(came) == judged_by(sound)
+        assert came.quality.messages == sound.quality.messages
+
+    @pytest.mark.slow
+    def test_a_stored_test_gives_the_same_diagnosis(self, carried: list[Frame]) -> None:
+        came = stored_test.diagnosis(stored_test.recording(carried))
+        assert stored_test.figures(came) == stored_test.figures(stored_test.expected())
+        assert came.verdict is Verdict.DEGRADED
 
     def test_every_frame_comes_once_and_in_order(
         self, receiving: Transport, feed: Callable[[], None]
@@ -114,6 +134,9 @@ class Contract:
 class TwoWay(Contract):
     """Transports with another end that can be written to, and read."""
 
+    speed = 4.0
+    """At which the stored test is played."""
+
     @pytest.fixture
     def other(self) -> Iterator[Transport]:
         raise NotImplementedError
@@ -125,6 +148,10 @@ class TwoWay(Contract):
                 other.send(item)
 
         return send
+
+    @pytest.fixture
+    def carried(self, receiving: Transport, other: Transport) -> list[Frame]:
+        return stored_test.carry(other, receiving, self.speed)
 
     def test_own_frames_do_not_come_back(self, receiving: Transport, other: Transport) -> None:
         for item in FRAMES[:50]:
@@ -158,16 +185,30 @@ class TestVirtual(TwoWay):
             yield transport
 
 
-def test_multicast_keeps_the_contract_in_a_namespace_of_its_own() -> None:
+@pytest.mark.parametrize(
+    "chosen", ["not slow", pytest.param("slow", marks=pytest.mark.slow)], ids=["quick", "slow"]
+)
+def test_multicast_keeps_the_contract_in_a_namespace_of_its_own(chosen: str) -> None:
     loopnet = str(ROOT / "tools" / "loopnet.sh")
     if subprocess.run([loopnet, "true"], capture_output=True, check=False).returncode == 125:
         pytest.skip("no network namespace can be made here")
     inside = str(Path(__file__).with_name("inside_loopnet.py"))
     done = subprocess.run(
-        [loopnet, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", inside],
+        [
+            loopnet,
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-m",
+            chosen,
+            "-p",
+            "no:cacheprovider",
+            inside,
+        ],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
         cwd=ROOT,
     )
@@ -280,6 +321,15 @@ class ReplayContract(Contract):
     @pytest.fixture
     def feed(self) -> Callable[[], None]:
         return lambda: None
+
+    @pytest.fixture
+    def carried(self, tmp_path: Path) -> list[Frame]:
+        path = tmp_path / f"test{self.suffix}"
+        with Recorder(path) as recorder:
+            for item in stored_test.frames():
+                recorder.write(item)
+        with ReplayTransport(read_frames(path), path.name) as transport:
+            return stored_test.received(transport)
 
     def test_the_end_is_known(self, receiving: Transport) -> None:
         assert not receiving.at_end
