@@ -25,7 +25,7 @@ __all__ = ["cache_folder", "cache_is_cold", "inlined", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-KERNEL_FOLDERS = ("ehadiag/model", "ehadiag/identify", "ehadiag_sim")
+KERNEL_FOLDERS = ("ehadiag/model", "ehadiag/identify", "ehadiag/monitor", "ehadiag_sim")
 
 
 def kernel(function: F) -> F:

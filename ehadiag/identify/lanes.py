@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, _constants
 from ehadiag.jit import kernel
+from ehadiag.model.constants import PlantConstants
 from ehadiag.model.lanes import (
     BUSY,
     COEFFICIENT_ROWS,
@@ -34,7 +35,7 @@ from ehadiag.model.transition import FINEST
 __all__ = ["LaneWork", "lane_costs", "lane_work", "runs_free"]
 
 TRAVEL = 1.0e-6
-RATIO = 0.05
+RATIO = 0.1
 BOW = 0.05e-6
 """A tick is cut for the jack until the spool's travel in a part (m, or share of its distance from
 the middle) and its distance from the chord (m) are about this small."""
@@ -126,6 +127,27 @@ def _add(
 
 
 @kernel
+def _jack_tick(
+    c: PlantConstants,
+    tick: float,
+    parts: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+) -> None:
+    """Jack of all lanes over a tick cut into so many parts."""
+    if parts == NODES:
+        midpoints(path, 0.25 * tick)
+    step = NODES // parts
+    span = tick / parts
+    for begin in range(0, NODES, step):
+        if jack_part(c, begin, begin + step, span, state, path, coefficients) > 0:
+            for i in range(LANES):
+                if state[BUSY * LANES + i] != 0.0:
+                    jack_event(c, i, begin, begin + step, span, state, path, coefficients)
+
+
+@kernel
 def _block(batch: Batch, cap: float, work: LaneWork) -> None:
     """Costs of the candidates in `work.rows` into `work.sums`."""
     state, path, coefficients = work.state, work.path, work.coefficients
@@ -154,15 +176,7 @@ def _block(batch: Batch, cap: float, work: LaneWork) -> None:
                 _add(spool[k], weight[0, k], cap, SPOOL, 3, state, rows, sums)
             if parts[k] == 0:
                 parts[k] = _parts(path)
-            if parts[k] == NODES:
-                midpoints(path, 0.25 * tick)
-            step = NODES // parts[k]
-            for begin in range(0, NODES, step):
-                span = tick * step / NODES
-                if jack_part(c, begin, begin + step, span, state, path, coefficients) > 0:
-                    for i in range(LANES):
-                        if state[BUSY * LANES + i] != 0.0:
-                            jack_event(c, i, begin, begin + step, span, state, path, coefficients)
+            _jack_tick(c, tick, parts[k], state, path, coefficients)
             if weight[1, k] != 0.0 and math.isfinite(pressure[k]):
                 pressures(c, state, path)
                 _add(pressure[k], weight[1, k], cap, PRESSURE, 4, state, rows, sums)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
-from ehadiag.identify.gapmodel import FAULT_COUNT
+from ehadiag.identify.gapmodel import CAP, FAULT_COUNT
 from ehadiag.identify.refine import Refinement
 
 __all__ = ["covariance", "interval95", "normal_matrix"]
 
+NORMAL = NormalDist()
+CUT = float(np.sqrt(CAP))
 LAGS = 20
 """Ticks over which gaps are held to be correlated."""
 TIMING_STD = 0.15e-6
@@ -54,7 +57,7 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     return np.asarray(out[:FAULT_COUNT, :FAULT_COUNT])
 
 
-EXPECTED_CAPPED = float(norm.expect(lambda x: x * x, lb=-3.0, ub=3.0, conditional=True))
+EXPECTED_CAPPED = 1.0 - 2.0 * CUT * NORMAL.pdf(CUT) / (2.0 * NORMAL.cdf(CUT) - 1.0)
 """Mean square of a normal variable of which values beyond three deviations are left out."""
 
 
@@ -81,5 +84,5 @@ def interval95(value: float, std: float) -> tuple[float, float]:
 
     For an estimate at a bound the interval begins there: the density beyond it carries nothing.
     """
-    half = float(norm.ppf(0.975)) * std
+    half = NORMAL.inv_cdf(0.975) * std
     return max(0.0, value - half), min(1.0, value + half)

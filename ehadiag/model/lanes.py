@@ -94,10 +94,12 @@ LEAST_DEPTH = -1e-14
 CREEP = 1e-18
 """m/s. A creeping spool never stops by the equations; slower than this it would run into
 denormal numbers, which cost a hundred times as much."""
-COARSE_TRAVEL = 5.0e-6
-COARSE_RATIO = 0.25
+COARSE_TRAVEL = 8.0e-6
+COARSE_RATIO = 0.5
 """Spool travel within a part (m, or share of the distance from the middle) to be cut up."""
-FINE_TRAVEL = 0.7e-6
+CORNER_TRAVEL = 2.0e-6
+"""The same where the part passes the opening at which the pressure gain saturates, m."""
+FINE_TRAVEL = 1.5e-6
 MOST_CUTS = 32
 DRIFT = -0.45
 SHORTEST = 1e-9
@@ -533,6 +535,7 @@ def jack_part(
         push = gain * x1 * by_divide - c.FR
         near = min(abs(x0), abs(x1)) if x0 * x1 > 0.0 else 0.0
         coarse = abs(x1 - x0) > max(COARSE_TRAVEL, COARSE_RATIO * near)
+        coarse |= ((abs(x0) - corner) * (abs(x1) - corner) < 0.0) & (abs(x1 - x0) > CORNER_TRAVEL)
         still = d == 0.0
         slides = (d != 0.0) & (later * d > 0.0) & (abs(moved) < c.XJM) & (not coarse)
         fine = slides | (still & (abs(push) <= 2.0 * friction))
