@@ -461,6 +461,8 @@ def test_bus_off_ends_the_bus() -> None:
 class TestSocketCan(TwoWay):
     @pytest.fixture
     def options(self) -> BusOptions:
+        if "vcan0" not in {name for _, name in socket.if_nameindex()}:
+            pytest.skip("no vcan0 here")
         return BusOptions("socketcan", channel="vcan0")
 
     @pytest.fixture

@@ -28,6 +28,7 @@ from ehadiag_tools.soakload import (
     send_own,
     sent_at_us,
 )
+from firmware_iface.frames import Frame
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 from firmware_iface.receiver import Receiver
 from firmware_iface.recorder import Recorder
@@ -40,6 +41,8 @@ AGE_BINS = 1_000_000
 PAGE = 4096
 WARM_S = 60.0
 """Memory is compared from here on: caches are full by then."""
+MOST_AT_ONCE = 64
+"""Frames between two looks at the clock."""
 QUIET_S = 1.0
 """Silence after which the bus counts as read empty."""
 LONGEST_START_S = 60.0
@@ -174,9 +177,19 @@ class _Reading:
         return float((np.searchsorted(total, share * total[-1]) + 1) * AGE_STEP_US * 1e-6)
 
     def _step(self) -> bool:
+        """Wait for a frame, then take all that are there; false after a silence."""
         frame = self._source.receive(QUIET_S)
         if frame is None:
             return False
+        self._take(frame)
+        for _ in range(MOST_AT_ONCE):
+            frame = self._source.receive(0.0)
+            if frame is None:
+                break
+            self._take(frame)
+        return True
+
+    def _take(self, frame: Frame) -> None:
         if frame.can_id in (TELEMETRY, COMMAND):
             age = time.monotonic_ns() // 1000 - sent_at_us(frame.data)
             self._ages[min(age // AGE_STEP_US, AGE_BINS - 1)] += 1
@@ -184,7 +197,6 @@ class _Reading:
             self.own += 1
         else:
             self.foreign += 1
-        return True
 
 
 def _resident() -> int:
