@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitState, Recording
@@ -98,13 +99,36 @@ def read_frames_noted(path: Path | str) -> tuple[FrameTable, tuple[str, ...]]:
 
 def _collect(path: Path, suffix: str) -> tuple[FrameTable, tuple[str, ...]]:
     columns = ColumnBuilder()
-    trouble = read_blf(path, columns) if suffix == ".blf" else _read_text(path, suffix, columns)
+    notes: tuple[str, ...] = ()
+    with _Complaints() as complaints:
+        trouble = read_blf(path, columns) if suffix == ".blf" else _read_text(path, suffix, columns)
     if len(columns) == 0:
         reason = f" ({trouble})" if trouble else ""
         raise InputOutputError(f"log {path}: no frames in it{reason}")
-    if not trouble:
-        return columns.table(), ()
-    return columns.table(), (f"{trouble} after {len(columns)} frames; the rest is lost",)
+    if complaints.count:
+        notes += (f"{complaints.count} lines of the log could not be read",)
+    if trouble:
+        notes += (f"{trouble} after {len(columns)} frames; the rest is lost",)
+    return columns.table(), notes
+
+
+class _Complaints(logging.Handler):
+    """Counts what python-can's readers skip with no more than a line in its own log."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.count = 0
+
+    def emit(self, _: logging.LogRecord) -> None:
+        """Count a complaint."""
+        self.count += 1
+
+    def __enter__(self) -> Self:
+        logging.getLogger("can").addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("can").removeHandler(self)
 
 
 def _read_text(path: Path, suffix: str, columns: ColumnBuilder) -> str:
