@@ -329,6 +329,12 @@ interval) of that of the sound bus.
 | fault | handshake and samples | diagnosis |
 | --- | --- | --- |
 {rows}
+In closed loop, losses of 1, 5 and 10 %, late frames, a pause of 0.1 s and damaged frames with a
+valid CRC were tried (in the same file): the outcomes are those above. **Not so a loss of 20 %**:
+there the servovalve current must be rebuilt from positions that are missing, and the stated error
+leaves that out. With one seed the verdict was right but FSS was 0.0009 off, 4.8 standard
+deviations; with another it was NOT TESTED.
+
 ## What a damaged log does to a diagnosis
 
 The recording of the same test, damaged, and read as `ehadiag diagnose` reads it

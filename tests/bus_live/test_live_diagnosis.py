@@ -21,6 +21,14 @@ from ehadiag.verdict import Verdict
 LONGEST_S = 9.0
 """Simulated time: request, 5.5 s of test, 1 s to its end, 1 s for an abort; not 2 s beyond."""
 QUICK = ("loss of 20 %", "telemetry counter stuck", "bit flips with a valid CRC, 1 %")
+CLOSED = (
+    "loss of 1 %",
+    "loss of 5 %",
+    "loss of 10 %",
+    "frames 40 places late, 5 %",
+    "pause of 0.1 s, frames lost",
+    "bit flips with a valid CRC, 1 %",
+)
 QUICK_LOGS = ("last 0.2 s missing, word of completion too", "last 0.3 s missing")
 
 
@@ -51,6 +59,15 @@ def test_a_fault_gives_the_stated_verdict(case: Case, diagnoser: Diagnoser, soun
     came = diagnoser.judge(case)
     assert objection(case, sound.diagnosis, came.diagnosis) == ""
     assert came.run.simulated_s < LONGEST_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CLOSED)
+def test_the_closed_loop_test_bears_it_too(name: str) -> None:
+    diagnoser = Diagnoser("closed")
+    sound = diagnoser.judge(CASES[0]).diagnosis
+    case = next(item for item in CASES if item.name == name)
+    assert objection(case, sound, diagnoser.judge(case).diagnosis) == ""
 
 
 @pytest.mark.parametrize("case", marked(LOG_CASES, QUICK_LOGS))
