@@ -9,7 +9,7 @@ from ehadiag.identify.current import CONTROL_LAW_LSB, FRAME_TOLERANCE
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.pipeline import Identification
 from ehadiag.recording import BitState, CommandMode, Environment, Recording, Samples
-from ehadiag.storedtest import StoredTest
+from ehadiag.storedtest import SAME_RATE, StoredTest
 
 __all__ = ["objections_to_estimate", "objections_to_experiment", "objections_to_recording"]
 
@@ -17,13 +17,14 @@ MOST_LOST = 0.25
 """Share of samples of a channel that may be missing."""
 LONGEST_GAP_S = 0.25
 """Longest span without a sample."""
+LEAST_SHARE = 0.5
+"""Share of the samples of a window that a search needs."""
 MOST_SATURATED = 0.02
 """Share of samples at a converter's end."""
 TEMPERATURES = (-54.0, 135.0)
 """degC; the range in which the oil's law is used."""
 LEAST_SUPPLY = 0.5
 """Share of the actuator's own supply pressure."""
-SAME_RATE = 1e-6
 MOST_OUTLIERS = 0.015
 MOST_RMS = 1.25
 
@@ -74,6 +75,12 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
             out.append(f"{share:.0%} of the {name} samples are missing (limit {MOST_LOST:.0%})")
         elif gap > LONGEST_GAP_S:
             out.append(f"no {name} sample for {gap:.2f} s (limit {LONGEST_GAP_S:g} s)")
+    both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])
+    for search in ("FDJ", "Kintas", "FSS", "refinement"):
+        for start, end in getattr(test.windows, search):
+            inside = both[round(start * test.rate) : round(end * test.rate)]
+            if inside.sum() < LEAST_SHARE * (end - start) * test.rate:
+                out.append(f"samples are missing in {start:g} … {end:g} s, which {search} needs")
     return out
 
 
@@ -104,10 +111,10 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     trace, test = experiment.trace, experiment.test
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     if trace.command_gap > FRAME_TOLERANCE[mode]:
-        scale, unit = (1e3, "mm") if test.closed_loop else (1e3, "mA")
+        unit = "mm" if test.closed_loop else "mA"
         out.append(
             f"the command differs from test {test.name!r} by up to "
-            f"{trace.command_gap * scale:.3g} {unit}: another test was played"
+            f"{trace.command_gap * 1e3:.3g} {unit}: another test was played"
         )
     if not trace.rebuilt:
         out.append(

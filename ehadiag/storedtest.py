@@ -18,9 +18,22 @@ from numpy.typing import NDArray
 from ehadiag.errors import ConfigurationError
 from ehadiag.tomlfile import decode_toml, read_toml
 
-__all__ = ["Line", "Sine", "StoredTest", "Window", "bundled_tests", "load_test", "resolve_test"]
+__all__ = [
+    "SAME_RATE",
+    "Line",
+    "Sine",
+    "StoredTest",
+    "Window",
+    "bundled_tests",
+    "load_test",
+    "resolve_test",
+]
 
 MAX_DURATION_S = 600.0
+SAME_RATE = 1e-6
+"""Relative difference up to which two rates are one."""
+LEAST_WINDOW = 10
+"""Ticks."""
 SLACK_S = 5e-10
 """Tick times are not exact in binary: times nearer than this are one."""
 UNITS = {"current": {"A": 1.0, "mA": 1e-3}, "position": {"m": 1.0, "mm": 1e-3}}
@@ -124,14 +137,6 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             out[inside] = part.values(time[inside])
         return out * UNITS[self.mode][self.unit]
 
-    def mask(self, windows: tuple[Window, ...]) -> NDArray[np.bool_]:
-        """Ticks that lie in any of the windows, shape (ticks,)."""
-        time = self.time()
-        out = np.zeros(self.ticks, dtype=np.bool_)
-        for start, end in windows:
-            out |= (time >= start - SLACK_S) & (time < end - SLACK_S)
-        return out
-
 
 def load_test(path: Path | str) -> StoredTest:
     """Read a test file.
@@ -191,6 +196,11 @@ def _checked(test: StoredTest, where: str) -> StoredTest:
         raise ConfigurationError(f"{where}: longer than {MAX_DURATION_S:g} s")
     if test.ticks < 100:
         raise ConfigurationError(f"{where}: shorter than 100 ticks")
+    _check_windows(test, where)
+    return test
+
+
+def _check_windows(test: StoredTest, where: str) -> None:
     for field in ("FDJ", "Kintas", "FSS", "refinement"):
         windows: tuple[Window, ...] = getattr(test.windows, field)
         if not windows:
@@ -200,4 +210,8 @@ def _checked(test: StoredTest, where: str) -> StoredTest:
                 raise ConfigurationError(
                     f"{where}: windows.{field} [{start:g}, {end:g}] not inside the test"
                 )
-    return test
+            if (end - start) * test.rate < LEAST_WINDOW:
+                raise ConfigurationError(
+                    f"{where}: windows.{field} [{start:g}, {end:g}] shorter than "
+                    f"{LEAST_WINDOW} ticks"
+                )

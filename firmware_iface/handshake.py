@@ -190,7 +190,7 @@ class Handshake:
                 if status.state in ACTIVE:
                     return self._end(f"test {status.test_id} of another tester is running")
             case Phase.WAITING:
-                wanted = self.test_id in (None, status.test_id)
+                wanted = self.test_id is None or self._ours(status)
                 fresh = status.elapsed <= FRESH_S
                 if status.state in ACTIVE and wanted and fresh:
                     self._follow(now, status)
@@ -246,8 +246,12 @@ class Handshake:
             confirmed = False if self.phase is Phase.ABORTING else None
             self._end(why, confirmed=confirmed)
 
+    def _ours(self, status: BitStatus) -> bool:
+        """Whether a status is of our test; a bus that names no test has only one."""
+        return status.test_id is None or status.test_id == self.test_id
+
     def _answered(self, now: int, status: BitStatus) -> list[Action]:
-        ours = status.test_id == self.test_id
+        ours = self._ours(status)
         if status.state in ACTIVE:
             if not ours:
                 return self._end(f"test {status.test_id} of another tester is running")
@@ -264,7 +268,7 @@ class Handshake:
         if status.state is BitState.REFUSED:
             # The answer to another request; the computer goes on with the running test.
             return self.on_foreign_request(now)
-        if status.test_id != self.test_id and status.state is not BitState.IDLE:
+        if not self._ours(status) and status.state is not BitState.IDLE:
             return self._end(f"the status changed to test {status.test_id}")
         self._status = status
         match status.state, self.phase:
@@ -283,7 +287,8 @@ class Handshake:
         return []
 
     def _follow(self, now: int, status: BitStatus) -> None:
-        self.test_id = status.test_id
+        if status.test_id is not None:
+            self.test_id = status.test_id
         self._status = status
         if status.state is BitState.RUNNING:
             self._run(now)

@@ -62,10 +62,11 @@ class LiveDecoder:
             return None
         reason = round(values.get("status.reason", 0.0))
         serial = values.get("status.serial")
+        test_id = values.get("status.test_id")
         return BitStatus(
             state=BitState(state),
             reason=BitReason(reason) if reason in REASONS else BitReason.NONE,
-            test_id=round(values.get("status.test_id", 0.0)),
+            test_id=None if test_id is None else round(test_id),
             elapsed=values.get("status.elapsed", 0.0),
             serial=None if serial is None else round(serial),
         )

@@ -15,7 +15,7 @@ class BitStatus:
 
     state: BitState
     reason: BitReason = BitReason.NONE
-    test_id: int = 0
+    test_id: int | None = 0
     elapsed: float = 0.0
     """s."""
     serial: int | None = None

@@ -109,6 +109,13 @@ class PythonCanTransport(Transport):
         return _kernel_drops(self._bus)
 
     def _receive(self, timeout: float) -> Frame | None:
+        frame = self._next(timeout)
+        while frame is not None and self._echoes is not None and self._echoes.is_own(frame):
+            # Nothing of others' may wait behind own frames: a reader takes None for an empty bus.
+            frame = self._next(0.0)
+        return frame
+
+    def _next(self, timeout: float) -> Frame | None:
         try:
             message = self._bus.recv(timeout)
         except Exception as error:
@@ -124,8 +131,6 @@ class PythonCanTransport(Transport):
         if message is None:
             return None
         frame = frame_of(message)
-        if self._echoes is not None and self._echoes.is_own(frame):
-            return None
         of_kernel = self._options.interface in SOCKETCAN_ERRORS
         if frame.error and frame.can_id & BUS_OFF and of_kernel:
             raise self._fail("bus off; check wiring and bit rate, then restart the interface")

@@ -15,7 +15,7 @@ from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
 from ehadiag.errors import ConfigurationError
 from ehadiag.recording import Environment, Outcome, Quality, Recording
-from ehadiag.storedtest import StoredTest, resolve_test
+from ehadiag.storedtest import SAME_RATE, StoredTest, resolve_test
 from ehadiag.verdict import Levels
 
 if TYPE_CHECKING:
@@ -95,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     levels = Levels(arguments.advisory, arguments.limit)
     bus_map = options.the_bus_map(arguments)
     _refuse_contradictions(arguments)
+    _refuse_other_rates(test, actuator, bus_map)
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
     from ehadiag.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
@@ -123,6 +124,18 @@ def run(arguments: argparse.Namespace) -> int:
     show(result, arguments, read_s)
     write_report(result, stem, arguments, read_s)
     return int(result.verdict)
+
+
+def _refuse_other_rates(test: StoredTest, actuator: Actuator, bus_map: BusMap) -> None:
+    """Say before the surface moves that its test could not be judged."""
+    rates = {
+        f"test {test.name!r}": test.rate,
+        f"controller of actuator {actuator.name!r}": actuator.controller.rate,
+        "mapping of the bus": 1e9 / bus_map.tick_ns,
+    }
+    if max(rates.values()) > min(rates.values()) * (1.0 + SAME_RATE):
+        each = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
+        raise ConfigurationError(f"different rates: {each}")
 
 
 def _refuse_contradictions(arguments: argparse.Namespace) -> None:

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from typing import NoReturn
 
 from ehadiag.cli import bit, checkbus, diagnose, replay, sim, tests, warmup
-from ehadiag.errors import EhadiagError
+from ehadiag.errors import EhadiagError, InputOutputError
 
 __all__ = ["main"]
 
@@ -49,6 +49,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Whoever read our output has gone; what is left of it must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
+    except OSError as error:
+        print(f"ehadiag: standard output: {error.strerror or error}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return InputOutputError.exit_code
     except KeyboardInterrupt:
         print("ehadiag: interrupted", file=sys.stderr)
         return INTERRUPTED

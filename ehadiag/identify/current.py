@@ -23,6 +23,10 @@ __all__ = ["CurrentTrace", "commanded_current"]
 
 FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
 """A command frame that far (A, m) from the stored test says that another command was played."""
+NOISE_SHARE = 2.0
+"""The same in units of the current's own noise, where that is large."""
+MEDIAN_TO_STD = 0.67449
+"""Median of the absolute value of a standard normal variable."""
 LEAST_LEVELS = 100
 """Values sent that it takes to know their resolution."""
 CONTROL_LAW_LSB = 4.0
@@ -38,7 +42,7 @@ class CurrentTrace:
     current: A, shape (n,).
     gap_lsb: rms of measured less commanded current, converter steps; NaN without measurement.
     offset: constant error of the measured current, A.
-    rebuilt: whether control law and command gave it; else it is the measured current.
+    rebuilt: whether the measured current bears it out.
     command_gap: largest distance of a command frame from the stored test, A or m.
     """
 
@@ -61,7 +65,8 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
         current = np.clip(command, -controller.IM, controller.IM)
     else:
         current = _control_law(command, samples, controller)
-    finite = np.isfinite(samples.current)
+    # A code at the converter's end says no more than that the current is at least so large.
+    finite = np.isfinite(samples.current) & ~samples.saturated[0]
     difference = samples.current[finite] - current[finite]
     if difference.size == 0:
         return CurrentTrace(current, float("nan"), 0.0, True, command_gap)
@@ -69,10 +74,7 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     # A handful of ticks may be far off where samples were lost: compare most of them.
     spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
     gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
-    rebuilt = gap_lsb < CONTROL_LAW_LSB
-    if not rebuilt:
-        ticks = np.arange(n)
-        current = np.interp(ticks, ticks[finite], samples.current[finite])
+    rebuilt = gap_lsb < max(CONTROL_LAW_LSB, NOISE_SHARE * _noise_lsb(difference))
     return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap)
 
 
@@ -81,6 +83,14 @@ def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     if len(command) >= n:
         return command[:n]
     return np.concatenate([command, np.full(n - len(command), command[-1])])
+
+
+def _noise_lsb(difference: NDArray[np.float64]) -> float:
+    """Noise of the measured current, LSB; what the control law fails to explain moves slowly."""
+    second = np.abs(np.diff(difference, 2))
+    if second.size == 0:
+        return 0.0
+    return float(np.median(second)) / (MEDIAN_TO_STD * np.sqrt(6.0) * CURRENT.lsb)
 
 
 def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -136,6 +146,7 @@ def _positions_seen(
     if not clear or controller.GAI or controller.GAD:
         return seen
     linear = np.abs(samples.current) < controller.IM - 3.0 * CURRENT.lsb
+    linear &= ~samples.saturated[0]
     exact = present & linear
     offset = 0.0
     if exact.any():

@@ -17,7 +17,14 @@ from ehadiag.model.monitoring import FREE_RUN, Anchor
 from ehadiag.recording import Environment, Samples
 from ehadiag.storedtest import StoredTest, Window
 
-__all__ = ["ANCHOR_LSB", "Experiment", "Span", "build_experiment", "judge_noise", "make_batch"]
+__all__ = [
+    "ANCHOR_LSB",
+    "Experiment",
+    "build_experiment",
+    "judge_noise",
+    "make_batch",
+    "share_offsets",
+]
 
 KEPT_SHARE = 0.98
 KEPT_MEAN = 0.75978
@@ -27,6 +34,8 @@ TYPICAL_NOISE_LSB = float(np.sqrt(0.5**2 + 1.0 / 12.0))
 ANCHOR_GAIN = 0.3
 ANCHOR_LSB = (1.3, 6.0)
 """Filtered and single innovations beyond which the model is put back on the spool, LSB."""
+DISPLACED = 0.3e6
+"""Pressure at rest (Pa) above which it is none of the sensor's offset."""
 LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 QUIET_BLOCK = 100
@@ -54,20 +63,15 @@ class Experiment:
     """Already taken off `spool`, m: its mean while the actuator rests before the test moves it."""
     pressure_offset: float
     """Already taken off `pressure`, Pa."""
+    rested: bool
+    """Whether the actuator rested long enough before the test to show them."""
+    origin: float
+    """Spool position before the test, m, as the pressure at rest tells."""
 
     @property
     def ticks(self) -> int:
         """Number of ticks."""
         return len(self.spool)
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """A part of a test to be explained: from `start` to `end` (s), after `lead` s of run-in."""
-
-    start: float
-    end: float
-    lead: float = 0.0
 
 
 def build_experiment(
@@ -78,11 +82,21 @@ def build_experiment(
     pressure = np.where(samples.saturated[2], np.nan, samples.pressure)
     trace = commanded_current(samples, test, actuator.controller)
     rest = _ticks_at_rest(trace.current)
+    constants = plant_constants(actuator, environment)
     spool_offset, pressure_offset = _mean(spool[:rest]), _mean(pressure[:rest])
+    origin = 0.0
+    if constants.FR != 0.0:
+        # What the jack's load asks for is no offset.
+        pressure_offset = 0.0
+    elif abs(pressure_offset) > DISPLACED:
+        # So much pressure is that of a spool that friction holds beside the middle.
+        leak = 1.0 + constants.GP / constants.GQ * constants.CLK
+        origin = min(max(pressure_offset * leak / constants.GP, -constants.XSM), constants.XSM)
+        spool_offset, pressure_offset = spool_offset - origin, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
     return Experiment(
         test=test,
-        constants=plant_constants(actuator, environment),
+        constants=constants,
         tick=samples.period_ns * 1e-9,
         trace=trace,
         spool=spool,
@@ -91,6 +105,8 @@ def build_experiment(
         pressure_noise=_noise(pressure, PRESSURE),
         spool_offset=spool_offset,
         pressure_offset=pressure_offset,
+        rested=rest >= LEAST_REST,
+        origin=origin,
     )
 
 
@@ -107,6 +123,27 @@ def _mean(values: NDArray[np.float64]) -> float:
     """Mean of what is there; 0 of too little."""
     seen = values[np.isfinite(values)]
     return float(seen.mean()) if seen.size >= LEAST_REST else 0.0
+
+
+def share_offsets(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Take the sensors' offsets, where one test of the actuator shows them at rest, off all."""
+    resting = [item for item in experiments if item.rested]
+    if not resting:
+        return list(experiments)
+    spool = float(np.mean([item.spool_offset for item in resting]))
+    pressure = float(np.mean([item.pressure_offset for item in resting]))
+    return [
+        item
+        if item.rested
+        else replace(
+            item,
+            spool=item.spool - spool,
+            pressure=item.pressure - pressure,
+            spool_offset=spool,
+            pressure_offset=pressure,
+        )
+        for item in experiments
+    ]
 
 
 def judge_noise(experiment: Experiment, gaps: NDArray[np.float64]) -> Experiment:
@@ -186,9 +223,9 @@ def make_batch(
 
 
 def _origin(experiment: Experiment, first: int) -> float:
-    """Spool position before tick `first`, m: the middle at the start of a test, else measured."""
+    """Spool position before tick `first`, m: where it rests before the test, else measured."""
     if first == 0:
-        return 0.0
+        return experiment.origin
     before = experiment.spool[max(0, first - 5) : first]
     seen = before[np.isfinite(before)]
     return float(seen[-1]) if seen.size else 0.0

@@ -10,7 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, judge_noise, make_batch
+from ehadiag.identify.experiment import (
+    ANCHOR_LSB,
+    Experiment,
+    judge_noise,
+    make_batch,
+    share_offsets,
+)
 from ehadiag.identify.first import FirstApproximation, first_approximation
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import Objective
@@ -155,6 +161,7 @@ def identify(
     tell = progress or (lambda _stage, _share: None)
     begin = time.perf_counter()
     tell("first approximation", 0.0)
+    experiments = share_offsets(experiments)
     first = first_approximation(experiments)
     start, zero = np.array(first.values), np.zeros(2)
     searched_at = time.perf_counter()
@@ -250,7 +257,7 @@ def _polish(experiments: Sequence[Experiment], best: Refinement) -> Refinement:
     found = POLISH.minimise(objective, best.values, POLISH_DEVIATION, seed=0)
     noise = experiments[0].spool_noise, experiments[0].pressure_noise
     start = found.best if found.cost < best.cost else best.values
-    other = describe(batch, start, best.offsets, noise)
+    other = describe(batch, start, best.offsets, noise, converged=best.converged)
     return replace(other, evaluations=other.evaluations + found.evaluations)
 
 

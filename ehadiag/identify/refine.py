@@ -119,6 +119,8 @@ def describe(
     values: NDArray[np.float64],
     offsets: NDArray[np.float64],
     noise: tuple[float, float],
+    *,
+    converged: bool,
 ) -> Refinement:
     """What `refine` returns, for a point beside steps in the cost that something else has found.
 
@@ -127,7 +129,7 @@ def describe(
     model = GapModel(batch, noise)
     x = np.concatenate([values, offsets / np.array(noise)])
     x = centre(model, x)
-    return _described(model, x, converged=True, jagged=True)
+    return _described(model, x, converged=converged, jagged=True)
 
 
 def _described(

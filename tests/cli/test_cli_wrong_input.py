@@ -146,7 +146,7 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
     (tmp_path / "slow.toml").write_text(changed(TEST, "rate = 1000.0", "rate = 500.0"))
     result = run("bit", "--simulate", "--test", "slow.toml")
     assert result.code == 2
-    assert "runs at 500 Hz, the controller of actuator 'reference-31' at 1000" in result.message
+    assert "test 'closed' 500 Hz, controller of actuator 'reference-31' 1000 Hz" in result.message
 
 
 @pytest.mark.parametrize(
