@@ -23,10 +23,6 @@ __all__ = ["CurrentTrace", "commanded_current"]
 
 FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
 """A command frame that far (A, m) from the stored test says that another command was played."""
-NOISE_SHARE = 2.0
-"""The same in units of the current's own noise, where that is large."""
-MEDIAN_TO_STD = 0.67449
-"""Median of the absolute value of a standard normal variable."""
 LEAST_LEVELS = 100
 """Values sent that it takes to know their resolution."""
 CONTROL_LAW_LSB = 4.0
@@ -74,7 +70,7 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     # A handful of ticks may be far off where samples were lost: compare most of them.
     spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
     gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
-    rebuilt = gap_lsb < max(CONTROL_LAW_LSB, NOISE_SHARE * _noise_lsb(difference))
+    rebuilt = gap_lsb < CONTROL_LAW_LSB
     return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap)
 
 
@@ -83,14 +79,6 @@ def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     if len(command) >= n:
         return command[:n]
     return np.concatenate([command, np.full(n - len(command), command[-1])])
-
-
-def _noise_lsb(difference: NDArray[np.float64]) -> float:
-    """Noise of the measured current, LSB; what the control law fails to explain moves slowly."""
-    second = np.abs(np.diff(difference, 2))
-    if second.size == 0:
-        return 0.0
-    return float(np.median(second)) / (MEDIAN_TO_STD * np.sqrt(6.0) * CURRENT.lsb)
 
 
 def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
