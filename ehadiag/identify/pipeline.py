@@ -133,7 +133,6 @@ class Identification:
     evaluations: int
     """Runs of the model in all stages."""
     generations: int
-    search_cost: float
     cost: float
     converged: bool
     attempts: int
@@ -201,7 +200,6 @@ def identify(
         seed=seed,
         evaluations=evaluations,
         generations=best.found.generations,
-        search_cost=best.found.cost,
         cost=best.refined.cost,
         converged=best.refined.converged,
         attempts=number + 1,
