@@ -18,7 +18,15 @@ from ehadiag.model.jack import jack_response
 from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
 from ehadiag.model.transition import spool_tables
 
-__all__ = ["Batch", "Workspace", "costs", "residuals", "spool_rates", "workspace"]
+__all__ = [
+    "Batch",
+    "Workspace",
+    "costs",
+    "many_residuals",
+    "residuals",
+    "spool_rates",
+    "workspace",
+]
 
 
 class Batch(NamedTuple):
@@ -128,6 +136,19 @@ def residuals(
             gap = (batch.pressure[a + k] - candidate[4] - work.pressure[k]) * batch.weight[1, a + k]
             out[1, a + k] = gap if math.isfinite(gap) else 0.0
     return anchored
+
+
+@kernel
+def many_residuals(
+    batch: Batch,
+    candidates: NDArray[np.float64],
+    work: Workspace,
+    out: NDArray[np.float64],
+    anchored: NDArray[np.int64],
+) -> None:
+    """`residuals` of each candidate: out, shape (n, 2, N), and `anchored`, shape (n,)."""
+    for i in range(candidates.shape[0]):
+        anchored[i] = residuals(batch, candidates[i], work, out[i])
 
 
 @kernel

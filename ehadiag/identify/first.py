@@ -23,7 +23,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
 from ehadiag.identify.objective import Objective
@@ -33,12 +32,13 @@ from ehadiag.model.jack import jack_response
 
 __all__ = ["FirstApproximation", "first_approximation"]
 
-GRID = 25
+GRID = 32
 """Points of the coarse search over 0 … 1."""
 RANGES = ((0.2, 0.06), (0.05, 0.02))
 """Half-widths of the repeated searches, Kintas and FSS."""
-FINER_GRID = 11
-TOLERANCE = 2e-4
+FINER_GRID = 16
+TOLERANCE = 6e-4
+"""Spacing of the last grid."""
 LEAD_S = 0.05
 CREEP_CAP = 100.0
 """A stick-slip jump at another tick counts no more than ten times the noise."""
@@ -119,19 +119,31 @@ def _search(
     high: float,
     points: int,
 ) -> float:
-    """Minimum of a scalar function on [low, high] within 0 … 1: grid, then golden section."""
-    grid = np.linspace(max(low, 0.0), min(high, 1.0), points)
-    values = cost(grid)
-    best = int(np.argmin(values))
-    bracket = grid[max(best - 1, 0)], grid[min(best + 1, points - 1)]
-    fine = minimize_scalar(
-        lambda x: float(cost(np.array([x]))[0]),
-        bounds=bracket,
-        method="bounded",
-        options={"xatol": TOLERANCE},
-    )
-    counter.count += points + int(fine.nfev)
-    return float(fine.x) if fine.fun <= values[best] else float(grid[best])
+    """Minimum of a scalar function on [low, high] within 0 … 1.
+
+    Ever finer grids about the lowest point, all points of one at once; at last the vertex of the
+    parabola through the three lowest neighbours.
+    """
+    while True:
+        grid = np.linspace(max(low, 0.0), min(high, 1.0), points)
+        values = cost(grid)
+        counter.count += points
+        best = int(np.argmin(values))
+        spacing = float(grid[1] - grid[0])
+        if spacing <= TOLERANCE:
+            return _vertex(grid, values, best)
+        low, high = float(grid[best]) - spacing, float(grid[best]) + spacing
+        points = FINER_GRID
+
+
+def _vertex(grid: NDArray[np.float64], values: NDArray[np.float64], best: int) -> float:
+    """Vertex of the parabola through the lowest point and its neighbours, if it has some."""
+    if not 0 < best < len(grid) - 1:
+        return float(grid[best])
+    left, middle, right = values[best - 1 : best + 2]
+    bent = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / bent if bent > 0.0 else 0.0
+    return float(grid[best] + shift * (grid[1] - grid[0]))
 
 
 class _JackSearch:

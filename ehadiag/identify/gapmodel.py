@@ -1,13 +1,15 @@
-"""Gaps of a candidate, their derivatives and their capped sum of squares."""
+"""Gaps of candidates, their derivatives and their capped sum of squares."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch, Workspace, residuals, spool_rates, workspace
+from ehadiag.identify.batch import Batch, Workspace, many_residuals, spool_rates, workspace
 
-__all__ = ["CAP", "FAULT_COUNT", "STEP", "GapModel", "capped"]
+__all__ = ["CAP", "FAULT_COUNT", "STEP", "GapModel", "Slope", "capped"]
 
 CAP = 9.0
 """Largest square of one weighted gap that counts."""
@@ -21,22 +23,60 @@ KINK = 0.3
 """Two-sided differences that disagree by more (in units of noise) mark a break-away."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Slope:
+    """Gaps at a point and how they change about it.
+
+    Attributes
+    ----------
+    x: fault constants, and offsets in units of noise, shape (5,).
+    gaps: weighted gaps there, shape (2, N).
+    cost: their capped sum of squares.
+    jacobian: derivatives of the gaps, shape (5, 2, N).
+    smooth: rows whose derivatives hold, shape (2, N).
+    """
+
+    x: NDArray[np.float64]
+    gaps: NDArray[np.float64]
+    cost: float
+    jacobian: NDArray[np.float64]
+    smooth: NDArray[np.bool_]
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Rows that a step goes by, shape (2, N)."""
+        return self.smooth & (self.gaps**2 < CAP)
+
+
 class GapModel:
-    """Gaps of a candidate; counts evaluations."""
+    """Gaps of candidates; counts evaluations."""
 
     def __init__(self, batch: Batch, noise: tuple[float, float]) -> None:
         self.batch = batch
         self.work: Workspace = workspace(batch)
         self.evaluations = 0
-        self.anchored = 0
         self.scale = np.array([1.0, 1.0, 1.0, *noise])
 
-    def gaps(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Weighted gaps at x (fault constants, offsets in units of noise), shape (2, N)."""
-        out = np.empty((2, len(self.batch.current)))
-        self.anchored = residuals(self.batch, x * self.scale, self.work, out)
-        self.evaluations += 1
-        return out
+    def many(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weighted gaps of points, shape (n, 2, N) for points of shape (n, 5)."""
+        return self._run(points)[0]
+
+    def _run(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        out = np.empty((len(points), 2, len(self.batch.current)))
+        anchored = np.zeros(len(points), dtype=np.int64)
+        many_residuals(self.batch, points * self.scale, self.work, out, anchored)
+        self.evaluations += len(points)
+        return out, anchored
+
+    def costs(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Capped sum of squares of each point, shape (n,)."""
+        return np.array([capped(gaps) for gaps in self.many(points)])
+
+    def anchored(self, x: NDArray[np.float64]) -> int:
+        """How often the model is re-anchored at x."""
+        return int(self._run(x[None, :])[1][0])
 
     def spool_rate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weighted velocity of the spool at the end of each tick, 1/s, shape (N,)."""
@@ -44,37 +84,60 @@ class GapModel:
         spool_rates(self.batch, x * self.scale, self.work, out)
         return out * self.batch.weight[0]
 
-    def jacobian(
-        self, x: NDArray[np.float64], gaps: NDArray[np.float64], width: float = STEP
+    def slopes(self, centres: list[NDArray[np.float64]]) -> list[Slope]:
+        """Gaps and derivatives at several points, all runs of the model together."""
+        sides = [_sides(x, STEP) for x in centres]
+        points = np.vstack([np.vstack([x[None, :], at]) for x, at in zip(centres, sides, strict=True)])
+        runs = self.many(points).reshape(len(centres), 1 + 2 * FAULT_COUNT, 2, -1)
+        out = []
+        for x, at, gaps in zip(centres, sides, runs, strict=True):
+            jacobian, smooth = self._differences(x, gaps[0], at, gaps[1:])
+            out.append(Slope(x, gaps[0], capped(gaps[0]), jacobian, smooth))
+        return out
+
+    def trusted_slope(self, x: NDArray[np.float64]) -> Slope:
+        """Gaps and derivatives at x, and the rows where two widths of difference agree on them.
+
+        A break-away inside a difference makes a jump that looks like information but is none.
+        """
+        near, far = _sides(x, STEP), _sides(x, WIDE_STEP)
+        runs = self.many(np.vstack([x[None, :], near, far]))
+        middle = 1 + 2 * FAULT_COUNT
+        jacobian, smooth = self._differences(x, runs[0], near, runs[1:middle])
+        wide, wide_smooth = self._differences(x, runs[0], far, runs[middle:])
+        typical = np.sqrt(np.mean(wide**2, axis=(1, 2), keepdims=True))
+        allowed = AGREEMENT * np.maximum(np.abs(jacobian), np.abs(wide)) + typical
+        agree = np.all(np.abs(jacobian - wide) <= allowed, axis=0)
+        return Slope(x, runs[0], capped(runs[0]), jacobian, smooth & wide_smooth & agree)
+
+    def _differences(
+        self,
+        x: NDArray[np.float64],
+        gaps: NDArray[np.float64],
+        sides: NDArray[np.float64],
+        runs: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Derivatives, shape (5, 2, N), and the rows whose derivatives hold, shape (2, N)."""
+        """Derivatives from runs on both sides, and the rows where these agree with the middle."""
         out = np.zeros((len(x), *gaps.shape))
         smooth = np.ones(gaps.shape, dtype=np.bool_)
         for j in range(FAULT_COUNT):
-            above, below = x.copy(), x.copy()
-            above[j] = x[j] + width if x[j] + width <= 1.0 else x[j] - 2.0 * width
-            below[j] = x[j] - width if x[j] - width >= 0.0 else x[j] + 2.0 * width
-            high, low = self.gaps(above), self.gaps(below)
-            out[j] = (high - low) / (above[j] - below[j])
-            straight = low + out[j] * (x[j] - below[j])
+            above, below = sides[2 * j, j], sides[2 * j + 1, j]
+            high, low = runs[2 * j], runs[2 * j + 1]
+            out[j] = (high - low) / (above - below)
+            straight = low + out[j] * (x[j] - below)
             smooth &= np.abs(gaps - straight) < KINK
         out[3, 0] = -self.batch.weight[0] * self.scale[3]
         out[4, 1] = -self.batch.weight[1] * self.scale[4]
         return out, smooth
 
-    def trusted_jacobian(
-        self, x: NDArray[np.float64], gaps: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Derivatives, shape (5, 2, N), and the rows where two widths of difference agree on them.
 
-        A break-away inside a difference makes a jump that looks like information but is none.
-        """
-        jacobian, smooth = self.jacobian(x, gaps)
-        wide, wide_smooth = self.jacobian(x, gaps, WIDE_STEP)
-        typical = np.sqrt(np.mean(wide**2, axis=(1, 2), keepdims=True))
-        allowed = AGREEMENT * np.maximum(np.abs(jacobian), np.abs(wide)) + typical
-        agree = np.all(np.abs(jacobian - wide) <= allowed, axis=0)
-        return jacobian, smooth & wide_smooth & agree
+def _sides(x: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+    """Points above and below x in each fault constant, within 0 … 1, shape (6, 5)."""
+    out = np.repeat(x[None, :], 2 * FAULT_COUNT, axis=0)
+    for j in range(FAULT_COUNT):
+        out[2 * j, j] = x[j] + width if x[j] + width <= 1.0 else x[j] - 2.0 * width
+        out[2 * j + 1, j] = x[j] - width if x[j] - width >= 0.0 else x[j] + 2.0 * width
+    return out
 
 
 def capped(gaps: NDArray[np.float64]) -> float:

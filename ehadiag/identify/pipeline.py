@@ -20,7 +20,7 @@ from ehadiag.identify.experiment import (
 from ehadiag.identify.first import FirstApproximation, first_approximation
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.refine import Refinement, describe, median_offsets, refine
+from ehadiag.identify.refine import Refinement, describe, gaps_of, median_offsets, refine
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
@@ -54,7 +54,7 @@ PLANS = (
 DEVIATION_SHARE = np.array([1.0, 1.0, 0.2])
 """The first approximation knows FDJ best."""
 SEARCH_LEAD_S = 0.1
-POLISH = CompactGa(budget=241, virtual_population=30.0, tolerance=1e-7)
+POLISH = CompactGa(budget=241,  virtual_population=30.0, tolerance=1e-7)
 POLISH_DEVIATION = 3e-4
 POOR_FIT = 0.01
 """Share of gaps beyond three deviations that asks for another attempt."""
@@ -171,7 +171,8 @@ def identify(
         before = time.perf_counter()
         offsets = zero
         if plan.median_offsets:
-            offsets = median_offsets(make_batch(experiments), start)
+            free = make_batch(experiments)
+            offsets = median_offsets(free, gaps_of(free, start))
         windows = [experiment.test.windows.refinement for experiment in experiments]
         found = solver.with_budget(round(solver.budget * plan.budget)).minimise(
             Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S), offsets),
@@ -223,20 +224,21 @@ class _Attempt:
 
 def _attempt(experiments: Sequence[Experiment], found: SearchResult) -> _Attempt:
     """Refine the optimum of a search, weighing by the noise that the gaps show."""
-    offsets = median_offsets(make_batch(experiments), found.best)
+    free = make_batch(experiments)
+    gaps = gaps_of(free, found.best)
+    offsets = median_offsets(free, gaps)
+    experiments = _judged(experiments, gaps)
     best = _refine(experiments, found.best, offsets)
-    evaluations = best.evaluations
+    evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [(item.spool_noise, item.pressure_noise) for item in experiments]
-        experiments = [
-            judge_noise(experiment, best.gaps[:, a:b])
-            for experiment, (a, b) in zip(experiments, _bounds(experiments), strict=True)
-        ]
-        best = _refine(experiments, best.values, best.offsets)
-        evaluations += best.evaluations
-        after = [(item.spool_noise, item.pressure_noise) for item in experiments]
+        judged = _judged(experiments, best.gaps)
+        after = [(item.spool_noise, item.pressure_noise) for item in judged]
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
+        experiments = judged
+        best = _refine(experiments, best.values, best.offsets)
+        evaluations += best.evaluations
     if best.jagged:
         best = _polish(experiments, best)
         evaluations += best.evaluations
@@ -265,6 +267,16 @@ def _refine(
     batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
     noise = experiments[0].spool_noise, experiments[0].pressure_noise
     return refine(batch, start, offsets, noise)
+
+
+def _judged(
+    experiments: Sequence[Experiment], gaps: NDArray[np.float64]
+) -> Sequence[Experiment]:
+    """Weigh all experiments by the noise that their gaps show, shape (2, N)."""
+    return [
+        judge_noise(experiment, gaps[:, a:b])
+        for experiment, (a, b) in zip(experiments, _bounds(experiments), strict=True)
+    ]
 
 
 def _bounds(experiments: Sequence[Experiment]) -> list[tuple[int, int]]:

@@ -15,13 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, residuals, workspace
-from ehadiag.identify.gapmodel import CAP, FAULT_COUNT, STEP, GapModel, capped
+from ehadiag.identify.gapmodel import FAULT_COUNT, STEP, GapModel, Slope
 from ehadiag.identify.settle import centre, settle
 
-__all__ = ["Refinement", "describe", "median_offsets", "refine"]
+__all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
 
 ITERATIONS = 20
 CONVERGED = 1e-6
+LEAST_DAMPING = 1e-6
+CAUTIOUS_DAMPING = 0.3
+"""Two steps are tried at once, the second one damped at least so much."""
+MORE = 100.0
+"""Ratio of their damping at least."""
+MOST_DAMPING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,42 +82,43 @@ def refine(
     """
     model = GapModel(batch, noise)
     x = np.concatenate([np.clip(start, 0.0, 1.0), offsets / np.array(noise)])
-    gaps = model.gaps(x)
-    cost = capped(gaps)
-    damping = 1e-5
+    slope = model.slopes([x])[0]
+    damping = LEAST_DAMPING
     converged = False
     for _ in range(ITERATIONS):
-        jacobian, smooth = model.jacobian(x, gaps)
-        used = smooth & (gaps**2 < CAP)
-        rows = jacobian[:, used]
-        normal, gradient = rows @ rows.T, rows @ gaps[used]
-        free = ~((x == 0.0) & (gradient > 0.0) | (x == 1.0) & (gradient < 0.0))
-        free[FAULT_COUNT:] = True
-        moved = False
-        for _ in range(8):
-            step = np.zeros(len(x))
-            damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
-            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
-            trial = x + step
-            trial[:FAULT_COUNT] = np.clip(trial[:FAULT_COUNT], 0.0, 1.0)
-            trial_gaps = model.gaps(trial)
-            trial_cost = capped(trial_gaps)
-            if trial_cost <= cost:
-                moved = True
-                break
-            damping = max(damping * 10.0, 1e-6)
-        if not moved:
-            # No step improves: the optimum, to within the jumps that break-aways make.
-            converged = bool(np.abs(step[:FAULT_COUNT]).max() < STEP)
-            break
-        size = float(np.abs(trial - x)[:FAULT_COUNT].max())
-        x, gaps, cost = trial, trial_gaps, trial_cost
-        damping = max(damping / 10.0, 1e-9)
+        cautious = max(MORE * damping, CAUTIOUS_DAMPING)
+        trials = [_stepped(slope, damping), _stepped(slope, cautious)]
+        size = float(np.abs(trials[0] - slope.x)[:FAULT_COUNT].max())
         if size < CONVERGED:
             converged = True
             break
-    x, smooth_bowl = settle(model, x, gaps, cost)
+        best = min(model.slopes(trials), key=lambda trial: trial.cost)
+        if best.cost < slope.cost:
+            slope = best
+            damping = max(damping / 10.0, LEAST_DAMPING)
+        elif damping >= MOST_DAMPING:
+            # No step improves: the optimum, to within the jumps that break-aways make.
+            converged = size < STEP
+            break
+        else:
+            damping = MOST_DAMPING
+    x, smooth_bowl = settle(model, slope)
     return _described(model, x, converged=converged, jagged=not smooth_bowl)
+
+
+def _stepped(slope: Slope, damping: float) -> NDArray[np.float64]:
+    """Point that a damped Gauss-Newton step leads to, within the bounds."""
+    x, used = slope.x, slope.used
+    rows = slope.jacobian[:, used]
+    normal, gradient = rows @ rows.T, rows @ slope.gaps[used]
+    free = ~((x == 0.0) & (gradient > 0.0) | (x == 1.0) & (gradient < 0.0))
+    free[FAULT_COUNT:] = True
+    step = np.zeros(len(x))
+    damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+    step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
+    out = x + step
+    out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
+    return np.asarray(out)
 
 
 def describe(
@@ -127,25 +134,23 @@ def describe(
     The point is moved to the middle of the ground that the steps leave.
     """
     model = GapModel(batch, noise)
-    x = np.concatenate([values, offsets / np.array(noise)])
-    x = centre(model, x)
+    x = centre(model, model.slopes([np.concatenate([values, offsets / np.array(noise)])])[0])
     return _described(model, x, converged=converged, jagged=True)
 
 
 def _described(
     model: GapModel, x: NDArray[np.float64], *, converged: bool, jagged: bool
 ) -> Refinement:
-    gaps = model.gaps(x)
-    anchored = model.anchored
+    slope = model.trusted_slope(x)
+    anchored = model.anchored(x)
     weighted = model.batch.weight > 0.0
-    jacobian, steady = model.trusted_jacobian(x, gaps)
-    used = steady & (gaps**2 < CAP) & weighted
-    jacobian[:, ~used] = 0.0
+    used = slope.used & weighted
+    jacobian = np.where(used, slope.jacobian, 0.0)
     return Refinement(
         values=x[:FAULT_COUNT],
         offsets=x[FAULT_COUNT:] * model.scale[FAULT_COUNT:],
-        cost=capped(gaps),
-        gaps=gaps,
+        cost=slope.cost,
+        gaps=slope.gaps,
         jacobian=jacobian,
         spool_rate=model.spool_rate(x),
         used=used,
@@ -157,13 +162,18 @@ def _described(
     )
 
 
-def median_offsets(batch: Batch, faults: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Median gap of spool (m) and pressure (Pa), shape (2,), at fault constants of shape (3,).
+def gaps_of(batch: Batch, faults: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weighted gaps, shape (2, N), at fault constants of shape (3,), no offsets taken off."""
+    gaps = np.empty((2, len(batch.current)))
+    residuals(batch, np.concatenate([faults, [0.0, 0.0]]), workspace(batch), gaps)
+    return gaps
+
+
+def median_offsets(batch: Batch, gaps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Median gap of spool (m) and pressure (Pa), shape (2,), of weighted gaps of shape (2, N).
 
     For a batch that runs free: re-anchoring would take most of an offset away.
     """
-    gaps = np.empty((2, len(batch.current)))
-    residuals(batch, np.concatenate([faults, [0.0, 0.0]]), workspace(batch), gaps)
     out = np.zeros(2)
     for channel in range(2):
         weight = batch.weight[channel]

@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.gapmodel import CAP, FAULT_COUNT, GapModel, capped
+from ehadiag.identify.gapmodel import FAULT_COUNT, GapModel, Slope
 
 __all__ = ["centre", "settle"]
 
 SETTLINGS = 2
 REACH = 2.0
 """Deviations to either side over which the bowl is looked at."""
-POINTS = 9
+POINTS = 11
 FINE_POINTS = 33
 LEAST_POINTS = 5
 LONGEST_AXIS = 0.005
@@ -27,54 +27,55 @@ ROUGH = 3.0
 """Distance of the cost from a parabola from which it counts as jagged."""
 
 
-def settle(
-    model: GapModel, x: NDArray[np.float64], gaps: NDArray[np.float64], cost: float
-) -> tuple[NDArray[np.float64], bool]:
+def settle(model: GapModel, slope: Slope) -> tuple[NDArray[np.float64], bool]:
     """Move to the vertex of the smooth bowl that the cost is, its small jumps apart.
 
     Parabolas through the cost over some deviations, along the axes of the uncertainty, see past
-    its steps. `x` are fault constants and offsets in units of noise, shape (5,), `gaps` and `cost`
-    those at x. Returns the vertex, and whether the cost is a smooth bowl about it.
+    its steps. Returns the vertex, shape (5,), and whether the cost is a smooth bowl about it.
     """
+    x, cost = slope.x, slope.cost
+    axes = _axes(slope)
     smooth_bowl = True
     for _ in range(SETTLINGS):
-        best = x.copy()
-        for direction in _axes(model, x, gaps):
-            best, rough = _vertex(model, best, direction)
-            smooth_bowl &= rough < ROUGH
-        moved_gaps = model.gaps(best)
-        moved_cost = capped(moved_gaps)
-        if moved_cost > cost + WORSE:
+        moved, rough = _vertex(model, x, cost, axes)
+        smooth_bowl &= rough < ROUGH
+        if smooth_bowl:
+            return moved, True
+        slope = model.slopes([moved])[0]
+        if slope.cost > cost + WORSE:
             break
-        x, gaps, cost = best, moved_gaps, moved_cost
+        x, cost, axes = moved, slope.cost, _axes(slope)
     return x, smooth_bowl
 
 
-def centre(model: GapModel, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
     """Mean of the likelihood along the longest axis of the uncertainty, steps and all."""
-    gaps = model.gaps(x)
-    cost = capped(gaps)
-    axes = _axes(model, x, gaps)
+    axes = _axes(slope)
+    x = slope.x
     if not axes:
         return x
     shares = np.linspace(-REACH, REACH, FINE_POINTS)
     points = x + shares[:, None] * axes[0]
-    inside = np.all((points[:, :FAULT_COUNT] >= 0.0) & (points[:, :FAULT_COUNT] <= 1.0), axis=1)
-    values = np.array([capped(model.gaps(point)) for point in points[inside]])
+    inside = _inside(points)
+    values = model.costs(points[inside])
     weight = np.exp(-0.5 * (values - values.min()))
     middle = x + float(shares[inside] @ weight / weight.sum()) * axes[0]
-    return middle if capped(model.gaps(middle)) < cost + WORSE else x
+    return middle if float(model.costs(middle[None, :])[0]) < slope.cost + WORSE else x
 
 
-def _axes(
-    model: GapModel, x: NDArray[np.float64], gaps: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
+def _inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Points whose fault constants are 0 … 1."""
+    faults = points[:, :FAULT_COUNT]
+    return np.asarray(np.all((faults >= 0.0) & (faults <= 1.0), axis=1))
+
+
+def _axes(slope: Slope) -> list[NDArray[np.float64]]:
     """Axes of the uncertainty of the constants inside their bounds, the longest first.
 
     Each is one deviation long, shape (5,).
     """
-    jacobian, smooth = model.jacobian(x, gaps)
-    rows = jacobian[:, smooth & (gaps**2 < CAP)]
+    x = slope.x
+    rows = slope.jacobian[:, slope.used]
     free = (x[:FAULT_COUNT] > 0.0) & (x[:FAULT_COUNT] < 1.0)
     kept = np.concatenate([free, np.ones(len(x) - FAULT_COUNT, dtype=np.bool_)])
     spread = np.linalg.pinv((rows @ rows.T)[np.ix_(kept, kept)], hermitian=True)
@@ -89,21 +90,30 @@ def _axes(
 
 
 def _vertex(
-    model: GapModel, x: NDArray[np.float64], direction: NDArray[np.float64]
+    model: GapModel, x: NDArray[np.float64], cost: float, axes: list[NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], float]:
-    """Minimum of the parabola through the cost at points along a direction.
+    """Minimum of the parabolas through the cost along all axes, which are conjugate.
 
-    Returns that point, and how far the cost is from the parabola at most.
+    Returns that point, and how far the cost is from a parabola at most.
     """
     shares = np.linspace(-REACH, REACH, POINTS)
-    points = x + shares[:, None] * direction
-    inside = np.all((points[:, :FAULT_COUNT] >= 0.0) & (points[:, :FAULT_COUNT] <= 1.0), axis=1)
-    if inside.sum() < LEAST_POINTS:
+    aside = shares[shares != 0.0]
+    lines = [x + aside[:, None] * axis for axis in axes]
+    kept = [_inside(points) for points in lines]
+    wanted = [points[inside] for points, inside in zip(lines, kept, strict=True)]
+    if not wanted:
         return x, 0.0
-    shares = shares[inside]
-    values = np.array([capped(model.gaps(point)) for point in points[inside]])
-    fit = np.polyfit(shares, values, 2)
-    rough = float(np.abs(values - np.polyval(fit, shares)).max())
-    bent, slope, _ = fit
-    share = shares[np.argmin(values)] if bent <= 0.0 else -0.5 * slope / bent
-    return x + float(np.clip(share, shares[0], shares[-1])) * direction, rough
+    values = np.split(model.costs(np.vstack(wanted)), np.cumsum([len(w) for w in wanted])[:-1])
+    out, roughest = x.copy(), 0.0
+    for axis, inside, measured in zip(axes, kept, values, strict=True):
+        if len(measured) + 1 < LEAST_POINTS:
+            continue
+        at = np.append(aside[inside], 0.0)
+        costs = np.append(measured, cost)
+        fit = np.polyfit(at, costs, 2)
+        roughest = max(roughest, float(np.abs(costs - np.polyval(fit, at)).max()))
+        bent, slope, _ = fit
+        share = at[np.argmin(costs)] if bent <= 0.0 else -0.5 * slope / bent
+        out += float(np.clip(share, at.min(), at.max())) * axis
+    out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
+    return out, roughest

@@ -74,7 +74,7 @@ class CompactGa:
     budget: int = 600
     """Evaluations at most."""
     virtual_population: float = 40.0
-    samples: int = 8
+    samples: int = 16
     """Individuals drawn a generation."""
     tolerance: float = 1e-5
     """Done when the deviation of every gene is below."""
