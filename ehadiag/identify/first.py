@@ -23,10 +23,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
 from ehadiag.identify.objective import Objective
+from ehadiag.identify.scalar import minimise_scalar
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.jack import jack_response
@@ -123,15 +123,10 @@ def _search(
     grid = np.linspace(max(low, 0.0), min(high, 1.0), points)
     values = cost(grid)
     best = int(np.argmin(values))
-    bracket = grid[max(best - 1, 0)], grid[min(best + 1, points - 1)]
-    fine = minimize_scalar(
-        lambda x: float(cost(np.array([x]))[0]),
-        bounds=bracket,
-        method="bounded",
-        options={"xatol": TOLERANCE},
-    )
-    counter.count += points + int(fine.nfev)
-    return float(fine.x) if fine.fun <= values[best] else float(grid[best])
+    bracket = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, points - 1)])
+    fine = minimise_scalar(lambda x: float(cost(np.array([x]))[0]), *bracket, TOLERANCE)
+    counter.count += points + fine.evaluations
+    return fine.x if fine.value <= values[best] else float(grid[best])
 
 
 class _JackSearch:
