@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import binascii
 import contextlib
+import select
 import struct
 import threading
 import time
@@ -32,8 +33,12 @@ TIME_WRAP_US = 1 << 32
 READ_BYTES = 4096
 POLL = 0.01
 """s; the port's own time limit. Setting it anew at each call would reconfigure the line."""
-WRITE_TIMEOUT = 1.0
-"""s; a port that takes no byte for so long is lost."""
+PATIENCE = 0.25
+"""s; a port that takes no byte for so long has nobody who reads at its other end."""
+RETRY = 0.1
+"""s between two tries of such a port, where it cannot be asked whether there is room again."""
+NO_WRITE_TIMEOUT = ("rfc2217://",)
+"""pyserial URLs that refuse to open with a time limit on writing; they have one of their own."""
 
 
 def packet_of(frame: Frame) -> bytes:
@@ -130,6 +135,10 @@ class SerialTransport(Transport):
 
     Frame times are the sender's clock, shifted once to this host's at the first frame.
 
+    A serial line does not say whether anybody reads it, but a pseudo-terminal or a network port
+    fills up when nobody does: frames that find no room are dropped and counted (DEGRADED), and
+    sending goes on when there is room again.
+
     Raises
     ------
     ConfigurationError: pyserial does not know the URL or the settings.
@@ -144,6 +153,10 @@ class SerialTransport(Transport):
         self._ready: deque[Frame] = deque()
         self._shift_ns: int | None = None
         self._said_bad = 0
+        self._unsent = 0
+        self._stalled = False
+        self._cut = False
+        self._next_try = 0.0
         self._write_lock = threading.Lock()
         # A network port says only whether anything waits, not how much: read in blocks there.
         self._first_read = 256 if "://" in url else 1
@@ -153,6 +166,11 @@ class SerialTransport(Transport):
     def bad_packets(self) -> int:
         """Packets dropped so far."""
         return self._framer.bad
+
+    @property
+    def unsent(self) -> int:
+        """Frames dropped so far because the port had no room; of each stall one may have gone out."""
+        return self._unsent
 
     def _receive(self, timeout: float) -> Frame | None:
         deadline = time.monotonic() + timeout
@@ -181,15 +199,47 @@ class SerialTransport(Transport):
             )
         if self._framer.bad != self._said_bad:
             self._said_bad = self._framer.bad
-            self._degrade(f"{self._said_bad} damaged packets dropped")
+            self._tell()
 
     def _send(self, frame: Frame) -> None:
         packet = packet_of(frame)
+        with self._write_lock:
+            if not self._write(packet):
+                self._unsent += 1
+                self._tell()
+
+    def _write(self, packet: bytes) -> bool:
+        """Hand a packet to the port; False where it had no room for all of it."""
+        from serial import SerialTimeoutException  # noqa: PLC0415 - only serial users need it
+
         try:
-            with self._write_lock:
-                self._port.write(packet)
+            if not self._has_room():
+                self._stalled = True
+                return False
+            # What a cut packet left behind ends here, so that it does not spoil this one as well.
+            self._port.write(b"\0" * self._cut + packet)
+        except SerialTimeoutException:
+            self._stalled = self._cut = True
+            self._next_try = time.monotonic() + RETRY
+            return False
         except Exception as error:
             raise self._lost(error) from None
+        self._stalled = self._cut = False
+        return True
+
+    def _has_room(self) -> bool:
+        """Whether the port takes bytes; waits for it once, not for each frame of a long stall."""
+        try:
+            descriptor = self._port.fileno()
+        except (AttributeError, OSError):  # Windows, RFC 2217
+            return not self._stalled or time.monotonic() >= self._next_try
+        return bool(select.select([], [descriptor], [], 0.0 if self._stalled else PATIENCE)[1])
+
+    def _tell(self) -> None:
+        parts = [f"{self._said_bad} damaged packets dropped"] if self._said_bad else []
+        if self._unsent:
+            parts.append(f"{self._unsent} frames not sent, nobody read at the other end")
+        self._degrade("; ".join(parts))
 
     def _close(self) -> None:
         with contextlib.suppress(Exception):
@@ -202,11 +252,12 @@ class SerialTransport(Transport):
 def _open_port(url: str, baudrate: int) -> Any:
     import serial  # noqa: PLC0415 - only serial users need it
 
+    patience = None if url.lower().startswith(NO_WRITE_TIMEOUT) else PATIENCE
     try:
         return serial.serial_for_url(
-            url, baudrate=baudrate, timeout=POLL, write_timeout=WRITE_TIMEOUT, exclusive=True
+            url, baudrate=baudrate, timeout=POLL, write_timeout=patience, exclusive=True
         )
-    except ValueError as error:
+    except (ValueError, NotImplementedError) as error:
         raise ConfigurationError(f"serial {url}: wrong option: {error}") from None
     except (serial.SerialException, OSError) as error:
         text = " ".join(str(error).split())

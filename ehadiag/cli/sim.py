@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     ):
         names = ", ".join(f"{test.id} {test.name}" for test in tests)
         say(f"flight-control computer on {transport.name}, tests {names}; Ctrl-C stops it")
-        ticks = run_emulator(core, transport, stop)
-    say(f"stopped after {ticks} ticks, {core.tests_started} tests started")
+        ticks = run_emulator(core, transport, stop, tell=say)
+        damage = f"; {transport.detail}" if transport.detail else ""
+    say(f"stopped after {ticks} ticks, {core.tests_started} tests started{damage}")
     return 0

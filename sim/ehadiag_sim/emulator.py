@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 
 from ehadiag_sim.fcc import FccCore
 from firmware_iface.frames import Frame
-from firmware_iface.transport import Transport
+from firmware_iface.transport import Transport, TransportState
 
 __all__ = ["EmulatorTransport", "run_emulator"]
 
@@ -19,9 +20,16 @@ MOST_READ = 64
 
 
 def run_emulator(
-    core: FccCore, transport: Transport, stop: threading.Event, *, real_time: bool = True
+    core: FccCore,
+    transport: Transport,
+    stop: threading.Event,
+    *,
+    real_time: bool = True,
+    tell: Callable[[str], None] | None = None,
 ) -> int:
     """Run the computer on a bus until `stop` is set; return the number of ticks.
+
+    `tell` hears once, the first time that the transport is degraded, what it says of itself.
 
     Ticks have absolute deadlines, so lateness is made up and the rate does not drift. With
     `real_time` false ticks follow at once and only the frames' time stamps tell the time.
@@ -47,6 +55,9 @@ def run_emulator(
             core.take(frame)
         for frame in core.step():
             transport.send(frame)
+        if tell is not None and transport.state is TransportState.DEGRADED:
+            tell(transport.detail)
+            tell = None
         ticks += 1
     return ticks
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface import busmap, seriallink
+from firmware_iface import busmap, livedecode, seriallink
 from firmware_iface.frames import Frame
 from fuzz import targets
 
@@ -62,3 +62,27 @@ def test_a_framer_that_depends_on_the_pieces_is_a_finding(monkeypatch: pytest.Mo
     monkeypatch.setattr(seriallink.Framer, "feed", forgetful)
     with pytest.raises(AssertionError, match="depends"):
         targets.target("serial")((CORPUS / "serial" / "packets").read_bytes())
+
+
+def test_decoders_that_disagree_are_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = (CORPUS / "frames" / "test").read_bytes()
+    sound = livedecode._si
+    monkeypatch.setattr(livedecode, "_si", lambda *given: 1.001 * sound(*given))
+    with pytest.raises(AssertionError, match="disagree"):
+        targets.target("frames")(data)
+    monkeypatch.setattr(livedecode, "_intact", lambda *_: False)
+    with pytest.raises(AssertionError, match="accept different"):
+        targets.target("frames")(data)
+
+
+@pytest.mark.parametrize(("name", "last"), [("frames", "assemble"), ("logs", "read_recordings")])
+def test_while_fuzzing_a_share_of_the_inputs_goes_all_the_way(
+    name: str, last: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[object] = []
+    monkeypatch.setattr(targets, last, lambda *given: seen.append(given))
+    check = targets.target(name, share=4)
+    record = (CORPUS / "frames" / "one").read_bytes()[:-1]
+    for number in range(64):
+        check(record + bytes((number,)))
+    assert 4 <= len(seen) <= 32

@@ -30,7 +30,7 @@ def main() -> None:
     with atheris.instrument_imports(include=list(SEEN)):
         import targets  # noqa: PLC0415 - the fuzzer must see its imports
     options = [f"-timeout={HANG_S}", f"-rss_limit_mb={MEMORY_MB}", *sys.argv[1:]]
-    atheris.Setup([sys.argv[0], *options], targets.target(name))
+    atheris.Setup([sys.argv[0], *options], targets.target(name, targets.SHARE))
     atheris.Fuzz()
 
 
