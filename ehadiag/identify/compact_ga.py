@@ -93,10 +93,8 @@ def compact_ga(
     population = np.empty((samples, genes + 2))
     population[:, genes:] = offsets
     values = np.empty(samples)
-    population[0, :genes] = start
-    costs(batch, population[:1], cap, work, gaps, values[:1])
-    elite, best = start.copy(), values[0]
-    used, generation = 1, 0
+    elite, best = start.copy(), np.inf
+    used, generation = 0, 0
     while used + samples <= budget and control[0] == 0:
         for i in range(samples):
             for g in range(genes):
@@ -106,6 +104,8 @@ def compact_ga(
                     if 0.0 <= value <= 1.0:
                         break
                 population[i, g] = min(max(value, 0.0), 1.0)
+        if generation == 0:
+            population[0, :genes] = start
         costs(batch, population, cap, work, gaps, values)
         used += samples
         for i in range(samples):

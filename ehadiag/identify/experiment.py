@@ -94,6 +94,8 @@ def build_experiment(
         origin = min(max(pressure_offset * leak / constants.GP, -constants.XSM), constants.XSM)
         spool_offset, pressure_offset = spool_offset - origin, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
+    # Judged before the sines only: the same while the test still runs.
+    quiet = round(min(begin for begin, _ in test.windows.refinement) * test.rate) or None
     return Experiment(
         test=test,
         constants=constants,
@@ -101,8 +103,8 @@ def build_experiment(
         trace=trace,
         spool=spool,
         pressure=pressure,
-        spool_noise=_noise(spool, SPOOL),
-        pressure_noise=_noise(pressure, PRESSURE),
+        spool_noise=_noise(spool[:quiet], SPOOL),
+        pressure_noise=_noise(pressure[:quiet], PRESSURE),
         spool_offset=spool_offset,
         pressure_offset=pressure_offset,
         rested=rest >= LEAST_REST,

@@ -18,19 +18,21 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.identify.batch import Batch
 from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
 from ehadiag.identify.objective import Objective
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.jack import jack_response
 
-__all__ = ["FirstApproximation", "first_approximation"]
+__all__ = ["FirstApproximation", "FirstInputs", "first_approximation", "first_inputs"]
 
 GRID = 32
 """Points of the coarse search over 0 … 1."""
@@ -40,6 +42,7 @@ FINER_GRID = 16
 TOLERANCE = 6e-4
 """Spacing of the last grid."""
 LEAD_S = 0.05
+CREEP_PRESSURE_CAP = 25.0
 CREEP_CAP = 100.0
 """A stick-slip jump at another tick counts no more than ten times the noise."""
 
@@ -53,33 +56,52 @@ class FirstApproximation:
     evaluations: int
 
 
-def first_approximation(experiments: Sequence[Experiment]) -> FirstApproximation:
-    """Search FDJ, then Kintas, then FSS; then Kintas and FSS twice more."""
-    counter = _Counter()
-    jacks = [_JackSearch(experiment) for experiment in experiments]
-    fdj = _search(
-        counter, lambda grid: np.sum([jack(grid) for jack in jacks], axis=0), 0.0, 1.0, GRID
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstInputs:
+    """All that the three searches look at."""
 
-    slewing = Objective(
-        make_batch(
+    creeps: tuple[_Creep, ...]
+    slewing: Batch
+    creeping: Batch
+
+    def arrays(self) -> Iterator[NDArray[np.float64] | NDArray[np.int64]]:
+        """Return every number in it."""
+        for creep in self.creeps:
+            yield np.array([*creep.constants, creep.before, creep.noise])
+            yield creep.nodes
+            yield creep.pressure
+        yield from self.slewing
+        yield from self.creeping
+
+
+def first_inputs(experiments: Sequence[Experiment]) -> FirstInputs:
+    """Lay out the windows of the three searches."""
+    return FirstInputs(
+        creeps=tuple(piece for experiment in experiments for piece in _creeps(experiment)),
+        slewing=make_batch(
             experiments,
             [experiment.test.windows.Kintas for experiment in experiments],
             lead=LEAD_S,
             channels=(True, False),
         ),
-        cap=np.inf,
-    )
-    creeping = Objective(
-        make_batch(
+        creeping=make_batch(
             experiments,
             [experiment.test.windows.FSS for experiment in experiments],
             lead=LEAD_S,
             channels=(True, False),
             anchor_lsb=ANCHOR_LSB,
         ),
-        cap=CREEP_CAP,
     )
+
+
+def first_approximation(inputs: FirstInputs) -> FirstApproximation:
+    """Search FDJ, then Kintas, then FSS; then Kintas and FSS twice more."""
+    counter = _Counter()
+    slewing = Objective(inputs.slewing, cap=np.inf)
+    creeping = Objective(inputs.creeping, cap=CREEP_CAP)
+
+    def fdj_cost(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sum([_pressure_costs(*creep, grid, CREEP_PRESSURE_CAP) for creep in inputs.creeps], axis=0)
 
     def kintas_cost(grid: NDArray[np.float64], fss: float) -> NDArray[np.float64]:
         return slewing(np.column_stack([grid, np.full_like(grid, fss), np.zeros_like(grid)]))
@@ -87,6 +109,7 @@ def first_approximation(experiments: Sequence[Experiment]) -> FirstApproximation
     def fss_cost(grid: NDArray[np.float64], kintas: float) -> NDArray[np.float64]:
         return creeping(np.column_stack([np.full_like(grid, kintas), grid, np.zeros_like(grid)]))
 
+    fdj = _search(counter, fdj_cost, 0.0, 1.0, GRID)
     kintas = _search(counter, lambda grid: kintas_cost(grid, 0.0), 0.0, 1.0, GRID)
     fss = _search(counter, lambda grid: fss_cost(grid, kintas), 0.0, 1.0, GRID)
     for kintas_range, fss_range in RANGES:
@@ -146,38 +169,39 @@ def _vertex(grid: NDArray[np.float64], values: NDArray[np.float64], best: int) -
     return float(grid[best] + shift * (grid[1] - grid[0]))
 
 
-class _JackSearch:
-    """Pressure gap of candidates for FDJ in one experiment, spool as measured."""
+class _Creep(NamedTuple):
+    """Span in which the jack creeps, driven by the spool as it was measured.
 
-    CAP = 25.0
+    constants: of the plant.
+    before: spool position before the span, m.
+    nodes: the spool's path in the form that the jack's kernel takes.
+    pressure: measured, Pa, shape (n,).
+    noise: of the pressure, Pa.
+    """
 
-    def __init__(self, experiment: Experiment) -> None:
-        self.experiment = experiment
-        ticks = np.arange(experiment.ticks)
-        seen = np.isfinite(experiment.spool)
-        spool = np.interp(ticks, ticks[seen], experiment.spool[seen])
-        self.pieces: list[tuple[NDArray[np.float64], float, NDArray[np.float64]]] = []
-        for start, end in experiment.test.windows.FDJ:
-            a = round(start / experiment.tick)
-            b = min(round(end / experiment.tick), experiment.ticks)
-            if b - a > 1:
-                before = float(spool[a - 1]) if a else 0.0
-                nodes = _straight_path(spool[a:b], before, experiment.tick)
-                self.pieces.append((nodes, before, experiment.pressure[a:b]))
+    constants: PlantConstants
+    before: float
+    nodes: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    noise: float
 
-    def __call__(self, grid: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.zeros(len(grid))
-        for nodes, before, pressure in self.pieces:
-            out += _pressure_costs(
-                self.experiment.constants,
-                grid,
+
+def _creeps(experiment: Experiment) -> Iterator[_Creep]:
+    ticks = np.arange(experiment.ticks)
+    seen = np.isfinite(experiment.spool)
+    spool = np.interp(ticks, ticks[seen], experiment.spool[seen])
+    for start, end in experiment.test.windows.FDJ:
+        a = round(start / experiment.tick)
+        b = min(round(end / experiment.tick), experiment.ticks)
+        if b - a > 1:
+            before = float(spool[a - 1]) if a else 0.0
+            yield _Creep(
+                experiment.constants,
                 before,
-                nodes,
-                pressure,
-                self.experiment.pressure_noise,
-                self.CAP,
+                _straight_path(spool[a:b], before, experiment.tick),
+                experiment.pressure[a:b],
+                experiment.pressure_noise,
             )
-        return out
 
 
 def _straight_path(spool: NDArray[np.float64], before: float, tick: float) -> NDArray[np.float64]:
@@ -190,11 +214,11 @@ def _straight_path(spool: NDArray[np.float64], before: float, tick: float) -> ND
 @kernel
 def _pressure_costs(
     constants: PlantConstants,
-    grid: NDArray[np.float64],
     before: float,
     nodes: NDArray[np.float64],
     measured: NDArray[np.float64],
     noise: float,
+    grid: NDArray[np.float64],
     cap: float,
 ) -> NDArray[np.float64]:
     """Capped squared pressure gap for each FDJ of the grid, shape (len(grid),)."""

@@ -17,11 +17,19 @@ from ehadiag.identify.experiment import (
     make_batch,
     share_offsets,
 )
-from ehadiag.identify.first import FirstApproximation, first_approximation
+from ehadiag.identify.first import FirstApproximation
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import Objective
 from ehadiag.identify.refine import Refinement, describe, gaps_of, median_offsets, refine
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
+from ehadiag.identify.stages import (
+    DEVIATION_SHARE,
+    LEAD_S,
+    STAGES,
+    Memory,
+    first_stage,
+    staged_search,
+)
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
 
@@ -30,7 +38,7 @@ __all__ = ["Estimate", "Fit", "Identification", "Timing", "identify"]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How one attempt searches.
+    """How a further attempt searches.
 
     deviation: of the genetic search about its start, fault constants.
     budget: in budgets of the solver.
@@ -43,17 +51,13 @@ class Plan:
     median_offsets: bool = False
 
 
-PLANS = (
-    Plan(0.004, budget=0.5),
+RESCUES = (
     Plan(0.02, median_offsets=True),
     Plan(0.1, budget=2.0),
     Plan(0.1, budget=2.0, median_offsets=True),
     Plan(0.4, budget=3.0),
 )
-"""One after the other until the model explains the recording."""
-DEVIATION_SHARE = np.array([1.0, 1.0, 0.2])
-"""The first approximation knows FDJ best."""
-SEARCH_LEAD_S = 0.1
+"""One after the other where the staged search does not explain the recording."""
 POLISH = CompactGa(budget=241,  virtual_population=30.0, tolerance=1e-7)
 POLISH_DEVIATION = 3e-4
 POOR_FIT = 0.01
@@ -151,46 +155,42 @@ def identify(
     solver: Solver | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    memory: Memory | None = None,
 ) -> Identification:
     """Estimate the fault constants from one or more recordings of one actuator.
 
-    The same seed gives the same answer on the same machine.
+    The same seed gives the same answer on the same machine, with results of `memory` (see
+    `ehadiag.identify.stages`) or without.
     """
     solver = solver or CompactGa()
     tell = progress or (lambda _stage, _share: None)
     begin = time.perf_counter()
+    memory = Memory() if memory is None else memory
     tell("first approximation", 0.0)
     experiments = share_offsets(experiments)
-    first = first_approximation(experiments)
-    start, zero = np.array(first.values), np.zeros(2)
+    first = first_stage(experiments, memory)
+    start = np.array(first.values)
     searched_at = time.perf_counter()
-    search_s = 0.0
-    evaluations = first.evaluations
-    best: _Attempt | None = None
-    for number, plan in enumerate(PLANS):
+    before = time.perf_counter()
+    found = staged_search(experiments, start, solver, seed, memory, tell)
+    search_s = time.perf_counter() - before
+    tell("refinement", 0.0)
+    best = _attempt(experiments, found)
+    evaluations, attempts = first.evaluations + found.evaluations + best.evaluations, 1
+    for plan in RESCUES:
+        if _outliers(best.refined) <= POOR_FIT:
+            break
         before = time.perf_counter()
-        offsets = zero
-        if plan.median_offsets:
-            free = make_batch(experiments)
-            offsets = median_offsets(free, gaps_of(free, start))
-        windows = [experiment.test.windows.refinement for experiment in experiments]
-        found = solver.with_budget(round(solver.budget * plan.budget)).minimise(
-            Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S), offsets),
-            start,
-            plan.deviation * DEVIATION_SHARE,
-            seed + number,
-            lambda done, budget: tell("search", done / budget),
+        found = _rescue(
+            experiments, best.refined.values, solver, seed + len(STAGES) + attempts, plan, tell
         )
         search_s += time.perf_counter() - before
         tell("refinement", 0.0)
         attempt = _attempt(experiments, found)
         evaluations += found.evaluations + attempt.evaluations
-        if best is None or attempt.score < best.score:
+        attempts += 1
+        if attempt.score < best.score:
             best = attempt
-        if _outliers(best.refined) <= POOR_FIT:
-            break
-        start = best.refined.values
-    assert best is not None
     end = time.perf_counter()
     spread = covariance(best.refined)
     return Identification(
@@ -203,8 +203,31 @@ def identify(
         generations=best.found.generations,
         cost=best.refined.cost,
         converged=best.refined.converged,
-        attempts=number + 1,
+        attempts=attempts,
         timing=Timing(searched_at - begin, search_s, end - searched_at - search_s),
+    )
+
+
+def _rescue(
+    experiments: Sequence[Experiment],
+    start: NDArray[np.float64],
+    solver: Solver,
+    seed: int,
+    plan: Plan,
+    tell: Progress,
+) -> SearchResult:
+    """Search the whole window anew, wider than before."""
+    offsets = np.zeros(2)
+    if plan.median_offsets:
+        free = make_batch(experiments)
+        offsets = median_offsets(free, gaps_of(free, start))
+    windows = [experiment.test.windows.refinement for experiment in experiments]
+    return solver.with_budget(round(solver.budget * plan.budget)).minimise(
+        Objective(make_batch(experiments, windows, lead=LEAD_S), offsets),
+        start,
+        plan.deviation * DEVIATION_SHARE,
+        seed,
+        lambda done, budget: tell("search", done / budget),
     )
 
 

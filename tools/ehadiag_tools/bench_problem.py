@@ -8,7 +8,7 @@ from pathlib import Path
 from ehadiag.actuator import default_actuator
 from ehadiag.identify.batch import Batch
 from ehadiag.identify.experiment import Experiment, build_experiment, make_batch
-from ehadiag.identify.pipeline import SEARCH_LEAD_S
+from ehadiag.identify.stages import LEAD_S
 from ehadiag.recording import Recording, Samples
 from ehadiag.storedtest import resolve_test
 from firmware_iface.logs import read_recording
@@ -48,4 +48,4 @@ def whole_test(logs: Path, tests: int) -> Batch:
 def search_window(logs: Path) -> Batch:
     """Lay out the window on which the genetic search works."""
     item = experiment(logs)
-    return make_batch([item], [item.test.windows.refinement], lead=SEARCH_LEAD_S)
+    return make_batch([item], [item.test.windows.refinement], lead=LEAD_S)
