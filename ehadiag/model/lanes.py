@@ -1,6 +1,6 @@
 """The monitoring model for many candidates at once: one lane of a vector register each.
 
-The same equations as `ehadiag.model.spool` and `ehadiag.model.jack`, as loops over lanes that the
+The same equations as `ehadiag.model.spooltick` and `ehadiag.model.jacktick`, as loops over lanes that the
 compiler turns into vector instructions. The spool moves by quarters of a tick, exactly; a lane in
 which an event may hide takes the whole tick alone (`event_tick`). The second stage is written with
 one common denominator, so that it needs no branch and two divisions a part; a lane whose jack
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ehadiag.jit import inlined, kernel
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.spool import (
+from ehadiag.model.spooltick import (
     BREAKAWAY,
     FLAPPER_STOP,
     NOTHING,
@@ -475,7 +475,7 @@ def _jack_step(
 ) -> tuple[float, float, float, float]:  # fmt: skip
     """Velocity of the moving jack over a part, p0 + p1 t + p2 t² + (v - p0) exp(-rate t).
 
-    See `ehadiag.model.jack._approach`. With D = GQ max(abs(x), PSR/GP) + PSR CLK the second stage
+    See `ehadiag.model.jacktick._approach`. With D = GQ max(abs(x), PSR/GP) + PSR CLK the second stage
     gives g PS = PSR GQ x / D and g R = PSR / D at any x, so the steady velocity is
     (AJ PSR GQ x - load D) / (AJ² PSR + CJ D) and tau = MJ D / (AJ² PSR + CJ D).
     """
