@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from ehadiag.recording import BitReason, BitState
+from firmware_iface.limits import Limits, Watch
 from firmware_iface.livemessages import BitStatus, Sample
 
 __all__ = [
     "Action",
     "Handshake",
-    "Limits",
     "Phase",
     "TimeLimits",
     "Verdict",
@@ -59,23 +59,6 @@ class Action(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """Magnitudes that end the test when exceeded; None is not watched.
-
-    A limit counts as exceeded after `samples` successive samples beyond it: the CRC keeps out
-    corrupted ones, a spike of the converter is not yet a surface that runs away.
-    """
-
-    position: float | None = None
-    """m."""
-    pressure: float | None = None
-    """Pa, differential."""
-    current: float | None = None
-    """A."""
-    samples: int = 3
-
-
-@dataclass(frozen=True, slots=True)
 class TimeLimits:
     """Longest durations of each step, s."""
 
@@ -88,7 +71,7 @@ class TimeLimits:
     arming: float = 10.0
     """Answer to running."""
     telemetry: float = 0.25
-    """Silence of the telemetry while the test runs."""
+    """Silence of the telemetry, or of a watched channel, while the test runs."""
     finish: float = 1.0
     """End of the test's duration to the word that it is complete."""
     trail: float = 0.03
@@ -140,13 +123,14 @@ class Handshake:
     _before: BitStatus | None = field(init=False, default=None)
     _status: BitStatus | None = field(init=False, default=None)
     _why: str = field(init=False, default="")
-    _beyond: dict[str, int] = field(init=False, default_factory=dict)
+    _watch: Watch = field(init=False)
 
     def __post_init__(self) -> None:
         if self.transmit and self.test_id is None:
             raise ValueError("a test that is requested needs its number")
         self.phase = Phase.SETTLING if self.transmit else Phase.WAITING
         self._since = self.now
+        self._watch = Watch(self.limits, self.times.telemetry)
 
     def on_time(self, now: int) -> list[Action]:
         """Let time pass; to be called at least every 50 ms."""
@@ -165,6 +149,8 @@ class Handshake:
                 actions = self._abort(f"still arming after {times.arming:g} s", now)
             case Phase.RUNNING if (now - self._heard) / 1e9 >= times.telemetry:
                 actions = self._abort(f"telemetry lost for {times.telemetry:g} s", now)
+            case Phase.RUNNING if why := self._watch.on_time(now):
+                actions = self._abort(why, now)
             case Phase.RUNNING if waited >= self.duration + times.finish:
                 late = f"not complete {times.finish:g} s after its {self.duration:g} s"
                 actions = self._abort(late, now)
@@ -181,6 +167,7 @@ class Handshake:
         """Take out a time in which the reader itself did not run: what came then still waits."""
         self._since += gap_ns
         self._heard += gap_ns
+        self._watch.excuse(gap_ns)
 
     def on_status(self, now: int, status: BitStatus) -> list[Action]:
         """Take a valid status message."""
@@ -208,15 +195,8 @@ class Handshake:
         self._heard = now
         if self.phase is not Phase.RUNNING:
             return []
-        for name in ("position", "pressure", "current"):
-            limit: float | None = getattr(self.limits, name)
-            if limit is None:
-                continue
-            beyond = abs(getattr(sample, name)) > limit
-            self._beyond[name] = self._beyond.get(name, 0) + 1 if beyond else 0
-            if self._beyond[name] >= self.limits.samples:
-                return self._abort(f"{name} beyond its limit", now)
-        return []
+        why = self._watch.on_sample(now, sample)
+        return self._abort(why, now) if why else []
 
     def on_foreign_request(self, now: int) -> list[Action]:
         """Take a request that someone else sent."""
@@ -299,6 +279,7 @@ class Handshake:
         self._enter(Phase.RUNNING, now)
         self.running_since = now
         self._heard = now
+        self._watch.begin(now)
 
     def _enter(self, phase: Phase, now: int) -> None:
         self.phase = phase

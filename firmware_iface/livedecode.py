@@ -20,7 +20,8 @@ __all__ = ["LiveDecoder"]
 
 FLOAT_FORMATS = {2: "<e", 4: "<f", 8: "<d"}
 REASONS = frozenset(BitReason)
-CHANNELS = ("channels.current", "channels.spool", "channels.pressure", "channels.position")
+CHANNELS = {f"channels.{key}": key for key in ("current", "spool", "pressure", "position")}
+"""Roles in the order of `Sample`'s fields."""
 
 
 class LiveDecoder:
@@ -48,7 +49,8 @@ class LiveDecoder:
         values = _values(message, frame.data)
         if any(name in self._last for name in values):
             self._last |= {name: values[name] for name in CHANNELS if name in values}
-            return Sample(*(self._last[name] for name in CHANNELS))
+            brought = frozenset(key for name, key in CHANNELS.items() if name in values)
+            return Sample(*(self._last[name] for name in CHANNELS), brought)
         if "status.state" in values:
             return self._status(values)
         if "request.code" in values:

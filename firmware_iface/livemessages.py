@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 from ehadiag.recording import BitReason, BitState
 
-__all__ = ["BitStatus", "Request", "Sample"]
+__all__ = ["CHANNELS", "BitStatus", "Request", "Sample"]
+
+CHANNELS = frozenset(("current", "spool", "pressure", "position"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +25,14 @@ class BitStatus:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One valid telemetry message: A, m, Pa, m."""
+    """One valid telemetry message: A, m, Pa, m; the last known value of what it does not bring."""
 
     current: float
     spool: float
     pressure: float
     position: float
+    brought: frozenset[str] = CHANNELS
+    """Channels that this very message brings."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -169,7 +169,7 @@ class SerialTransport(Transport):
 
     @property
     def unsent(self) -> int:
-        """Frames dropped so far because the port had no room; of each stall one may have gone out."""
+        """Frames dropped for want of room; one of each stall may have gone out all the same."""
         return self._unsent
 
     def _receive(self, timeout: float) -> Frame | None:

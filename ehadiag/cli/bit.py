@@ -164,7 +164,7 @@ def _acquire(
 ) -> tuple[Recording, str, Path]:
     """Run the test on the bus; return the recording, why it is not one, and the files' stem."""
     from firmware_iface.assembler import Assembler  # noqa: PLC0415 - loads python-can
-    from firmware_iface.handshake import Limits  # noqa: PLC0415
+    from firmware_iface.limits import Limits  # noqa: PLC0415
     from firmware_iface.tester import run_test  # noqa: PLC0415
 
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())

@@ -18,15 +18,7 @@ from ehadiag.model.jack import jack_response
 from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
 from ehadiag.model.transition import spool_tables
 
-__all__ = [
-    "Batch",
-    "Workspace",
-    "costs",
-    "many_residuals",
-    "residuals",
-    "spool_rates",
-    "workspace",
-]
+__all__ = ["Batch", "Workspace", "constants_of", "costs", "residuals", "spool_rates", "workspace"]
 
 
 class Batch(NamedTuple):
@@ -78,7 +70,8 @@ def workspace(batch: Batch) -> Workspace:
 
 
 @kernel
-def _constants(row: NDArray[np.float64]) -> PlantConstants:
+def constants_of(row: NDArray[np.float64]) -> PlantConstants:
+    """Constants of a span, `row` of `Batch.constants`."""
     return PlantConstants(
         row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], row[9],
         row[10], row[11], row[12], row[13], row[14], row[15], row[16], row[17], row[18], row[19],
@@ -90,7 +83,7 @@ def _constants(row: NDArray[np.float64]) -> PlantConstants:
 def _run_spool(batch: Batch, candidate: NDArray[np.float64], work: Workspace, index: int) -> int:
     """Spool's path of one span into the workspace; returns how often it was re-anchored."""
     a, b = batch.start[index], batch.start[index + 1]
-    constants = _constants(batch.constants[index])
+    constants = constants_of(batch.constants[index])
     tick = batch.tick[index]
     return spool_response(
         constants,
@@ -122,7 +115,7 @@ def residuals(
         n = b - a
         anchored += _run_spool(batch, candidate, work, index)
         jack_response(
-            _constants(batch.constants[index]),
+            constants_of(batch.constants[index]),
             candidate[2],
             batch.origin[index],
             work.nodes,
@@ -136,19 +129,6 @@ def residuals(
             gap = (batch.pressure[a + k] - candidate[4] - work.pressure[k]) * batch.weight[1, a + k]
             out[1, a + k] = gap if math.isfinite(gap) else 0.0
     return anchored
-
-
-@kernel
-def many_residuals(
-    batch: Batch,
-    candidates: NDArray[np.float64],
-    work: Workspace,
-    out: NDArray[np.float64],
-    anchored: NDArray[np.int64],
-) -> None:
-    """`residuals` of each candidate: out, shape (n, 2, N), and `anchored`, shape (n,)."""
-    for i in range(candidates.shape[0]):
-        anchored[i] = residuals(batch, candidates[i], work, out[i])
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cantools.database
@@ -14,6 +15,8 @@ from firmware_iface.align import assemble
 from firmware_iface.busmap import load_map
 from firmware_iface.encode import Encoder
 from firmware_iface.frames import Frame, FrameTable
+from firmware_iface.livedecode import LiveDecoder
+from firmware_iface.livemessages import Sample
 
 FOLDER = Path(__file__).parents[2] / "docs" / "examples" / "buses"
 TICKS = 800
@@ -218,6 +221,18 @@ def test_float_that_is_no_number_or_out_of_range_is_left_out(bits):
     recording = rig.one(frames)
     assert np.flatnonzero(np.isnan(recording.samples.spool)).tolist() == [100]
     assert recording.quality.messages["SpoolPosition"].range_errors == 1
+
+
+def test_a_live_message_tells_which_channels_it_brings():
+    rig, truth = Rig("canaerospace"), make_truth(TICKS)
+    decoder = LiveDecoder(rig.map)
+    brought = {1500: "current", 1501: "spool", 1502: "pressure", 1503: "position"}
+    samples = [(f.can_id, decoder.decode(f)) for f in canaerospace(rig, truth)[:100]]
+    heard = [(i, item) for i, item in samples if isinstance(item, Sample)]
+    assert {i for i, _ in heard} == set(brought)
+    assert all(item.brought == {brought[i]} for i, item in heard)
+    assert math.isnan(heard[0][1].position)  # not yet known, and not brought
+    assert math.isfinite(heard[-1][1].position)
 
 
 def multiplexed(rig, truth, start_counter=200):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ehadiag.recording import BitReason, BitState
-from firmware_iface.handshake import Action, Handshake, Limits, Phase, TimeLimits
+from firmware_iface.handshake import Action, Handshake, Phase, TimeLimits
+from firmware_iface.limits import Limits
 from firmware_iface.livemessages import BitStatus, Sample
 
 MS = 1_000_000
@@ -209,22 +213,74 @@ def test_a_foreign_request_seen_only_by_its_refusal_aborts_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "sample", "name"),
+    ("limits", "sample", "why"),
     [
-        (Limits(position=0.01), Sample(0, 0, 0, -0.02), "position"),
-        (Limits(pressure=1e6), Sample(0, 0, 2e6, 0), "pressure"),
-        (Limits(current=1e-3), Sample(-2e-3, 0, 0, 0), "current"),
+        (
+            Limits(position=0.01),
+            Sample(0, 0, 0, -0.02531),
+            "position -25.31 mm beyond its limit ±10 mm",
+        ),
+        (Limits(pressure=1e6), Sample(0, 0, 2e6, 0), "pressure 2 MPa beyond its limit ±1 MPa"),
+        (Limits(current=1e-3), Sample(-2e-3, 0, 0, 0), "current -2 mA beyond its limit ±1 mA"),
     ],
 )
 def test_a_limit_is_exceeded_at_the_third_successive_sample(
-    limits: Limits, sample: Sample, name: str
+    limits: Limits, sample: Sample, why: str
 ) -> None:
     driver = Driver(limits=limits).running()
     driver.sample(sample).sample(sample).sample(QUIET).sample(sample).sample(sample)
     assert driver.sent == [Action.START]
     driver.sample(sample)
     assert driver.sent == [Action.START, Action.ABORT]
-    assert driver.hear(IDLE).ended() == f"{name} beyond its limit"
+    assert driver.hear(IDLE).ended() == why
+
+
+def test_messages_of_other_channels_neither_add_to_a_count_nor_end_it() -> None:
+    beyond = Sample(0, 0, 0, 0.02, frozenset({"position"}))
+    other = replace(beyond, brought=frozenset({"spool"}))
+    driver = Driver(limits=Limits(position=0.01)).running()
+    for _ in range(2):
+        driver.sample(beyond).sample(other).sample(other)
+    assert driver.sent == [Action.START]  # two samples of the position, six messages
+    driver.sample(beyond)
+    assert driver.sent == [Action.START, Action.ABORT]
+
+
+@pytest.mark.parametrize("position", [math.nan, 0.0])
+def test_a_watched_channel_that_ends_is_lost_telemetry(position: float) -> None:
+    """The others go on; a number that is none is no sample either."""
+    driver = Driver(limits=Limits(position=0.01)).running()
+    brought = {"position"} if math.isnan(position) else {"current", "spool"}
+    for _ in range(24):
+        driver.wait(0.01, telemetry=False).sample(Sample(0, 0, 0, position, frozenset(brought)))
+    assert driver.sent == [Action.START]
+    driver.wait(0.01, telemetry=False)
+    assert driver.sent == [Action.START, Action.ABORT]
+    why = "telemetry lost: no position for 0.25 s, and its limit is watched"
+    assert driver.hear(status(BitState.ABORTED)).ended() == why
+
+
+def test_a_channel_that_ends_is_let_go_where_nobody_watches_it() -> None:
+    driver = Driver(limits=Limits(current=0.01)).running()
+    for _ in range(40):
+        sample = Sample(0, 0, 0, math.nan, frozenset({"current", "spool", "pressure"}))
+        driver.wait(0.01, telemetry=False).sample(sample)
+    assert driver.machine.phase is Phase.RUNNING
+
+
+def test_one_number_that_is_none_does_not_begin_the_count_anew() -> None:
+    beyond = Sample(0, 0, 0, 0.02)
+    driver = Driver(limits=Limits(position=0.01)).running()
+    driver.sample(beyond).sample(beyond).sample(replace(beyond, position=math.nan)).sample(beyond)
+    assert driver.sent == [Action.START, Action.ABORT]
+
+
+def test_a_reader_that_did_not_run_has_not_lost_a_watched_channel() -> None:
+    driver = Driver(limits=Limits(position=0.01)).running().wait(0.1)
+    driver.now += 400 * MS
+    driver.machine.excuse(400 * MS)
+    driver.sent += driver.machine.on_time(driver.now)
+    assert driver.machine.phase is Phase.RUNNING
 
 
 def test_limits_do_not_count_at_their_very_value() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -28,7 +29,8 @@ from firmware_iface.align import assemble
 from firmware_iface.busmap import default_map
 from firmware_iface.encode import Encoder
 from firmware_iface.frames import Frame, FrameTable
-from firmware_iface.handshake import Limits, Phase, TimeLimits
+from firmware_iface.handshake import Phase, TimeLimits
+from firmware_iface.limits import Limits
 from firmware_iface.logs import read_frames, read_recording
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 from firmware_iface.recorder import Recorder
@@ -117,7 +119,7 @@ def test_an_exceeded_limit_aborts_and_the_current_is_gone(make_core: CoreFactory
         outcome = run_test(
             transport, test_id=9, duration=0.4, transmit=True, limits=Limits(current=1.5e-3)
         )
-    assert outcome.why == "current beyond its limit"
+    assert re.fullmatch(r"current 1\.5\d+ mA beyond its limit ±1\.5 mA", outcome.why)
     assert outcome.abort_confirmed is True
     assert outcome.outcome.state is BitState.ABORTED
     assert core.plant.truth[0] == 0.0

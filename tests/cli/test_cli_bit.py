@@ -124,7 +124,8 @@ def test_refusal_is_not_tested(options: list[str], reason: str, run: Run) -> Non
 def test_exceeded_limit_aborts(run: Run) -> None:
     result = run(*FAST, "--test", "closed", "--max-position", "5", "--record", "a.blf")
     assert result.code == 30
-    assert result.objects[0]["reasons"][0].startswith("position beyond its limit")
+    (reason,) = result.objects[0]["reasons"]
+    assert re.fullmatch(r"position -?5\.\d+ mm beyond its limit ±5 mm", reason)
     assert read_recording("a.blf").outcome.state is BitState.ABORTED
     assert run(*FAST, "--test", "closed", "--max-position", "15").code == 0
 

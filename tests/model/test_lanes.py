@@ -7,11 +7,11 @@ import pytest
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
-from ehadiag.identify.batch import Batch, costs, workspace
+from ehadiag.identify.batch import Batch, costs, residuals, workspace
 from ehadiag.identify.experiment import build_experiment, make_batch
-from ehadiag.identify.lanes import lane_costs, lane_work, runs_free
+from ehadiag.identify.lanes import lane_costs, lane_residuals, lane_work
 from ehadiag.model.constants import plant_constants
-from ehadiag.model.lanes import LANES
+from ehadiag.model.lanelayout import LANES
 from ehadiag.model.monitoring import FREE_RUN, respond
 from ehadiag.storedtest import resolve_test
 from firmware_iface.logs import read_recording
@@ -185,9 +185,18 @@ def test_a_flapper_that_does_not_ring():
     )
 
 
-def test_a_batch_that_reanchors_is_refused(recorded_batch):
-    anchored = recorded_batch._replace(anchor=np.array([[0.3, 1e-7, 1e-6]]))
-    assert runs_free(recorded_batch)
-    assert not runs_free(anchored)
-    with pytest.raises(ValueError, match="free"):
-        lane_work(anchored)
+def test_residuals_and_anchors_are_the_scalar_kernels(recorded_batch, population):
+    noise = 1.0 / recorded_batch.weight[0].max()
+    anchored = recorded_batch._replace(anchor=np.array([[0.1, 3.0 * noise, 12.0 * noise]]))
+    n, ticks = 18, len(recorded_batch.current)
+    population = population[-n:].copy()
+    population[:, 3] = np.linspace(-1e-6, 1e-6, n)
+    out, counts = np.empty((n, 2, ticks)), np.empty(n, dtype=np.int64)
+    lane_residuals(anchored, population, lane_work(anchored), out, counts)
+    there, scalar = np.empty((2, ticks)), workspace(anchored)
+    assert counts.max() > 0
+    for i in range(n):
+        assert residuals(anchored, population[i], scalar, there) == counts[i]
+        np.testing.assert_allclose(out[i, 0], there[0], atol=1e-6)
+    costs_here = np.minimum(out**2, 25.0).sum(axis=(1, 2))
+    np.testing.assert_allclose(costs_here, in_lanes(anchored, population, 25.0), rtol=1e-12)
