@@ -18,7 +18,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch, Workspace, costs
+from ehadiag.identify.batch import Batch
+from ehadiag.identify.lanes import LaneWork, lane_costs
 from ehadiag.jit import kernel
 
 __all__ = ["compact_ga", "state_bytes"]
@@ -53,8 +54,7 @@ def _next_normal(state: NDArray[np.uint64]) -> float:
 @kernel
 def compact_ga(
     batch: Batch,
-    work: Workspace,
-    gaps: NDArray[np.float64],
+    work: LaneWork,
     offsets: NDArray[np.float64],
     cap: float,
     start: NDArray[np.float64],
@@ -71,7 +71,7 @@ def compact_ga(
 
     Parameters
     ----------
-    batch, work, gaps, cap: see `ehadiag.identify.batch.costs`.
+    batch, work, cap: see `ehadiag.identify.lanes.lane_costs`.
     offsets: sensor offsets, held, shape (2,).
     start, deviation: mean and deviation of the first probability vector, shape (3,).
     virtual_population: size N_p of the population that the vector stands for.
@@ -106,7 +106,7 @@ def compact_ga(
                 population[i, g] = min(max(value, 0.0), 1.0)
         if generation == 0:
             population[0, :genes] = start
-        costs(batch, population, cap, work, gaps, values)
+        lane_costs(batch, population, cap, work, values)
         used += samples
         for i in range(samples):
             wins = values[i] < best

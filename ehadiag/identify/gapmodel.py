@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch, Workspace, many_residuals, spool_rates, workspace
+from ehadiag.identify.batch import Batch, spool_rates, workspace
+from ehadiag.identify.lanes import LaneWork, lane_residuals, lane_work
 
 __all__ = ["CAP", "FAULT_COUNT", "STEP", "GapModel", "Slope", "capped"]
 
@@ -53,7 +54,7 @@ class GapModel:
 
     def __init__(self, batch: Batch, noise: tuple[float, float]) -> None:
         self.batch = batch
-        self.work: Workspace = workspace(batch)
+        self.work: LaneWork = lane_work(batch)
         self.evaluations = 0
         self.scale = np.array([1.0, 1.0, 1.0, *noise])
 
@@ -66,7 +67,7 @@ class GapModel:
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         out = np.empty((len(points), 2, len(self.batch.current)))
         anchored = np.zeros(len(points), dtype=np.int64)
-        many_residuals(self.batch, points * self.scale, self.work, out, anchored)
+        lane_residuals(self.batch, points * self.scale, self.work, out, anchored)
         self.evaluations += len(points)
         return out, anchored
 
@@ -81,7 +82,7 @@ class GapModel:
     def spool_rate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weighted velocity of the spool at the end of each tick, 1/s, shape (N,)."""
         out = np.empty(len(self.batch.current))
-        spool_rates(self.batch, x * self.scale, self.work, out)
+        spool_rates(self.batch, x * self.scale, workspace(self.batch), out)
         return out * self.batch.weight[0]
 
     def slopes(self, centres: list[NDArray[np.float64]]) -> list[Slope]:

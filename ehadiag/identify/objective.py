@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch, costs, workspace
+from ehadiag.identify.batch import Batch
+from ehadiag.identify.lanes import lane_costs, lane_work
 
 __all__ = ["SEARCH_CAP", "Objective"]
 
@@ -29,8 +30,7 @@ class Objective:
         self.cap = cap
         self.offsets = np.zeros(2) if offsets is None else offsets
         self.evaluations = 0
-        self.work = workspace(batch)
-        self.gaps = np.empty((2, len(batch.current)))
+        self.work = lane_work(batch)
 
     def __call__(self, population: NDArray[np.float64]) -> NDArray[np.float64]:
         """Cost of each row, shape (n,) for a population of shape (n, 3)."""
@@ -39,6 +39,6 @@ class Objective:
         candidates[:, :3] = rows
         candidates[:, 3:] = self.offsets
         out = np.empty(len(rows))
-        costs(self.batch, candidates, self.cap, self.work, self.gaps, out)
+        lane_costs(self.batch, candidates, self.cap, self.work, out)
         self.evaluations += len(rows)
         return out

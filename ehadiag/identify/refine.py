@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, residuals, workspace
-from ehadiag.identify.gapmodel import FAULT_COUNT, STEP, GapModel, Slope
+from ehadiag.identify.gapmodel import FAULT_COUNT, GapModel, Slope
 from ehadiag.identify.settle import centre, settle
 
 __all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
@@ -98,7 +98,7 @@ def refine(
             damping = max(damping / 10.0, LEAST_DAMPING)
         elif damping >= MOST_DAMPING:
             # No step improves: the optimum, to within the jumps that break-aways make.
-            converged = size < STEP
+            converged = True
             break
         else:
             damping = MOST_DAMPING

@@ -102,7 +102,6 @@ class CompactGa:
                 compact_ga(
                     objective.batch,
                     objective.work,
-                    objective.gaps,
                     objective.offsets,
                     objective.cap,
                     np.asarray(start, dtype=np.float64),

@@ -21,7 +21,7 @@ from scipy.optimize import differential_evolution
 from ehadiag.identify.compact_ga import state_bytes
 from ehadiag.identify.first import first_approximation
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.pipeline import PLANS
+from ehadiag.identify.stages import DEVIATION
 from ehadiag.identify.solvers import CompactGa, PygadGa
 from ehadiag_tools.bench_figures import Figure, Sizes
 from ehadiag_tools.bench_problem import experiment, search_window
@@ -33,7 +33,6 @@ POPULATION = 24
 """Of the rivals but pygad: eight for each constant."""
 SLACK = 1e-3
 """A rival is there when its cost is at most so much above (share)."""
-DEVIATION = PLANS[0].deviation
 
 Vector = NDArray[np.float64]
 

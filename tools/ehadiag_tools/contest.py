@@ -13,7 +13,7 @@ from scipy.optimize import differential_evolution
 from ehadiag.identify.experiment import make_batch
 from ehadiag.identify.first import first_approximation
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.pipeline import PLANS, SEARCH_LEAD_S
+from ehadiag.identify.stages import DEVIATION, LEAD_S
 from ehadiag.identify.solvers import CompactGa, PygadGa
 from ehadiag_tools.runs import Run, experiments_of
 
@@ -31,11 +31,11 @@ def contest(run: Run) -> dict[str, Any]:
     experiments = experiments_of(run)
     start = np.array(first_approximation(experiments).values)
     windows = [experiment.test.windows.refinement for experiment in experiments]
-    objective = Objective(make_batch(experiments, windows, lead=SEARCH_LEAD_S))
+    objective = Objective(make_batch(experiments, windows, lead=LEAD_S))
     budget = CompactGa().budget
     outcome: dict[str, Any] = {}
     for solver in (CompactGa(), PygadGa().with_budget(budget)):
-        found = solver.minimise(objective, start, PLANS[0].deviation, run.search_seed)
+        found = solver.minimise(objective, start, DEVIATION, run.search_seed)
         outcome[solver.name] = _entry(found.best, found.cost, found.evaluations)
     outcome["scipy DE"] = _evolve(objective, start, budget, run.search_seed)
     return {**asdict(run), "outcome": outcome}
@@ -45,7 +45,7 @@ def _evolve(
     objective: Objective, start: NDArray[np.float64], budget: int, seed: int
 ) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
-    first = np.clip(rng.normal(start, PLANS[0].deviation, (POPULATION, len(start))), 0.0, 1.0)
+    first = np.clip(rng.normal(start, DEVIATION, (POPULATION, len(start))), 0.0, 1.0)
     first[0] = start
     before = objective.evaluations
     result = differential_evolution(
