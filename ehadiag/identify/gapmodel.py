@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch, spool_rates, workspace
+from ehadiag.identify.batch import Batch, Workspace, residuals, spool_rates, workspace
 from ehadiag.identify.lanes import LaneWork, lane_residuals, lane_work
 
-__all__ = ["CAP", "FAULT_COUNT", "STEP", "GapModel", "Slope", "capped"]
+__all__ = ["CAP", "FAULT_COUNT", "STEP", "GapModel", "Slope", "capped", "wide_sides"]
 
 CAP = 9.0
 """Largest square of one weighted gap that counts."""
@@ -55,34 +55,29 @@ class GapModel:
     def __init__(self, batch: Batch, noise: tuple[float, float]) -> None:
         self.batch = batch
         self.work: LaneWork = lane_work(batch)
+        self.single: Workspace = workspace(batch)
         self.evaluations = 0
         self.scale = np.array([1.0, 1.0, 1.0, *noise])
 
     def many(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weighted gaps of points, shape (n, 2, N) for points of shape (n, 5)."""
-        return self._run(points)[0]
-
-    def _run(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         out = np.empty((len(points), 2, len(self.batch.current)))
-        anchored = np.zeros(len(points), dtype=np.int64)
+        anchored = np.empty(len(points), dtype=np.int64)
         lane_residuals(self.batch, points * self.scale, self.work, out, anchored)
         self.evaluations += len(points)
+        return out
+
+    def one(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+        """Weighted gaps at x, shape (2, N), and how often the model was re-anchored."""
+        out = np.empty((2, len(self.batch.current)))
+        anchored = residuals(self.batch, x * self.scale, self.single, out)
+        self.evaluations += 1
         return out, anchored
-
-    def costs(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Capped sum of squares of each point, shape (n,)."""
-        return np.array([capped(gaps) for gaps in self.many(points)])
-
-    def anchored(self, x: NDArray[np.float64]) -> int:
-        """How often the model is re-anchored at x."""
-        return int(self._run(x[None, :])[1][0])
 
     def spool_rate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weighted velocity of the spool at the end of each tick, 1/s, shape (N,)."""
         out = np.empty(len(self.batch.current))
-        spool_rates(self.batch, x * self.scale, workspace(self.batch), out)
+        spool_rates(self.batch, x * self.scale, self.single, out)
         return out * self.batch.weight[0]
 
     def slopes(self, centres: list[NDArray[np.float64]]) -> list[Slope]:
@@ -97,19 +92,22 @@ class GapModel:
         return out
 
     def trusted_slope(self, x: NDArray[np.float64]) -> Slope:
-        """Gaps and derivatives at x, and the rows where two widths of difference agree on them.
+        """Gaps and derivatives at x, and the rows where two widths of difference agree on them."""
+        slope = self.slopes([x])[0]
+        return self.trusted(slope, self.many(wide_sides(x)))
+
+    def trusted(self, slope: Slope, runs: NDArray[np.float64]) -> Slope:
+        """Leave rows out where derivatives over a wider difference disagree.
 
         A break-away inside a difference makes a jump that looks like information but is none.
+        `runs`: gaps at `wide_sides` of the slope's point, shape (6, 2, N).
         """
-        near, far = _sides(x, STEP), _sides(x, WIDE_STEP)
-        runs = self.many(np.vstack([x[None, :], near, far]))
-        middle = 1 + 2 * FAULT_COUNT
-        jacobian, smooth = self._differences(x, runs[0], near, runs[1:middle])
-        wide, wide_smooth = self._differences(x, runs[0], far, runs[middle:])
+        sides = wide_sides(slope.x)
+        wide, wide_smooth = self._differences(slope.x, slope.gaps, sides, runs)
         typical = np.sqrt(np.mean(wide**2, axis=(1, 2), keepdims=True))
-        allowed = AGREEMENT * np.maximum(np.abs(jacobian), np.abs(wide)) + typical
-        agree = np.all(np.abs(jacobian - wide) <= allowed, axis=0)
-        return Slope(x, runs[0], capped(runs[0]), jacobian, smooth & wide_smooth & agree)
+        allowed = AGREEMENT * np.maximum(np.abs(slope.jacobian), np.abs(wide)) + typical
+        agree = np.all(np.abs(slope.jacobian - wide) <= allowed, axis=0)
+        return replace(slope, smooth=slope.smooth & wide_smooth & agree)
 
     def _differences(
         self,
@@ -130,6 +128,11 @@ class GapModel:
         out[3, 0] = -self.batch.weight[0] * self.scale[3]
         out[4, 1] = -self.batch.weight[1] * self.scale[4]
         return out, smooth
+
+
+def wide_sides(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points about x for derivatives over a wider difference, shape (6, 5)."""
+    return _sides(x, WIDE_STEP)
 
 
 def _sides(x: NDArray[np.float64], width: float) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, residuals, workspace
-from ehadiag.identify.gapmodel import FAULT_COUNT, GapModel, Slope
+from ehadiag.identify.gapmodel import CAP, FAULT_COUNT, GapModel, Slope, capped
 from ehadiag.identify.settle import centre, settle
 
 __all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
@@ -102,8 +102,8 @@ def refine(
             break
         else:
             damping = MOST_DAMPING
-    x, smooth_bowl = settle(model, slope)
-    return _described(model, x, converged=converged, jagged=not smooth_bowl)
+    bowl = settle(model, slope)
+    return _described(model, bowl.x, bowl.slope, converged=converged, jagged=not bowl.smooth)
 
 
 def _stepped(slope: Slope, damping: float) -> NDArray[np.float64]:
@@ -135,22 +135,22 @@ def describe(
     """
     model = GapModel(batch, noise)
     x = centre(model, model.slopes([np.concatenate([values, offsets / np.array(noise)])])[0])
-    return _described(model, x, converged=converged, jagged=True)
+    return _described(model, x, model.trusted_slope(x), converged=converged, jagged=True)
 
 
 def _described(
-    model: GapModel, x: NDArray[np.float64], *, converged: bool, jagged: bool
+    model: GapModel, x: NDArray[np.float64], slope: Slope, *, converged: bool, jagged: bool
 ) -> Refinement:
-    slope = model.trusted_slope(x)
-    anchored = model.anchored(x)
+    """Put together what is known at x; `slope` is that of a point so near that it holds there."""
+    gaps, anchored = model.one(x)
     weighted = model.batch.weight > 0.0
-    used = slope.used & weighted
+    used = slope.smooth & (gaps**2 < CAP) & weighted
     jacobian = np.where(used, slope.jacobian, 0.0)
     return Refinement(
         values=x[:FAULT_COUNT],
         offsets=x[FAULT_COUNT:] * model.scale[FAULT_COUNT:],
-        cost=slope.cost,
-        gaps=slope.gaps,
+        cost=capped(gaps),
+        gaps=gaps,
         jacobian=jacobian,
         spool_rate=model.spool_rate(x),
         used=used,

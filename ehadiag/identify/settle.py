@@ -6,46 +6,75 @@ wherever it comes from.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.gapmodel import FAULT_COUNT, GapModel, Slope
+from ehadiag.identify.gapmodel import FAULT_COUNT, GapModel, Slope, capped, wide_sides
 
-__all__ = ["centre", "settle"]
+__all__ = ["Bowl", "centre", "settle"]
 
 SETTLINGS = 2
 REACH = 2.0
 """Deviations to either side over which the bowl is looked at."""
-POINTS = 11
+POINTS = 9
 FINE_POINTS = 33
 LEAST_POINTS = 5
 LONGEST_AXIS = 0.005
 """Fault constants; a constant that the test hardly shows is not followed further."""
 WORSE = 4.0
 """Cost by which the bowl's vertex may lie above a chance minimum beside it."""
+NEAR = 1e-4
+"""Fault constants over which derivatives do not change."""
 ROUGH = 3.0
 """Distance of the cost from a parabola from which it counts as jagged."""
 
 
-def settle(model: GapModel, slope: Slope) -> tuple[NDArray[np.float64], bool]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Bowl:
+    """Where the cost's smooth bowl has its vertex.
+
+    x: the vertex, shape (5,).
+    smooth: whether the cost is a smooth bowl about it.
+    slope: near the vertex, with the rows that can be trusted.
+    """
+
+    x: NDArray[np.float64]
+    smooth: bool
+    slope: Slope
+
+
+def settle(model: GapModel, slope: Slope) -> Bowl:
     """Move to the vertex of the smooth bowl that the cost is, its small jumps apart.
 
     Parabolas through the cost over some deviations, along the axes of the uncertainty, see past
-    its steps. Returns the vertex, shape (5,), and whether the cost is a smooth bowl about it.
+    its steps.
     """
-    x, cost = slope.x, slope.cost
-    axes = _axes(slope)
-    smooth_bowl = True
+    smooth = True
     for _ in range(SETTLINGS):
-        moved, rough = _vertex(model, x, cost, axes)
-        smooth_bowl &= rough < ROUGH
-        if smooth_bowl:
-            return moved, True
-        slope = model.slopes([moved])[0]
-        if slope.cost > cost + WORSE:
-            break
-        x, cost, axes = moved, slope.cost, _axes(slope)
-    return x, smooth_bowl
+        axes = _axes(slope)
+        lines = [_line(slope.x, axis) for axis in axes]
+        sides = wide_sides(slope.x)
+        runs = model.many(np.vstack([sides, *(points for _, points in lines)]))
+        trusted = model.trusted(slope, runs[: len(sides)])
+        costs = [capped(gaps) for gaps in runs[len(sides) :]]
+        x = slope.x.copy()
+        for axis, (shares, _) in zip(axes, lines, strict=True):
+            share, rough = _vertex(
+                np.append(shares, 0.0), np.append(costs[: len(shares)], slope.cost)
+            )
+            costs = costs[len(shares) :]
+            smooth &= rough < ROUGH
+            x += share * axis
+        x[:FAULT_COUNT] = np.clip(x[:FAULT_COUNT], 0.0, 1.0)
+        if smooth and np.abs(x - slope.x)[:FAULT_COUNT].max() < NEAR:
+            return Bowl(x, True, trusted)
+        moved = model.slopes([x])[0]
+        if moved.cost > slope.cost + WORSE:
+            return Bowl(slope.x, smooth, trusted)
+        slope = moved
+    return Bowl(slope.x, smooth, model.trusted(slope, model.many(wide_sides(slope.x))))
 
 
 def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
@@ -57,10 +86,10 @@ def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
     shares = np.linspace(-REACH, REACH, FINE_POINTS)
     points = x + shares[:, None] * axes[0]
     inside = _inside(points)
-    values = model.costs(points[inside])
+    values = np.array([capped(gaps) for gaps in model.many(points[inside])])
     weight = np.exp(-0.5 * (values - values.min()))
     middle = x + float(shares[inside] @ weight / weight.sum()) * axes[0]
-    return middle if float(model.costs(middle[None, :])[0]) < slope.cost + WORSE else x
+    return middle if capped(model.one(middle)[0]) < slope.cost + WORSE else x
 
 
 def _inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -89,31 +118,26 @@ def _axes(slope: Slope) -> list[NDArray[np.float64]]:
     return out
 
 
-def _vertex(
-    model: GapModel, x: NDArray[np.float64], cost: float, axes: list[NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], float]:
-    """Minimum of the parabolas through the cost along all axes, which are conjugate.
-
-    Returns that point, and how far the cost is from a parabola at most.
-    """
+def _line(
+    x: NDArray[np.float64], axis: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points beside x along an axis, within the bounds, shape (n, 5), and their shares of it."""
     shares = np.linspace(-REACH, REACH, POINTS)
-    aside = shares[shares != 0.0]
-    lines = [x + aside[:, None] * axis for axis in axes]
-    kept = [_inside(points) for points in lines]
-    wanted = [points[inside] for points, inside in zip(lines, kept, strict=True)]
-    if not wanted:
-        return x, 0.0
-    values = np.split(model.costs(np.vstack(wanted)), np.cumsum([len(w) for w in wanted])[:-1])
-    out, roughest = x.copy(), 0.0
-    for axis, inside, measured in zip(axes, kept, values, strict=True):
-        if len(measured) + 1 < LEAST_POINTS:
-            continue
-        at = np.append(aside[inside], 0.0)
-        costs = np.append(measured, cost)
-        fit = np.polyfit(at, costs, 2)
-        roughest = max(roughest, float(np.abs(costs - np.polyval(fit, at)).max()))
-        bent, slope, _ = fit
-        share = at[np.argmin(costs)] if bent <= 0.0 else -0.5 * slope / bent
-        out += float(np.clip(share, at.min(), at.max())) * axis
-    out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
-    return out, roughest
+    shares = shares[shares != 0.0]
+    points = x + shares[:, None] * axis
+    inside = _inside(points)
+    return shares[inside], points[inside]
+
+
+def _vertex(shares: NDArray[np.float64], costs: NDArray[np.float64]) -> tuple[float, float]:
+    """Where the parabola through the costs has its minimum, and how far they are from it at most.
+
+    `shares`, `costs`: shape (n,), the last of them where the search stands.
+    """
+    if len(shares) < LEAST_POINTS:
+        return 0.0, 0.0
+    fit = np.polyfit(shares, costs, 2)
+    rough = float(np.abs(costs - np.polyval(fit, shares)).max())
+    bent, slope, _ = fit
+    share = shares[np.argmin(costs)] if bent <= 0.0 else -0.5 * slope / bent
+    return float(np.clip(share, shares.min(), shares.max())), rough
