@@ -11,6 +11,7 @@ from ehadiag.fitness import (
     objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
+    remarks_on_recording,
 )
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.pipeline import Identification, Progress, identify
@@ -35,6 +36,8 @@ class Diagnosis:
     """None where the recording could not be identified from."""
     experiments: tuple[Experiment, ...]
     """What was identified from; empty without identification."""
+    notes: tuple[str, ...]
+    """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
     """s from samples to verdict."""
 
@@ -75,6 +78,7 @@ def diagnose(
             reasons=tuple(reasons),
             identification=identification,
             experiments=experiments,
+            notes=_notes(recordings, matched, actuator),
             elapsed=time.perf_counter() - begin,
         )
 
@@ -110,8 +114,20 @@ def not_tested(
         reasons=tuple(reasons),
         identification=None,
         experiments=(),
+        notes=_notes((recording,), (test,), actuator),
         elapsed=0.0,
     )
+
+
+def _notes(
+    recordings: Sequence[Recording], tests: Sequence[StoredTest | None], actuator: Actuator
+) -> tuple[str, ...]:
+    """Notes on all recordings, each once."""
+    each = (
+        (*recording.quality.notes, *remarks_on_recording(recording, test, actuator))
+        for recording, test in zip(recordings, tests, strict=True)
+    )
+    return tuple(dict.fromkeys(note for notes in each for note in notes))
 
 
 def _match(

@@ -9,15 +9,27 @@ from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.current import CONTROL_LAW_LSB, FRAME_TOLERANCE
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.pipeline import Identification
+from ehadiag.model.constants import REFERENCE_TEMPERATURE
 from ehadiag.recording import BitState, CommandMode, Environment, Recording, Samples
 from ehadiag.storedtest import SAME_RATE, StoredTest
 
-__all__ = ["objections_to_estimate", "objections_to_experiment", "objections_to_recording"]
+__all__ = [
+    "objections_to_estimate",
+    "objections_to_experiment",
+    "objections_to_recording",
+    "remarks_on_recording",
+]
 
 MOST_LOST = 0.25
 """Share of samples of a channel that may be missing."""
 LONGEST_GAP_S = 0.25
 """Longest span without a sample."""
+LEAST_COMMANDS = 100
+"""Command frames that tell at which resolution the control law got its command."""
+MOST_GUESSED = 0.02
+"""Share of ticks in closed loop whose current had to be guessed (docs/reference/bus-faults.md)."""
+LEAST_MISSED_S = 0.01
+"""A shorter piece missing at an end of the test is a lost frame like others."""
 LEAST_SHARE = 0.5
 """Share of the samples of a window that a search needs."""
 MOST_SATURATED = 0.02
@@ -56,7 +68,13 @@ def objections_to_recording(
 
 def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
     out = []
-    if samples.mode is not (CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT):
+    commands = int(np.isfinite(samples.command).sum())
+    if test.closed_loop and commands < LEAST_COMMANDS:
+        out.append(
+            f"{commands or 'no'} command frames in the recording, and closed loop cannot be judged"
+            " without them: record the message with the command too, and name it in the mapping"
+        )
+    elif samples.mode is not (CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT):
         out.append(
             f"the command is a {samples.mode.name.lower()}, test {test.name!r} needs another"
         )
@@ -128,6 +146,11 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
             f"{'control law' if test.closed_loop else 'command'} gives (limit "
             f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
         )
+    if trace.guessed > MOST_GUESSED:
+        out.append(
+            f"{trace.guessed:.1%} of the jack positions that the control law worked on are lost "
+            f"(limit {MOST_GUESSED:.0%}): the servovalve current cannot be rebuilt"
+        )
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
         seen = values[np.isfinite(values)]
         if seen.size and float(np.ptp(seen)) == 0.0:
@@ -150,6 +173,33 @@ def objections_to_estimate(identification: Identification) -> list[str]:
     if hidden:
         out.append(f"the test does not show {', '.join(hidden)}")
     return out
+
+
+def remarks_on_recording(
+    recording: Recording, test: StoredTest | None, actuator: Actuator
+) -> tuple[str, ...]:
+    """What was assumed and what is missing, where a verdict can be given all the same."""
+    samples = recording.samples
+    if samples is None:
+        return ()
+    out = []
+    environment = recording.environment
+    if environment.oil_temperature is None:
+        out.append(f"no oil temperature on the bus: {REFERENCE_TEMPERATURE:g} degC assumed")
+    if environment.supply_pressure is None or environment.return_pressure is None:
+        supply = actuator.servovalve.PSR / 1e6
+        out.append(f"no supply pressure on the bus: the actuator file's {supply:g} MPa assumed")
+    present = np.flatnonzero(np.isfinite(samples.spool))
+    if test is not None and len(present):
+        first = float(present[0]) / test.rate
+        last = max(test.ticks - 1 - float(present[-1]), 0.0) / test.rate
+        if first >= LEAST_MISSED_S:
+            out.append(f"the first {first:.3f} s of the test are missing")
+        if last >= LEAST_MISSED_S:
+            out.append(f"the last {last:.3f} s of the test are missing: the recording ends early")
+        elif recording.outcome.state is BitState.RUNNING:
+            out.append("the recording ends before the computer's word that the test is complete")
+    return tuple(out)
 
 
 def _words(name: str) -> str:

@@ -8,7 +8,6 @@ folder keyed by the versions of the compiler and a hash of *all* kernel sources.
 from __future__ import annotations
 
 import hashlib
-import os
 import sys
 import tempfile
 from collections.abc import Callable
@@ -21,7 +20,9 @@ import numba
 import numpy as np
 from numba.core import caching
 
-__all__ = ["cache_folder", "cache_is_cold", "inlined", "kernel"]
+from ehadiag.cachefolder import private_folder
+
+__all__ = ["cache_folder", "inlined", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -43,41 +44,9 @@ def inlined(function: F) -> F:
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of compiled kernels, created if need be.
-
-    `EHADIAG_CACHE_DIR`, else the user's cache folder, else a folder of this user's own below the
-    system's temporary folder.
-    """
-    leaf = f"kernels-{_digest()}"
-    candidates = []
-    if named := os.environ.get("EHADIAG_CACHE_DIR"):
-        candidates.append(Path(named))
-    if xdg := os.environ.get("XDG_CACHE_HOME"):
-        candidates.append(Path(xdg) / "ehadiag")
-    if home := os.environ.get("HOME"):
-        candidates.append(Path(home) / ".cache" / "ehadiag")
-    owner = os.getuid() if hasattr(os, "getuid") else "user"
-    candidates.append(Path(tempfile.gettempdir()) / f"ehadiag-{owner}")
-    for folder in candidates:
-        if _usable(folder / leaf):
-            return folder / leaf
-    return Path(tempfile.mkdtemp(prefix="ehadiag-"))
-
-
-def cache_is_cold() -> bool:
-    """Whether no kernel of this version has been compiled here yet."""
-    return not any(cache_folder().glob("*.nbi"))
-
-
-def _usable(folder: Path) -> bool:
-    """Create the folder; it must be writable and, as it holds code, nobody else's."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        info = folder.stat()
-    except OSError:
-        return False
-    ours = not hasattr(os, "getuid") or info.st_uid == os.getuid()
-    return ours and os.access(folder, os.W_OK)
+    """Return the folder of compiled kernels, created if need be; see `private_folder`."""
+    folder = private_folder(f"kernels-{_digest()}")
+    return folder or Path(tempfile.mkdtemp(prefix="ehadiag-"))
 
 
 @cache

@@ -7,23 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitState, CommandMode
 from ehadiag.tomlfile import decode_toml, read_toml
+from firmware_iface.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, parse_dbc, recall_dbc
 from firmware_iface.frames import MAX_PAYLOAD
 from firmware_iface.layout import SignalLayout
 from firmware_iface.mapping import MappingFile, Policy, Protection, SignalRef
 from firmware_iface.units import si_factor
 
-if TYPE_CHECKING:
-    from cantools.database.can.message import Message as DbcMessage
-    from cantools.database.can.signal import Signal as DbcSignal
-
 __all__ = ["BusMap", "MessageMap", "Role", "default_map", "load_map"]
 
-MAX_DBC_BYTES = 8 << 20
 MAX_MULTIPLEXERS = 8
 """Multiplexers of multiplexers."""
 
@@ -112,7 +107,8 @@ def default_map() -> BusMap:
     folder = resources.files("firmware_iface").joinpath("data")
     where = "bundled mapping eha_fcc.toml"
     tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)
-    return resolve(tree, folder.joinpath(tree.dbc).read_bytes(), where, tree.dbc)
+    text = folder.joinpath(tree.dbc).read_bytes()
+    return resolve_parsed(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
 
 
 def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
@@ -137,12 +133,18 @@ def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
             text = file.read(MAX_DBC_BYTES + 1)
     except OSError as error:
         raise InputOutputError(f"DBC file {dbc}: {error.strerror or error}") from None
-    return resolve(tree, text, f"mapping file {path}", str(dbc))
+    return resolve_parsed(tree, recall_dbc(text, str(dbc)), f"mapping file {path}", str(dbc))
 
 
 def resolve(tree: MappingFile, dbc: bytes, where: str, dbc_name: str) -> BusMap:
     """Resolve a mapping against DBC text; `where` begins the error texts."""
-    database = _parse_dbc(dbc, dbc_name)
+    return resolve_parsed(tree, parse_dbc(dbc, dbc_name), where, dbc_name)
+
+
+def resolve_parsed(
+    tree: MappingFile, database: Mapping[str, DbcMessage], where: str, dbc_name: str
+) -> BusMap:
+    """Resolve a mapping against the messages of a DBC."""
     roles: dict[str, list[Role]] = {}
     for section, dimensions in DIMENSIONS.items():
         signals = getattr(tree, section)
@@ -193,26 +195,6 @@ def _fixed_mode(tree: MappingFile, where: str) -> CommandMode | None:
     return CommandMode.POSITION if command.position is not None else None
 
 
-def _parse_dbc(text: bytes, name: str) -> dict[str, DbcMessage]:
-    if len(text) > MAX_DBC_BYTES:
-        raise ConfigurationError(f"DBC file {name}: larger than {MAX_DBC_BYTES} bytes")
-    import cantools.database  # noqa: PLC0415 - slow to import
-    from cantools.database.can.database import Database  # noqa: PLC0415
-
-    try:
-        content = text.decode("utf-8")
-    except UnicodeDecodeError:
-        content = text.decode("cp1252", "replace")  # what older tools write
-    try:
-        database = cantools.database.load_string(content, "dbc")
-    except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ConfigurationError(f"DBC file {name}: not a valid DBC: {reason}") from None
-    if not isinstance(database, Database):
-        raise ConfigurationError(f"DBC file {name}: no CAN messages in it")
-    return {message.name: message for message in database.messages}
-
-
 def _role(
     ref: SignalRef,
     name: str,
@@ -242,9 +224,8 @@ def _layout(message: DbcMessage, name: str, at: str, depth: int = 0) -> SignalLa
 
 
 def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 0) -> SignalLayout:
-    """Layout of a cantools signal, with its chain of multiplexers."""
-    conversion = signal.conversion
-    scale, offset = getattr(conversion, "scale", None), getattr(conversion, "offset", None)
+    """Layout of a signal, with its chain of multiplexers."""
+    scale, offset = signal.scale, signal.offset
     if scale is None or offset is None or not 1 <= signal.length <= 64:
         raise ConfigurationError(f"{at}: signal {signal.name!r} is not a plain number")
     if scale == 0 or not math.isfinite(scale) or not math.isfinite(offset):
@@ -254,8 +235,8 @@ def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 
     if depth > MAX_MULTIPLEXERS:
         raise ConfigurationError(f"{at}: the multiplexers of {message.name!r} go in a circle")
     selectors: tuple[tuple[SignalLayout, frozenset[int]], ...] = ()
-    if signal.multiplexer_signal is not None and signal.multiplexer_ids:
-        parent = _layout(message, signal.multiplexer_signal, at, depth + 1)
+    if signal.multiplexer is not None and signal.multiplexer_ids:
+        parent = _layout(message, signal.multiplexer, at, depth + 1)
         selectors = (*parent.selectors, (parent, frozenset(signal.multiplexer_ids)))
     low, high = signal.minimum, signal.maximum
     ranged = low is not None and high is not None and low < high
@@ -265,12 +246,12 @@ def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 
         length=signal.length,
         big_endian=signal.byte_order == "big_endian",
         signed=signal.is_signed,
-        is_float=conversion.is_float,
-        scale=float(scale),
-        offset=float(offset),
-        minimum=float(low) if ranged and low is not None else None,
-        maximum=float(high) if ranged and high is not None else None,
-        unit=signal.unit or "",
+        is_float=signal.is_float,
+        scale=scale,
+        offset=offset,
+        minimum=low if ranged else None,
+        maximum=high if ranged else None,
+        unit=signal.unit,
         selectors=selectors,
     )
     if layout.last_byte >= message.length:
@@ -296,13 +277,13 @@ def _message(
     return MessageMap(
         name=message.name,
         can_id=message.frame_id,
-        extended=message.is_extended_frame,
-        fd=message.is_fd,
+        extended=message.extended,
+        fd=message.fd,
         length=message.length,
         roles=roles,
         counter=counter,
         counts_ticks=counter is not None and guard.counts == "ticks",
         crc=crc,
         crc_kind=guard.crc_kind if crc is not None else "none",
-        cycle_ns=int(message.cycle_time or 0) * 1_000_000,
+        cycle_ns=message.cycle_ms * 1_000_000,
     )

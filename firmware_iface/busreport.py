@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.busmap import BusMap, MessageMap
+from firmware_iface.busmap import DIMENSIONS, BusMap, MessageMap
 from firmware_iface.decode import Decoded, decode
 from firmware_iface.frames import FrameTable
 from firmware_iface.ticks import TickAxis, place
@@ -77,6 +77,7 @@ class BusReport:
     foreign: identifier, whether extended, frames; the most frequent first.
     delay: median time from a command to the telemetry of its tick, s; None if unknown.
     problems: what stands in the way of a diagnosis, one sentence each; empty if nothing.
+    remarks: what a diagnosis has to assume, one sentence each.
     """
 
     duration: float
@@ -87,6 +88,7 @@ class BusReport:
     foreign: tuple[tuple[int, bool, int], ...]
     delay: float | None
     problems: tuple[str, ...]
+    remarks: tuple[str, ...]
 
 
 def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
@@ -105,6 +107,7 @@ def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
         foreign=_foreign(table, decoded.foreign),
         delay=_delay(decoded.messages, axis),
         problems=_problems(messages, len(table)),
+        remarks=_remarks(decoded.messages, len(table)),
     )
 
 
@@ -221,6 +224,23 @@ def _problems(messages: tuple[MessageReport, ...], frames: int) -> tuple[str, ..
     return tuple(problems)
 
 
+def _remarks(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:
+    """What the bus does not say of oil and supply."""
+    if not frames:
+        return ()
+    said = {
+        name
+        for item in messages.values()
+        for name, value in item.values.items()
+        if np.isfinite(value).any()
+    }
+    return tuple(
+        f"{name} is not on the bus: a diagnosis assumes the actuator file's"
+        for name in DIMENSIONS["environment"]
+        if f"environment.{name}" not in said
+    )
+
+
 def render(report: BusReport) -> str:
     """Text of a report, lines of at most some 100 characters."""
     lines = [
@@ -250,5 +270,7 @@ def render(report: BusReport) -> str:
     if report.foreign:
         listed = ", ".join(f"{number:#x} ({count})" for number, _, count in report.foreign)
         lines += ["", f"not mapped: {listed}"]
+    if report.remarks:
+        lines += ["", *report.remarks]
     lines += ["", *(report.problems or ("everything that a diagnosis needs is there",))]
     return "\n".join(lines)

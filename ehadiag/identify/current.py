@@ -40,6 +40,8 @@ class CurrentTrace:
     offset: constant error of the measured current, A.
     rebuilt: whether the measured current bears it out.
     command_gap: largest distance of a command frame from the stored test, A or m.
+    guessed: share of ticks whose current follows from a position that was lost, and that the
+        measured current does not tell either.
     """
 
     current: NDArray[np.float64]
@@ -47,6 +49,7 @@ class CurrentTrace:
     offset: float
     rebuilt: bool
     command_gap: float
+    guessed: float = 0.0
 
 
 def commanded_current(samples: Samples, test: StoredTest, controller: Controller) -> CurrentTrace:
@@ -57,21 +60,24 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     gap = np.abs(samples.command - stored)[known]
     command_gap = float(gap.max()) if gap.size else 0.0
     command = np.where(known, samples.command, _as_sent(stored, samples.command[known]))
+    guessed = 0.0
     if samples.mode is CommandMode.CURRENT:
         current = np.clip(command, -controller.IM, controller.IM)
     else:
-        current = _control_law(command, samples, controller)
+        seen, unknown = _positions_seen(command, samples, controller)
+        current = _control_law(command, seen, samples.period_ns * 1e-9, controller)
+        guessed = float(np.mean(unknown))
     # A code at the converter's end says no more than that the current is at least so large.
     finite = np.isfinite(samples.current) & ~samples.saturated[0]
     difference = samples.current[finite] - current[finite]
     if difference.size == 0:
-        return CurrentTrace(current, float("nan"), 0.0, True, command_gap)
+        return CurrentTrace(current, float("nan"), 0.0, True, command_gap, guessed)
     offset = float(np.median(difference))
     # A handful of ticks may be far off where samples were lost: compare most of them.
     spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
     gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
     rebuilt = gap_lsb < CONTROL_LAW_LSB
-    return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap)
+    return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap, guessed)
 
 
 def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
@@ -95,12 +101,10 @@ def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[
 
 
 def _control_law(
-    command: NDArray[np.float64], samples: Samples, controller: Controller
+    command: NDArray[np.float64], seen: NDArray[np.float64], period: float, controller: Controller
 ) -> NDArray[np.float64]:
     """Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt), Err = Com − XJm (model.md section 1)."""
-    seen = _positions_seen(command, samples, controller)
     error = command - seen
-    period = samples.period_ns * 1e-9
     demand = controller.GAP * error
     if controller.GAD:
         demand += controller.GAD * np.diff(error, prepend=error[0]) / period
@@ -120,19 +124,26 @@ def _control_law(
 
 def _positions_seen(
     command: NDArray[np.float64], samples: Samples, controller: Controller
-) -> NDArray[np.float64]:
-    """Digitised jack position that each tick's control law worked on, m, shape (n,)."""
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Digitised jack position that each tick's control law worked on, m, shape (n,).
+
+    Also the ticks whose position was lost and is bridged over: the sensor's noise in that sample,
+    which the control law turned into current, cannot be told. A current at its limit is none of
+    them: there the position did not matter.
+    """
     seen = np.concatenate([[np.nan], samples.position[:-1]])
     lost = np.flatnonzero(np.isnan(seen))
+    unknown = np.zeros(len(seen), dtype=np.bool_)
     if lost.size == 0:
-        return seen
+        return seen, unknown
     ticks = np.arange(len(seen))
     present = np.isfinite(seen)
     bridged = np.interp(ticks, ticks[present], seen[present]) if present.any() else 0.0 * command
     seen = np.where(present, seen, np.round(bridged / POSITION.lsb) * POSITION.lsb)
     clear = controller.GAP * POSITION.lsb > 6.0 * CURRENT.lsb
+    unknown[lost] = True
     if not clear or controller.GAI or controller.GAD:
-        return seen
+        return seen, unknown
     linear = np.abs(samples.current) < controller.IM - 3.0 * CURRENT.lsb
     linear &= ~samples.saturated[0]
     exact = present & linear
@@ -144,4 +155,4 @@ def _positions_seen(
         if linear[k]:
             position = command[k] - (samples.current[k] - offset) / controller.GAP
             seen[k] = np.round(position / POSITION.lsb) * POSITION.lsb
-    return seen
+    return seen, unknown & np.isnan(samples.current)

@@ -7,35 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.model.anchor import FREE_RUN, Anchor
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.jack import jack_response
 from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
 from ehadiag.model.transition import spool_tables
 
 __all__ = ["FREE_RUN", "Anchor", "Response", "respond"]
-
-
-@dataclass(frozen=True, slots=True)
-class Anchor:
-    """Re-anchoring of the modelled spool on the measured one, once a tick.
-
-    The innovation is filtered, f += gain (e - f); a sample further off than `large` moves the model
-    onto it, a filtered innovation above `small` moves it by that. It undoes a break-away that went
-    the other way, and leaves a model that runs true alone.
-    """
-
-    gain: float
-    small: float
-    """m."""
-    large: float
-    """m."""
-
-    def as_array(self) -> NDArray[np.float64]:
-        """The form that kernels take."""
-        return np.array([self.gain, self.small, self.large])
-
-
-FREE_RUN = Anchor(0.0, np.inf, np.inf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,7 @@
 """One tick of the monitoring model from a state carried between calls: kernel of the monitor.
 
-The same steps, events and closed forms as `ehadiag.model.spool` and `ehadiag.model.jack`, of which
-it takes the parts without arrays; a test holds it to their answer.
+Spool and jack are those of `ehadiag.model`; here stand the current, what a
+lost sample does, and the sums.
 """
 
 from __future__ import annotations
@@ -11,19 +11,24 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import kernel
+from ehadiag.jit import inlined, kernel
+from ehadiag.model.anchor import re_anchored
 from ehadiag.model.constants import PlantConstants
+from ehadiag.model.jacktick import jack_tick, second_stage
+from ehadiag.model.spooltick import spool_tick
 from ehadiag.model.transition import SpoolScalars
-from ehadiag.monitor.jacktick import jack_tick
 from ehadiag.monitor.layout import (
     ANCHOR_GAIN,
     ANCHOR_LARGE,
     ANCHOR_SMALL,
+    CLAMPED,
     CLOSED,
     CODE_POSITION,
     COMMAND,
     CUSUM,
     DEVIATION,
+    DIRECTION,
+    DYNAMIC,
     ERROR_BEFORE,
     FILTERED,
     GAD,
@@ -32,7 +37,10 @@ from ehadiag.monitor.layout import (
     IM,
     INTEGRAL,
     INVERTIBLE,
+    JACK_DIRECTION,
     JACK_POSITION,
+    JACK_SPOOL,
+    JACK_VELOCITY,
     LIMIT,
     LINEAR,
     LOST,
@@ -46,10 +54,12 @@ from ehadiag.monitor.layout import (
     STARTED,
     THRESHOLD,
     TICK,
+    VS,
     WEIGHTS,
+    WF,
+    XF,
     XS,
 )
-from ehadiag.monitor.spooltick import spool_tick
 
 __all__ = ["push_tick"]
 
@@ -137,23 +147,54 @@ def _commanded(p: Vector, s: Vector, command: float, current: float, position: f
     return float(out)
 
 
-@kernel
-def _re_anchor(p: Vector, s: Vector, bound: float, error: float) -> float:
-    """Move the modelled spool as `ehadiag.model.monitoring.Anchor` says; returns by how much, m."""
-    if not math.isfinite(error):
-        return 0.0
-    s[FILTERED] += p[ANCHOR_GAIN] * (error - s[FILTERED])
-    move = 0.0
-    if abs(error) > p[ANCHOR_LARGE]:
-        move = error
-    elif abs(s[FILTERED]) > p[ANCHOR_SMALL]:
-        move = s[FILTERED]
-    if move == 0.0:
-        return 0.0
-    before = s[XS]
-    s[XS] = min(max(before + move, -bound), bound)
-    s[FILTERED] = 0.0
-    return float(s[XS] - before)
+@inlined
+def _spool(
+    p: Vector, s: Vector, moving: Vector, stuck: Vector, decay: Vector, torque: float, nodes: Vector
+) -> int:
+    """Flapper and spool over the tick; returns the number of nodes of the path."""
+    xf, wf, xs, vs, direction, clamped, count = spool_tick(
+        _plant(p),
+        _scalars(p),
+        moving,
+        stuck,
+        decay,
+        torque,
+        p[TICK],
+        s[XF],
+        s[WF],
+        s[XS],
+        s[VS],
+        int(s[DIRECTION]),
+        s[CLAMPED] != 0.0,
+        nodes,
+        0,
+    )
+    s[XF], s[WF], s[XS], s[VS] = xf, wf, xs, vs
+    s[DIRECTION], s[CLAMPED] = direction, 1.0 if clamped else 0.0
+    return count
+
+
+@inlined
+def _jack(p: Vector, s: Vector, nodes: Vector, count: int) -> float:
+    """Second stage and jack over the spool's path; returns the pressure at its end, Pa."""
+    c = _plant(p)
+    supply, resistance, _, _ = second_stage(c, s[JACK_SPOOL])
+    pressure, velocity, place, direction, spool, _, _ = jack_tick(
+        c,
+        p[DYNAMIC],
+        nodes,
+        0,
+        count,
+        s[JACK_VELOCITY],
+        s[JACK_POSITION],
+        s[JACK_DIRECTION],
+        s[JACK_SPOOL],
+        supply,
+        resistance,
+    )
+    s[JACK_VELOCITY], s[JACK_POSITION], s[JACK_DIRECTION] = velocity, place, direction
+    s[JACK_SPOOL] = spool
+    return pressure
 
 
 @kernel
@@ -200,15 +241,17 @@ def push_tick(
     command, current, spool, pressure, position: the tick's sample, SI, NaN where lost.
     """
     p, s = parameters, state
-    c = _plant(p)
-    torque = c.GM * _commanded(p, s, command, current, position)
-    count = spool_tick(c, _scalars(p), moving, stuck, decay, torque, p[TICK], s, nodes)
+    torque = _plant(p).GM * _commanded(p, s, command, current, position)
+    count = _spool(p, s, moving, stuck, decay, torque, nodes)
     s[PREDICTED] = s[XS]
     gap = spool - p[OFFSETS] - s[XS]
     s[RESIDUAL] = gap * p[WEIGHTS]
-    jump = _re_anchor(p, s, c.XSM, gap)
-    s[PREDICTED + 1] = jack_tick(c, p, nodes, count, jump, s)
+    s[PREDICTED + 1] = _jack(p, s, nodes, count)
     s[PREDICTED + 2] = s[JACK_POSITION]
     s[RESIDUAL + 1] = (pressure - p[OFFSETS + 1] - s[PREDICTED + 1]) * p[WEIGHTS + 1]
+    s[XS], s[FILTERED], _ = re_anchored(
+        gap, p[ANCHOR_GAIN], p[ANCHOR_SMALL], p[ANCHOR_LARGE], s[XS], s[FILTERED], _plant(p).XSM
+    )
+    s[JACK_SPOOL] += s[XS] - s[PREDICTED]
     _accumulate(p, s, alarmed, 0)
     _accumulate(p, s, alarmed, 1)

@@ -120,7 +120,7 @@ def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
         "foreign": sum(recording.quality.foreign for recording in diagnosis.recordings),
         "error_frames": sum(recording.quality.error_frames for recording in diagnosis.recordings),
         "saturated": saturated,
-        "notes": [note for recording in diagnosis.recordings for note in recording.quality.notes],
+        "notes": list(diagnosis.notes),
     }
 
 

@@ -44,9 +44,8 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
     if diagnosis.identification is not None:
         console.print(_constants(diagnosis), crop=False)
     console.print(f"  {_quality(diagnosis)}", soft_wrap=True, highlight=False)
-    for recording in diagnosis.recordings:
-        for note in recording.quality.notes:
-            console.print(f"  note: {note}", soft_wrap=True, highlight=False)
+    for note in diagnosis.notes:
+        console.print(f"  note: {note}", soft_wrap=True, highlight=False)
     if diagnosis.identification is not None:
         console.print(f"  {_effort(diagnosis)}", soft_wrap=True, highlight=False)
 

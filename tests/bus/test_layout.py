@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_iface.busmap import signal_layout
+from firmware_iface.dbc import plain_message
 from firmware_iface.layout import SignalLayout
 
 
@@ -42,7 +43,8 @@ def messages(draw):
 def parse(text):
     database = cantools.database.load_string(text, "dbc")
     (message,) = database.messages
-    return message, signal_layout(message.signals[-1], message, "test")
+    plain = plain_message(message)
+    return message, signal_layout(plain.signals[-1], plain, "test")
 
 
 @settings(max_examples=300, deadline=None)

@@ -68,6 +68,9 @@ def test_limits_are_the_documented_ones() -> None:
     for limit in (
         f"missing | {100 * fitness.MOST_LOST:g} % |",
         f"for x s | {fitness.LONGEST_GAP_S:g} s |",
+        f"are lost (closed loop) | {100 * fitness.MOST_GUESSED:g} %, see",
+        f"the command too | {fitness.LEAST_COMMANDS} frames |",
+        f"at least {1000 * fitness.LEAST_MISSED_S:g} ms missing",
         f"converter's end | {100 * fitness.MOST_SATURATED:g} % |",
         f"outside −{-low:g} … {high:g} °C",
         f"more than {100 * fitness.MOST_OUTLIERS:g} % of the gaps",

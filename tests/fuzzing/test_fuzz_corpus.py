@@ -16,7 +16,7 @@ CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
 
 def keep_dbc_parser(monkeypatch: pytest.MonkeyPatch) -> None:
     """A target puts a cache before it; take that away again."""
-    monkeypatch.setattr(busmap, "_parse_dbc", busmap._parse_dbc)
+    monkeypatch.setattr(busmap, "parse_dbc", busmap.parse_dbc)
 
 
 @pytest.mark.parametrize("name", targets.TARGETS)

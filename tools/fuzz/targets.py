@@ -188,7 +188,7 @@ def _mappings(_: int) -> Callable[[bytes], None]:
     data_files = resources.files("firmware_iface").joinpath("data")
     dbc = data_files.joinpath("eha_fcc.dbc").read_bytes()
     mapping = decode_toml(data_files.joinpath("eha_fcc.toml").read_bytes(), MappingFile, "default")
-    parse = busmap._parse_dbc
+    parse = busmap.parse_dbc
 
     @functools.lru_cache(maxsize=1)
     def parsed_default() -> Mapping[str, object]:
@@ -198,7 +198,7 @@ def _mappings(_: int) -> Callable[[bytes], None]:
         return parsed_default() if text is dbc else parse(text, name)
 
     # Ten milliseconds for the same answer every time would be nearly all of the time.
-    busmap._parse_dbc = parse_once  # type: ignore[assignment]
+    busmap.parse_dbc = parse_once  # type: ignore[assignment]
 
     def check(data: bytes) -> None:
         if not data:

@@ -1,4 +1,12 @@
-"""First stage and spool over one tick."""
+"""First stage and spool over one tick, integrated exactly: kernel of the monitoring model.
+
+Between events, flapper and spool obey linear equations with constant coefficients (model.md
+section 1, the current being held over a tick), so the state moves by a transition matrix, without
+error. Events switch the equations: the flapper meets or leaves a stop; the spool sticks, breaks
+away or meets a stop. A step that contains an event is halved until the event is located.
+Coefficients depend on one fault constant only, `Kintas`, so the matrices are made once for each
+candidate (`ehadiag.model.transition`).
+"""
 
 from __future__ import annotations
 
@@ -7,40 +15,58 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import inlined, kernel
+from ehadiag.jit import inlined
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.spool import (
-    BASE,
-    BEND,
+from ehadiag.model.spoolevents import (
     BREAKAWAY,
     FLAPPER_STOP,
-    LAST,
-    LAST_BEND,
-    NODE_LEVEL,
-    NODES_PER_TICK,
     NOTHING,
     RELEASE,
     REVERSAL,
     SPOOL_STOP,
-    WHOLE,
-    _clamped_event,
-    _moving_event,
-    _rests,
-    _stuck_event,
+    clamped_event,
+    moving_event,
+    stuck_event,
 )
 from ehadiag.model.transition import FINEST, SpoolScalars
-from ehadiag.monitor.layout import CLAMPED, DIRECTION, VS, WF, XF, XS
 
-__all__ = ["spool_tick"]
+__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "spool_rest", "spool_tick"]
 
-Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+BASE = 3
+"""Level of the ordinary step: tick / 8."""
+WHOLE = 1 << FINEST
+"""A tick in units of the finest step."""
+NODE_LEVEL = 5
+"""Away from events a node is written only at multiples of tick / 2^NODE_LEVEL."""
+NODES_PER_TICK = 128
+"""Room for nodes of one tick."""
+NODE_COLUMNS = 5
+LAST = WHOLE - (WHOLE >> BASE)
+"""Start of the last ordinary step: pressure at the end of a tick hangs on the last piece most."""
+LAST_BEND = 0.002e-6
+BEND = 0.05e-6
+"""A node is written where the path bends away from its chord by about this much, m."""
+
+
+@inlined
+def _rests(
+    c: PlantConstants, t: SpoolScalars, torque: float, xf: float, wf: float, xs: float
+) -> bool:
+    """Whether a spool at rest stays so while this torque lasts: the flapper rings too little."""
+    if t.ring_rate <= 0.0:
+        return False
+    rest_xf = (torque - c.KSF * xs) / c.KF
+    a = xf - rest_xf
+    b = (wf + t.ring_damping * a) / t.ring_rate
+    return abs(rest_xf) + math.sqrt(a * a + b * b) < min(t.breakaway, c.XFM)
 
 
 @inlined
 def _slide(
     c: PlantConstants,
     t: SpoolScalars,
-    m: Vector,
+    m: Matrix,
     torque: float,
     xf: float,
     wf: float,
@@ -62,7 +88,7 @@ def _slide(
 
 @inlined
 def _ring(
-    c: PlantConstants, n: Vector, torque: float, xf: float, wf: float, xs: float
+    c: PlantConstants, n: Matrix, torque: float, xf: float, wf: float, xs: float
 ) -> tuple[float, float]:
     """Flapper free, spool at rest: a step of the flapper about its rest."""
     rest_xf = (torque - c.KSF * xs) / c.KF
@@ -108,25 +134,55 @@ def _node_wanted(event: int, done: int, bend: float) -> bool:
     return bend > BEND or (done == LAST and bend > LAST_BEND)
 
 
-@kernel
+@inlined
+def spool_rest(
+    c: PlantConstants, t: SpoolScalars, current: float, origin: float
+) -> tuple[float, float]:
+    """Positions of flapper and spool (m) at rest with a current (A) and the spool at `origin`."""
+    xs = min(max(origin, -c.XSM), c.XSM)
+    xf = (c.GM * current - c.KSF * xs) / c.KF
+    return min(max(xf, -t.breakaway), t.breakaway), xs
+
+
+@inlined
 def spool_tick(
     c: PlantConstants,
     t: SpoolScalars,
-    moving: Vector,
-    stuck: Vector,
-    decay: Vector,
+    moving: Matrix,
+    stuck: Matrix,
+    decay: Matrix,
     torque: float,
     tick: float,
-    state: Vector,
-    nodes: Vector,
-) -> int:
-    """Advance flapper and spool by one tick, in place; returns the number of nodes written.
+    xf: float,
+    wf: float,
+    xs: float,
+    vs: float,
+    direction: int,
+    clamped: bool,
+    nodes: Matrix,
+    first: int,
+) -> tuple[float, float, float, float, int, bool, int]:
+    """Flapper and spool over one tick.
 
-    For the form of nodes see `ehadiag.model.spool.spool_response`; jumps are left out.
+    Parameters
+    ----------
+    moving, stuck, decay: see `ehadiag.model.transition.SpoolTables`.
+    torque: of the motor, N, held over the tick.
+    tick: s.
+    xf, wf, xs, vs: position and velocity of flapper and spool, m and m/s.
+    direction: of the spool's motion, +1 or -1; 0 at rest.
+    clamped: whether the flapper is on its stop.
+    nodes: out, shape (at least first + NODES_PER_TICK, NODE_COLUMNS), one row a piece of the path:
+        duration (s), position at its end (m), velocity at its start and at its end (m/s); the last
+        column, the jump after the piece (m), is set to 0.
+    first: index of the tick's first node.
+
+    Returns
+    -------
+    xf, wf, xs, vs, direction and clamped at the end, and the index one past the last node.
     """
-    xf, wf, xs, vs = state[XF], state[WF], state[XS], state[VS]
-    direction, clamped = int(state[DIRECTION]), state[CLAMPED] != 0.0
-    count, done, since, level = 0, 0, 0, BASE
+    full = first + NODES_PER_TICK - 1
+    count, done, since, level = first, 0, 0, BASE
     if direction == 0 and not clamped and _rests(c, t, torque, xf, wf, xs):
         level = 0
     begin, slowest, fastest = vs, vs, vs
@@ -141,15 +197,15 @@ def spool_tick(
                 fade = decay[level]
                 new_xs += steady * h + (vs - steady) * (1.0 - fade) * c.MS / t.damping
                 new_vs = steady + (vs - steady) * fade
-            event = _clamped_event(c, t, torque, xf, new_xs, new_vs, direction)
+            event = clamped_event(c, t, torque, xf, new_xs, new_vs, direction)
         elif direction != 0:
             new_xf, new_wf, new_xs, new_vs = _slide(
                 c, t, moving[level], torque, xf, wf, xs, vs, direction
             )
-            event = _moving_event(c, t, h, xf, wf, new_xf, new_wf, new_xs, new_vs, direction)
+            event = moving_event(c, t, h, xf, wf, new_xf, new_wf, new_xs, new_vs, direction)
         else:
             new_xf, new_wf = _ring(c, stuck[level], torque, xf, wf, xs)
-            event = _stuck_event(c, t, h, xf, wf, new_xf, new_wf, xs)
+            event = stuck_event(c, t, h, xf, wf, new_xf, new_wf, xs)
         if level == 0:
             event = NOTHING  # `_rests` has looked
         if event != NOTHING and level < FINEST:
@@ -164,16 +220,15 @@ def spool_tick(
         slowest, fastest = min(slowest, end), max(fastest, end)
         span = tick * since / WHOLE
         wanted = _node_wanted(event, done, 0.125 * (fastest - slowest) * span)
-        if wanted and (done == WHOLE or count < NODES_PER_TICK - 1):
+        if wanted and (done == WHOLE or count < full):
             nodes[count, 0] = span
             nodes[count, 1] = xs
             nodes[count, 2] = begin
             nodes[count, 3] = end
+            nodes[count, 4] = 0.0
             count += 1
             begin, slowest, fastest = vs, vs, vs
             since = 0
         if level > BASE and done & ((WHOLE >> (level - 1)) - 1) == 0:
             level -= 1
-    state[XF], state[WF], state[XS], state[VS] = xf, wf, xs, vs
-    state[DIRECTION], state[CLAMPED] = direction, 1.0 if clamped else 0.0
-    return count
+    return xf, wf, xs, vs, direction, clamped, count
