@@ -16,6 +16,7 @@ from ehadiag.fitness import (
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.pipeline import Identification, Progress, identify
 from ehadiag.identify.solvers import Solver
+from ehadiag.identify.stages import Memory
 from ehadiag.recording import Recording
 from ehadiag.storedtest import StoredTest
 from ehadiag.verdict import Levels, Verdict, judge
@@ -52,6 +53,7 @@ def diagnose(
     solver: Solver | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    memory: Memory | None = None,
 ) -> Diagnosis:
     """Diagnose one actuator from one recording, or from several together.
 
@@ -59,6 +61,7 @@ def diagnose(
     ----------
     tests: the tests that a recording may be of, told apart by number.
     default: test of recordings whose bus does not carry a number.
+    memory: what was worked out ahead (see `ehadiag.online`); it does not change the answer.
     """
     begin = time.perf_counter()
     known = tuple(tests)
@@ -94,7 +97,9 @@ def diagnose(
         reasons.append("the recordings are of actuators with different serial numbers")
     if reasons:
         return result(Verdict.NOT_TESTED, reasons)
-    identification = identify(experiments, solver=solver, seed=seed, progress=progress)
+    identification = identify(
+        experiments, solver=solver, seed=seed, progress=progress, memory=memory
+    )
     doubts = objections_to_estimate(identification)
     if doubts:
         return result(Verdict.NOT_TESTED, doubts, identification, tuple(experiments))

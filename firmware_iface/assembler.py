@@ -65,11 +65,18 @@ class Assembler:
 
     def recordings(self) -> tuple[Recording, ...]:
         """All tests so far, at least one recording (see `align.assemble`)."""
-        notes: tuple[str, ...] = ()
-        if self._forgotten:
-            notes = (f"the first {self._forgotten} frames were too old to keep",)
-        return assemble(self.table(), self._map, self._source, notes)
+        return self._recordings_of(self.table())
 
     def recording(self) -> Recording:
         """Last complete test so far; the last one begun if none was completed."""
-        return choose(self.recordings())
+        return self.recording_of(self.table())
+
+    def recording_of(self, table: FrameTable) -> Recording:
+        """As `recording`, of what `table` gave earlier; any thread may call this."""
+        return choose(self._recordings_of(table))
+
+    def _recordings_of(self, table: FrameTable) -> tuple[Recording, ...]:
+        notes: tuple[str, ...] = ()
+        if self._forgotten:
+            notes = (f"the first {self._forgotten} frames were too old to keep",)
+        return assemble(table, self._map, self._source, notes)

@@ -27,7 +27,7 @@ POLL = 0.02
 STALL_NS = 100_000_000
 """A wait so much longer than POLL: this process did not run, which is no silence of the bus."""
 PROGRESS_NS = 100_000_000
-"""Between two progress reports."""
+"""Between two progress reports of one phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,11 @@ class Progress:
     duration: float
     frames: int
     sample: Sample | None
+
+    @property
+    def ended(self) -> bool:
+        """Whether the test is complete, but for frames still under way."""
+        return self.phase is Phase.TRAILING
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +146,7 @@ class _Session:
         self._sample: Sample | None = None
         self._serial: int | None = None
         self._shown = 0
+        self._shown_phase: Phase | None = None
         self.on_frame: Callable[[Frame], None] | None = None
         self.progress: Callable[[Progress], None] | None = None
 
@@ -223,10 +229,11 @@ class _Session:
             self._recorder = recorder
 
     def _report(self, now: int) -> None:
-        if self.progress is None or now - self._shown < PROGRESS_NS:
-            return
-        self._shown = now
         machine = self._machine
+        same = machine.phase is self._shown_phase
+        if self.progress is None or (same and now - self._shown < PROGRESS_NS):
+            return
+        self._shown, self._shown_phase = now, machine.phase
         since = machine.running_since
         elapsed = 0.0 if since is None else (now - since) / 1e9
         self.progress(

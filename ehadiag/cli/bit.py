@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ehadiag.actuator import Actuator
 from ehadiag.cli import options
+from ehadiag.cli.ahead import working_ahead
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
 from ehadiag.errors import ConfigurationError
@@ -19,6 +20,7 @@ from ehadiag.storedtest import SAME_RATE, StoredTest, resolve_test
 from ehadiag.verdict import Levels
 
 if TYPE_CHECKING:
+    from ehadiag.online import OnlineIdentification
     from firmware_iface.busmap import BusMap
     from firmware_iface.recorder import Recorder
     from firmware_iface.tester import Progress
@@ -101,11 +103,14 @@ def run(arguments: argparse.Namespace) -> int:
     from ehadiag.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
     from ehadiag.identify.solvers import make_solver  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
+    from ehadiag.online import OnlineIdentification  # noqa: PLC0415
 
     # Before the test: a verdict must not wait for the compiler.
     warm_up(actuator, test)
     begin = time.perf_counter()
-    recording, why, stem = _acquire(arguments, actuator, test, bus_map, folder)
+    solver = make_solver(arguments.solver)
+    online = OnlineIdentification(test, actuator, solver=solver, seed=arguments.seed)
+    recording, why, stem = _acquire(arguments, actuator, test, bus_map, folder, online)
     read_s = time.perf_counter() - begin
     if why:
         result = not_tested(recording, test, actuator, [why])
@@ -117,9 +122,10 @@ def run(arguments: argparse.Namespace) -> int:
                 [test],
                 default=test,
                 levels=levels,
-                solver=make_solver(arguments.solver),
+                solver=solver,
                 seed=arguments.seed,
                 progress=progress,
+                memory=online.memory,
             )
     show(result, arguments, read_s)
     write_report(result, stem, arguments, read_s)
@@ -161,6 +167,7 @@ def _acquire(
     test: StoredTest,
     bus_map: BusMap,
     folder: Path,
+    online: OnlineIdentification,
 ) -> tuple[Recording, str, Path]:
     """Run the test on the bus; return the recording, why it is not one, and the files' stem."""
     from firmware_iface.assembler import Assembler  # noqa: PLC0415 - loads python-can
@@ -175,10 +182,13 @@ def _acquire(
         say(f"test {test.name!r} on {ours.name}, recording to {path}")
         display = stack.enter_context(progress_bar())
 
+        assembler = Assembler(str(path), bus_map)
+        ahead = stack.enter_context(working_ahead(online, assembler))
+
         def tell(progress: Progress) -> None:
+            ahead.watch(progress)
             display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
 
-        assembler = Assembler(str(path), bus_map)
         began = time.monotonic()
         outcome = run_test(
             ours,

@@ -101,7 +101,9 @@ def first_approximation(inputs: FirstInputs) -> FirstApproximation:
     creeping = Objective(inputs.creeping, cap=CREEP_CAP)
 
     def fdj_cost(grid: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.sum([_pressure_costs(*creep, grid, CREEP_PRESSURE_CAP) for creep in inputs.creeps], axis=0)
+        return np.sum(
+            [_pressure_costs(*creep, grid, CREEP_PRESSURE_CAP) for creep in inputs.creeps], axis=0
+        )
 
     def kintas_cost(grid: NDArray[np.float64], fss: float) -> NDArray[np.float64]:
         return slewing(np.column_stack([grid, np.full_like(grid, fss), np.zeros_like(grid)]))

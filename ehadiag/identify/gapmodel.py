@@ -83,7 +83,9 @@ class GapModel:
     def slopes(self, centres: list[NDArray[np.float64]]) -> list[Slope]:
         """Gaps and derivatives at several points, all runs of the model together."""
         sides = [_sides(x, STEP) for x in centres]
-        points = np.vstack([np.vstack([x[None, :], at]) for x, at in zip(centres, sides, strict=True)])
+        points = np.vstack(
+            [np.vstack([x[None, :], at]) for x, at in zip(centres, sides, strict=True)]
+        )
         runs = self.many(points).reshape(len(centres), 1 + 2 * FAULT_COUNT, 2, -1)
         out = []
         for x, at, gaps in zip(centres, sides, runs, strict=True):

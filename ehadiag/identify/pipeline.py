@@ -27,6 +27,8 @@ from ehadiag.identify.stages import (
     LEAD_S,
     STAGES,
     Memory,
+    digest,
+    experiment_arrays,
     first_stage,
     staged_search,
 )
@@ -58,7 +60,7 @@ RESCUES = (
     Plan(0.4, budget=3.0),
 )
 """One after the other where the staged search does not explain the recording."""
-POLISH = CompactGa(budget=241,  virtual_population=30.0, tolerance=1e-7)
+POLISH = CompactGa(budget=241, virtual_population=30.0, tolerance=1e-7)
 POLISH_DEVIATION = 3e-4
 POOR_FIT = 0.01
 """Share of gaps beyond three deviations that asks for another attempt."""
@@ -164,8 +166,19 @@ def identify(
     """
     solver = solver or CompactGa()
     tell = progress or (lambda _stage, _share: None)
-    begin = time.perf_counter()
     memory = Memory() if memory is None else memory
+    windows = [repr(item.test.windows) for item in experiments]
+    arrays = [array for item in experiments for array in experiment_arrays(item)]
+    key = digest(f"identify {seed} {solver!r} {windows}", arrays)
+    return memory.recall(
+        key, Identification, lambda: _identify(experiments, solver, seed, tell, memory)
+    )
+
+
+def _identify(
+    experiments: Sequence[Experiment], solver: Solver, seed: int, tell: Progress, memory: Memory
+) -> Identification:
+    begin = time.perf_counter()
     tell("first approximation", 0.0)
     experiments = share_offsets(experiments)
     first = first_stage(experiments, memory)
@@ -292,9 +305,7 @@ def _refine(
     return refine(batch, start, offsets, noise)
 
 
-def _judged(
-    experiments: Sequence[Experiment], gaps: NDArray[np.float64]
-) -> Sequence[Experiment]:
+def _judged(experiments: Sequence[Experiment], gaps: NDArray[np.float64]) -> Sequence[Experiment]:
     """Weigh all experiments by the noise that their gaps show, shape (2, N)."""
     return [
         judge_noise(experiment, gaps[:, a:b])

@@ -16,7 +16,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch
 from ehadiag.identify.experiment import Experiment, make_batch, share_offsets
 from ehadiag.identify.first import FirstApproximation, first_approximation, first_inputs
 from ehadiag.identify.objective import Objective
@@ -29,6 +28,8 @@ __all__ = [
     "LEAD_S",
     "STAGES",
     "Memory",
+    "digest",
+    "experiment_arrays",
     "first_ends_at",
     "first_stage",
     "run_ahead",
@@ -100,7 +101,7 @@ def first_stage(experiments: Sequence[Experiment], memory: Memory) -> FirstAppro
     """First approximation, from memory if the inputs are the same."""
     inputs = first_inputs(experiments)
     return memory.recall(
-        _digest("first", inputs.arrays()), FirstApproximation, lambda: first_approximation(inputs)
+        digest("first", inputs.arrays()), FirstApproximation, lambda: first_approximation(inputs)
     )
 
 
@@ -158,7 +159,7 @@ def _search_stage(
     spread = DEVIATION * NARROWING**stage * DEVIATION_SHARE
     part = solver.with_budget(round(solver.budget * BUDGET / len(STAGES)))
     return memory.recall(
-        _digest(f"search {seed} {part!r}", [*batch, start, spread]),
+        digest(f"search {seed} {part!r}", [*batch, start, spread]),
         SearchResult,
         lambda: part.minimise(Objective(batch), start, spread, seed + stage),
     )
@@ -176,7 +177,18 @@ def _grown(windows: Iterable[Window], share: float) -> list[Window]:
     return out
 
 
-def _digest(label: str, arrays: Iterable[NDArray[np.generic]]) -> bytes:
+def experiment_arrays(experiment: Experiment) -> Iterable[NDArray[np.generic]]:
+    """Return all numbers that an identification of a whole test works on."""
+    item = experiment
+    yield np.array([*item.constants, item.tick, item.origin, float(item.rested)])
+    yield np.array([item.spool_noise, item.pressure_noise, item.spool_offset, item.pressure_offset])
+    yield item.trace.current
+    yield item.spool
+    yield item.pressure
+
+
+def digest(label: str, arrays: Iterable[NDArray[np.generic]]) -> bytes:
+    """Fingerprint of the inputs of a stage."""
     digest = hashlib.blake2b(label.encode(), digest_size=16)
     for array in arrays:
         digest.update(repr((array.shape, array.dtype.str)).encode())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from identify_cases import PAPER_FAULTS, own_experiment, recorded
 
-from ehadiag.identify.first import first_approximation
+from ehadiag.identify.first import first_approximation, first_inputs
 from ehadiag.identify.pipeline import identify
 from ehadiag.identify.solvers import PygadGa
 from ehadiag.parameters import FAULT_NAMES
@@ -31,7 +31,7 @@ def errors(result, faults):
 
 @pytest.mark.parametrize(("test", "number"), ALL)
 def test_first_approximation_is_no_worse_than_the_papers(test, number):
-    found = first_approximation([paper(test, number)])
+    found = first_approximation(first_inputs([paper(test, number)]))
     error = 100.0 * np.abs(np.array(found.values) - PAPER_FAULTS[number - 1]).mean()
     assert error <= PAPER_FIRST[test][number - 1]
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from ehadiag.identify.compact_ga import state_bytes
-from ehadiag.identify.first import first_approximation
+from ehadiag.identify.first import first_approximation, first_inputs
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.stages import DEVIATION
 from ehadiag.identify.solvers import CompactGa, PygadGa
+from ehadiag.identify.stages import DEVIATION
 from ehadiag_tools.bench_figures import Figure, Sizes
 from ehadiag_tools.bench_problem import experiment, search_window
 
@@ -59,7 +59,7 @@ class _Goal(Objective):
 def measure(sizes: Sizes) -> list[Figure]:
     """Run the section."""
     objective = Objective(search_window(sizes.logs))
-    start = np.array(first_approximation([experiment(sizes.logs)]).values)
+    start = np.array(first_approximation(first_inputs([experiment(sizes.logs)])).values)
     goals, own = [], []
     for seed in range(sizes.seeds):
         found = CompactGa().minimise(objective, start, DEVIATION, seed)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from ehadiag.identify.experiment import make_batch
-from ehadiag.identify.first import first_approximation
+from ehadiag.identify.first import first_approximation, first_inputs
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.stages import DEVIATION, LEAD_S
 from ehadiag.identify.solvers import CompactGa, PygadGa
+from ehadiag.identify.stages import DEVIATION, LEAD_S
 from ehadiag_tools.runs import Run, experiments_of
 
 __all__ = ["RIVALS", "contest", "print_contest"]
@@ -29,7 +29,7 @@ WORSE = 1e-6
 def contest(run: Run) -> dict[str, Any]:
     """Search with each solver from the same first approximation, deviation, seed and budget."""
     experiments = experiments_of(run)
-    start = np.array(first_approximation(experiments).values)
+    start = np.array(first_approximation(first_inputs(experiments)).values)
     windows = [experiment.test.windows.refinement for experiment in experiments]
     objective = Objective(make_batch(experiments, windows, lead=LEAD_S))
     budget = CompactGa().budget

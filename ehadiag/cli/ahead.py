@@ -1,0 +1,69 @@
+"""Identifies in a thread of its own while `ehadiag bit` still runs the test."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from ehadiag.errors import EhadiagError
+
+if TYPE_CHECKING:
+    from ehadiag.online import OnlineIdentification
+    from firmware_iface.assembler import Assembler
+    from firmware_iface.frames import FrameTable
+    from firmware_iface.tester import Progress
+
+__all__ = ["Ahead", "working_ahead"]
+
+MARGIN_S = 0.02
+"""Frames of a tick are there that long after it."""
+
+
+class Ahead:
+    """Takes snapshots of a running test, and has them worked on."""
+
+    def __init__(self, online: OnlineIdentification, assembler: Assembler) -> None:
+        self._online = online
+        self._assembler = assembler
+        self._due = list(online.due_s)
+        self._work: queue.SimpleQueue[FrameTable | None] = queue.SimpleQueue()
+        self._over = False
+        self._thread = threading.Thread(target=self._run, name="ehadiag-ahead", daemon=True)
+        self._thread.start()
+
+    def watch(self, progress: Progress) -> None:
+        """Hand over what has come once a stage can run; in the thread that collects frames."""
+        due = False
+        while self._due and progress.elapsed >= self._due[0] + MARGIN_S:
+            self._due.pop(0)
+            due = True
+        if progress.ended and not self._over:
+            self._over = due = True
+        if due:
+            self._work.put(self._assembler.table())
+
+    def finish(self) -> None:
+        """Wait for the work under way."""
+        self._work.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (table := self._work.get()) is not None:
+            try:
+                self._online.take(self._assembler.recording_of(table))
+            except EhadiagError:
+                # The finished recording will tell what is wrong with it.
+                return
+
+
+@contextmanager
+def working_ahead(online: OnlineIdentification, assembler: Assembler) -> Iterator[Ahead]:
+    """Work ahead as long as the context lasts."""
+    ahead = Ahead(online, assembler)
+    try:
+        yield ahead
+    finally:
+        ahead.finish()

@@ -1,0 +1,60 @@
+"""Identification of a test while it runs: finished, but for a last look, when the test is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ehadiag.actuator import Actuator
+from ehadiag.identify.experiment import build_experiment
+from ehadiag.identify.pipeline import identify
+from ehadiag.identify.solvers import CompactGa, Solver
+from ehadiag.identify.stages import STAGES, Memory, first_ends_at, run_ahead, stage_ends_at
+from ehadiag.recording import Recording
+from ehadiag.storedtest import StoredTest
+
+__all__ = ["OnlineIdentification"]
+
+LEAST_SHARE = 0.75
+"""Share of samples without which nothing is worked out ahead."""
+
+
+class OnlineIdentification:
+    """Works ahead on the samples of a running test.
+
+    Call `take` with the recording as it is so far, after each instant of `due_s` and once all
+    samples are there; then hand `memory` to `ehadiag.diagnosis.diagnose` with the finished
+    recording. What was worked out ahead is used where the finished recording has the same samples
+    to the last bit, so that the answer is that of the recording alone, only sooner.
+
+    For one thread at a time.
+    """
+
+    def __init__(
+        self,
+        test: StoredTest,
+        actuator: Actuator,
+        *,
+        solver: Solver | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._test = test
+        self._actuator = actuator
+        self._solver = solver or CompactGa()
+        self._seed = seed
+        self.memory = Memory()
+        ends = {first_ends_at(test), *(stage_ends_at(test, i) for i in range(len(STAGES)))}
+        self.due_s: tuple[float, ...] = tuple(sorted(end for end in ends if end < test.duration))
+        """Instants of the test (s) at which there is something to work out."""
+
+    def take(self, recording: Recording) -> None:
+        """Work out all that the samples so far allow."""
+        samples = recording.samples
+        if samples is None or samples.ticks == 0:
+            return
+        for values in (samples.spool, samples.pressure):
+            if np.isfinite(values).mean() < LEAST_SHARE:
+                return
+        experiment = build_experiment(samples, recording.environment, self._test, self._actuator)
+        run_ahead(experiment, self._solver, self._seed, self.memory)
+        if samples.ticks >= self._test.ticks:
+            identify([experiment], solver=self._solver, seed=self._seed, memory=self.memory)
