@@ -22,6 +22,8 @@ __all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
 
 ITERATIONS = 20
 CONVERGED = 1e-6
+LEAST_GAIN = 1e-3
+"""Cost; the optimum is then nearer than some hundredths of a deviation."""
 LEAST_DAMPING = 1e-6
 CAUTIOUS_DAMPING = 0.3
 """Two steps are tried at once, the second one damped at least so much."""
@@ -93,8 +95,12 @@ def refine(
             converged = True
             break
         best = min(model.slopes(trials), key=lambda trial: trial.cost)
-        if best.cost < slope.cost:
+        gained = slope.cost - best.cost
+        if gained > 0.0:
             slope = best
+            if gained < LEAST_GAIN:
+                converged = True
+                break
             damping = max(damping / 10.0, LEAST_DAMPING)
         elif damping >= MOST_DAMPING:
             # No step improves: the optimum, to within the jumps that break-aways make.

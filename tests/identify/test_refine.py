@@ -7,7 +7,7 @@ from identify_cases import NOISE, own_experiment, recorded
 from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.experiment import make_batch
 from ehadiag.identify.pipeline import ANCHOR_LSB
-from ehadiag.identify.refine import median_offsets, refine
+from ehadiag.identify.refine import gaps_of, median_offsets, refine
 from ehadiag.identify.uncertainty import covariance
 
 FAULTS = ((0.3, 0.6, 0.3), (0.6, 0.2, 0.9), (0.1, 0.9, 0.5))
@@ -73,7 +73,8 @@ def test_glitches_are_left_out():
 
 def test_median_offsets_are_those_of_the_sensors():
     experiment = own_experiment((0.4, 0.5, 0.6), offsets_lsb=(3.0, -5.0))
-    found = median_offsets(make_batch([experiment]), np.array([0.4, 0.5, 0.6]))
+    batch = make_batch([experiment])
+    found = median_offsets(batch, gaps_of(batch, np.array([0.4, 0.5, 0.6])))
     total = found + np.array([experiment.spool_offset, experiment.pressure_offset])
     assert total[0] / SPOOL.lsb == pytest.approx(3.0, abs=0.1)
     assert total[1] / PRESSURE.lsb == pytest.approx(-5.0, abs=0.1)
