@@ -18,7 +18,8 @@ from typing import Any, TypeVar
 import llvmlite
 import numba
 import numpy as np
-from numba.core import caching
+from numba.core import caching, environment
+from numba.core.runtime import rtsys
 
 from ehadiag.cachefolder import private_folder
 
@@ -38,8 +39,13 @@ def kernel(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Compile as a part of the kernels that call it: named tuples cost nothing to hand over."""
-    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+    """Compile as a part of the kernels that call it: named tuples cost nothing to hand over.
+
+    A product and a sum may become one instruction with one rounding, nothing else is loosened.
+    """
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})(
+        function
+    )
 
 
 @cache
@@ -55,6 +61,7 @@ def _digest() -> str:
     digest = hashlib.sha256()
     for part in (sys.version, np.__version__, numba.__version__, llvmlite.__version__):
         digest.update(part.encode())
+    digest.update(Path(__file__).read_bytes())  # the compiler's options
     for folder in KERNEL_FOLDERS:
         for root in dict.fromkeys((Path(__file__).parent.parent, *map(Path, sys.path))):
             sources = sorted((root / folder).glob("*.py"))
@@ -90,9 +97,42 @@ class _Locator:
         return cls(function, source)
 
 
+class _BareEnvironment:
+    """Stands in the cache for the environment of a function of numba that a kernel has inlined.
+
+    Unpickling the environment itself loads the module that the function is of, for constants that
+    the function does not have.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return environment._rebuild_env, ("numba", [], self._name)
+
+
 class _KernelCacheImpl(caching.CompileResultCacheImpl):
     _locator_classes = (_Locator,)
+
+    def reduce(self, cres: Any) -> tuple[Any, ...]:
+        """Return what is pickled of a compiled kernel."""
+        *head, environments = super().reduce(cres)
+        return (*head, tuple(_bare_if_empty(item) for item in environments))
+
+
+def _bare_if_empty(item: Any) -> Any:
+    foreign = str(item.globals["__name__"]).startswith("numba.")
+    return _BareEnvironment(item.env_name) if foreign and not item.consts else item
 
 
 class _KernelCache(caching.FunctionCache):
     _impl_class = _KernelCacheImpl
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load compiled code without the compiler's tables of Python and numpy.
+
+        They take 0.2 s and 60 MB, and only who compiles needs them (numba loads them then). Machine
+        code needs the symbols of the runtime.
+        """
+        rtsys.initialize(target_context)
+        return self._load_overload(sig, target_context)

@@ -50,7 +50,8 @@ class LiveDecoder:
         if any(name in self._last for name in values):
             self._last |= {name: values[name] for name in CHANNELS if name in values}
             brought = frozenset(key for name, key in CHANNELS.items() if name in values)
-            return Sample(*(self._last[name] for name in CHANNELS), brought)
+            current, spool, pressure, position = (self._last[name] for name in CHANNELS)
+            return Sample(current, spool, pressure, position, brought)
         if "status.state" in values:
             return self._status(values)
         if "request.code" in values:

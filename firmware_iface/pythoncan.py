@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-import ipaddress
+import errno
 import os
 import socket
-import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ehadiag.errors import ConfigurationError, EhadiagError, InputOutputError
+from firmware_iface.adapters import BusOptions, one_line, open_bus
 from firmware_iface.frames import Frame
 from firmware_iface.transport import Transport
 
@@ -24,9 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["BusOptions", "PythonCanTransport", "frame_of", "message_of"]
 
-MULTICAST_GROUP = "239.74.163.2"
-"""Default channel of udp_multicast; python-can's own is IPv6 and needs a route few hosts have."""
-ROUTES = Path("/proc/net/route")
 RECEIVE_BUFFER = 4 << 20
 """Bytes asked of the kernel for a socket's receive buffer: a second of a full bus and more."""
 SO_MEMINFO = 55
@@ -35,20 +28,17 @@ MEMINFO_DROPS = 8
 """Place of the number of dropped frames among them."""
 DROP_CHECK = 1024
 """Calls between two looks at that number while the bus is busy."""
-SEND_TIMEOUT = 0.5
-"""s; a bus that takes no frame for so long is lost."""
+PATIENCE = 0.5
+"""s; on a bus that takes no frame for so long nobody listens: frames are dropped."""
+RETRY = 0.1
+"""s between two tries of such a bus, each of which waits for `RETRY_PATIENCE`."""
+RETRY_PATIENCE = 0.02
+FULL_QUEUE_PAUSE = 0.001
+"""s until a full queue is tried again."""
+NO_ROOM = "Transmit buffer full"
+"""What python-can says of a socket that took no frame in time."""
 BUS_OFF = 0x40
 """Bit of SocketCAN's error class (linux/can/error.h, CAN_ERR_BUSOFF)."""
-LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
-    "slcan": {"listen_only": True},
-    "vector": {"listen_only": True},
-    "nixnet": {"listen_only": True},
-    "kvaser": {"driver_mode": False},
-}
-"""Options that silence an adapter. PCAN and Systec take a bus state instead."""
-OWN_OPTIONS = frozenset(("interface", "channel", "bitrate", "data_bitrate", "fd", "app_name"))
-"""Options that may not hide among the further arguments: what is checked must be what is opened."""
-PASSIVE_STATE = ("pcan", "systec")
 SOCKETCAN_ERRORS = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames carry SocketCAN's error class as identifier."""
 ECHOES = ("udp_multicast",)
@@ -57,51 +47,35 @@ NOT_A_FRAME = "could not unpack received message"
 """What python-can says of a datagram that is none of its own."""
 
 
-@dataclass(frozen=True, slots=True)
-class BusOptions:
-    """Options of a bus, named as python-can names them; None leaves its default.
-
-    Attributes
-    ----------
-    interface: socketcan, virtual, udp_multicast, slcan, pcan, kvaser, vector, ixxat, …
-    channel: as the interface understands it.
-    bitrate, data_bitrate: bit/s.
-    fd: accept CAN FD frames.
-    app_name: Vector's application name.
-    extra: further keyword arguments of the interface (python-can's `--bus-kwargs`).
-    allow_multicast: let udp_multicast join a group beyond the loopback interface.
-    """
-
-    interface: str
-    channel: str | None = None
-    bitrate: int | None = None
-    data_bitrate: int | None = None
-    fd: bool = False
-    app_name: str | None = None
-    extra: Mapping[str, Any] = field(default_factory=dict)
-    allow_multicast: bool = False
-
-
 class PythonCanTransport(Transport):
     """One python-can bus; see `Transport` for what it promises.
 
+    A bus on which nobody listens fills up: frames that find no room are dropped and counted
+    (DEGRADED), and sending goes on when there is room again.
+
     Raises
     ------
-    ConfigurationError: unknown interface, missing driver or module, a wrong option, multicast that
-        would leave the machine without leave.
-    InputOutputError: the channel is absent, busy or refused.
+    ConfigurationError, InputOutputError: see `open_bus`.
     """
 
     def __init__(self, options: BusOptions, *, transmit: bool = False) -> None:
         name = f"{options.interface} {options.channel or ''}".strip()
         super().__init__(name, transmit=transmit)
         self._options = options
-        self._bus = _open(options, name, transmit)
+        self._bus = open_bus(options, transmit=transmit)
+        _widen_buffer(self._bus)
         self._bus_closed = False
         self._damaged = 0
         self._echoes = _EchoFilter() if options.interface in ECHOES else None
         self._received = 0
         self._dropped = 0
+        self._unsent = 0
+        self._next_try = 0.0
+
+    @property
+    def unsent(self) -> int:
+        """Frames dropped for want of room; one of each stall may have gone out all the same."""
+        return self._unsent
 
     @property
     def dropped(self) -> int | None:
@@ -119,12 +93,12 @@ class PythonCanTransport(Transport):
         try:
             message = self._bus.recv(timeout)
         except Exception as error:
-            if str(error) == NOT_A_FRAME:
+            if self._is_damage(error):
                 self._damaged += 1
-                self._degrade(f"{self._damaged} datagrams on the group were no CAN frames")
+                self._tell()
                 return None
             # Drivers raise what they like; all of it means that this bus gives no more frames.
-            raise self._fail(_one_line(error)) from None
+            raise self._fail(one_line(error)) from None
         self._received += 1
         if message is None or self._received % DROP_CHECK == 0:
             self._look_for_drops()
@@ -136,20 +110,62 @@ class PythonCanTransport(Transport):
             raise self._fail("bus off; check wiring and bit rate, then restart the interface")
         return frame
 
+    def _is_damage(self, error: Exception) -> bool:
+        """Whether an error tells of something on the line that was no frame, not of its end."""
+        if str(error) == NOT_A_FRAME:
+            return True
+        if self._options.interface != "slcan":
+            return False
+        if isinstance(error.__cause__, UnicodeDecodeError):
+            # python-can would stumble over the same bytes for ever.
+            with contextlib.suppress(Exception):
+                getattr(self._bus, "flush", list)()
+            return True
+        return isinstance(error, ValueError | IndexError | KeyError)
+
     def _send(self, frame: Frame) -> None:
         if self._echoes is not None:
             self._echoes.sent(frame)
-        try:
-            self._bus.send(message_of(frame), timeout=SEND_TIMEOUT)
-        except Exception as error:
-            raise self._fail(f"cannot send: {_one_line(error)}") from None
+        if self._next_try and time.monotonic() < self._next_try:
+            taken = False
+        else:
+            taken = self._deliver(message_of(frame), RETRY_PATIENCE if self._next_try else PATIENCE)
+            self._next_try = 0.0 if taken else time.monotonic() + RETRY
+        if not taken:
+            self._unsent += 1
+            self._tell()
+
+    def _deliver(self, message: can.Message, patience: float) -> bool:
+        """Hand a message to the bus; False where it had no room for so long."""
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                self._bus.send(message, timeout=patience)
+            except Exception as error:
+                if _timed_out(error):
+                    return False
+                if getattr(error, "error_code", None) != errno.ENOBUFS:
+                    raise self._fail(f"cannot send: {one_line(error)}") from None
+            else:
+                return True
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(FULL_QUEUE_PAUSE)
 
     def _look_for_drops(self) -> None:
         """Say it when frames were lost between kernel and reader: no error tells of it."""
         dropped = self.dropped or 0
         if dropped > self._dropped:
             self._dropped = dropped
-            self._degrade(f"{dropped} frames dropped by the kernel, the reader was too slow")
+            self._tell()
+
+    def _tell(self) -> None:
+        counts = (
+            (self._damaged, "messages on the line were no CAN frames"),
+            (self._dropped, "frames dropped by the kernel, the reader was too slow"),
+            (self._unsent, "frames not sent, nobody took them off the bus"),
+        )
+        self._degrade("; ".join(f"{count} {what}" for count, what in counts if count))
 
     def _close(self) -> None:
         if not self._bus_closed:
@@ -216,100 +232,10 @@ def message_of(frame: Frame) -> can.Message:
     )
 
 
-def _open(options: BusOptions, name: str, transmit: bool) -> can.BusABC:
-    import can  # noqa: PLC0415 - costs half a second
-
-    arguments = _arguments(options, transmit)
-    if options.interface not in can.VALID_INTERFACES:
-        known = ", ".join(sorted(can.VALID_INTERFACES))
-        raise ConfigurationError(f"interface {options.interface!r} unknown, need one of {known}")
-    try:
-        bus = can.Bus(**arguments)
-    except EhadiagError:
-        raise
-    except (can.CanInterfaceNotImplementedError, ImportError, NameError) as error:
-        raise ConfigurationError(
-            f"{name}: driver or Python module of the interface is missing: {_one_line(error)}"
-        ) from None
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ConfigurationError(f"{name}: wrong option: {_one_line(error)}") from None
-    except (can.CanError, OSError) as error:
-        raise InputOutputError(
-            f"{name}: cannot open: {_one_line(error)}; is its driver installed, the adapter "
-            "plugged in, the channel up and not in use?"
-        ) from None
-    except Exception as error:
-        raise InputOutputError(f"{name}: cannot open: {_one_line(error)}") from None
-    _widen_buffer(bus)
-    return bus
-
-
-def _arguments(options: BusOptions, transmit: bool) -> dict[str, Any]:
-    if options.extra.get("receive_own_messages"):
-        raise ConfigurationError(
-            f"{options.interface}: receive_own_messages is not supported: own requests are "
-            "recorded as they are sent, and an echo would look like another tester's"
-        )
-    for key in OWN_OPTIONS & options.extra.keys():
-        raise ConfigurationError(f"{options.interface}: give {key} as an option of its own")
-    arguments: dict[str, Any] = dict(options.extra)
-    arguments |= {"interface": options.interface, "ignore_config": True}
-    for key in ("channel", "bitrate", "data_bitrate", "app_name"):
-        value = getattr(options, key)
-        if value is not None:
-            arguments[key] = value
-    if options.fd:
-        arguments["fd"] = True
-    if options.interface == "udp_multicast":
-        arguments |= _multicast(options)
-    if not transmit:
-        arguments |= LISTEN_ONLY.get(options.interface, {})
-        if options.interface in PASSIVE_STATE:
-            arguments["state"] = importlib.import_module("can").BusState.PASSIVE
-    return arguments
-
-
-def _multicast(options: BusOptions) -> dict[str, Any]:
-    """Keep the group on this machine unless the user lets it out.
-
-    Without leave the kernel's own route must be the loopback interface: a hop limit of zero alone
-    keeps frames in, but the group's membership report goes out and foreign frames come in.
-    """
-    group = options.channel or MULTICAST_GROUP
-    if options.allow_multicast:
-        return {"channel": group}
-    try:
-        address = ipaddress.ip_address(group)
-    except ValueError:
-        raise ConfigurationError(
-            f"udp_multicast {group}: not an IP address; need a group such as {MULTICAST_GROUP}"
-        ) from None
-    interface = _route(address)
-    if interface != "lo":
-        where = f"leave the machine through {interface}" if interface else "find no loopback route"
-        raise ConfigurationError(
-            f"udp_multicast {group}: would {where}; run inside tools/loopnet.sh, or allow it "
-            "with --allow-multicast"
-        )
-    return {"channel": group, "hop_limit": 0}
-
-
-def _route(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str | None:
-    """Interface that the kernel sends to an IPv4 address through; None where it cannot be told."""
-    try:
-        lines = ROUTES.read_text(encoding="ascii").splitlines()[1:]
-    except OSError:
-        return None
-    found: tuple[int, str] | None = None
-    for line in lines:
-        columns = line.split()
-        # The kernel prints addresses as hexadecimal words of this machine's byte order.
-        target, mask = (int(columns[i], 16).to_bytes(4, sys.byteorder) for i in (1, 7))
-        bits = int.from_bytes(mask, "big")
-        same = int(address) & bits == int.from_bytes(target, "big")
-        if address.version == 4 and same and (found is None or bits > found[0]):
-            found = (bits, columns[0])
-    return None if found is None else found[1]
+def _timed_out(error: Exception) -> bool:
+    """Whether python-can, or pyserial below it, found no room in time."""
+    kinds = {type(item).__name__ for item in (error, error.__cause__)}
+    return bool(kinds & {"CanTimeoutError", "SerialTimeoutException"}) or str(error) == NO_ROOM
 
 
 def _widen_buffer(bus: can.BusABC) -> None:
@@ -331,7 +257,3 @@ def _kernel_drops(bus: can.BusABC) -> int | None:
         return None
     words = memoryview(info).cast("I")
     return words[MEMINFO_DROPS] if len(words) > MEMINFO_DROPS else None
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__

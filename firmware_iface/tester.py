@@ -13,7 +13,8 @@ from ehadiag.recording import Outcome
 from firmware_iface.busmap import BusMap, default_map
 from firmware_iface.encode import Encoder
 from firmware_iface.frames import Frame
-from firmware_iface.handshake import Action, Handshake, Limits, Phase, TimeLimits
+from firmware_iface.handshake import Action, Handshake, Phase, TimeLimits
+from firmware_iface.limits import Limits
 from firmware_iface.livedecode import LiveDecoder
 from firmware_iface.livemessages import BitStatus, Request, Sample
 from firmware_iface.receiver import open_source

@@ -49,7 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
             stop=stop,
             progress=lambda done: display("replay", done / max(len(table), 1)),
         )
-    say(f"sent {sent} of {len(table)} frames on {transport.name}")
+        damage = f"; {transport.detail}" if transport.detail else ""
+    say(f"sent {sent} of {len(table)} frames on {transport.name}{damage}")
     return 0
 
 

@@ -53,21 +53,41 @@ class SpoolTables(NamedTuple):
 
 
 @kernel
+def _product(
+    left: NDArray[np.float64], right: NDArray[np.float64], out: NDArray[np.float64]
+) -> None:
+    """Matrix product of two small squares; a library's would be loaded at each start for it."""
+    n = left.shape[0]
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 0.0
+            for k in range(n):
+                out[i, j] += left[i, k] * right[k, j]
+
+
+@kernel
 def _transition(rates: NDArray[np.float64], tick: float) -> NDArray[np.float64]:
     """exp(rates h) for h = tick / 2^level, level 0 … FINEST: Taylor at a small h, then squaring."""
     n = rates.shape[0]
     levels = FINEST + TAYLOR_HALVINGS
-    scaled = rates * (tick / 2.0**levels)
-    term = np.eye(n)
-    power = np.eye(n)
+    shortest = tick / 2.0**levels
+    term, power, product = np.zeros((n, n)), np.zeros((n, n)), np.empty((n, n))
+    for i in range(n):
+        term[i, i] = power[i, i] = 1.0
     for order in range(1, TAYLOR_ORDER + 1):
-        term = np.dot(term, scaled) / order
-        power = power + term
+        _product(term, rates, product)
+        for i in range(n):
+            for j in range(n):
+                term[i, j] = product[i, j] * (shortest / order)
+                power[i, j] += term[i, j]
     out = np.empty((FINEST + 1, n, n))
     for level in range(levels, -1, -1):
         if level <= FINEST:
-            out[level] = power
-        power = np.dot(power, power)
+            for i in range(n):
+                for j in range(n):
+                    out[level, i, j] = power[i, j]
+        _product(power, power, product)
+        power, product = product, power
     return out
 
 
@@ -89,10 +109,13 @@ def spool_tables(constants: PlantConstants, kintas: float, fss: float, tick: flo
     rates[3, 3] = -damping / c.MS
     ring_damping = 0.5 * c.CF / c.JF
     square = c.KF / c.JF - ring_damping * ring_damping
+    decay = np.empty(FINEST + 1)
+    for level in range(FINEST + 1):
+        decay[level] = math.exp(-(tick * damping / c.MS) / 2.0**level)
     return SpoolTables(
         moving=_transition(rates, tick),
         stuck=_transition(rates[:2, :2].copy(), tick),
-        decay=np.exp(-(tick * damping / c.MS) / 2.0 ** np.arange(FINEST + 1)),
+        decay=decay,
         scalars=SpoolScalars(
             force=force,
             damping=damping,

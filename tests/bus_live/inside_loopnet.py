@@ -58,7 +58,7 @@ class TestMulticast(TwoWay):
         other.send(FRAMES[0])
         assert content(collect(receiving, 1)) == content(FRAMES[:1])
         assert receiving.state is TransportState.DEGRADED
-        assert "1 datagrams" in receiving.detail
+        assert "1 messages on the line" in receiving.detail
 
 
 def node(stop: Event, ready: Event) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -13,7 +15,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import ClassVar
 
+import can
 import pytest
+import serial
 import stored_test
 from fault_diagnosis import content as judged_by
 
@@ -21,7 +25,7 @@ from ehadiag.errors import BusLostError, ConfigurationError, InputOutputError
 from ehadiag.verdict import Verdict
 from firmware_iface.frames import Frame, FrameTable
 from firmware_iface.logs import read_frames
-from firmware_iface.pythoncan import BusOptions, PythonCanTransport
+from firmware_iface.pythoncan import BusOptions, PythonCanTransport, frame_of
 from firmware_iface.recorder import Recorder
 from firmware_iface.replay import ReplayTransport, play
 from firmware_iface.seriallink import SerialTransport
@@ -220,7 +224,7 @@ def test_multicast_keeps_the_contract_in_a_namespace_of_its_own(chosen: str) -> 
 def test_multicast_that_would_leave_the_machine_is_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from firmware_iface import pythoncan
+    from firmware_iface import adapters
 
     routes = tmp_path / "route"
     header = "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
@@ -228,7 +232,7 @@ def test_multicast_that_would_leave_the_machine_is_refused(
     loopback = "lo 000000EF 00000000 0001 0 0 0 000000FF 0 0 0\n"
     if sys.byteorder == "big":
         pytest.skip("the table above is that of a little-endian machine")
-    monkeypatch.setattr(pythoncan, "ROUTES", routes)
+    monkeypatch.setattr(adapters, "ROUTES", routes)
     for text, why in ((header + default, "through eth7"), (header, "no loopback route")):
         routes.write_text(text)
         with pytest.raises(ConfigurationError, match=why):
@@ -238,9 +242,9 @@ def test_multicast_that_would_leave_the_machine_is_refused(
         PythonCanTransport(BusOptions("udp_multicast", channel="ff15::1"))
     with pytest.raises(ConfigurationError, match="not an IP address"):
         PythonCanTransport(BusOptions("udp_multicast", channel="can0"))
-    assert pythoncan._arguments(BusOptions("udp_multicast"), True)["hop_limit"] == 0
+    assert adapters.bus_arguments(BusOptions("udp_multicast"), True)["hop_limit"] == 0
     allowed = BusOptions("udp_multicast", allow_multicast=True)
-    assert "hop_limit" not in pythoncan._arguments(allowed, True)
+    assert "hop_limit" not in adapters.bus_arguments(allowed, True)
 
 
 class TestSerial(TwoWay):
@@ -289,6 +293,93 @@ class TestSlcan(TwoWay):
         options = BusOptions("slcan", channel=wire[0], extra=self.quick)
         with PythonCanTransport(options) as transport:
             yield transport
+
+
+def test_what_is_no_slcan_line_is_skipped_and_counted(wire: tuple[str, str]) -> None:
+    quick = {"sleep_after_open": 0.0}
+    with (
+        PythonCanTransport(BusOptions("slcan", channel=wire[0], extra=quick)) as receiving,
+        serial.Serial(wire[1]) as line,
+    ):
+        damage = b"t1108001t11\r", b"tZZZ8\r", b"t1\r", b"T12\r", b"\xff\xfe\r", b"t110x\r"
+        for k, item in enumerate(damage):
+            line.write(item + b"t20180102030405060708\r")
+            # Bytes that are no text take with them what waits behind them.
+            got = collect(receiving, 1) if item[0] != 0xFF else []
+            assert content(got) in ([(0x201, bytes(range(1, 9)))], []), item
+            while receiving.receive(0.05) is not None:
+                pass
+            assert f"{k + 1} messages on the line" in receiving.detail, item
+        assert receiving.state is TransportState.DEGRADED
+        line.write(b"t20180102030405060708\r")
+        assert content(collect(receiving, 1)) == [(0x201, bytes(range(1, 9)))]
+
+
+def test_an_slcan_line_that_nobody_reads_drops_frames_and_goes_on() -> None:
+    tty = pytest.importorskip("tty", reason="no pseudo-terminals on this system")
+    far, near = os.openpty()
+    for item in (far, near):
+        tty.setraw(item)
+    options = BusOptions("slcan", channel=os.ttyname(near), extra={"sleep_after_open": 0.0})
+    with PythonCanTransport(options, transmit=True) as bus:
+        for k in range(2000):
+            bus.send(frame(k))
+        assert bus.state is TransportState.DEGRADED
+        assert f"{bus.unsent} frames not sent" in bus.detail
+        while select.select([far], [], [], 0.05)[0]:
+            os.read(far, 65536)
+        unsent, deadline, sent = bus.unsent, time.monotonic() + 5.0, b""
+        while b"t1FF8" not in sent and time.monotonic() < deadline:
+            bus.send(Frame(0, 0x1FF, bytes(8)))
+            if select.select([far], [], [], 0.01)[0]:
+                sent += os.read(far, 65536)
+        assert b"t1FF80000000000000000\r" in sent
+        assert bus.unsent >= unsent
+    for item in (far, near):
+        os.close(item)
+
+
+@pytest.mark.parametrize(
+    ("failures", "dropped"), [(3, 0), (10**9, 20)], ids=["for a moment", "for ever"]
+)
+def test_a_full_queue_of_the_kernel_is_waited_for_and_then_dropped(
+    failures: int, dropped: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody acknowledges on a real bus: the adapter's queue is full and stays so."""
+    left = failures
+    sent: list[can.Message] = []
+
+    def send(message: can.Message, timeout: float) -> None:
+        nonlocal left
+        if left:
+            left -= 1
+            raise can.CanOperationError("Failed to transmit", errno.ENOBUFS)
+        sent.append(message)
+
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    with PythonCanTransport(options, transmit=True) as bus:
+        monkeypatch.setattr(bus._bus, "send", send)
+        for item in FRAMES[:20]:
+            bus.send(item)
+        assert (bus.unsent, len(sent)) == (dropped, 20 - dropped)
+        assert (bus.state is TransportState.OPEN) == (dropped == 0)
+        left = 0
+        deadline = time.monotonic() + 5.0
+        while len(sent) < 20 - dropped + 1 and time.monotonic() < deadline:
+            bus.send(FRAMES[20])
+        assert content([frame_of(sent[-1])]) == content([FRAMES[20]])
+
+
+def test_a_bus_that_refuses_for_another_reason_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    def send(message: can.Message, timeout: float) -> None:
+        raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    with PythonCanTransport(options, transmit=True) as bus:
+        monkeypatch.setattr(bus._bus, "send", send)
+        with pytest.raises(BusLostError, match="cannot send: Failed to transmit: Network is down"):
+            bus.send(FRAMES[0])
+        assert bus.state is TransportState.FAILED
 
 
 def test_a_serial_line_that_goes_away_is_a_lost_bus() -> None:
@@ -395,11 +486,21 @@ def test_playing_onto_a_bus_keeps_order_skips_errors_and_stops() -> None:
     ("options", "error", "text"),
     [
         (BusOptions("no_such_bus"), ConfigurationError, "unknown, need one of"),
-        (BusOptions("pcan", channel="PCAN_USBBUS1"), InputOutputError, "cannot open"),
-        (BusOptions("vector", channel="0", app_name="x"), ConfigurationError, "missing"),
-        (BusOptions("slcan", channel="/dev/no-such-port"), InputOutputError, "cannot open"),
-        (BusOptions("socketcan", channel="nocan7"), InputOutputError, "cannot open"),
-        (BusOptions("socketcand", channel="can0"), ConfigurationError, "wrong option"),
+        (BusOptions("pcan", channel="PCAN_USBBUS1"), InputOutputError, "install PEAK's driver"),
+        (BusOptions("kvaser", channel="0"), ConfigurationError, "install Kvaser's driver"),
+        (BusOptions("vector", channel="0", app_name="x"), ConfigurationError, "install Vector's"),
+        (BusOptions("ixxat", channel="0"), ConfigurationError, "install HMS's VCI driver"),
+        (BusOptions("neovi", channel="1"), ConfigurationError, "its Python module"),
+        (BusOptions("pcan"), ConfigurationError, "name the channel, such as --channel PCAN"),
+        (BusOptions("slcan"), ConfigurationError, "name the channel, such as --channel /dev/tty"),
+        (BusOptions("slcan", channel="/dev/no-such-port"), InputOutputError, "the right one"),
+        (BusOptions("socketcan", channel="nocan7"), InputOutputError, "ip link set"),
+        (BusOptions("socketcand", channel="can0"), ConfigurationError, "--bus-kwargs host="),
+        (
+            BusOptions("socketcand", channel="can0", extra={"host": "127.0.0.1", "port": 9}),
+            InputOutputError,
+            "no daemon at 127.0.0.1:9: .*is the daemon running",
+        ),
         (
             BusOptions("virtual", extra={"receive_own_messages": True}),
             ConfigurationError,
@@ -413,11 +514,12 @@ def test_playing_onto_a_bus_keeps_order_skips_errors_and_stops() -> None:
     ],
 )
 def test_a_bus_that_cannot_be_opened_is_one_line(
-    options: BusOptions, error: type[Exception], text: str
+    options: BusOptions, error: type[Exception], text: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(error, match=text) as caught:
         PythonCanTransport(options)
     assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")  # python-can's own lines would bury it
     assert options.interface in str(caught.value)
 
 
@@ -429,16 +531,16 @@ def test_a_serial_port_that_cannot_be_opened_is_one_line() -> None:
 
 
 def test_adapters_are_silenced_unless_asked_to_transmit() -> None:
-    from firmware_iface.pythoncan import _arguments
+    from firmware_iface.adapters import bus_arguments
 
     for interface, option in (("slcan", "listen_only"), ("vector", "listen_only")):
-        assert _arguments(BusOptions(interface), False)[option] is True
-        assert option not in _arguments(BusOptions(interface), True)
+        assert bus_arguments(BusOptions(interface), False)[option] is True
+        assert option not in bus_arguments(BusOptions(interface), True)
     loud = BusOptions("slcan", extra={"listen_only": False})
-    assert _arguments(loud, False)["listen_only"] is True
-    assert _arguments(BusOptions("kvaser"), False)["driver_mode"] is False
-    assert _arguments(BusOptions("pcan"), False)["state"].name == "PASSIVE"
-    assert "state" not in _arguments(BusOptions("pcan"), True)
+    assert bus_arguments(loud, False)["listen_only"] is True
+    assert bus_arguments(BusOptions("kvaser"), False)["driver_mode"] is False
+    assert bus_arguments(BusOptions("pcan"), False)["state"].name == "PASSIVE"
+    assert "state" not in bus_arguments(BusOptions("pcan"), True)
 
 
 def test_bus_off_ends_the_bus() -> None:

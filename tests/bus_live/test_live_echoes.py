@@ -39,7 +39,7 @@ Opened = Callable[[str], tuple[PythonCanTransport, ScriptedBus]]
 def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
     def make(interface: str) -> tuple[PythonCanTransport, ScriptedBus]:
         bus = ScriptedBus()
-        monkeypatch.setattr(pythoncan, "_open", lambda *_: bus)
+        monkeypatch.setattr(pythoncan, "open_bus", lambda *_, **__: bus)
         return PythonCanTransport(BusOptions(interface), transmit=True), bus
 
     return make

@@ -7,7 +7,6 @@ import select
 import socket
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -22,7 +21,7 @@ from firmware_iface.seriallink import Framer, SerialTransport
 from firmware_iface.tester import run_test
 from firmware_iface.transport import Transport, TransportState
 
-needs_pty = pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals here")
+tty = pytest.importorskip("tty", reason="no pseudo-terminals here")
 
 
 def frame(k: int) -> Frame:
@@ -52,7 +51,6 @@ def emptied(descriptor: int, framer: Framer) -> list[Frame]:
     return frames
 
 
-@needs_pty
 def test_frames_that_nobody_reads_are_dropped_and_counted(unread: tuple[int, str]) -> None:
     far, name = unread
     framer = Framer()
@@ -76,7 +74,6 @@ def test_frames_that_nobody_reads_are_dropped_and_counted(unread: tuple[int, str
         assert bus.state is TransportState.DEGRADED
 
 
-@needs_pty
 def test_a_long_stall_does_not_cost_its_patience_for_each_frame(unread: tuple[int, str]) -> None:
     with SerialTransport(unread[1], transmit=True) as bus:
         for k in range(5000):
@@ -89,7 +86,6 @@ def test_a_long_stall_does_not_cost_its_patience_for_each_frame(unread: tuple[in
         assert time.monotonic() - before[1] < 5.0 + 10.0 * (time.process_time() - before[0])
 
 
-@needs_pty
 def test_a_port_that_cannot_be_asked_for_room_drops_as_well(
     unread: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,7 +111,6 @@ def test_a_port_that_cannot_be_asked_for_room_drops_as_well(
         assert framer.bad <= 1
 
 
-@needs_pty
 def test_a_computer_without_a_reader_serves_the_tester_that_comes_later(
     make_core: Callable[..., FccCore],
 ) -> None:

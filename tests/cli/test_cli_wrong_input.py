@@ -224,7 +224,7 @@ def test_multicast_stays_on_the_machine_unless_asked(
 ) -> None:
     route = tmp_path / "route"
     route.write_text("head\neth0 00000000 0101A8C0 0003 0 0 0 00000000 0 0 0\n")
-    monkeypatch.setattr("firmware_iface.pythoncan.ROUTES", route)
+    monkeypatch.setattr("firmware_iface.adapters.ROUTES", route)
     result = run("sim", "-i", "udp_multicast")
     assert result.code == 2
     assert "would leave the machine through eth0" in result.message
