@@ -1,0 +1,112 @@
+"""Stages of the search, worked out ahead while a test runs."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from identify_cases import own_experiment
+
+from ehadiag.actuator import default_actuator
+from ehadiag.identify.pipeline import identify
+from ehadiag.identify.stages import STAGES, Memory, first_ends_at, run_ahead, stage_ends_at
+from ehadiag.online import OnlineIdentification
+from ehadiag.recording import Environment, Outcome, Quality, Recording, Samples
+from ehadiag.storedtest import resolve_test
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.plant import simulate
+
+FAULTS = (0.4, 0.5, 0.6)
+
+
+@pytest.fixture(scope="module", params=["open", "closed"])
+def recording(request):
+    test = resolve_test(request.param)
+    return simulate(default_actuator(), test, Faults(*FAULTS), seed=3).recording("simulated")
+
+
+def cut(recording: Recording, ticks: int) -> Recording:
+    """The recording as it was after so many ticks."""
+    samples = recording.samples
+    arrays = {
+        field.name: getattr(samples, field.name)[..., :ticks]
+        for field in fields(Samples)
+        if isinstance(getattr(samples, field.name), np.ndarray)
+    }
+    return replace(recording, samples=replace(samples, **arrays))
+
+
+def same(a, b):
+    """Whether two identifications are the same to the last bit."""
+    return (
+        [(e.first, e.search, e.value, e.std) for e in a.estimates]
+        == [(e.first, e.search, e.value, e.std) for e in b.estimates]
+        and a.cost == b.cost
+        and a.evaluations == b.evaluations
+    )
+
+
+def test_working_ahead_does_not_change_the_answer(recording):
+    from ehadiag.identify.experiment import build_experiment  # noqa: PLC0415
+
+    test = resolve_test("open" if recording.test_id == 1 else "closed")
+    online = OnlineIdentification(test, default_actuator())
+    for due in online.due_s:
+        online.take(cut(recording, round(due * test.rate) + 7))
+    stages = len(online.memory)
+    assert stages == 1 + sum(end < test.duration for end in ends(test))
+    experiment = build_experiment(
+        recording.samples, recording.environment, test, default_actuator()
+    )
+    alone = identify([experiment])
+    ahead = identify([experiment], memory=online.memory)
+    assert online.memory.reused >= stages
+    assert same(alone, ahead)
+
+
+def test_a_finished_test_is_identified_ahead_as_a_whole(recording):
+    from ehadiag.diagnosis import diagnose  # noqa: PLC0415
+
+    test = resolve_test("open" if recording.test_id == 1 else "closed")
+    online = OnlineIdentification(test, default_actuator())
+    online.take(recording)
+    before = online.memory.reused
+    result = diagnose([recording], default_actuator(), [test], memory=online.memory)
+    assert online.memory.reused == before + 1
+    assert same(
+        result.identification, diagnose([recording], default_actuator(), [test]).identification
+    )
+
+
+def ends(test):
+    return [stage_ends_at(test, stage) for stage in range(len(STAGES))]
+
+
+def test_stages_follow_the_second_part():
+    test = resolve_test("open")
+    assert first_ends_at(test) == pytest.approx(3.5)
+    assert ends(test) == pytest.approx([4.0, 4.5, 5.0, 5.5])
+
+
+def test_other_samples_are_not_answered_from_memory():
+    experiment = own_experiment(FAULTS)
+    memory = Memory()
+    run_ahead(experiment, _solver(), 0, memory)
+    assert memory.reused == 0
+    experiment.spool[4200] += 1e-6  # after the first stage's window, in the others
+    run_ahead(experiment, _solver(), 0, memory)
+    assert memory.reused == 2
+    run_ahead(experiment, _solver(), 1, memory)
+    assert memory.reused == 3, "another seed searches anew; the first approximation needs none"
+
+
+def _solver():
+    from ehadiag.identify.solvers import CompactGa  # noqa: PLC0415
+
+    return CompactGa(budget=128)
+
+
+def test_too_little_is_left_alone():
+    online = OnlineIdentification(resolve_test("open"), default_actuator())
+    empty = Recording("bus", None, 1, None, Outcome(), Environment(), Quality())
+    online.take(empty)
+    assert len(online.memory) == 0
