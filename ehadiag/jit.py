@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import llvmlite
 import numba
@@ -32,10 +32,22 @@ KERNEL_FOLDERS = ("ehadiag/model", "ehadiag/identify", "ehadiag/monitor", "ehadi
 
 def kernel(function: F) -> F:
     """Compile on first call: no interpreter lock, IEEE division, cached on disk."""
-    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    return _cached(numba.njit(nogil=True, error_model="numpy")(function), function)
+
+
+def brief_kernel(function: F) -> F:
+    """Compile like `kernel`, for calls of a microsecond: the interpreter lock is kept.
+
+    To give it back and take it again costs more than such a call, and beside a thread that runs
+    Python it may take milliseconds.
+    """
+    return _cached(numba.njit(error_model="numpy")(function), function)
+
+
+def _cached(dispatcher: Any, function: F) -> F:
     if hasattr(dispatcher, "enable_caching"):  # absent with NUMBA_DISABLE_JIT=1
         dispatcher._cache = _KernelCache(function)
-    return dispatcher
+    return cast("F", dispatcher)
 
 
 def inlined(function: F) -> F:

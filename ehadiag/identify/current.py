@@ -66,7 +66,9 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     else:
         seen, unknown = _positions_seen(command, samples, controller)
         current = _control_law(command, seen, samples.period_ns * 1e-9, controller)
-        guessed = float(np.mean(unknown))
+        # What the control law did after the last sample explains none.
+        last = np.flatnonzero(np.isfinite(samples.spool) | np.isfinite(samples.pressure))
+        guessed = float(np.mean(unknown[: last[-1] + 1])) if last.size else 1.0
     # A code at the converter's end says no more than that the current is at least so large.
     finite = np.isfinite(samples.current) & ~samples.saturated[0]
     difference = samples.current[finite] - current[finite]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.jacktick import jack_tick, second_stage
+from ehadiag.model.jacktick import jack_tick
 
 __all__ = ["jack_response"]
 
@@ -36,25 +36,12 @@ def jack_response(
     dynamic = c.FDJ0 + fdj * (c.FDJ1 - c.FDJ0)
     velocity, place, direction = 0.0, 0.0, 0.0
     spool = origin
-    supply, resistance, _, _ = second_stage(c, spool)
     first = 0
     for k in range(node_end.shape[0]):
         end = node_end[k]
-        pressure[k], velocity, place, direction, spool, supply, resistance = jack_tick(
-            c,
-            dynamic,
-            nodes,
-            first,
-            end,
-            velocity,
-            place,
-            direction,
-            spool,
-            supply,
-            resistance,
+        pressure[k], velocity, place, direction, spool = jack_tick(
+            c, dynamic, nodes, first, end, velocity, place, direction, spool
         )
         position[k] = place
-        if nodes[end - 1, 4] != 0.0:
-            spool += nodes[end - 1, 4]
-            supply, resistance, _, _ = second_stage(c, spool)
+        spool += nodes[end - 1, 4]
         first = end

@@ -33,23 +33,15 @@ DRIFT = -0.45
 
 
 @inlined
-def second_stage(constants: PlantConstants, spool: float) -> tuple[float, float, float, float]:
+def second_stage(c: PlantConstants, spool: float) -> tuple[float, float, float]:
     """Second stage at a spool position (m), leakage solved for.
 
-    Returns g PS (Pa), g R (Pa s/m³) and the derivatives of both by the spool position.
+    With D = GQ max(abs(spool), PSR / GP) + PSR CLK the stage gives g PS = PSR GQ spool / D and
+    g R = PSR / D whether the pressure gain saturates or not. Returns D, 1 / D and
+    1 / (AJ² PSR + CJ D).
     """
-    c = constants
-    pressure = c.GP * spool
-    if abs(pressure) <= c.PSR:
-        resistance = c.GP / c.GQ
-        share = 1.0 / (1.0 + resistance * c.CLK)
-        return share * pressure, share * resistance, share * c.GP, 0.0
-    inverse = 1.0 / spool
-    pressure = math.copysign(c.PSR, spool)
-    resistance = pressure * inverse / c.GQ
-    share = 1.0 / (1.0 + resistance * c.CLK)
-    slope = -share * share * resistance * inverse
-    return share * pressure, share * resistance, -pressure * c.CLK * slope, slope
+    divide = c.GQ * max(abs(spool), c.PSR / c.GP) + c.PSR * c.CLK
+    return divide, 1.0 / divide, 1.0 / (c.AJ * c.AJ * c.PSR + c.CJ * divide)
 
 
 @inlined
@@ -57,10 +49,11 @@ def _parts(origin: float, target: float, rise0: float, rise1: float) -> int:
     """Into how many parts a piece is cut: short ones where the orifice is almost closed."""
     travel = abs(target - origin)
     nearest = 0.0 if origin * target <= 0.0 else min(abs(origin), abs(target))
-    by_travel = travel / max(TRAVEL, RATIO * nearest)
+    limit = max(TRAVEL, RATIO * nearest)
     bend = 0.125 * abs(rise1 - rise0)
-    by_bend = math.sqrt(bend / BEND)
-    return min(MOST_PARTS, 1 + int(max(by_travel, by_bend)))
+    if travel < limit and bend < BEND:
+        return 1
+    return min(MOST_PARTS, 1 + int(max(travel / limit, math.sqrt(bend / BEND))))
 
 
 @inlined
@@ -92,55 +85,60 @@ def _path(
 def _approach(
     c: PlantConstants,
     load: float,
-    span: float,
+    per_span: float,
     velocity: float,
-    supply: float,
-    resistance: float,
-    end_supply: float,
-    end_resistance: float,
-    end_supply_rate: float,
-    end_resistance_rate: float,
+    spool: float,
+    divide: float,
+    by_divide: float,
+    ease: float,
+    end_spool: float,
+    end_rate: float,
+    end_divide: float,
+    end_by_divide: float,
+    end_ease: float,
 ) -> tuple[float, float, float, float, float]:
     """How the velocity of the moving jack goes over a part of a piece.
 
-    The steady velocity s is taken as a parabola that ends with the slope of the spool's path, tau
-    as a straight line: tau v' + v = s is then met by a parabola p0 + p1 t + p2 t² exactly, and the
-    rest of the velocity decays. Returns p0, p1, p2, that rest at the start, and its decay rate.
+    The steady velocity s = (AJ PSR GQ spool - load D) / (AJ² PSR + CJ D) is taken as a parabola
+    that ends with the slope of the spool's path (`end_rate`, m/s), tau = MJ D / (AJ² PSR + CJ D) as
+    a straight line: tau v' + v = s is then met by a parabola p0 + p1 t + p2 t² exactly, and the
+    rest of the velocity decays. `per_span` is 1 over the part's duration, `divide`, `by_divide` and
+    `ease` are of `second_stage`. Returns p0, p1, p2, that rest at the start, and its decay rate.
     """
-    area2 = c.AJ * c.AJ
-    ease0 = 1.0 / (area2 * resistance + c.CJ)
-    ease1 = 1.0 / (area2 * end_resistance + c.CJ)
-    steady0 = (c.AJ * supply - load) * ease0
-    steady1 = (c.AJ * end_supply - load) * ease1
-    slope1 = (c.AJ * end_supply_rate - steady1 * area2 * end_resistance_rate) * ease1
-    mean = (steady1 - steady0) / span
-    bend = (slope1 - mean) / span
-    tau, end_tau = c.MJ * ease0, c.MJ * ease1
-    drift = max((end_tau - tau) / span, DRIFT)
-    p2 = bend / (1.0 + 2.0 * drift)
-    p1 = (2.0 * mean - slope1 - 2.0 * p2 * tau) / (1.0 + drift)
-    p0 = steady0 - tau * p1
+    gain = c.AJ * c.PSR * c.GQ
+    steady = (gain * spool - load * divide) * ease
+    end_steady = (gain * end_spool - load * end_divide) * end_ease
+    turn = math.copysign(c.GQ, end_spool) if abs(end_spool) > c.PSR / c.GP else 0.0
+    slope = end_rate * (gain - (load + c.CJ * end_steady) * turn) * end_ease
+    mean = (end_steady - steady) * per_span
+    tau, end_tau = c.MJ * divide * ease, c.MJ * end_divide * end_ease
+    drift = max((end_tau - tau) * per_span, DRIFT)
+    once, twice, both = 1.0 + drift, 1.0 + 2.0 * drift, tau + end_tau
+    inverse = 1.0 / (once * twice * both)
+    share = inverse * both
+    p2 = (slope - mean) * per_span * once * share
+    p1 = (2.0 * mean - slope - 2.0 * p2 * tau) * twice * share
+    p0 = steady - tau * p1
     # Mean of 1/tau by Simpson's rule.
-    rate = (area2 * (resistance + end_resistance) + 2.0 * c.CJ) / (6.0 * c.MJ)
-    rate += 4.0 / (3.0 * (tau + end_tau))
+    rate = (c.AJ * c.AJ * c.PSR * (by_divide + end_by_divide) + 2.0 * c.CJ) * (1.0 / (6.0 * c.MJ))
+    rate += inverse * once * twice * (4.0 / 3.0)
     return p0, p1, p2, velocity - p0, rate
 
 
 @inlined
 def _break_away(
-    c: PlantConstants, static: float, supply: float, end_supply: float, place: float
+    c: PlantConstants, static: float, push: float, end_push: float, place: float
 ) -> tuple[float, float]:
-    """Whether a jack at rest breaks away on the way from one pressure to the next.
+    """Whether a jack at rest breaks away while the force on it (N) goes from `push` to `end_push`.
 
     Returns its direction, 0 if it stays, and the share of the way at which it goes.
     """
-    push0, push1 = c.AJ * supply - c.FR, c.AJ * end_supply - c.FR
-    blocked = abs(place) >= c.XJM and place * push1 > 0.0
-    if abs(push1) <= static or blocked:
+    blocked = abs(place) >= c.XJM and place * end_push > 0.0
+    if abs(end_push) <= static or blocked:
         return 0.0, 1.0
-    direction = 1.0 if push1 > 0.0 else -1.0
-    if push0 * direction <= static:
-        return direction, (static * direction - push0) / (push1 - push0)
+    direction = 1.0 if end_push > 0.0 else -1.0
+    if push * direction <= static:
+        return direction, (static * direction - push) / (end_push - push)
     return direction, 0.0
 
 
@@ -155,9 +153,7 @@ def jack_tick(
     place: float,
     direction: float,
     spool: float,
-    supply: float,
-    resistance: float,
-) -> tuple[float, float, float, float, float, float, float]:
+) -> tuple[float, float, float, float, float]:
     """Second stage and jack over the spool's path of one tick.
 
     Parameters
@@ -167,49 +163,60 @@ def jack_tick(
     velocity, place: of the jack, m/s and m.
     direction: of its motion, +1 or -1; 0 at rest.
     spool: position before the tick, m.
-    supply, resistance: `second_stage` there.
 
     Returns
     -------
-    Differential pressure at the end of the tick (Pa), then velocity, place, direction, spool,
-    supply and resistance there. Jumps of the path are the caller's.
+    Differential pressure at the end of the tick (Pa), then velocity, place, direction and spool
+    there. Jumps of the path are the caller's.
     """
     static = 2.0 * dynamic
+    gain = c.AJ * c.PSR * c.GQ
+    divide, by_divide, ease = second_stage(c, spool)
     for node in range(first, end):
         span = nodes[node, 0]
+        per_span = 1.0 / span
         start, target = spool, nodes[node, 1]
         rise0, rise1 = span * nodes[node, 2], span * nodes[node, 3]
         parts = _parts(start, target, rise0, rise1)
         for part in range(1, parts + 1):
-            left = span / parts
-            end_spool, rise = _path(part / parts, start, target, rise0, rise1)
-            end_supply, end_resistance, gain, gain_resistance = second_stage(c, end_spool)
+            left, per_left = span, per_span
+            end_spool, rise = target, rise1
+            if parts > 1:
+                left, per_left = span / parts, per_span * parts
+                end_spool, rise = _path(part / parts, start, target, rise0, rise1)
+            end_divide, end_by_divide, end_ease = second_stage(c, end_spool)
             while left > SHORTEST:
                 if direction == 0.0:
-                    direction, wait = _break_away(c, static, supply, end_supply, place)
+                    push = gain * spool * by_divide - c.FR
+                    end_push = gain * end_spool * end_by_divide - c.FR
+                    direction, wait = _break_away(c, static, push, end_push, place)
                     if direction == 0.0:
                         break
                     if wait != 0.0:
                         spool += wait * (end_spool - spool)
-                        supply, resistance, _, _ = second_stage(c, spool)
+                        divide, by_divide, ease = second_stage(c, spool)
                         left -= wait * left
+                        per_left = 1.0 / max(left, SHORTEST)
                     continue
                 p0, p1, p2, excess, rate = _approach(
                     c,
                     c.FR + direction * dynamic,
-                    left,
+                    per_left,
                     velocity,
-                    supply,
-                    resistance,
-                    end_supply,
-                    end_resistance,
-                    gain * rise / span,
-                    gain_resistance * rise / span,
+                    spool,
+                    divide,
+                    by_divide,
+                    ease,
+                    end_spool,
+                    rise * per_span,
+                    end_divide,
+                    end_by_divide,
+                    end_ease,
                 )
                 fade = math.exp(-left * rate)
                 end_velocity = p0 + left * (p1 + left * p2) + excess * fade
                 if end_velocity * direction > 0.0:
-                    place += left * (p0 + left * (0.5 * p1 + left * p2 / 3.0))
+                    place += left * (p0 + left * (0.5 * p1 + left * p2 * (1.0 / 3.0)))
                     place += excess * (1.0 - fade) / rate
                     velocity = end_velocity
                     if abs(place) >= c.XJM and place * velocity > 0.0:
@@ -217,11 +224,11 @@ def jack_tick(
                         velocity, direction = 0.0, 0.0
                     break
                 moved = _sign_change(p0, p1, p2, excess, rate, left)
-                spool += moved / left * (end_spool - spool)
-                supply, resistance, _, _ = second_stage(c, spool)
+                spool += moved * per_left * (end_spool - spool)
+                divide, by_divide, ease = second_stage(c, spool)
                 left -= moved
+                per_left = 1.0 / max(left, SHORTEST)
                 velocity, direction = 0.0, 0.0
-            spool, supply, resistance = end_spool, end_supply, end_resistance
-    p12 = supply - resistance * c.AJ * velocity
-    pressure = min(max(p12, -c.PSR), c.PSR)
-    return pressure, velocity, place, direction, spool, supply, resistance
+            spool, divide, by_divide, ease = end_spool, end_divide, end_by_divide, end_ease
+    p12 = c.PSR * (c.GQ * spool - c.AJ * velocity) * by_divide
+    return min(max(p12, -c.PSR), c.PSR), velocity, place, direction, spool

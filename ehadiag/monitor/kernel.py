@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import inlined, kernel
+from ehadiag.jit import brief_kernel, inlined, kernel
 from ehadiag.model.anchor import re_anchored
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.jacktick import jack_tick, second_stage
+from ehadiag.model.jacktick import jack_tick
 from ehadiag.model.spooltick import spool_tick
 from ehadiag.model.transition import SpoolScalars
 from ehadiag.monitor.layout import (
@@ -177,10 +177,8 @@ def _spool(
 @inlined
 def _jack(p: Vector, s: Vector, nodes: Vector, count: int) -> float:
     """Second stage and jack over the spool's path; returns the pressure at its end, Pa."""
-    c = _plant(p)
-    supply, resistance, _, _ = second_stage(c, s[JACK_SPOOL])
-    pressure, velocity, place, direction, spool, _, _ = jack_tick(
-        c,
+    pressure, velocity, place, direction, spool = jack_tick(
+        _plant(p),
         p[DYNAMIC],
         nodes,
         0,
@@ -189,8 +187,6 @@ def _jack(p: Vector, s: Vector, nodes: Vector, count: int) -> float:
         s[JACK_POSITION],
         s[JACK_DIRECTION],
         s[JACK_SPOOL],
-        supply,
-        resistance,
     )
     s[JACK_VELOCITY], s[JACK_POSITION], s[JACK_DIRECTION] = velocity, place, direction
     s[JACK_SPOOL] = spool
@@ -215,7 +211,7 @@ def _accumulate(p: Vector, s: Vector, alarmed: NDArray[np.bool_], channel: int) 
             s[at] = 0.0
 
 
-@kernel
+@brief_kernel
 def push_tick(
     parameters: Vector,
     moving: Vector,

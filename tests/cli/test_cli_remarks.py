@@ -104,6 +104,12 @@ def test_a_recording_cut_at_an_end_says_how_much_is_missing(
     assert came.verdict is Verdict.DEGRADED
 
 
+def test_the_end_that_is_missing_in_closed_loop_needs_no_current() -> None:
+    came = diagnosis_of(cut(read_recording(LOGS / "paper-closed-1.blf"), 0, 5300))
+    assert came.notes == ("the last 0.200 s of the test are missing: the recording ends early",)
+    assert came.verdict is Verdict.DEGRADED
+
+
 def test_a_single_lost_frame_at_the_end_is_no_cut(recording: Recording) -> None:
     assert diagnosis_of(cut(recording, 0, 5497)).notes == ()
 
