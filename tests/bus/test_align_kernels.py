@@ -255,3 +255,49 @@ def test_the_environment_is_the_median_over_the_test() -> None:
     assert inner.oil_temperature is None
     whole = align._environment(decoded, 0, 10)
     assert (whole.supply_pressure, whole.oil_temperature) == (25.0, 5.5)
+
+
+def partial(roles: dict[str, list[float]], saturated: list[bool]) -> Any:
+    """What `_samples` asks of a grid that brings only some of the channels."""
+    count = len(next(iter(roles.values())))
+
+    def fill(role: str) -> Any:
+        if role not in roles:
+            return None
+        host = 50 + np.arange(count)
+        return align._Filled(np.array(roles[role]), np.array(saturated), host)
+
+    bus_map = SimpleNamespace(tick_ns=2 * MS, fixed_mode=CommandMode.CURRENT, modes={})
+    return SimpleNamespace(fill=fill, episode=span(0, count), bus_map=bus_map)
+
+
+def test_channels_that_no_frame_brings_are_empty_and_noted() -> None:
+    flags = [False, True, False]
+    roles = {"channels.current": [1.0, 2.0, 3.0], "channels.position": [4.0, 5.0, 6.0]}
+    samples, notes = align._samples(partial(roles, flags))
+    assert notes == [
+        "no frame brings the spool",
+        "no frame brings the pressure",
+        "no command frames",
+    ]
+    assert (samples.current.tolist(), samples.position.tolist()) == tuple(roles.values())
+    for empty in (samples.spool, samples.pressure):
+        assert empty.dtype == np.float64
+        np.testing.assert_array_equal(empty, [NAN] * 3)
+    assert samples.saturated.dtype == np.bool_
+    assert samples.saturated.tolist() == [flags, [False] * 3, [False] * 3, flags]
+    assert samples.host_ns.tolist() == [-1] * 3
+    assert samples.host_ns.dtype == np.int64
+    assert samples.period_ns == 2 * MS
+
+
+def test_a_frozen_channel_is_noted_with_its_time() -> None:
+    roles = {"channels.spool": stretch(100, 130, 100).tolist(), "command.current": [0.0] * 329}
+    samples, notes = align._samples(partial(roles, [False] * 329))
+    assert notes == [
+        "no frame brings the current",
+        "spool stood at one code for 0.26 s though it moves elsewhere",
+        "no frame brings the pressure",
+        "no frame brings the position",
+    ]
+    assert samples.host_ns.tolist() == list(range(50, 379))
