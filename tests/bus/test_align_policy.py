@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from bus_synth import (
     START,
@@ -110,3 +111,20 @@ def test_a_stuck_counter_outside_the_test_is_not_noted(encoder, bus_map, truth):
     rows = sorted([*frames, *early], key=lambda frame: frame.time_ns)
     (note,) = one(rows, bus_map).quality.notes
     assert note == "Environment: the counter stands still in 58 frames"
+
+
+def test_a_recording_counts_from_its_first_row_to_its_last(frames, bus_map):
+    alone = [frame for frame in frames if frame.can_id == TELEMETRY]
+    recording = one(alone, bus_map)
+    assert recording.quality.messages["ServoTelemetry"].received == TICKS
+    assert np.isfinite(recording.samples.spool).all()
+    silent = [frame for frame in frames if frame.can_id != TELEMETRY]
+    messages = one(silent, bus_map).quality.messages
+    assert sum(item.received for item in messages.values()) == len(silent)
+
+
+def test_a_test_of_one_tick(encoder, bus_map):
+    recording = one(play(encoder, make_truth(1), idle_before=60, idle_after=60), bus_map)
+    assert recording.samples.ticks == 1
+    assert np.isfinite(recording.samples.spool).all()
+    assert recording.quality.messages["ServoTelemetry"].received == 1
