@@ -13,7 +13,7 @@ from firmware_iface.frames import FrameTable
 from firmware_iface.layout import SignalLayout
 from firmware_iface.protection import crc8_rows
 
-__all__ = ["Decoded", "DecodedTable", "decode"]
+__all__ = ["Decoded", "DecodedTable", "decode", "value_ends"]
 
 Rows = NDArray[np.int64]
 
@@ -167,12 +167,18 @@ def _outside(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.
     return wrong
 
 
-def _at_end(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.bool_]:
-    """Values at an end of the DBC's range, or of the raw number where it gives none."""
+def value_ends(signal: SignalLayout) -> tuple[float, float]:
+    """Physical values at and beyond which a converter stands at its end: those of the DBC's range,
+    or of the raw number where it gives none."""
     slack = 0.0 if signal.is_float else 0.5 * abs(signal.scale)
     low, high = -np.inf, np.inf
     if not signal.is_float:
         low, high = _raw_ends(signal)
     if signal.minimum is not None and signal.maximum is not None:
         low, high = max(low, signal.minimum), min(high, signal.maximum)
-    return (physical <= low + slack) | (physical >= high - slack)
+    return low + slack, high - slack
+
+
+def _at_end(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.bool_]:
+    low, high = value_ends(signal)
+    return (physical <= low) | (physical >= high)

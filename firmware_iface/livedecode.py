@@ -16,7 +16,7 @@ from firmware_iface.layout import SignalLayout
 from firmware_iface.livemessages import BitStatus, Request, Sample
 from firmware_iface.protection import crc8
 
-__all__ = ["LiveDecoder"]
+__all__ = ["LiveDecoder", "bit_pattern", "checked_values"]
 
 FLOAT_FORMATS = {2: "<e", 4: "<f", 8: "<d"}
 REASONS = frozenset(BitReason)
@@ -73,6 +73,17 @@ class LiveDecoder:
             elapsed=values.get("status.elapsed", 0.0),
             serial=None if serial is None else round(serial),
         )
+
+
+def checked_values(message: MessageMap, data: bytes) -> dict[str, float] | None:
+    """SI value of each role in a payload; None where its length or its check sum is wrong."""
+    return _values(message, data) if _intact(message, data) else None
+
+
+def bit_pattern(signal: SignalLayout, data: bytes) -> int:
+    """Bits of a signal in a payload, as an unsigned number."""
+    words = {True: int.from_bytes(data, "big"), False: int.from_bytes(data, "little")}
+    return _pattern(signal, words, 8 * len(data))
 
 
 def _intact(message: MessageMap, data: bytes) -> bool:

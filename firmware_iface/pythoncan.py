@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import select
 import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from firmware_iface.adapters import BusOptions, one_line, open_bus
@@ -64,6 +66,7 @@ class PythonCanTransport(Transport):
         self._options = options
         self._bus = open_bus(options, transmit=transmit)
         _widen_buffer(self._bus)
+        self._line = _descriptor(self._bus) if options.interface == "slcan" else None
         self._bus_closed = False
         self._damaged = 0
         self._echoes = _EchoFilter() if options.interface in ECHOES else None
@@ -91,7 +94,7 @@ class PythonCanTransport(Transport):
 
     def _next(self, timeout: float) -> Frame | None:
         try:
-            message = self._bus.recv(timeout)
+            message = self._read(timeout)
         except Exception as error:
             if self._is_damage(error):
                 self._damaged += 1
@@ -109,6 +112,19 @@ class PythonCanTransport(Transport):
         if frame.error and frame.can_id & BUS_OFF and of_kernel:
             raise self._fail("bus off; check wiring and bit rate, then restart the interface")
         return frame
+
+    def _read(self, timeout: float) -> can.Message | None:
+        """Read from python-can; its SLCAN waits a millisecond also where it shall not wait."""
+        if self._line is None:
+            return self._bus.recv(timeout)
+        deadline = time.monotonic() + timeout
+        while True:
+            left = deadline - time.monotonic()
+            if not select.select([self._line], [], [], max(left, 0.0))[0]:
+                return None
+            message = self._bus.recv(0.0)
+            if message is not None or left <= 0.0:
+                return message
 
     def _is_damage(self, error: Exception) -> bool:
         """Whether an error tells of something on the line that was no frame, not of its end."""
@@ -238,20 +254,45 @@ def _timed_out(error: Exception) -> bool:
     return bool(kinds & {"CanTimeoutError", "SerialTimeoutException"}) or str(error) == NO_ROOM
 
 
+def _descriptor(bus: can.BusABC) -> int | None:
+    """What can be waited for; None on systems, or behind ports, that have no such thing."""
+    if os.name != "posix":
+        return None
+    try:
+        return bus.fileno()
+    except Exception:
+        return None
+
+
+@contextlib.contextmanager
+def _socket_of(bus: can.BusABC) -> Iterator[socket.socket]:
+    """The socket behind an interface, until the block ends.
+
+    Raises
+    ------
+    NotImplementedError, OSError, AttributeError, TypeError: there is none.
+    """
+    descriptor = os.dup(bus.fileno())
+    try:
+        twin = socket.socket(fileno=descriptor)
+    except OSError:  # a serial port
+        os.close(descriptor)
+        raise
+    with twin:
+        yield twin
+
+
 def _widen_buffer(bus: can.BusABC) -> None:
     """Ask the kernel for room, so that a reader that waits for a processor loses no frame."""
-    try:
-        descriptor = bus.fileno()
-        with socket.socket(fileno=os.dup(descriptor)) as twin:
-            twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-    except (NotImplementedError, OSError, AttributeError):
-        return  # no socket behind this interface
+    nothing_there = contextlib.suppress(NotImplementedError, OSError, AttributeError, TypeError)
+    with nothing_there, _socket_of(bus) as twin:
+        twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
 
 
 def _kernel_drops(bus: can.BusABC) -> int | None:
     """Frames that found no room in the socket's buffer; None where that cannot be told."""
     try:
-        with socket.socket(fileno=os.dup(bus.fileno())) as twin:
+        with _socket_of(bus) as twin:
             info = twin.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (MEMINFO_DROPS + 1))
     except (NotImplementedError, OSError, AttributeError, TypeError):
         return None

@@ -161,6 +161,7 @@ class SerialTransport(Transport):
         # A network port says only whether anything waits, not how much: read in blocks there.
         self._first_read = 256 if "://" in url else 1
         self._port = _open_port(url, baudrate)
+        self._readable = _descriptor(self._port)
 
     @property
     def bad_packets(self) -> int:
@@ -183,7 +184,7 @@ class SerialTransport(Transport):
 
     def _fill(self, timeout: float) -> None:
         try:
-            if timeout <= 0.0 and not self._port.in_waiting:
+            if not self._has_come(timeout):
                 return
             # Wait for a first byte, then take what has come: a read of many would wait for all.
             chunk = self._port.read(self._first_read)
@@ -200,6 +201,12 @@ class SerialTransport(Transport):
         if self._framer.bad != self._said_bad:
             self._said_bad = self._framer.bad
             self._tell()
+
+    def _has_come(self, timeout: float) -> bool:
+        """Whether to read now; the port's own time limit is too coarse for a millisecond."""
+        if self._readable is not None:
+            return bool(select.select([self._readable], [], [], max(timeout, 0.0))[0])
+        return timeout > 0.0 or bool(self._port.in_waiting)
 
     def _send(self, frame: Frame) -> None:
         packet = packet_of(frame)
@@ -229,9 +236,8 @@ class SerialTransport(Transport):
 
     def _has_room(self) -> bool:
         """Whether the port takes bytes; waits for it once, not for each frame of a long stall."""
-        try:
-            descriptor = self._port.fileno()
-        except (AttributeError, OSError):  # Windows, RFC 2217
+        descriptor = _descriptor(self._port)
+        if descriptor is None:
             return not self._stalled or time.monotonic() >= self._next_try
         return bool(select.select([], [descriptor], [], 0.0 if self._stalled else PATIENCE)[1])
 
@@ -247,6 +253,15 @@ class SerialTransport(Transport):
 
     def _lost(self, error: Exception) -> BusLostError:
         return self._fail(" ".join(str(error).split()) or type(error).__name__)
+
+
+def _descriptor(port: Any) -> int | None:
+    """What can be waited for; None where there is no such thing: Windows, RFC 2217."""
+    try:
+        descriptor: int = port.fileno()
+    except (AttributeError, OSError):
+        return None
+    return descriptor
 
 
 def _open_port(url: str, baudrate: int) -> Any:

@@ -107,12 +107,13 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
 def _anchor_axis(anchor: Decoded, tick_ns: int) -> TickAxis:
     tick, every, notes = _own_ticks(anchor, tick_ns)
     name = anchor.message.name
+    sound = tick != OUTSIDE
     return TickAxis(
         ticks={name: tick},
         rows={name: anchor.row},
-        row=anchor.row[tick > OUTSIDE // 2],
-        tick=tick[tick > OUTSIDE // 2],
-        time_ns=anchor.time_ns[tick > OUTSIDE // 2],
+        row=anchor.row[sound],
+        tick=tick[sound],
+        time_ns=anchor.time_ns[sound],
         every={name: every},
         turn=anchor.message.modulus * every,
         notes=notes,
@@ -198,10 +199,9 @@ def _phase(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
     count = len(fraction)
     starts = np.arange(0, count, PHASE_BLOCK)
     turn = np.exp(2j * np.pi * fraction)
-    sizes = np.diff(np.append(starts, count))
-    angle = np.angle(np.add.reduceat(turn, starts) / sizes) / (2.0 * np.pi)
+    angle = np.angle(np.add.reduceat(turn, starts)) / (2.0 * np.pi)
     smooth = np.unwrap(angle, period=1.0)
-    centre = starts + 0.5 * sizes
+    centre = starts + 0.5 * np.diff(np.append(starts, count))
     phase: NDArray[np.float64] = np.interp(np.arange(count), centre, smooth)
     return phase
 
@@ -210,11 +210,12 @@ def _with_others(
     axis: TickAxis, messages: Mapping[str, Decoded], anchor: Decoded, tick_ns: int
 ) -> TickAxis:
     """Add the messages that the axis does not hold, by time against the anchor's frames."""
-    ticks, every, notes = dict(axis.ticks), dict(axis.every), list(axis.notes)
+    ticks, rows = dict(axis.ticks), dict(axis.rows)
+    every, notes = dict(axis.every), list(axis.notes)
     own = ticks.get(anchor.message.name)
     reference = axis
     if own is not None and len(axis.row) != len(own):
-        sound = own > OUTSIDE // 2
+        sound = own != OUTSIDE
         reference = replace(
             axis, row=anchor.row[sound], tick=own[sound], time_ns=anchor.time_ns[sound]
         )
@@ -234,9 +235,10 @@ def _with_others(
         every[name] = max(spacing, 1)
         if item.counter is not None and spacing >= 1:
             sound = alone != OUTSIDE
-            ticks[name] = alone + int(np.rint(np.median((by_time - alone)[sound])))
+            shift = int(np.rint(np.median((by_time - alone)[sound])))
+            ticks[name] = np.where(sound, alone + shift, OUTSIDE)
         else:
             ticks[name] = _settle(by_time, spacing)
             notes.append(f"{name}: no counter to place samples by; host time stamps do")
-    rows = {name: messages[name].row for name in ticks}
+        rows[name] = item.row
     return replace(axis, ticks=ticks, rows=rows, every=every, notes=tuple(notes))

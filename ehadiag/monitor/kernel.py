@@ -15,8 +15,8 @@ from ehadiag.jit import brief_kernel, inlined, kernel
 from ehadiag.model.anchor import re_anchored
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.jacktick import jack_tick
-from ehadiag.model.spooltick import spool_tick
-from ehadiag.model.transition import SpoolScalars
+from ehadiag.model.spooltick import NODE_COLUMNS, NODES_PER_TICK, spool_tick
+from ehadiag.model.transition import FINEST, SpoolScalars
 from ehadiag.monitor.layout import (
     ANCHOR_GAIN,
     ANCHOR_LARGE,
@@ -26,6 +26,7 @@ from ehadiag.monitor.layout import (
     CODE_POSITION,
     COMMAND,
     CUSUM,
+    DECAY,
     DEVIATION,
     DIRECTION,
     DYNAMIC,
@@ -44,14 +45,18 @@ from ehadiag.monitor.layout import (
     LIMIT,
     LINEAR,
     LOST,
+    MOVING,
+    NODES,
     OFFSETS,
     PREDICTED,
     REFERENCE,
     RESIDUAL,
     SCALARS,
     SEEN,
+    SIZE,
     SLOPE,
     STARTED,
+    STUCK,
     THRESHOLD,
     TICK,
     VS,
@@ -148,16 +153,14 @@ def _commanded(p: Vector, s: Vector, command: float, current: float, position: f
 
 
 @inlined
-def _spool(
-    p: Vector, s: Vector, moving: Vector, stuck: Vector, decay: Vector, torque: float, nodes: Vector
-) -> int:
+def _spool(p: Vector, s: Vector, torque: float, nodes: Vector) -> int:
     """Flapper and spool over the tick; returns the number of nodes of the path."""
     xf, wf, xs, vs, direction, clamped, count = spool_tick(
         _plant(p),
         _scalars(p),
-        moving,
-        stuck,
-        decay,
+        p[MOVING:STUCK].reshape((FINEST + 1, 4, 4)),
+        p[STUCK:DECAY].reshape((FINEST + 1, 2, 2)),
+        p[DECAY:NODES],
         torque,
         p[TICK],
         s[XF],
@@ -194,51 +197,49 @@ def _jack(p: Vector, s: Vector, nodes: Vector, count: int) -> float:
 
 
 @kernel
-def _accumulate(p: Vector, s: Vector, alarmed: NDArray[np.bool_], channel: int) -> None:
-    """Advance both sums of a channel; a sum that gives alarm begins anew, a lost sample rests."""
+def _accumulate(p: Vector, s: Vector, channel: int) -> int:
+    """Advance both sums of a channel; a sum that gives alarm begins anew, a lost sample rests.
+
+    Returns the sums that gave alarm: 1 for the upper, 2 for the lower one, 3 for both.
+    """
     z = s[RESIDUAL + channel]
+    if not math.isfinite(z):
+        return 0
+    step = min(max(z, -p[LIMIT]), p[LIMIT])
+    alarms = 0
     for side in range(2):
-        alarmed[channel, side] = False
-        if not math.isfinite(z):
-            continue
         at = CUSUM + 2 * channel + side
-        step = min(max(z, -p[LIMIT]), p[LIMIT])
-        if side == 1:
-            step = -step
-        s[at] = max(0.0, s[at] + step - p[REFERENCE])
+        s[at] = max(0.0, s[at] + (step if side == 0 else -step) - p[REFERENCE])
         if s[at] > p[THRESHOLD]:
-            alarmed[channel, side] = True
+            alarms += 1 + side
             s[at] = 0.0
+    return alarms
 
 
 @brief_kernel
 def push_tick(
-    parameters: Vector,
-    moving: Vector,
-    stuck: Vector,
-    decay: Vector,
-    state: Vector,
-    nodes: Vector,
-    alarmed: NDArray[np.bool_],
+    memory: Vector,
     command: float,
     current: float,
     spool: float,
     pressure: float,
     position: float,
-) -> None:
+) -> int:
     """Advance model and sums by one tick, in place.
 
     Parameters
     ----------
-    parameters, state: see `ehadiag.monitor.layout`.
-    moving, stuck, decay: see `ehadiag.model.transition.SpoolTables`.
-    nodes: scratch, shape (NODES_PER_TICK, NODE_COLUMNS).
-    alarmed: out, shape (2, 2), rows spool and pressure, columns upper and lower sum.
+    memory: see `ehadiag.monitor.layout`.
     command, current, spool, pressure, position: the tick's sample, SI, NaN where lost.
+
+    Returns
+    -------
+    The sums that gave alarm: 1 spool's upper, 2 its lower, 4 pressure's upper, 8 its lower one.
     """
-    p, s = parameters, state
+    p = s = memory
     torque = _plant(p).GM * _commanded(p, s, command, current, position)
-    count = _spool(p, s, moving, stuck, decay, torque, nodes)
+    nodes = memory[NODES:SIZE].reshape((NODES_PER_TICK, NODE_COLUMNS))
+    count = _spool(p, s, torque, nodes)
     s[PREDICTED] = s[XS]
     gap = spool - p[OFFSETS] - s[XS]
     s[RESIDUAL] = gap * p[WEIGHTS]
@@ -249,5 +250,4 @@ def push_tick(
         gap, p[ANCHOR_GAIN], p[ANCHOR_SMALL], p[ANCHOR_LARGE], s[XS], s[FILTERED], _plant(p).XSM
     )
     s[JACK_SPOOL] += s[XS] - s[PREDICTED]
-    _accumulate(p, s, alarmed, 0)
-    _accumulate(p, s, alarmed, 1)
+    return _accumulate(p, s, 0) + 4 * _accumulate(p, s, 1)

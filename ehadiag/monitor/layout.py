@@ -1,11 +1,15 @@
-"""Where the numbers of a monitor stand in its two flat arrays.
+"""Where the numbers of a monitor stand in its one flat array.
 
-A kernel call takes flat arrays at once; a named tuple would be looked through field by field.
+Every array that is handed to a kernel costs an allocation while the call lasts, and a named tuple
+is looked through field by field; one flat array is had at once.
 """
 
 from __future__ import annotations
 
 from typing import Final
+
+from ehadiag.model.spooltick import NODE_COLUMNS, NODES_PER_TICK
+from ehadiag.model.transition import FINEST
 
 # Parameters: constants of the plant, scalars of the spool (ehadiag.model), then:
 SCALARS: Final = 25
@@ -28,31 +32,34 @@ REFERENCE: Final = 48  # CUSUM: k, h, largest residual that counts
 THRESHOLD: Final = 49
 LIMIT: Final = 50
 DEVIATION: Final = 51  # a lost command did not go on where the current is off by more, A
-PARAMETERS: Final = 52
 
 # State. Flapper (m, m/s) and spool (m, m/s); direction of motion +1, -1, 0; flapper on its stop.
-XF: Final = 0
-WF: Final = 1
-XS: Final = 2
-VS: Final = 3
-DIRECTION: Final = 4
-CLAMPED: Final = 5
-FILTERED: Final = 6  # innovation, m
+XF: Final = 52
+WF: Final = 53
+XS: Final = 54
+VS: Final = 55
+DIRECTION: Final = 56
+CLAMPED: Final = 57
+FILTERED: Final = 58  # innovation, m
 # Jack: velocity, position, direction, and where it has the spool.
-JACK_VELOCITY: Final = 7
-JACK_POSITION: Final = 8
-JACK_DIRECTION: Final = 9
-JACK_SPOOL: Final = 10
+JACK_VELOCITY: Final = 59
+JACK_POSITION: Final = 60
+JACK_DIRECTION: Final = 61
+JACK_SPOOL: Final = 62
 # Control law.
-SEEN: Final = 11  # measured position of the tick before, m; NaN if lost
-ERROR_BEFORE: Final = 12
-INTEGRAL: Final = 13
-STARTED: Final = 14
-COMMAND: Final = 15  # of the tick before, known or not, its rise over a tick, ticks lost since
-SLOPE: Final = 16
-LOST: Final = 17
+SEEN: Final = 63  # measured position of the tick before, m; NaN if lost
+ERROR_BEFORE: Final = 64
+INTEGRAL: Final = 65
+STARTED: Final = 66
+COMMAND: Final = 67  # of the tick before, known or not, its rise over a tick, ticks lost since
+SLOPE: Final = 68
+LOST: Final = 69
 # Results.
-PREDICTED: Final = 18  # spool, pressure, position
-RESIDUAL: Final = 21  # spool, pressure
-CUSUM: Final = 23  # spool upper, lower; pressure upper, lower
-STATES: Final = 27
+PREDICTED: Final = 70  # spool, pressure, position
+RESIDUAL: Final = 73  # spool, pressure
+CUSUM: Final = 75  # spool upper, lower; pressure upper, lower
+MOVING: Final = 79  # ehadiag.model.transition.SpoolTables
+STUCK: Final = MOVING + 16 * (FINEST + 1)
+DECAY: Final = STUCK + 4 * (FINEST + 1)
+NODES: Final = DECAY + FINEST + 1  # path of the spool, scratch
+SIZE: Final = NODES + NODES_PER_TICK * NODE_COLUMNS

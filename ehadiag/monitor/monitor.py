@@ -15,7 +15,6 @@ from ehadiag.channels import CURRENT, POSITION, PRESSURE, SPOOL
 from ehadiag.errors import ConfigurationError
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.monitoring import Anchor
-from ehadiag.model.spool import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.transition import spool_tables
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
@@ -35,6 +34,8 @@ RESIDUAL_LIMIT = 4.0
 DEVIATION_LSB = 4.0
 """A lost command did not go on as it was where the measured current is further off."""
 TICKS_S = (1e-5, 0.1)
+ALARMS = np.array([[[n & 1, n & 2], [n & 4, n & 8]] for n in range(16)], dtype=np.bool_)
+"""What `push_tick` returns, taken apart: rows spool and pressure, columns upper and lower sum."""
 
 
 class Tick(NamedTuple):
@@ -81,9 +82,8 @@ class Reading:
 class Monitor:
     """Follows an actuator tick by tick.
 
-    `push` takes constant memory, no lock, and releases the interpreter lock in its kernel: call it
-    from the thread that receives, and from one thread only. It is compiled when the monitor is
-    made, never in `push`.
+    `push` takes constant memory and no lock of its own: call it from the thread that receives, and
+    from one thread only. It is compiled when the monitor is made, never in `push`.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class Monitor:
         tables = spool_tables(constants, values[0], values[1], tick)
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
-        p = np.zeros(layout.PARAMETERS)
+        p = np.zeros(layout.SIZE)
         p[: layout.SCALARS] = constants
         p[layout.SCALARS : layout.TICK] = tables.scalars
         p[layout.TICK] = tick
@@ -135,49 +135,52 @@ class Monitor:
         p[layout.THRESHOLD] = self.design.threshold
         p[layout.LIMIT] = RESIDUAL_LIMIT
         p[layout.DEVIATION] = DEVIATION_LSB * CURRENT.lsb
-        self._parameters = p
-        self._tables = tables.moving, tables.stuck, tables.decay
-        self._state = np.zeros(layout.STATES)
-        self._nodes = np.empty((NODES_PER_TICK, NODE_COLUMNS))
+        p[layout.MOVING : layout.STUCK] = tables.moving.ravel()
+        p[layout.STUCK : layout.DECAY] = tables.stuck.ravel()
+        p[layout.DECAY : layout.NODES] = tables.decay
+        self._memory = p
+        self._alarms = 0
         self._alarmed = np.zeros((2, 2), dtype=np.bool_)
-        self._fixed = p, *self._tables, self._state, self._nodes, self._alarmed
         self.reading: Reading = Reading(
-            _view(self._state[layout.PREDICTED : layout.RESIDUAL]),
-            _view(self._state[layout.RESIDUAL : layout.CUSUM]),
-            _view(self._state[layout.CUSUM :].reshape(2, 2)),
+            _view(p[layout.PREDICTED : layout.RESIDUAL]),
+            _view(p[layout.RESIDUAL : layout.CUSUM]),
+            _view(p[layout.CUSUM : layout.MOVING].reshape(2, 2)),
             _view(self._alarmed),
         )
         """What the last push left."""
         self.push(Tick(0.0, 0.0, 0.0, 0.0, 0.0))
         self.reset()
 
-    def push(self, sample: Tick) -> Reading:
-        """Advance by one tick; returns `reading`, always the same object.
+    def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
+        """Advance by one tick, a `Tick` or its five numbers; returns `reading`, always the same.
 
         Call it for every tick: a tick that did not arrive is `Tick` of five NaN.
         """
         command, current, spool, pressure, position = sample
-        push_tick(
-            *self._fixed,
+        alarms = push_tick(
+            self._memory,
             float(command),
             float(current),
             float(spool),
             float(pressure),
             float(position),
         )
+        if alarms != self._alarms:
+            self._alarms = alarms
+            self._alarmed[:] = ALARMS[alarms]
         return self.reading
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""
-        constants, scalars = self._parameters, layout.SCALARS
-        bound, breakaway = constants[11], constants[scalars + 3]
-        stiffness, wire = constants[3], constants[4]
-        self._state[:] = 0.0
-        self._alarmed[:] = False
+        p = self._memory
+        bound, breakaway = p[11], p[layout.SCALARS + 3]
+        stiffness, wire = p[3], p[4]
+        p[layout.XF : layout.MOVING] = 0.0
+        self._alarms, self._alarmed[:] = 0, False
         xs = min(max(spool, -bound), bound)
-        self._state[layout.XS] = self._state[layout.JACK_SPOOL] = xs
-        self._state[layout.XF] = min(max(-wire * xs / stiffness, -breakaway), breakaway)
-        self._state[layout.SEEN] = math.nan
+        p[layout.XS] = p[layout.JACK_SPOOL] = xs
+        p[layout.XF] = min(max(-wire * xs / stiffness, -breakaway), breakaway)
+        p[layout.SEEN] = math.nan
 
 
 def _checked(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from bus_synth import ENVIRONMENT, START, TICK, flip, make_truth, play, recordings
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_iface.counts import _expected, _late, _sequence, within
+from ehadiag.recording import MessageCounts
+from firmware_iface.counts import _expected, _late, _sequence, count_frames, within
 from firmware_iface.frames import Frame
 
 
@@ -81,3 +84,79 @@ def test_values_at_the_very_end_of_their_range_are_not_outside(bus_map, encoder)
     (high,) = encoder.environment(40.95e6, 40.95e6, 309.5, START + 150 * TICK)
     (recording,) = recordings([*frames[:300], high, *frames[300:]], bus_map)
     assert recording.quality.messages["Environment"].range_errors == 0
+
+
+def counted(row, counter=None, stream=None, **bad):
+    """What counting reads of a decoded message of 256 counts."""
+    empty = np.empty(0, dtype=np.int64)
+    return SimpleNamespace(
+        message=SimpleNamespace(name="M", modulus=256),
+        row=np.array(row),
+        counter=None if counter is None else np.array(counter),
+        stream=np.zeros(len(row), dtype=np.int64) if stream is None else np.array(stream),
+        received=np.sort(np.concatenate([row, *bad.values()])).astype(np.int64),
+        crc_bad=np.array(bad.get("crc", empty)),
+        length_bad=np.array(bad.get("length", empty)),
+        range_bad=np.array([row[0]]),
+    )
+
+
+def on_axis(ticks, every=None):
+    ticks = {} if ticks is None else {"M": np.array(ticks)}
+    return SimpleNamespace(ticks=ticks, every=every or {})
+
+
+TEST = SimpleNamespace(first=100, ticks=10)
+
+
+def test_frames_on_the_grid_are_counted_by_their_ticks():
+    frames = counted(range(10, 20), crc=[3, 22], length=[23, 24])
+    ticks = [99, 100, 101, 103, 102, 102, 106, 109, 110, 111]
+    got = count_frames(frames, on_axis(ticks), TEST, 10, 23)
+    assert got == MessageCounts(
+        received=11,
+        accepted=6,
+        lost=3,
+        repeated=1,
+        out_of_order=1,
+        crc_errors=1,
+        length_errors=0,
+        range_errors=1,
+    )
+    assert count_frames(frames, on_axis(ticks), TEST, 11, 25).received == 12
+    assert count_frames(frames, on_axis(ticks), TEST, 11, 25).length_errors == 2
+    assert count_frames(frames, on_axis(ticks), TEST, 11, 25).lost == 1
+    assert count_frames(frames, on_axis(ticks), TEST, 14, 16).accepted == 1
+
+
+def test_frames_of_a_slow_message_are_expected_at_its_pace():
+    got = count_frames(counted([0, 1]), on_axis([101, 107], {"M": 3}), TEST, 0, 2)
+    assert (got.accepted, got.lost) == (2, 1)
+    assert count_frames(counted([0]), on_axis([101]), TEST, 0, 1).lost == 9
+    nothing = count_frames(counted([0]), on_axis([99], {"M": 3}), TEST, 0, 1)
+    assert (nothing.accepted, nothing.lost) == (0, 4)
+
+
+def test_two_streams_may_share_a_tick():
+    frames = counted([0, 1, 2, 3, 4], stream=[1, 2, 1, 2, 2])
+    got = count_frames(frames, on_axis([100, 100, 101, 101, 101]), TEST, 0, 5)
+    assert (got.accepted, got.repeated, got.lost, got.out_of_order) == (4, 1, 16, 0)
+
+
+def test_frames_on_event_are_counted_by_their_numbers():
+    frames = counted([0, 1, 2, 3, 4, 5], [254, 255, 2, 1, 1, 3], crc=[6])
+    for axis in (None, on_axis(None)):
+        got = count_frames(frames, axis, TEST, 0, 7)
+        assert (got.accepted, got.lost, got.repeated, got.out_of_order) == (5, 0, 1, 1)
+    got = count_frames(frames, None, TEST, 0, 4)
+    assert (got.received, got.accepted, got.lost, got.out_of_order) == (4, 4, 1, 1)
+    assert count_frames(frames, None, TEST, 7, 9).lost == 0
+    never = SimpleNamespace(first=0, ticks=0)
+    assert count_frames(frames, on_axis([0] * 6), never, 0, 7).accepted == 5
+
+
+def test_without_counter_and_ticks_only_damage_is_known():
+    frames = counted([0, 2, 4], crc=[1], length=[3])
+    got = count_frames(frames, None, TEST, 0, 4)
+    assert (got.received, got.accepted, got.lost, got.repeated) == (4, 2, 0, 0)
+    assert (got.crc_errors, got.length_errors) == (1, 1)

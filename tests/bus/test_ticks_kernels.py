@@ -97,10 +97,11 @@ def test_ticks_begin_at_the_first_frame_whatever_its_counter() -> None:
 
 
 def test_a_frame_out_of_line_has_no_tick() -> None:
-    counter = [*range(10), 150, *range(11, 20)]
-    alone, _, notes = ticks._own_ticks(item([float(k) for k in range(20)], counter), MS)
+    counter = [*range(7, 17), 150, *range(18, 27)]
+    alone, every, notes = ticks._own_ticks(item([2.0 * k for k in range(20)], counter), MS)
     assert alone[10] == OUTSIDE
-    assert np.delete(alone, 10).tolist() == [*range(10), *range(11, 20)]
+    assert np.delete(alone, 10).tolist() == [*range(0, 20, 2), *range(22, 40, 2)]
+    assert every == 2
     assert notes == ("1 frames with a counter out of line",)
 
 

@@ -65,8 +65,10 @@ def diagnosed(recording: Recording) -> diagnosis.Diagnosis:
 
 def compared(frames: list[Frame], sound: diagnosis.Diagnosis, truth: tuple[float, ...]) -> Outcome:
     came = diagnosed(assemble(FrameTable.from_frames(frames), default_map(), "lossy")[-1])
-    if came.identification is None or sound.identification is None:
-        raise AssertionError("; ".join(came.reasons))
+    if sound.identification is None:
+        raise AssertionError("; ".join(sound.reasons))
+    if came.identification is None:
+        return Outcome(float("nan"), False, False, 0.0, 0.0)
     ours, whole = came.identification.estimates, sound.identification.estimates
     return Outcome(
         guessed=came.experiments[0].trace.guessed,

@@ -126,6 +126,20 @@ class Contract:
             assert receiving.receive(0.02) is None
             assert receiving.state is TransportState.OPEN
 
+    def test_asking_without_waiting_does_not_wait(self, receiving: Transport) -> None:
+        """A computer asks at each control tick whether anything came."""
+        if not receiving.real_time:
+            return
+        begin = time.monotonic(), time.thread_time()
+        descriptors = len(os.listdir("/proc/self/fd")) if sys.platform == "linux" else 0
+        for _ in range(1000):
+            assert receiving.receive(0.0) is None
+        if sys.platform == "linux":
+            assert len(os.listdir("/proc/self/fd")) <= descriptors + 10
+        waited = time.monotonic() - begin[0]
+        # Each wait of a millisecond would make one second; a loaded machine makes this slow too.
+        assert waited < 0.5 + 20.0 * (time.thread_time() - begin[1])
+
     def test_the_clock_of_time_limits_runs_on(
         self, receiving: Transport, feed: Callable[[], None]
     ) -> None:

@@ -322,6 +322,31 @@ def test_in_real_time_over_the_serial_link(
     assert_whole(path, short_test)
 
 
+def test_in_real_time_over_slcan(
+    make_core: CoreFactory, short_test: StoredTest, wire: tuple[str, str], tmp_path: Path
+) -> None:
+    core, stop = make_core(), threading.Event()
+    core.step()
+    path = tmp_path / "live.blf"
+    near, far = (BusOptions("slcan", channel=end, extra={"sleep_after_open": 0.0}) for end in wire)
+    with (
+        PythonCanTransport(near, transmit=True) as bus,
+        PythonCanTransport(far, transmit=True) as ours,
+    ):
+        node = threading.Thread(target=run_emulator, args=(core, bus, stop))
+        node.start()
+        try:
+            outcome = run_test(
+                ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
+            )
+        finally:
+            stop.set()
+            node.join()
+    assert outcome.why == ""
+    assert outcome.degraded == ""
+    assert_whole(path, short_test)
+
+
 def test_a_silent_bus_ends_within_its_time_limits(tmp_path: Path) -> None:
     times = TimeLimits(settle=0.02, status=0.1, abort=0.1)
     with virtual(str(uuid.uuid4()), transmit=True) as bus:

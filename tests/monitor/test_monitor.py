@@ -6,10 +6,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import msgspec
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba.core.runtime import _nrt_python, rtsys
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
@@ -220,6 +222,23 @@ def test_push_keeps_no_memory():
     assert abs(after - before) < 512
     # What one call's arguments take while it lasts; nothing that grows.
     assert peak - before < 2048
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="no compiled code, no allocator")
+def test_the_kernel_allocates_nothing():
+    """By numba's own count: what it takes to hand over the one array, and that goes back."""
+    monitor, ticks = monitor_for("paper-closed-4.blf", MATCHED["paper-closed-4.blf"])
+    enabled = _nrt_python.memsys_stats_enabled()
+    _nrt_python.memsys_enable_stats()
+    try:
+        before = rtsys.get_allocation_stats()
+        for tick in ticks:
+            monitor.push(tick)
+        after = rtsys.get_allocation_stats()
+    finally:
+        if not enabled:
+            _nrt_python.memsys_disable_stats()
+    assert after.alloc - before.alloc == after.free - before.free == len(ticks)
 
 
 def test_another_thread_may_push():

@@ -1,13 +1,21 @@
-"""The how-to's example runs and prints what the page says."""
+"""The how-to's examples run and print what the page says."""
 
 import re
 from pathlib import Path
 
+import pytest
+
 PAGE = Path(__file__).parent.parent.parent / "docs" / "how-to" / "monitor.md"
+EXAMPLES = re.findall(
+    r"```python\n(.*?)```.*?```\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+)
 
 
-def test_example_prints_what_the_page_says(capsys):
-    text = PAGE.read_text(encoding="utf-8")
-    example, expected = re.search(r"```python\n(.*?)```.*?```\n(.*?)```", text, re.DOTALL).groups()
+def test_the_page_has_its_examples():
+    assert len(EXAMPLES) == 2
+
+
+@pytest.mark.parametrize(("example", "expected"), EXAMPLES, ids=["pushed", "received"])
+def test_example_prints_what_the_page_says(example, expected, capsys):
     exec(compile(example, str(PAGE), "exec"), {})
     assert capsys.readouterr().out == expected

@@ -28,6 +28,7 @@ from ehadiag_tools.soakload import (
     send_own,
     sent_at_us,
 )
+from ehadiag_tools.soakmonitor import BESIDE, monitor_soak, monitor_text
 from firmware_iface.frames import Frame
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 from firmware_iface.receiver import Receiver
@@ -221,6 +222,13 @@ def text(result: Soak) -> str:
     )
 
 
+def _monitor(options: BusOptions, arguments: argparse.Namespace) -> int:
+    switch = None if arguments.switch_ms is None else arguments.switch_ms * 1e-3
+    result = monitor_soak(options, arguments.minutes * 60.0, arguments.monitor, switch)
+    print(json.dumps(asdict(result)) if arguments.json else monitor_text(result))
+    return int(result.lost > 0)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Soak a bus; exit code 0 without, 1 with a lost frame, or that of the error."""
     parser = argparse.ArgumentParser(prog="soak", description=__doc__)
@@ -228,10 +236,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("-c", "--channel", help="as the interface names it")
     parser.add_argument("--minutes", type=float, default=10.0, help="(%(default)s)")
     parser.add_argument("--load", type=float, default=0.8, help="share of 1 Mbit/s (%(default)s)")
+    parser.add_argument(
+        "--monitor",
+        choices=BESIDE,
+        help="the monitor in the receive thread instead, diagnoses beside it in a thread or process"
+        " (sends telemetry and command only)",
+    )
+    parser.add_argument(
+        "--switch-ms", type=float, help="with --monitor: sys.setswitchinterval (left as it is: 5)"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object")
     arguments = parser.parse_args(argv)
     options = BusOptions(arguments.interface, channel=arguments.channel)
     try:
+        if arguments.monitor is not None:
+            return _monitor(options, arguments)
         with tempfile.TemporaryDirectory() as folder:
             result = soak(options, arguments.minutes * 60.0, arguments.load, Path(folder))
     except EhadiagError as error:

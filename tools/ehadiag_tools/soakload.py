@@ -15,7 +15,16 @@ from firmware_iface.frames import Frame
 from firmware_iface.protection import crc8
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 
-__all__ = ["COMMAND", "FRAME_S", "OWN_RATE", "TELEMETRY", "send_foreign", "send_own", "sent_at_us"]
+__all__ = [
+    "COMMAND",
+    "FRAME_S",
+    "OWN_RATE",
+    "PERIOD_NS",
+    "TELEMETRY",
+    "send_foreign",
+    "send_own",
+    "sent_at_us",
+]
 
 TELEMETRY, COMMAND = 0x110, 0x111
 FOREIGN = 0x300

@@ -43,22 +43,30 @@ def main() -> None:
         raise SystemExit(f"usage: run.py {'|'.join(NAMES)} [FOLDER...] [-option...]")
     with atheris.instrument_imports(include=list(SEEN)):
         import targets  # noqa: PLC0415 - the fuzzer must see its imports
-    _compare_arrays_past_atheris()
     options = [f"-timeout={HANG_S}", f"-rss_limit_mb={MEMORY_MB}", *sys.argv[1:]]
-    atheris.Setup([sys.argv[0], *options], targets.target(name, targets.SHARE))
+    atheris.Setup([sys.argv[0], *options], _without_leak(targets.target(name, targets.SHARE)))
     atheris.Fuzz()
 
 
-def _compare_arrays_past_atheris() -> None:
-    """Atheris 3.0 never frees what a comparison it watches returns: an array each time here."""
-    watched = atheris._trace_cmp
+def _without_leak(check: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    """Atheris 3.0 never frees what a comparison it watches returns: an array each time here.
+
+    It puts its own function in place when it starts; the first input comes after that.
+    """
+    watched: Callable[..., object] | None = None
 
     def compare(left: object, right: object, which: int, place: int, constant: bool) -> object:
-        if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
+        if watched is None or isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
             return COMPARISONS[which >> CMP_OP_SHIFT_AMOUNT](left, right)
         return watched(left, right, which, place, constant)
 
-    atheris._trace_cmp = compare
+    def run(data: bytes) -> None:
+        nonlocal watched
+        if watched is None:
+            watched, atheris._trace_cmp = atheris._trace_cmp, compare
+        check(data)
+
+    return run
 
 
 if __name__ == "__main__":
