@@ -9,7 +9,7 @@ being constant they are told apart from the faults, which act alike in both dire
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,22 +144,18 @@ def describe(
     return _described(model, x, model.trusted_slope(x), converged=converged, jagged=True)
 
 
-def _corrected(
-    model: GapModel, x: NDArray[np.float64], slope: Slope
-) -> NDArray[np.float64]:
+def _corrected(model: GapModel, x: NDArray[np.float64], slope: Slope) -> NDArray[np.float64]:
     """Take out of the optimum what the coarser pieces of the many runs have put in.
 
-    Their gaps differ a little from those of a single run, which cuts the jack's path finer: by so
-    much the optimum moves, the derivatives being the same.
+    Single runs cut the jack's path finer; the optimum moves by the difference of the Gauss-Newton
+    steps of both from the same point.
     """
-    used = slope.used
-    rows = slope.jacobian[:, used]
-    fine, _ = model.one(slope.x)
-    free = (x > 0.0) & (x < 1.0)
-    free[FAULT_COUNT:] = True
-    normal, gradient = (rows @ rows.T)[np.ix_(free, free)], rows @ (fine - slope.gaps)[used]
-    out = x.copy()
-    out[free] -= np.linalg.pinv(normal, hermitian=True) @ gradient[free]
+    fine = model.slopes([slope.x], fine=True)[0]
+    both = slope.used & fine.used
+    steps = [
+        _stepped(replace(item, smooth=both), LEAST_DAMPING) - slope.x for item in (fine, slope)
+    ]
+    out = x + steps[0] - steps[1]
     out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
     return np.asarray(out)
 
