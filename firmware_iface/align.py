@@ -123,7 +123,7 @@ def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int
     notes = []
     for name, item in decoded.messages.items():
         inside = slice(*np.searchsorted(item.row, [begin, end]))
-        if item.counter is None or inside.stop - inside.start < STUCK_FRAMES:
+        if item.counter is None:
             continue
         still = np.diff(item.counter[inside]) == 0
         still &= np.diff(item.time_ns[inside]) > bus_map.tick_ns // 2

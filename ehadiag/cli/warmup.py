@@ -31,11 +31,13 @@ def run(_arguments: argparse.Namespace) -> int:
     begin = time.perf_counter()
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415 - loads numba
     from ehadiag.jit import cache_folder  # noqa: PLC0415
+    from ehadiag.monitor import Monitor  # noqa: PLC0415
     from ehadiag_sim.plant import Plant  # noqa: PLC0415
     from firmware_iface.busmap import default_map  # noqa: PLC0415
 
     for test in bundled_tests().values():
         warm_up(default_actuator(), test)
+    Monitor(default_actuator(), (0.0, 0.0, 0.0))
     Plant(default_actuator()).tick(0.0, CommandMode.CURRENT)
     default_map()  # keeps what it finds in the DBC
     say(f"kernels ready in {cache_folder()} after {time.perf_counter() - begin:.1f} s")

@@ -17,33 +17,45 @@ from ehadiag.model.lanelayout import (
     ANCHORED,
     COEFFICIENT_ROWS,
     LANES,
-    NODES,
     PATH_ROWS,
     PRESSURE,
     PRESSURE_OFFSET,
     SPOOL,
     SPOOL_OFFSET,
     STATE_ROWS,
-    packed,
 )
-from ehadiag.model.lanespool import anchor_lanes, midpoints, rest, spool_lanes
+from ehadiag.model.lanespool import anchor_lanes, rest, spool_lanes
 from ehadiag.model.lanestops import jack_events
 from ehadiag.model.lanetables import MOVING_SIZE, STUCK_SIZE, tabulate
+from ehadiag.model.lanevector import (
+    WIDTH,
+    anywhere,
+    least,
+    load,
+    magnitude,
+    most,
+    packed,
+    store,
+    where,
+)
 
 __all__ = ["LaneWork", "lane_costs", "lane_residuals", "lane_work"]
 
-TRAVEL = 1.0e-6
-RATIO = 0.1
-BOW = 0.05e-6
-"""A tick is cut for the jack until the spool's travel in a part (m, or share of its distance from
-the middle) and its distance from the chord (m) are about this small."""
+BOW = 0.008e-6
+"""Distance (m) of the spool's path from its chord from which the jack takes two steps a tick, where
+the orifice is almost closed; elsewhere in proportion to its opening."""
+BOW_RATIO = 6.0
+"""The same, of four steps."""
+OPENING = 10.0e-6
+TRAVEL = 0.15
+"""Travel as a share of the opening, likewise."""
 
 
 class LaneWork(NamedTuple):
     """Scratch of the kernels below, one for each thread.
 
-    parts: into how many parts the jack's ticks are cut, 1, 2, 4 or 8, shape (N,). The same for
-        every candidate, so that none's answer hangs on the others in its block.
+    levels: how often the jack's ticks are halved, 0, 1 or 2, shape (N,). The same for every
+        candidate, so that none's answer hangs on the others in its block.
     state, path, coefficients, moving, stuck: see `ehadiag.model.lanelayout`.
     rows: candidates of a block, shape (LANES, 5).
     sums: shape (LANES,).
@@ -51,7 +63,7 @@ class LaneWork(NamedTuple):
     no_costs, uncounted, no_gaps: what is not wanted, of no candidate.
     """
 
-    parts: NDArray[np.int64]
+    levels: NDArray[np.int64]
     state: NDArray[np.float64]
     path: NDArray[np.float64]
     coefficients: NDArray[np.float64]
@@ -66,9 +78,9 @@ class LaneWork(NamedTuple):
 
 
 def lane_work(batch: Batch) -> LaneWork:
-    """Scratch for a batch, the jack's parts found by a run of candidates all over the cube."""
+    """Scratch for a batch, the jack's steps found by a run of candidates all over the cube."""
     work = LaneWork(
-        parts=np.zeros(len(batch.current), dtype=np.int64),
+        levels=np.full(len(batch.current), -1, dtype=np.int64),
         state=np.zeros(STATE_ROWS * LANES),
         path=np.zeros(PATH_ROWS * LANES),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
@@ -89,62 +101,57 @@ def lane_work(batch: Batch) -> LaneWork:
 
 
 @packed
-def _parts(path: NDArray[np.float64]) -> int:
-    """Into how many parts this tick must be cut for the jack of the most exacting lane."""
-    two, four, eight = 0, 0, 0
-    middle, last = NODES // 2 * LANES, NODES * LANES
-    for i in range(LANES):
-        x0, x1, x2 = path[i], path[middle + i], path[last + i]
-        travel = abs(x2 - x0)
-        near = min(abs(x0), abs(x2)) if x0 * x2 > 0.0 else 0.0
-        most = max(TRAVEL, RATIO * near)
-        bow = abs(x1 - 0.5 * (x0 + x2))
-        two += int((travel > most) | (bow > BOW))
-        four += int((travel > 2.0 * most) | (bow > 4.0 * BOW))
-        eight += int((travel > 4.0 * most) | (bow > 16.0 * BOW))
-    return 8 if eight > 0 else (4 if four > 0 else (2 if two > 0 else 1))
+def _level(path: NDArray[np.float64]) -> int:
+    """Halvings of this tick for the jack of the most exacting lane."""
+    level = 0
+    for o in range(0, LANES, WIDTH):
+        x0, x4 = load(path, o), load(path, 4 * LANES + o)
+        x1, x2, x3 = load(path, LANES + o), load(path, 2 * LANES + o), load(path, 3 * LANES + o)
+        near = where(x0 * x4 > 0.0, least(magnitude(x0), magnitude(x4)), 0.0)
+        near = most(near, OPENING)
+        bow = most(magnitude(x1 - 0.75 * x0 - 0.25 * x4), magnitude(x3 - 0.25 * x0 - 0.75 * x4))
+        bow = most(bow, magnitude(x2 - 0.5 * (x0 + x4)))
+        need = most(bow * (OPENING / BOW), magnitude(x4 - x0) / TRAVEL)
+        if anywhere(need > BOW_RATIO * near):
+            level = 2
+        elif anywhere(need > near):
+            level = max(level, 1)
+    return level
 
 
 @packed
 def _gaps(
     measured: float,
     weight: float,
+    cap: float,
     row: int,
     offset: int,
     state: NDArray[np.float64],
     coefficients: NDArray[np.float64],
     gaps: NDArray[np.float64],
+    sums: NDArray[np.float64],
 ) -> None:
-    """Weighted gap of one sample in every lane: gaps, shape (LANES,)."""
-    for i in range(LANES):
-        modelled = state[row * LANES + i]
-        gaps[i] = (measured - coefficients[offset * LANES + i] - modelled) * weight
+    """Weighted gap of one sample in every lane, its capped square added to the sums."""
+    for o in range(0, LANES, WIDTH):
+        seen = measured - load(coefficients, offset * LANES + o)
+        gap = (seen - load(state, row * LANES + o)) * weight
+        store(gaps, o, gap)
+        store(sums, o, load(sums, o) + least(gap * gap, cap))
 
 
 @packed
-def _add(gaps: NDArray[np.float64], cap: float, sums: NDArray[np.float64]) -> None:
-    """Add the capped squares to the sum of every lane."""
-    for i in range(LANES):
-        sums[i] += min(gaps[i] * gaps[i], cap)
-
-
-@kernel
 def _jack_tick(
     c: PlantConstants,
     tick: float,
-    parts: int,
+    level: int,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Jack of all lanes over a tick cut into so many parts."""
-    if parts == NODES:
-        midpoints(path, 0.25 * tick)
-    step = NODES // parts
-    span = tick / parts
-    for begin in range(0, NODES, step):
-        if jack_lanes(c, begin, begin + step, span, state, path, coefficients) > 0:
-            jack_events(c, begin, begin + step, span, state, path, coefficients)
+    """Jack of all lanes over a tick cut into 2^level steps."""
+    for step in range(1 << level):
+        if jack_lanes(c, level, step, tick, state, path, coefficients):
+            jack_events(c, level, step, tick, state, path, coefficients)
 
 
 @kernel
@@ -156,7 +163,7 @@ def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -
     state, path, coefficients = work.state, work.path, work.coefficients
     moving, stuck, rows, sums, gaps = work.moving, work.stuck, work.rows, work.sums, work.gaps
     current, spool, pressure = batch.current, batch.spool, batch.pressure
-    weight, parts, start = batch.weight, work.parts, batch.start
+    weight, levels, start = batch.weight, work.levels, batch.start
     wanted = out.shape[0]
     sums[:] = 0.0
     state[:] = 0.0
@@ -172,26 +179,25 @@ def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -
         ring_time = 1.0 / math.sqrt(square) if square > 0.0 else 1e30
         for k in range(start[index], start[index + 1]):
             torque = c.GM * current[k]
-            if spool_lanes(
-                state, path, coefficients, torque, tick / 16.0,
-                c.KF, c.KSF, c.XFM, c.XSM, damping, ring_time,
-            ) > 0:  # fmt: skip
+            if spool_lanes(c, torque, tick, damping, ring_time, state, path, coefficients):
                 event_ticks(c, torque, tick, state, path, coefficients, moving, stuck)
             seen = math.isfinite(spool[k])
             if weight[0, k] != 0.0 and seen:
-                _gaps(spool[k], weight[0, k], SPOOL, SPOOL_OFFSET, state, coefficients, gaps)
-                _add(gaps, cap, sums)
+                _gaps(
+                    spool[k], weight[0, k], cap, SPOOL, SPOOL_OFFSET,
+                    state, coefficients, gaps, sums,
+                )  # fmt: skip
                 for i in range(wanted):
                     out[i, 0, k] = gaps[i]
-            if parts[k] == 0:
-                parts[k] = _parts(path)
-            _jack_tick(c, tick, parts[k], state, path, coefficients)
+            if levels[k] < 0:
+                levels[k] = _level(path)
+            _jack_tick(c, tick, levels[k], state, path, coefficients)
             if weight[1, k] != 0.0 and math.isfinite(pressure[k]):
                 pressures(c, state, path)
                 _gaps(
-                    pressure[k], weight[1, k], PRESSURE, PRESSURE_OFFSET, state, coefficients, gaps
-                )
-                _add(gaps, cap, sums)
+                    pressure[k], weight[1, k], cap, PRESSURE, PRESSURE_OFFSET,
+                    state, coefficients, gaps, sums,
+                )  # fmt: skip
                 for i in range(wanted):
                     out[i, 1, k] = gaps[i]
             if anchored and seen:

@@ -1,4 +1,4 @@
-"""First stage and spool of one lane over a tick with events."""
+"""First stage and spool of one lane over a tick with events, and the jack beside them."""
 
 from __future__ import annotations
 
@@ -15,16 +15,23 @@ from ehadiag.model.lanelayout import (
     CLAMPED,
     DAMPING,
     DIRECTION,
+    DONE,
     DRY,
     DYNAMIC,
     FLAPPER,
     FLAPPER_RATE,
+    FRESH,
+    JACK,
+    JACK_DIRECTION,
+    JACK_FRICTION,
+    JACK_VELOCITY,
     LANES,
+    NODES,
     PLACE,
-    SLOPE,
     SPOOL,
     SPOOL_RATE,
 )
+from ehadiag.model.lanestops import jack_piece
 from ehadiag.model.lanetables import GRID
 from ehadiag.model.spoolevents import (
     BREAKAWAY,
@@ -87,6 +94,10 @@ def _event_tick(
     xs, vs = state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i]
     direction, clamped = int(state[DIRECTION * LANES + i]), state[CLAMPED * LANES + i] != 0.0
     done, single = 0, False
+    from_xs, from_vs, since = xs, vs, 0
+    friction = coefficients[JACK_FRICTION * LANES + i]
+    place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
+    d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
     while done < WHOLE:
         grid = GRID - (done & (GRID - 1))
         step = 1 if single else grid
@@ -148,6 +159,8 @@ def _event_tick(
             else:
                 step = (low + high) >> 1
         done += step
+        since += step
+        end_vs = new_vs
         xf, wf, xs, vs = new_xf, new_wf, new_xs, new_vs
         if event == REVERSAL:
             vs, direction = 0.0, 0
@@ -161,9 +174,17 @@ def _event_tick(
             xf, wf, clamped = math.copysign(c.XFM, xf), 0.0, True
         elif event == RELEASE:
             clamped = False
-        if done & (GRID - 1) == 0:
-            path[(PLACE + done // GRID) * LANES + i] = xs
-            path[(SLOPE + done // GRID) * LANES + i] = vs
+        if event > NOTHING or done & (2 * GRID - 1) == 0:
+            span = since * unit
+            place, velocity, d, fresh = jack_piece(
+                c, friction, span, from_xs, xs, from_vs * span, end_vs * span,
+                place, velocity, d, fresh,
+            )  # fmt: skip
+            from_xs, from_vs, since = xs, vs, 0
+    path[(PLACE + NODES) * LANES + i] = xs
+    state[DONE * LANES + i] = 1.0
+    state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
+    state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = xf, wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = xs, vs
     state[DIRECTION * LANES + i] = direction

@@ -1,13 +1,18 @@
 """Second stage and jack of many candidates: one lane each.
 
-The same equations as `ehadiag.model.jack`, written with one common denominator, so that a part
-needs no branch. A lane whose jack sticks, breaks away or crosses the closed orifice fast takes that
-part alone (`ehadiag.model.lanestops`).
+The equations of `ehadiag.model.jack` by Radau's collocation of order 5 (IIA, three stages; Hairer,
+Wanner, Solving Ordinary Differential Equations II, section IV.5), which damps what is stiff.
+Unknown are the pressures of the stages, not the velocities: with D = GQ max(abs(x), PSR/GP) +
+PSR CLK the second stage of model.md section 1 reads P12 = PSR (GQ x - AJ v) / D at any x, so the
+stages' equations are linear with coefficients that need no division, no branch and no exponential,
+and a step takes one division, for the last stage's pressure. A lane whose jack sticks, breaks away
+or meets its stop takes that step alone (`ehadiag.model.lanestops`).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +20,8 @@ from numpy.typing import NDArray
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.lanelayout import (
     BUSY,
-    DIVIDE,
-    EASE,
+    DONE,
+    FRESH,
     JACK,
     JACK_DIRECTION,
     JACK_FRICTION,
@@ -25,124 +30,178 @@ from ehadiag.model.lanelayout import (
     NODES,
     PLACE,
     PRESSURE,
-    RATE,
     SLOPE,
+)
+from ehadiag.model.lanevector import (
+    WIDTH,
+    anywhere,
+    least,
+    load,
+    magnitude,
+    most,
     packed,
-    packed_inline,
+    store,
+    where,
 )
 
-__all__ = ["jack_lanes", "jack_step", "pressures"]
+__all__ = ["C1", "C2", "divide", "jack_lanes", "last_velocity", "pressures"]
 
-COARSE_TRAVEL = 8.0e-6
-COARSE_RATIO = 0.5
-"""Spool travel within a part (m, or share of the distance from the middle) to be cut up."""
-CORNER_TRAVEL = 2.0e-6
-"""The same where the part passes the opening at which the pressure gain saturates, m."""
-FINE_TRAVEL = 1.5e-6
-MOST_CUTS = 32
-DRIFT = -0.45
-
-
-@packed_inline
-def _fade(z: float) -> float:
-    """exp(-z) for z >= 0, absolute error below 1e-7: a polynomial at z / 64, then squarings."""
-    y = min(z, 40.0) * (-1.0 / 64.0)
-    e = 1.0 / 24.0 + y * (1.0 / 120.0 + y * (1.0 / 720.0 + y * (1.0 / 5040.0)))
-    e = 1.0 + y * (1.0 + y * (0.5 + y * (1.0 / 6.0 + y * e)))
-    e *= e
-    e *= e
-    e *= e
-    e *= e
-    e *= e
-    return e * e
+ROOT = math.sqrt(6.0)
+C1, C2 = (4.0 - ROOT) / 10.0, (4.0 + ROOT) / 10.0
+A11, A12, A13 = (
+    (88.0 - 7.0 * ROOT) / 360.0,
+    (296.0 - 169.0 * ROOT) / 1800.0,
+    (3.0 * ROOT - 2.0) / 225.0,
+)
+A21, A22, A23 = (
+    (296.0 + 169.0 * ROOT) / 1800.0,
+    (88.0 + 7.0 * ROOT) / 360.0,
+    -(3.0 * ROOT + 2.0) / 225.0,
+)
+A31, A32, A33 = (16.0 - ROOT) / 36.0, (16.0 + ROOT) / 36.0, 1.0 / 9.0
 
 
-@packed_inline
-def jack_step(
-    c: PlantConstants, load: float, span: float,
-    x0: float, divide0: float, ease0: float, rate0: float,
-    x1: float, v1: float, divide1: float, ease1: float, rate1: float,
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """Velocity of the moving jack over a part, p0 + p1 t + p2 t² + (v - p0) exp(-rate t).
+COARSE_TRAVEL = 10.0e-6
+"""Spool travel in a step (m, or the distance from the middle) from which a lane goes alone."""
+CORNER_TRAVEL = 3.0e-6
+"""The same where the step passes the opening at which the pressure gain saturates, m."""
 
-    See `ehadiag.model.jack._approach`. With D = GQ max(abs(x), PSR/GP) + PSR CLK the second stage
-    gives g PS = PSR GQ x / D and g R = PSR / D at any x, so the steady velocity is
-    (AJ PSR GQ x - load D) / (AJ² PSR + CJ D) and tau = MJ D / (AJ² PSR + CJ D).
+
+def _stages() -> NDArray[np.float64]:
+    """Where the first two stages of a step stand on the spool's path, shape (3, NODES, 2, 5).
+
+    For a tick cut into 1, 2 or 4 steps, and each step: the node before, and Hermite's weights of
+    place before and after and of slope (by the length of the tick) before and after.
     """
-    gain, by_span = c.AJ * c.PSR * c.GQ, 1.0 / span
-    steady0 = (gain * x0 - load * divide0) * ease0
-    steady1 = (gain * x1 - load * divide1) * ease1
-    turn = math.copysign(c.GQ, x1) if abs(x1) > c.PSR / c.GP else 0.0
-    slope1 = v1 * (gain - (load + steady1 * c.CJ) * turn) * ease1
-    mean = (steady1 - steady0) * by_span
-    tau0, tau1 = c.MJ * divide0 * ease0, c.MJ * divide1 * ease1
-    drift = max((tau1 - tau0) * by_span, DRIFT)
-    once, twice = 1.0 + drift, 1.0 + 2.0 * drift
-    both, sum_tau = once * twice, tau0 + tau1
-    inverse = 1.0 / (both * sum_tau)
-    share = inverse * sum_tau
-    p2 = (slope1 - mean) * by_span * once * share
-    p1 = (2.0 * mean - slope1 - 2.0 * p2 * tau0) * twice * share
-    p0 = steady0 - tau0 * p1
-    return p0, p1, p2, (rate0 + rate1) * (1.0 / 6.0) + inverse * both * (4.0 / 3.0)
+    out = np.zeros((3, NODES, 2, 5))
+    for level in range(3):
+        for step in range(1 << level):
+            for stage, share in enumerate((C1, C2)):
+                where = (step + share) / (1 << level) * NODES
+                node = int(where)
+                u = where - node
+                out[level, step, stage] = (
+                    node,
+                    (1.0 + 2.0 * u) * (1.0 - u) ** 2,
+                    u * u * (3.0 - 2.0 * u),
+                    u * (1.0 - u) ** 2 / NODES,
+                    u * u * (u - 1.0) / NODES,
+                )
+    return out
+
+
+STAGES = _stages()
+
+
+@packed
+def divide(c: PlantConstants, width: Any) -> Any:
+    """Common denominator D of the second stage, its opening `width` (m) no less than PSR / GP."""
+    return c.GQ * width + c.PSR * c.CLK
+
+
+@packed
+def opening(c: PlantConstants, x: Any) -> Any:
+    """Opening from which both gains follow, spool at x, in many lanes, m."""
+    return most(magnitude(x), c.PSR / c.GP)
+
+
+@packed
+def last_velocity(
+    c: PlantConstants, h: float, load: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, width1: Any, width2: Any, width3: Any,
+) -> Any:  # fmt: skip
+    """Velocity (m/s) of the moving jack after a step of `h` seconds.
+
+    load: external and friction force, N; x1, x2, x3: spool at the three stages, m;
+    width1, width2, width3: openings there, m. Numbers or vectors of them.
+    """
+    # E = D / (PSR AJ): velocity that a pressure takes; y: velocity without load.
+    scale, k = 1.0 / (c.PSR * c.AJ), h / c.MJ
+    e1, e2 = divide(c, width1) * scale, divide(c, width2) * scale
+    e3 = divide(c, width3) * scale
+    flow, thrust, drag = c.GQ / c.AJ, k * c.AJ, k * c.CJ
+    y1, y2, y3 = flow * x1, flow * x2, flow * x3
+    f1, f2, f3 = thrust + drag * e1, thrust + drag * e2, thrust + drag * e3
+    z1 = y1 + drag * (A11 * y1 + A12 * y2 + A13 * y3) + k * C1 * load - velocity
+    z2 = y2 + drag * (A21 * y1 + A22 * y2 + A23 * y3) + k * C2 * load - velocity
+    z3 = y3 + drag * (A31 * y1 + A32 * y2 + A33 * y3) + k * load - velocity
+    m11, m12, m13 = e1 + A11 * f1, A12 * f2, A13 * f3
+    m21, m22, m23 = A21 * f1, e2 + A22 * f2, A23 * f3
+    m31, m32, m33 = A31 * f1, A32 * f2, e3 + A33 * f3
+    # Cramer's rule for the last stage's pressure.
+    minor = m11 * m22 - m12 * m21
+    above = m31 * (m12 * z2 - z1 * m22) - m32 * (m11 * z2 - z1 * m21) + z3 * minor
+    below = m31 * (m12 * m23 - m13 * m22) - m32 * (m11 * m23 - m13 * m21) + m33 * minor
+    return y3 - e3 * above / below
 
 
 @packed
 def jack_lanes(
     c: PlantConstants,
-    begin: int,
-    end: int,
-    span: float,
+    level: int,
+    step: int,
+    tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
-) -> int:
-    """Jack of all lanes from one node of the path to another, `span` s later.
+) -> bool:
+    """Jack of all lanes over one of the 2^level steps of a tick.
 
-    Lanes with an event are marked BUSY and left as they were; returns their number.
+    Lanes with an event are marked BUSY and left as they were; returns whether there are any.
     """
-    busy = 0
-    gain, flow = c.AJ * c.PSR * c.GQ, c.AJ * c.AJ * c.PSR
-    corner, leak, by_MJ = c.PSR / c.GP, c.PSR * c.CLK, 1.0 / c.MJ
-    for i in range(LANES):
-        x0, x1 = path[(PLACE + begin) * LANES + i], path[(PLACE + end) * LANES + i]
-        v1 = path[(SLOPE + end) * LANES + i]
-        place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
-        d = state[JACK_DIRECTION * LANES + i]
-        divide0, ease0 = state[DIVIDE * LANES + i], state[EASE * LANES + i]
-        rate0 = state[RATE * LANES + i]
-        friction = coefficients[JACK_FRICTION * LANES + i]
-        divide1 = c.GQ * max(abs(x1), corner) + leak
-        stiff = flow + c.CJ * divide1
-        inverse = 1.0 / (divide1 * stiff)
-        ease1, by_divide = inverse * divide1, inverse * stiff
-        rate1 = stiff * by_divide * by_MJ
-        p0, p1, p2, rate = jack_step(
-            c, c.FR + d * friction, span, x0, divide0, ease0, rate0, x1, v1, divide1, ease1, rate1
+    any_busy = False
+    h = tick / (1 << level)
+    first, second = STAGES[level, step, 0], STAGES[level, step, 1]
+    p1, q1, r1, s1 = first[1], first[2], first[3] * tick, first[4] * tick
+    p2, q2, r2, s2 = second[1], second[2], second[3] * tick, second[4] * tick
+    for o in range(0, LANES, WIDTH):
+        a = int(first[0]) * LANES + o
+        b = a + LANES
+        x1 = p1 * load(path, a) + q1 * load(path, b)
+        x1 = x1 + r1 * load(path, SLOPE * LANES + a) + s1 * load(path, SLOPE * LANES + b)
+        a = int(second[0]) * LANES + o
+        b = a + LANES
+        x2 = p2 * load(path, a) + q2 * load(path, b)
+        x2 = x2 + r2 * load(path, SLOPE * LANES + a) + s2 * load(path, SLOPE * LANES + b)
+        x0 = load(path, (PLACE + step * (NODES >> level)) * LANES + o)
+        x3 = load(path, (PLACE + (step + 1) * (NODES >> level)) * LANES + o)
+        place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
+        d = load(state, JACK_DIRECTION * LANES + o)
+        friction = load(coefficients, JACK_FRICTION * LANES + o)
+        width1, width2, width3 = opening(c, x1), opening(c, x2), opening(c, x3)
+        later = last_velocity(
+            c, h, c.FR + d * friction, velocity, x1, x2, x3, width1, width2, width3
         )
-        later = p0 + span * (p1 + span * p2) + (velocity - p0) * _fade(span * rate)
-        moved = place + 0.5 * span * (velocity + later)
-        push = gain * x1 * by_divide - c.FR
-        near = min(abs(x0), abs(x1)) if x0 * x1 > 0.0 else 0.0
-        coarse = abs(x1 - x0) > max(COARSE_TRAVEL, COARSE_RATIO * near)
-        coarse |= ((abs(x0) - corner) * (abs(x1) - corner) < 0.0) & (abs(x1 - x0) > CORNER_TRAVEL)
-        still = d == 0.0
-        slides = (d != 0.0) & (later * d > 0.0) & (abs(moved) < c.XJM) & (not coarse)
-        fine = slides | (still & (abs(push) <= 2.0 * friction))
-        state[JACK * LANES + i] = moved if slides else place
-        state[JACK_VELOCITY * LANES + i] = later if slides else velocity
-        state[DIVIDE * LANES + i] = divide1 if fine else divide0
-        state[EASE * LANES + i] = ease1 if fine else ease0
-        state[RATE * LANES + i] = rate1 if fine else rate0
-        state[BUSY * LANES + i] = 0.0 if fine else 1.0
-        busy += int(not fine)
-    return busy
+        moved = place + 0.5 * h * (velocity + later)
+        slides = (later * d > 0.0) & (magnitude(moved) < c.XJM)
+        # At rest: the force of the second stage, times D, against what holds.
+        push = c.AJ * c.PSR * c.GQ * x3 - c.FR * divide(c, width3)
+        held = magnitude(push) <= 2.0 * friction * divide(c, width3)
+        # What the collocation does not follow: a fresh start, a fast way past the closed orifice.
+        near = where(x0 * x3 > 0.0, least(magnitude(x0), magnitude(x3)), 0.0)
+        travel = magnitude(x3 - x0)
+        corner = c.PSR / c.GP
+        coarse = travel > most(near, COARSE_TRAVEL)
+        coarse = coarse | (
+            (near < corner) & (most(width3, magnitude(x0)) > corner) & (travel > CORNER_TRAVEL)
+        )
+        slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
+        done = load(state, DONE * LANES + o) != 0.0
+        slides = slides & ~done
+        fine = slides | done | ((d == 0.0) & held)
+        store(state, JACK * LANES + o, where(slides, moved, place))
+        store(state, JACK_VELOCITY * LANES + o, where(slides, later, velocity))
+        store(state, BUSY * LANES + o, where(fine, 0.0, 1.0))
+        if anywhere(~fine):
+            any_busy = True
+    return any_busy
 
 
 @packed
 def pressures(c: PlantConstants, state: NDArray[np.float64], path: NDArray[np.float64]) -> None:
     """Differential pressure of all lanes at the end of a tick, into the state."""
-    for i in range(LANES):
-        flow = c.GQ * path[(PLACE + NODES) * LANES + i] - c.AJ * state[JACK_VELOCITY * LANES + i]
-        p12 = c.PSR * flow / state[DIVIDE * LANES + i]
-        state[PRESSURE * LANES + i] = min(max(p12, -c.PSR), c.PSR)
+    for o in range(0, LANES, WIDTH):
+        x = load(path, (PLACE + NODES) * LANES + o)
+        flow = c.GQ * x - c.AJ * load(state, JACK_VELOCITY * LANES + o)
+        p12 = c.PSR * flow / divide(c, opening(c, x))
+        store(state, PRESSURE * LANES + o, most(least(p12, c.PSR), -c.PSR))

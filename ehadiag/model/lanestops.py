@@ -1,4 +1,4 @@
-"""Second stage and jack of one lane over a part with events."""
+"""Second stage and jack of one lane over a step in which it stops or starts."""
 
 from __future__ import annotations
 
@@ -7,141 +7,188 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import inlined, kernel
+from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.lanejack import jack_step
+from ehadiag.model.lanejack import C1, C2, divide, last_velocity
 from ehadiag.model.lanelayout import (
     BUSY,
-    DIVIDE,
-    EASE,
+    FRESH,
     JACK,
     JACK_DIRECTION,
     JACK_FRICTION,
     JACK_VELOCITY,
     LANES,
-    PLACE,
-    RATE,
+    NODES,
     SLOPE,
 )
+from ehadiag.model.lanevector import packed
 
-__all__ = ["jack_events"]
+__all__ = ["jack_events", "jack_piece"]
 
-FINE_TRAVEL = 1.5e-6
+FINE_TRAVEL = 2.0e-6
+FINE_RATIO = 0.3
+"""Spool travel within a part (m, or share of the distance from the middle)."""
+FRESH_DECAY = 1.0
+"""Decay (power of e) of the jack's velocity within a part, where it starts or stops."""
 MOST_CUTS = 32
-SHORTEST = 1e-9
+ITERATIONS = 30
+SHORTEST = 1e-6
+"""Share of a piece that counts as nothing."""
 
 
-@inlined
-def _denominator(c: PlantConstants, x: float) -> tuple[float, float, float]:
-    """What `jack_step` wants to know of a spool position."""
-    divide = c.GQ * max(abs(x), c.PSR / c.GP) + c.PSR * c.CLK
-    stiff = c.AJ * c.AJ * c.PSR + c.CJ * divide
-    return divide, 1.0 / stiff, stiff / (divide * c.MJ)
+@packed
+def _place(q: float, x0: float, x1: float, rise0: float, rise1: float) -> float:
+    """Spool at the share q of a piece of its path, m."""
+    r = 1.0 - q
+    return x0 + q * q * (3.0 - 2.0 * q) * (x1 - x0) + q * r * (r * rise0 - q * rise1)
 
 
-@inlined
-def _zero(p0: float, p1: float, p2: float, excess: float, rate: float, span: float) -> float:
-    """First time, s, where the velocity, not 0 before and turned at `span`, is 0: regula falsi."""
-    low, high = 0.0, span
-    at_low = p0 + excess
-    at_high = p0 + span * (p1 + span * p2) + excess * math.exp(-span * rate)
-    for _ in range(30):
-        if at_low == at_high:
-            break
-        t = low + (high - low) * at_low / (at_low - at_high)
-        value = p0 + t * (p1 + t * p2) + excess * math.exp(-t * rate)
-        if value * at_low > 0.0:
-            low, at_low = t, value
-            at_high *= 0.5
+@packed
+def _velocity(
+    c: PlantConstants, load: float, velocity: float, span: float, begin: float, end: float,
+    x0: float, x1: float, rise0: float, rise1: float,
+) -> float:  # fmt: skip
+    """Velocity of the moving jack at the share `end` of a piece, `velocity` at `begin`, m/s."""
+    step, corner = end - begin, c.PSR / c.GP
+    first = _place(begin + C1 * step, x0, x1, rise0, rise1)
+    second = _place(begin + C2 * step, x0, x1, rise0, rise1)
+    third = _place(end, x0, x1, rise0, rise1)
+    return last_velocity(
+        c,
+        step * span,
+        load,
+        velocity,
+        first,
+        second,
+        third,
+        max(abs(first), corner),
+        max(abs(second), corner),
+        max(abs(third), corner),
+    )
+
+
+@packed
+def _excess(
+    c: PlantConstants, hold: float, q: float, x0: float, x1: float, rise0: float, rise1: float
+) -> float:
+    """Force on the jack at rest beyond `hold` (positive away from it), times D."""
+    x = _place(q, x0, x1, rise0, rise1)
+    return c.AJ * c.PSR * c.GQ * x - (c.FR + hold) * divide(c, max(abs(x), c.PSR / c.GP))
+
+
+@kernel
+def jack_piece(
+    c: PlantConstants,
+    friction: float,
+    span: float,
+    x0: float,
+    x1: float,
+    rise0: float,
+    rise1: float,
+    place: float,
+    velocity: float,
+    d: float,
+    fresh: float,
+) -> tuple[float, float, float, float]:
+    """Jack of one lane over a piece of the spool's path: `span` in s, rises in m.
+
+    d: direction of its motion, 0 at rest; fresh: not 0 if it has just started or stopped.
+    Returns place, velocity, d and fresh afterwards.
+    """
+    near = min(abs(x0), abs(x1)) if x0 * x1 > 0.0 else 0.0
+    wanted = abs(x1 - x0) / max(FINE_TRAVEL, FINE_RATIO * near)
+    # The collocation is slow to forget what a start or a stop leaves.
+    scale = divide(c, max(near, c.PSR / c.GP))
+    decay = span * (c.AJ * c.AJ * c.PSR / scale + c.CJ) / c.MJ
+    if d == 0.0 or fresh != 0.0:
+        wanted = max(wanted, decay / FRESH_DECAY)
+    cuts = min(MOST_CUTS, 1 + int(wanted))
+    q, cut, fresh = 0.0, 1, 0.0
+    while cut <= cuts:
+        end = cut / cuts
+        if d == 0.0:
+            hold = 2.0 * friction
+            up = _excess(c, hold, end, x0, x1, rise0, rise1)
+            down = _excess(c, -hold, end, x0, x1, rise0, rise1)
+            if (up <= 0.0 and down >= 0.0) or (abs(place) >= c.XJM and place * (up + down) > 0.0):
+                q, cut = end, cut + 1
+                continue
+            d = 1.0 if up > 0.0 else -1.0
+            hold *= d
+            low, high = q, end
+            at_low = _excess(c, hold, q, x0, x1, rise0, rise1) * d
+            at_high = up if d > 0.0 else -down
+            if at_low < 0.0:
+                for _ in range(ITERATIONS):
+                    q = low + (high - low) * at_low / (at_low - at_high)
+                    value = _excess(c, hold, q, x0, x1, rise0, rise1) * d
+                    if value < 0.0:
+                        low, at_low = q, value
+                        at_high *= 0.5
+                    else:
+                        high, at_high = q, value
+                        at_low *= 0.5
+                    if high - low < SHORTEST or abs(value) < 1e-9 * abs(hold):
+                        break
+            velocity, fresh = 0.0, 1.0
+        load = c.FR + d * friction
+        later = _velocity(c, load, velocity, span, q, end, x0, x1, rise0, rise1)
+        if later * d > 0.0:
+            place += 0.5 * (end - q) * span * (velocity + later)
+            velocity = later
+            if abs(place) >= c.XJM and place * velocity > 0.0:
+                place = math.copysign(c.XJM, place)
+                velocity, d = 0.0, 0.0
+            q, cut = end, cut + 1
+            continue
+        if velocity != 0.0:
+            low, high, at_low, at_high = q, end, velocity * d, later * d
+            for _ in range(ITERATIONS):
+                if at_low == at_high:
+                    break
+                t = low + (high - low) * at_low / (at_low - at_high)
+                value = _velocity(c, load, velocity, span, q, t, x0, x1, rise0, rise1) * d
+                if value > 0.0:
+                    low, at_low = t, value
+                    at_high *= 0.5
+                else:
+                    high, at_high = t, value
+                    at_low *= 0.5
+                if high - low < SHORTEST or abs(value) < 1e-12:
+                    high = t
+                    break
+            q = high
         else:
-            high, at_high = t, value
-            at_low *= 0.5
-        if high - low < SHORTEST or abs(value) < 1e-12:
-            return t
-    return high
+            q = end
+        velocity, d, fresh = 0.0, 0.0, 1.0
+        if end - q < SHORTEST:
+            q, cut = end, cut + 1
+    return place, velocity, d, fresh
 
 
 @kernel
 def jack_events(
     c: PlantConstants,
-    begin: int,
-    end: int,
-    span: float,
+    level: int,
+    step: int,
+    tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Jack of BUSY lanes over a part in which it stops, starts or crosses the closed orifice."""
+    """Jack of BUSY lanes over one of the 2^level steps of a tick, piece by piece of the path."""
+    span = tick / NODES
     for i in range(LANES):
-        if state[BUSY * LANES + i] != 0.0:
-            _jack_event(c, i, begin, end, span, state, path, coefficients)
-
-
-@inlined
-def _jack_event(
-    c: PlantConstants,
-    i: int,
-    begin: int,
-    end: int,
-    span: float,
-    state: NDArray[np.float64],
-    path: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
-) -> None:
-    """Lane `i`."""
-    place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
-    direction = state[JACK_DIRECTION * LANES + i]
-    friction = coefficients[JACK_FRICTION * LANES + i]
-    gain = c.AJ * c.PSR * c.GQ
-    x, target = path[(PLACE + begin) * LANES + i], path[(PLACE + end) * LANES + i]
-    rise0, rise1 = path[(SLOPE + begin) * LANES + i] * span, path[(SLOPE + end) * LANES + i] * span
-    origin, cuts = x, min(MOST_CUTS, 1 + int(abs(target - x) / FINE_TRAVEL))
-    divide, ease, rate = _denominator(c, x)
-    for cut in range(1, cuts + 1):
-        q = cut / cuts
-        r = 1.0 - q
-        end_x = origin + q * q * (3.0 - 2.0 * q) * (target - origin)
-        end_x += q * r * (r * rise0 - q * rise1)
-        slope = 6.0 * q * r * (target - origin) + r * (1.0 - 3.0 * q) * rise0
-        slope = (slope + q * (3.0 * q - 2.0) * rise1) / span
-        end_divide, end_ease, end_rate = _denominator(c, end_x)
-        left = span / cuts
-        while left > SHORTEST:
-            if direction == 0.0:
-                push0 = gain * x / divide - c.FR
-                push1 = gain * end_x / end_divide - c.FR
-                blocked = abs(place) >= c.XJM and place * push1 > 0.0
-                if abs(push1) <= 2.0 * friction or blocked:
-                    break
-                direction = 1.0 if push1 > 0.0 else -1.0
-                if push0 * direction <= 2.0 * friction:
-                    wait = (2.0 * friction * direction - push0) / (push1 - push0)
-                    x += wait * (end_x - x)
-                    divide, ease, rate = _denominator(c, x)
-                    left -= wait * left
-                continue
-            p0, p1, p2, decay = jack_step(
-                c, c.FR + direction * friction, left,
-                x, divide, ease, rate, end_x, slope, end_divide, end_ease, end_rate,
+        if state[BUSY * LANES + i] == 0.0:
+            continue
+        place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
+        d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
+        for n in range(step * (NODES >> level), (step + 1) * (NODES >> level)):
+            a, b = n * LANES + i, (n + 1) * LANES + i
+            place, velocity, d, fresh = jack_piece(
+                c, coefficients[JACK_FRICTION * LANES + i], span, path[a], path[b],
+                span * path[SLOPE * LANES + a], span * path[SLOPE * LANES + b],
+                place, velocity, d, fresh,
             )  # fmt: skip
-            excess = velocity - p0
-            fade = math.exp(-left * decay)
-            later = p0 + left * (p1 + left * p2) + excess * fade
-            if later * direction > 0.0:
-                place += left * (p0 + left * (0.5 * p1 + left * p2 / 3.0))
-                place += excess * (1.0 - fade) / decay
-                velocity = later
-                if abs(place) >= c.XJM and place * velocity > 0.0:
-                    place = math.copysign(c.XJM, place)
-                    velocity, direction = 0.0, 0.0
-                break
-            moved = left if velocity == 0.0 else _zero(p0, p1, p2, excess, decay, left)
-            x += moved / left * (end_x - x)
-            divide, ease, rate = _denominator(c, x)
-            left -= moved
-            velocity, direction = 0.0, 0.0
-        x, divide, ease, rate = end_x, end_divide, end_ease, end_rate
-    state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
-    state[JACK_DIRECTION * LANES + i] = direction
-    state[DIVIDE * LANES + i], state[EASE * LANES + i] = divide, ease
-    state[RATE * LANES + i] = rate
+        state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
+        state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh

@@ -19,8 +19,8 @@ from ehadiag.model.lanelayout import (
     REST,
     ROOM,
     SPOOL_OFFSET,
-    packed,
 )
+from ehadiag.model.lanevector import WIDTH, load, store
 from ehadiag.model.transition import FINEST, TAYLOR_HALVINGS
 
 __all__ = ["GRID", "MOVING_SIZE", "STUCK_SIZE", "tabulate"]
@@ -32,29 +32,30 @@ STUCK_SIZE = (GRID + 1) * 4
 TAYLOR_ORDER = 8
 
 
-@packed
+@kernel
 def _product(
     a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.float64], n: int, scale: float
 ) -> None:
-    """Product of the n x n matrices of all lanes, times `scale`; shape (n * n, LANES)."""
+    """Product of the n x n matrices of all lanes, times `scale`; flat, element by element."""
     for r in range(n):
         for q in range(n):
-            row = out[r * n + q]
-            row[:] = 0.0
-            for k in range(n):
-                x, y = a[r * n + k], b[k * n + q]
-                for i in range(LANES):
-                    row[i] += scale * x[i] * y[i]
+            for o in range(0, LANES, WIDTH):
+                total = load(a, r * n * LANES + o) * load(b, q * LANES + o)
+                for k in range(1, n):
+                    x, y = load(a, (r * n + k) * LANES + o), load(b, (k * n + q) * LANES + o)
+                    total = total + x * y
+                store(out, (r * n + q) * LANES + o, total * scale)
 
 
-@packed
+@kernel
 def _smallest(rates: NDArray[np.float64], n: int, tick: float) -> NDArray[np.float64]:
     """exp(rates h) for the finest step: Taylor at a still smaller one, then squaring."""
     scaled = rates * (tick / 2.0 ** (FINEST + TAYLOR_HALVINGS))
     term, power, spare = np.zeros_like(rates), np.zeros_like(rates), np.zeros_like(rates)
     for r in range(n):
-        term[r * n + r] = 1.0
-        power[r * n + r] = 1.0
+        start = (r * n + r) * LANES
+        term[start : start + LANES] = 1.0
+        power[start : start + LANES] = 1.0
     for order in range(1, TAYLOR_ORDER + 1):
         _product(term, scaled, spare, n, 1.0 / order)
         term, spare = spare, term
@@ -84,7 +85,7 @@ def tabulate(
         (LANES * (GRID + 1) * 16,).
     stuck: out, the same with the spool at rest, for all lanes, shape ((GRID + 1) * 4,).
     """
-    rates, ring = np.zeros((16, LANES)), np.zeros((4, LANES))
+    rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
     force = c.AS * c.GPF
     for i in range(LANES):
         flow_gain = c.GQF * (1.0 - 0.8 * candidates[i, 0])
@@ -98,30 +99,38 @@ def tabulate(
         coefficients[JACK_FRICTION * LANES + i] = c.FDJ0 + candidates[i, 2] * (c.FDJ1 - c.FDJ0)
         coefficients[SPOOL_OFFSET * LANES + i] = candidates[i, 3]
         coefficients[PRESSURE_OFFSET * LANES + i] = candidates[i, 4]
-        rates[1, i], rates[11, i] = 1.0, 1.0
-        rates[4, i], rates[5, i], rates[6, i] = -c.KF / c.JF, -c.CF / c.JF, -c.KSF / c.JF
-        rates[12, i], rates[15, i] = force / c.MS, -damping / c.MS
-        ring[1, i], ring[2, i], ring[3, i] = 1.0, -c.KF / c.JF, -c.CF / c.JF
-    one, spare = _smallest(rates, 4, tick), np.empty((16, LANES))
+        rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
+        rates[4 * LANES + i], rates[5 * LANES + i], rates[6 * LANES + i] = (
+            -c.KF / c.JF,
+            -c.CF / c.JF,
+            -c.KSF / c.JF,
+        )
+        rates[12 * LANES + i], rates[15 * LANES + i] = force / c.MS, -damping / c.MS
+        ring[1 * LANES + i], ring[2 * LANES + i], ring[3 * LANES + i] = (
+            1.0,
+            -c.KF / c.JF,
+            -c.CF / c.JF,
+        )
+    one, spare = _smallest(rates, 4, tick), np.empty(16 * LANES)
     power = one.copy()
     for j in range(1, GRID + 1):
         for i in range(LANES):
             for e in range(16):
-                moving[(i * (GRID + 1) + j) * 16 + e] = power[e, i]
+                moving[(i * (GRID + 1) + j) * 16 + e] = power[e * LANES + i]
         if j < GRID:
             _product(power, one, spare, 4, 1.0)
             power, spare = spare, power
     _product(power, power, spare, 4, 1.0)
-    coefficients[MOVE * LANES : (MOVE + 16) * LANES] = spare.ravel()
-    one, spare = _smallest(ring, 2, tick), np.empty((4, LANES))
+    coefficients[MOVE * LANES : (MOVE + 16) * LANES] = spare
+    one, spare = _smallest(ring, 2, tick), np.empty(4 * LANES)
     power = one.copy()
     for j in range(1, GRID + 1):
         for e in range(4):
-            stuck[j * 4 + e] = power[e, 0]
+            stuck[j * 4 + e] = power[e * LANES]
         if j < GRID:
             _product(power, one, spare, 2, 1.0)
             power, spare = spare, power
     for _ in range(3):
         _product(power, power, spare, 2, 1.0)
         power, spare = spare, power
-    coefficients[REST * LANES : (REST + 4) * LANES] = power.ravel()
+    coefficients[REST * LANES : (REST + 4) * LANES] = power

@@ -137,6 +137,12 @@ def test_frames_of_a_slow_message_are_expected_at_its_pace():
     assert (nothing.accepted, nothing.lost) == (0, 4)
 
 
+def test_a_test_of_one_tick_holds_one_frame():
+    once = SimpleNamespace(first=100, ticks=1)
+    got = count_frames(counted([0, 1, 2], [1, 2, 3]), on_axis([99, 100, 101]), once, 0, 3)
+    assert (got.accepted, got.lost) == (1, 0)
+
+
 def test_two_streams_may_share_a_tick():
     frames = counted([0, 1, 2, 3, 4], stream=[1, 2, 1, 2, 2])
     got = count_frames(frames, on_axis([100, 100, 101, 101, 101]), TEST, 0, 5)
@@ -151,6 +157,8 @@ def test_frames_on_event_are_counted_by_their_numbers():
     got = count_frames(frames, None, TEST, 0, 4)
     assert (got.received, got.accepted, got.lost, got.out_of_order) == (4, 4, 1, 1)
     assert count_frames(frames, None, TEST, 7, 9).lost == 0
+    late_first = count_frames(counted([0, 1, 2], [5, 3, 6]), None, TEST, 0, 3)
+    assert (late_first.accepted, late_first.lost) == (3, 1)
     never = SimpleNamespace(first=0, ticks=0)
     assert count_frames(frames, on_axis([0] * 6), never, 0, 7).accepted == 5
 
@@ -159,4 +167,7 @@ def test_without_counter_and_ticks_only_damage_is_known():
     frames = counted([0, 2, 4], crc=[1], length=[3])
     got = count_frames(frames, None, TEST, 0, 4)
     assert (got.received, got.accepted, got.lost, got.repeated) == (4, 2, 0, 0)
+    assert count_frames(frames, None, TEST, 2, 5).accepted == 2
+    nothing = count_frames(frames, None, TEST, 6, 9)
+    assert (nothing.accepted, nothing.lost) == (0, 0)
     assert (got.crc_errors, got.length_errors) == (1, 1)

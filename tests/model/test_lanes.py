@@ -154,8 +154,9 @@ def test_offsets_and_missing_samples_count_as_in_the_scalar_kernel():
     assert here[0] < 10.0  # an offset or gap taken wrongly makes hundreds
     np.testing.assert_allclose(here[1], there[1], rtol=1e-3)
     rows[:, 3] = 0.0
+    # The scalar jack is up to 0.1 LSB off: 1 in 600 of 2 x 400 squares.
     np.testing.assert_allclose(
-        in_lanes(batch, rows, 25.0), one_by_one(batch, rows, 25.0), rtol=1e-2
+        in_lanes(batch, rows, 25.0), one_by_one(batch, rows, 25.0), rtol=2e-2
     )
 
 

@@ -31,7 +31,7 @@ typedef struct {
 } Spool;
 
 typedef struct {
-    double supply, resistance, gain, gain_resistance;
+    double spool, divide, by_divide, ease;
 } Valve;
 
 typedef struct {
@@ -202,26 +202,18 @@ static int spool_tick(const Plant *c, const Scalars *t, const double (*moving)[4
 
 static Valve valve(const Plant *c, double spool)
 {
-    double pressure = c->GP * spool;
-    if (fabs(pressure) <= c->PSR) {
-        double resistance = c->GP / c->GQ;
-        double share = 1.0 / (1.0 + resistance * c->CLK);
-        return (Valve){share * pressure, share * resistance, share * c->GP, 0.0};
-    }
-    double inverse = 1.0 / spool;
-    pressure = copysign(c->PSR, spool);
-    double resistance = pressure * inverse / c->GQ;
-    double share = 1.0 / (1.0 + resistance * c->CLK);
-    double slope = -share * share * resistance * inverse;
-    return (Valve){share * pressure, share * resistance, -pressure * c->CLK * slope, slope};
+    double divide = c->GQ * fmax(fabs(spool), c->PSR / c->GP) + c->PSR * c->CLK;
+    return (Valve){spool, divide, 1.0 / divide, 1.0 / (c->AJ * c->AJ * c->PSR + c->CJ * divide)};
 }
 
 static int parts_of(double origin, double target, double rise0, double rise1)
 {
+    double travel = fabs(target - origin), bend = 0.125 * fabs(rise1 - rise0);
     double nearest = origin * target <= 0.0 ? 0.0 : fmin(fabs(origin), fabs(target));
-    double by_travel = fabs(target - origin) / fmax(TRAVEL, RATIO * nearest);
-    double by_bend = sqrt(0.125 * fabs(rise1 - rise0) / PART_BEND);
-    double parts = 1.0 + floor(fmax(by_travel, by_bend));
+    double limit = fmax(TRAVEL, RATIO * nearest);
+    if (travel < limit && bend < PART_BEND)
+        return 1;
+    double parts = 1.0 + floor(fmax(travel / limit, sqrt(bend / PART_BEND)));
     return parts < MOST_PARTS ? (int)parts : MOST_PARTS;
 }
 
@@ -238,27 +230,27 @@ static double sign_change(const Approach *p, double span)
     return high;
 }
 
-static Approach approach(const Plant *c, double load, double span, double velocity,
-                         const Valve *from, const Valve *to, double rise)
+static Approach approach(const Plant *c, double load, double per_span, double velocity,
+                         const Valve *from, const Valve *to, double end_rate)
 {
-    double area2 = c->AJ * c->AJ;
-    double ease0 = 1.0 / (area2 * from->resistance + c->CJ);
-    double ease1 = 1.0 / (area2 * to->resistance + c->CJ);
-    double steady0 = (c->AJ * from->supply - load) * ease0;
-    double steady1 = (c->AJ * to->supply - load) * ease1;
-    double slope1 =
-        (c->AJ * to->gain * rise - steady1 * area2 * to->gain_resistance * rise) * ease1;
-    double mean = (steady1 - steady0) / span;
-    double bend = (slope1 - mean) / span;
-    double tau = c->MJ * ease0, end_tau = c->MJ * ease1;
-    double drift = fmax((end_tau - tau) / span, DRIFT);
+    double gain = c->AJ * c->PSR * c->GQ;
+    double steady = (gain * from->spool - load * from->divide) * from->ease;
+    double end_steady = (gain * to->spool - load * to->divide) * to->ease;
+    double turn = fabs(to->spool) > c->PSR / c->GP ? copysign(c->GQ, to->spool) : 0.0;
+    double slope = end_rate * (gain - (load + c->CJ * end_steady) * turn) * to->ease;
+    double mean = (end_steady - steady) * per_span;
+    double tau = c->MJ * from->divide * from->ease, end_tau = c->MJ * to->divide * to->ease;
+    double drift = fmax((end_tau - tau) * per_span, DRIFT);
+    double once = 1.0 + drift, twice = 1.0 + 2.0 * drift, both = tau + end_tau;
+    double inverse = 1.0 / (once * twice * both), share = inverse * both;
     Approach p;
-    p.p2 = bend / (1.0 + 2.0 * drift);
-    p.p1 = (2.0 * mean - slope1 - 2.0 * p.p2 * tau) / (1.0 + drift);
-    p.p0 = steady0 - tau * p.p1;
+    p.p2 = (slope - mean) * per_span * once * share;
+    p.p1 = (2.0 * mean - slope - 2.0 * p.p2 * tau) * twice * share;
+    p.p0 = steady - tau * p.p1;
     p.excess = velocity - p.p0;
-    p.rate = (area2 * (from->resistance + to->resistance) + 2.0 * c->CJ) / (6.0 * c->MJ)
-             + 4.0 / (3.0 * (tau + end_tau));
+    p.rate = (c->AJ * c->AJ * c->PSR * (from->by_divide + to->by_divide) + 2.0 * c->CJ)
+                 * (1.0 / (6.0 * c->MJ))
+             + inverse * once * twice * (4.0 / 3.0);
     return p;
 }
 
@@ -271,43 +263,50 @@ void eha_respond(const Plant *c, const Scalars *t, const double (*moving)[4][4],
     double nodes[ROOM][COLUMNS];
     Spool s = {0};
     double dynamic = c->FDJ0 + fdj * (c->FDJ1 - c->FDJ0), fixed = 2.0 * dynamic;
-    double velocity = 0.0, place = 0.0, direction = 0.0, spool = 0.0;
-    Valve now = valve(c, spool);
+    double gain = c->AJ * c->PSR * c->GQ;
+    double velocity = 0.0, place = 0.0, direction = 0.0;
+    Valve now = valve(c, 0.0);
     for (long k = 0; k < n; k++) {
         int count = spool_tick(c, t, moving, stuck, decay, c->GM * current[k], tick, &s, nodes);
         spool_out[k] = s.xs;
         for (int node = 0; node < count; node++) {
-            double span = nodes[node][0], start = spool, target = nodes[node][1];
+            double span = nodes[node][0], start = now.spool, target = nodes[node][1];
+            double per_span = 1.0 / span;
             double rise0 = span * nodes[node][2], rise1 = span * nodes[node][3];
             int parts = parts_of(start, target, rise0, rise1);
             for (int part = 1; part <= parts; part++) {
-                double left = span / parts, x = (double)part / parts, y = 1.0 - x;
-                double end_spool = start + x * x * (3.0 - 2.0 * x) * (target - start)
-                                   + x * y * (y * rise0 - x * rise1);
-                double rise = 6.0 * x * y * (target - start) + y * (1.0 - 3.0 * x) * rise0
-                              + x * (3.0 * x - 2.0) * rise1;
+                double left = span, per_left = per_span, end_spool = target, rise = rise1;
+                if (parts > 1) {
+                    double x = (double)part / parts, y = 1.0 - x;
+                    left = span / parts;
+                    per_left = per_span * parts;
+                    end_spool = start + x * x * (3.0 - 2.0 * x) * (target - start)
+                                + x * y * (y * rise0 - x * rise1);
+                    rise = 6.0 * x * y * (target - start) + y * (1.0 - 3.0 * x) * rise0
+                           + x * (3.0 * x - 2.0) * rise1;
+                }
                 Valve end = valve(c, end_spool);
                 while (left > SHORTEST) {
                     if (direction == 0.0) {
-                        double push0 = c->AJ * now.supply - c->FR;
-                        double push1 = c->AJ * end.supply - c->FR;
+                        double push0 = gain * now.spool * now.by_divide - c->FR;
+                        double push1 = gain * end.spool * end.by_divide - c->FR;
                         if (fabs(push1) <= fixed || (fabs(place) >= c->XJM && place * push1 > 0.0))
                             break;
                         direction = push1 > 0.0 ? 1.0 : -1.0;
                         if (push0 * direction <= fixed) {
                             double wait = (fixed * direction - push0) / (push1 - push0);
-                            spool += wait * (end_spool - spool);
-                            now = valve(c, spool);
+                            now = valve(c, now.spool + wait * (end_spool - now.spool));
                             left -= wait * left;
+                            per_left = 1.0 / fmax(left, SHORTEST);
                         }
                         continue;
                     }
-                    Approach p = approach(c, c->FR + direction * dynamic, left, velocity, &now,
-                                          &end, rise / span);
+                    Approach p = approach(c, c->FR + direction * dynamic, per_left, velocity, &now,
+                                          &end, rise * per_span);
                     double fade = exp(-left * p.rate);
                     double end_velocity = p.p0 + left * (p.p1 + left * p.p2) + p.excess * fade;
                     if (end_velocity * direction > 0.0) {
-                        place += left * (p.p0 + left * (0.5 * p.p1 + left * p.p2 / 3.0));
+                        place += left * (p.p0 + left * (0.5 * p.p1 + left * p.p2 * (1.0 / 3.0)));
                         place += p.excess * (1.0 - fade) / p.rate;
                         velocity = end_velocity;
                         if (fabs(place) >= c->XJM && place * velocity > 0.0) {
@@ -317,16 +316,15 @@ void eha_respond(const Plant *c, const Scalars *t, const double (*moving)[4][4],
                         break;
                     }
                     double moved = sign_change(&p, left);
-                    spool += moved / left * (end_spool - spool);
-                    now = valve(c, spool);
+                    now = valve(c, now.spool + moved * per_left * (end_spool - now.spool));
                     left -= moved;
+                    per_left = 1.0 / fmax(left, SHORTEST);
                     velocity = direction = 0.0;
                 }
-                spool = end_spool;
                 now = end;
             }
         }
-        double p12 = now.supply - now.resistance * c->AJ * velocity;
+        double p12 = c->PSR * (c->GQ * now.spool - c->AJ * velocity) * now.by_divide;
         pressure_out[k] = fmin(fmax(p12, -c->PSR), c->PSR);
         position_out[k] = place;
     }
