@@ -66,7 +66,10 @@ class PythonCanTransport(Transport):
         self._options = options
         self._bus = open_bus(options, transmit=transmit)
         _widen_buffer(self._bus)
-        self._line = _descriptor(self._bus) if options.interface == "slcan" else None
+        self._line = None
+        if options.interface == "slcan":
+            self._line = _descriptor(self._bus)
+            self._flush()  # opening takes seconds, and what came meanwhile is old
         self._bus_closed = False
         self._damaged = 0
         self._echoes = _EchoFilter() if options.interface in ECHOES else None
@@ -133,11 +136,14 @@ class PythonCanTransport(Transport):
         if self._options.interface != "slcan":
             return False
         if isinstance(error.__cause__, UnicodeDecodeError):
-            # python-can would stumble over the same bytes for ever.
-            with contextlib.suppress(Exception):
-                getattr(self._bus, "flush", list)()
+            self._flush()  # python-can would stumble over the same bytes for ever
             return True
         return isinstance(error, ValueError | IndexError | KeyError)
+
+    def _flush(self) -> None:
+        """Forget what waits in python-can's SLCAN and in the port."""
+        with contextlib.suppress(Exception):
+            getattr(self._bus, "flush", list)()
 
     def _send(self, frame: Frame) -> None:
         if self._echoes is not None:

@@ -51,7 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
         options.open_transport(arguments, transmit=True) as transport,
         stop_on_signals(after_s=arguments.duration) as stop,
     ):
-        names = ", ".join(f"{test.id} {test.name}" for test in tests)
+        names = ", ".join(
+            f"{test.id} {test.name}" for test in sorted(tests, key=lambda item: item.id)
+        )
         say(f"flight-control computer on {transport.name}, tests {names}; Ctrl-C stops it")
         ticks = run_emulator(core, transport, stop, tell=say)
         damage = f"; {transport.detail}" if transport.detail else ""
