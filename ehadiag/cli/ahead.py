@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -30,7 +31,8 @@ class Ahead:
         self._assembler = assembler
         self._due = list(online.due_s)
         self._work: queue.SimpleQueue[FrameTable | None] = queue.SimpleQueue()
-        self._over = False
+        self.ended_at: float | None = None
+        """When the word came that the test is complete, on `time.perf_counter`."""
         self._thread = threading.Thread(target=self._run, name="ehadiag-ahead", daemon=True)
         self._thread.start()
 
@@ -40,8 +42,9 @@ class Ahead:
         while self._due and progress.elapsed >= self._due[0] + MARGIN_S:
             self._due.pop(0)
             due = True
-        if progress.ended and not self._over:
-            self._over = due = True
+        if progress.ended and self.ended_at is None:
+            self.ended_at = time.perf_counter()
+            due = True
         if due:
             self._work.put(self._assembler.table())
 

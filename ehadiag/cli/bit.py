@@ -16,6 +16,7 @@ from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
 from ehadiag.errors import ConfigurationError
 from ehadiag.recording import Environment, Outcome, Quality, Recording
+from ehadiag.report.spent import Spent
 from ehadiag.storedtest import SAME_RATE, StoredTest, resolve_test
 from ehadiag.verdict import Levels
 
@@ -110,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
     begin = time.perf_counter()
     solver = make_solver(arguments.solver)
     online = OnlineIdentification(test, actuator, solver=solver, seed=arguments.seed)
-    recording, why, stem = _acquire(arguments, actuator, test, bus_map, folder, online)
+    recording, why, stem, ended_at = _acquire(arguments, actuator, test, bus_map, folder, online)
     read_s = time.perf_counter() - begin
     if why:
         result = not_tested(recording, test, actuator, [why])
@@ -127,8 +128,9 @@ def run(arguments: argparse.Namespace) -> int:
                 progress=progress,
                 memory=online.memory,
             )
-    show(result, arguments, read_s)
-    write_report(result, stem, arguments, read_s)
+    timing = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
+    show(result, arguments, timing)
+    write_report(result, stem, arguments, timing)
     return int(result.verdict)
 
 
@@ -168,8 +170,11 @@ def _acquire(
     bus_map: BusMap,
     folder: Path,
     online: OnlineIdentification,
-) -> tuple[Recording, str, Path]:
-    """Run the test on the bus; return the recording, why it is not one, and the files' stem."""
+) -> tuple[Recording, str, Path, float | None]:
+    """Run the test on the bus.
+
+    Returns the recording, why it is not one, the files' stem, and when the test was complete.
+    """
     from firmware_iface.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.limits import Limits  # noqa: PLC0415
     from firmware_iface.tester import run_test  # noqa: PLC0415
@@ -213,7 +218,8 @@ def _acquire(
     if outcome.degraded:
         say(outcome.degraded)
     why = "" if outcome.complete else outcome.why + _what_was_heard(recording, ours.name, listened)
-    return recording, why, path.with_suffix("") if not arguments.record else folder / path.stem
+    stem = path.with_suffix("") if not arguments.record else folder / path.stem
+    return recording, why, stem, ahead.ended_at
 
 
 def _connect(

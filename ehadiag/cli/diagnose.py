@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from ehadiag.cli import options
 from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
 from ehadiag.errors import EhadiagError
+from ehadiag.report.spent import Spent
 from ehadiag.storedtest import resolve_test
 from ehadiag.verdict import Levels
 
@@ -124,9 +125,9 @@ class _Diagnosis:
                 seed=self._arguments.seed,
                 progress=progress,
             )
-        show(result, self._arguments, read_s)
+        show(result, self._arguments, Spent(read_s))
         if self._folder is not None:
-            write_report(result, self._folder / self._unused(name), self._arguments, read_s)
+            write_report(result, self._folder / self._unused(name), self._arguments, Spent(read_s))
         return int(result.verdict)
 
     def _unused(self, name: str) -> str:

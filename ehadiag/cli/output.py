@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from ehadiag.diagnosis import Diagnosis
+    from ehadiag.report.spent import Spent
 
 __all__ = [
     "make_folder",
@@ -76,12 +77,12 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
         yield lambda stage, share: display.update(task, description=stage, completed=share)
 
 
-def show(diagnosis: Diagnosis, arguments: argparse.Namespace, read_s: float) -> None:
+def show(diagnosis: Diagnosis, arguments: argparse.Namespace, spent: Spent) -> None:
     """Print a diagnosis as JSON or as a table."""
     if arguments.json:
         from ehadiag.report.jsonline import json_line  # noqa: PLC0415
 
-        print(json_line(diagnosis, read_s, arguments.solver, arguments.seed), flush=True)
+        print(json_line(diagnosis, spent, arguments.solver, arguments.seed), flush=True)
     else:
         from ehadiag.report.table import print_diagnosis  # noqa: PLC0415
 
@@ -104,7 +105,7 @@ def make_folder(name: str) -> Path:
 
 
 def write_report(
-    diagnosis: Diagnosis, stem: Path, arguments: argparse.Namespace, read_s: float
+    diagnosis: Diagnosis, stem: Path, arguments: argparse.Namespace, spent: Spent
 ) -> None:
     """Write `stem`.json and, where a model was fitted, `stem`.png.
 
@@ -114,7 +115,7 @@ def write_report(
     """
     from ehadiag.report.jsonline import json_line  # noqa: PLC0415
 
-    line = json_line(diagnosis, read_s, arguments.solver, arguments.seed)
+    line = json_line(diagnosis, spent, arguments.solver, arguments.seed)
     path = stem.with_name(stem.name + ".json")
     try:
         path.write_text(line + "\n", encoding="utf-8")

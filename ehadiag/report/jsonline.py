@@ -10,18 +10,19 @@ from ehadiag.parameters import FAULT_NAMES
 
 if TYPE_CHECKING:
     from ehadiag.diagnosis import Diagnosis
+    from ehadiag.report.spent import Spent
 
 __all__ = ["SCHEMA", "json_line", "source_name", "test_name"]
 
 SCHEMA = "ehadiag.diagnosis/1"
 
 
-def json_line(diagnosis: Diagnosis, read_s: float, solver: str, seed: int) -> str:
+def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str:
     """One line without its end.
 
     Parameters
     ----------
-    read_s: time spent on reading or acquiring the recording, s.
+    spent: around the diagnosis.
     solver, seed: what was asked for; stated also where nothing was identified.
     """
     found = diagnosis.identification
@@ -46,11 +47,12 @@ def json_line(diagnosis: Diagnosis, read_s: float, solver: str, seed: int) -> st
             "converged": found.converged if found else None,
         },
         "timing_s": {
-            "read": _rounded(read_s),
+            "read": _rounded(spent.read),
             "first": _rounded(timing.first) if timing else None,
             "search": _rounded(timing.search) if timing else None,
             "refine": _rounded(timing.refine) if timing else None,
-            "total": _rounded(read_s + diagnosis.elapsed),
+            "total": _rounded(spent.read + diagnosis.elapsed),
+            "after_test": None if spent.after_test is None else _rounded(spent.after_test),
         },
     }
     return json.dumps(tree, allow_nan=False, ensure_ascii=False)

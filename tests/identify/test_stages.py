@@ -46,7 +46,7 @@ def same(a, b):
 
 
 def test_working_ahead_does_not_change_the_answer(recording):
-    from ehadiag.identify.experiment import build_experiment  # noqa: PLC0415
+    from ehadiag.identify.experiment import build_experiment
 
     test = resolve_test("open" if recording.test_id == 1 else "closed")
     online = OnlineIdentification(test, default_actuator())
@@ -64,7 +64,7 @@ def test_working_ahead_does_not_change_the_answer(recording):
 
 
 def test_a_finished_test_is_identified_ahead_as_a_whole(recording):
-    from ehadiag.diagnosis import diagnose  # noqa: PLC0415
+    from ehadiag.diagnosis import diagnose
 
     test = resolve_test("open" if recording.test_id == 1 else "closed")
     online = OnlineIdentification(test, default_actuator())
@@ -100,7 +100,7 @@ def test_other_samples_are_not_answered_from_memory():
 
 
 def _solver():
-    from ehadiag.identify.solvers import CompactGa  # noqa: PLC0415
+    from ehadiag.identify.solvers import CompactGa
 
     return CompactGa(budget=128)
 

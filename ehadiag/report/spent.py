@@ -1,0 +1,17 @@
+"""Time spent around a diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["Spent"]
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """Seconds."""
+
+    read: float
+    """Acquiring or reading the recording."""
+    after_test: float | None = None
+    """From the word that a live test is complete to the verdict."""
