@@ -60,6 +60,7 @@ def objections_to_recording(
     if test is None:
         return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
     return [
+        *recording.quality.refused,
         *_unlike_the_test(samples, test, actuator),
         *_gaps(samples, test),
         *_out_of_range(recording.environment, samples, actuator),
