@@ -26,7 +26,7 @@ LONGEST_GAP_S = 0.25
 """Longest span without a sample."""
 LEAST_COMMANDS = 100
 """Command frames that tell at which resolution the control law got its command."""
-MOST_GUESSED = 0.02
+MOST_GUESSED = 0.015
 """Share of ticks in closed loop whose current had to be guessed (docs/reference/bus-faults.md)."""
 LEAST_MISSED_S = 0.01
 """A shorter piece missing at an end of the test is a lost frame like others."""
@@ -60,6 +60,7 @@ def objections_to_recording(
     if test is None:
         return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
     return [
+        *recording.quality.refused,
         *_unlike_the_test(samples, test, actuator),
         *_gaps(samples, test),
         *_out_of_range(recording.environment, samples, actuator),
@@ -149,7 +150,7 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     if trace.guessed > MOST_GUESSED:
         out.append(
             f"{trace.guessed:.1%} of the jack positions that the control law worked on are lost "
-            f"(limit {MOST_GUESSED:.0%}): the servovalve current cannot be rebuilt"
+            f"(limit {MOST_GUESSED:.1%}): the servovalve current cannot be rebuilt"
         )
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
         seen = values[np.isfinite(values)]

@@ -129,6 +129,8 @@ class Quality:
     error_frames: int = 0
     notes: tuple[str, ...] = ()
     """What else a reader should know, one sentence each."""
+    refused: tuple[str, ...] = ()
+    """Why the user's own policy wants no verdict on this recording, one sentence each."""
 
     def total(self, count: str) -> int:
         """Sum of one of the counts of `MessageCounts` over all messages."""

@@ -19,6 +19,7 @@ from firmware_iface.counts import count_frames, within
 from firmware_iface.decode import DecodedTable, decode
 from firmware_iface.episodes import Episode, find_episodes
 from firmware_iface.frames import FrameTable
+from firmware_iface.policy import judge_frames
 from firmware_iface.status import read_status, resolve_turns
 from firmware_iface.ticks import TickAxis, place
 
@@ -96,16 +97,14 @@ def _recording(
         name: count_frames(item, axis, episode, begin, end)
         for name, item in decoded.messages.items()
     }
-    if bus_map.policy.crc == "refuse" and any(item.crc_errors for item in counts.values()):
-        samples, extra = None, [*extra, "frames with a wrong check sum: refused by the policy"]
-    if bus_map.policy.range == "refuse" and any(item.range_errors for item in counts.values()):
-        samples, extra = None, [*extra, "values outside their range: refused by the policy"]
+    refused, used = judge_frames(bus_map.policy, counts)
     quality = Quality(
         messages=counts,
         saturated=_saturated(samples),
         foreign=within(decoded.foreign, begin, end),
         error_frames=within(decoded.errors, begin, end),
-        notes=(*notes, *episode.notes, *extra),
+        notes=(*notes, *episode.notes, *extra, *used),
+        refused=refused,
     )
     return Recording(
         source=source,

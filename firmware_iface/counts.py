@@ -85,8 +85,6 @@ def _sequence(counter: NDArray[np.int64], modulus: int) -> NDArray[np.int64]:
 
 def _late(position: NDArray[np.int64]) -> int:
     """Frames that came after a later one, repeats aside."""
-    if len(position) == 0:
-        return 0
     first = np.unique(position, return_index=True)[1]
     once = position[np.sort(first)]
     return int(np.count_nonzero(once < np.maximum.accumulate(once)))

@@ -15,6 +15,7 @@ __all__ = [
     "EnvironmentSignals",
     "MappingFile",
     "Policy",
+    "PolicyLimits",
     "Protection",
     "RequestSignals",
     "SignalRef",
@@ -25,6 +26,7 @@ Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 Number = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
 State = Literal["idle", "arming", "running", "complete", "aborted", "refused"]
 Action = Literal["drop", "flag", "refuse"]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class SignalRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,15 +103,31 @@ class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     crc_kind: Literal["crc8-j1850-id"] = "crc8-j1850-id"
 
 
+class PolicyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Share of a message's frames up to which `refuse` does not strike, for each kind."""
+
+    crc: Share = 0.0
+    range: Share = 0.0
+    length: Share = 0.0
+    lost: Share = 0.0
+    repeated: Share = 0.0
+    out_of_order: Share = 0.0
+
+
 class Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What happens to a recording or sample that fails a check.
 
-    `drop`: the sample is left out and counted; `flag`: it is used, counted and noted; `refuse`:
-    the recording is handed on without samples.
+    `drop`: the sample is left out and counted; `flag`: it is used and counted (and noted where its
+    value may be wrong); `refuse`: left out, and beyond its share in `limits` no verdict is given.
     """
 
     crc: Action = "drop"
     range: Action = "drop"
+    length: Literal["drop", "refuse"] = "drop"
+    lost: Literal["flag", "refuse"] = "flag"
+    repeated: Literal["drop", "refuse"] = "drop"
+    out_of_order: Literal["flag", "refuse"] = "flag"
+    limits: PolicyLimits = PolicyLimits()
 
 
 class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

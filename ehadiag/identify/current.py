@@ -25,6 +25,9 @@ FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
 """A command frame that far (A, m) from the stored test says that another command was played."""
 LEAST_LEVELS = 100
 """Values sent that it takes to know their resolution."""
+LONG_HOLE = 10
+"""Ticks of a hole that count as guessed: amidst a longer one there is no sample either that a wrong
+current could be held against. An integral in the control law remembers all of them."""
 CONTROL_LAW_LSB = 4.0
 """Gap (LSB rms) beyond which the control law does not explain the measured current."""
 
@@ -41,7 +44,7 @@ class CurrentTrace:
     rebuilt: whether the measured current bears it out.
     command_gap: largest distance of a command frame from the stored test, A or m.
     guessed: share of ticks whose current follows from a position that was lost, and that the
-        measured current does not tell either.
+        measured current does not tell either; of a hole at most `LONG_HOLE` ticks count.
     """
 
     current: NDArray[np.float64]
@@ -68,7 +71,8 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
         current = _control_law(command, seen, samples.period_ns * 1e-9, controller)
         # What the control law did after the last sample explains none.
         last = np.flatnonzero(np.isfinite(samples.spool) | np.isfinite(samples.pressure))
-        guessed = float(np.mean(unknown[: last[-1] + 1])) if last.size else 1.0
+        until = int(last[-1]) + 1 if last.size else n
+        guessed = _guessed_share(unknown[:until], n if controller.GAI else LONG_HOLE)
     # A code at the converter's end says no more than that the current is at least so large.
     finite = np.isfinite(samples.current) & ~samples.saturated[0]
     difference = samples.current[finite] - current[finite]
@@ -80,6 +84,13 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
     rebuilt = gap_lsb < CONTROL_LAW_LSB
     return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap, guessed)
+
+
+def _guessed_share(unknown: NDArray[np.bool_], longest: int) -> float:
+    """Share of ticks that are unknown; of a hole no more than its first `longest` ones."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], unknown.astype(np.int8), [0]])))
+    lengths = edges[1::2] - edges[::2]
+    return float(np.minimum(lengths, longest).sum()) / max(len(unknown), 1)
 
 
 def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from bus_synth import (
 
 from firmware_iface.align import assemble
 from firmware_iface.frames import FrameTable
-from firmware_iface.mapping import Policy
+from firmware_iface.mapping import Policy, PolicyLimits
 
 TICKS = 500
 
@@ -73,12 +74,12 @@ def test_the_policy_may_refuse_wrong_check_sums_inside_the_test(encoder, bus_map
         damaged = list(frames)
         damaged[place[index]] = flip(frames[place[index]], 3)
         recording = one(damaged, strict)
-        assert (recording.samples is None) is refused
-        note = "frames with a wrong check sum: refused by the policy"
-        assert (note in recording.quality.notes) is refused
-        assert one(damaged, bus_map).samples is not None
+        why = (
+            "ServoTelemetry: 1 of 500 frames with a wrong check sum (the mapping's policy allows 0)"
+        )
+        assert recording.quality.refused == ((why,) if refused else ())
+        assert one(damaged, bus_map).quality.refused == ()
         if refused:
-            assert recording.quality.saturated == {}
             assert recording.quality.messages["ServoTelemetry"].crc_errors == 1
 
 
@@ -92,10 +93,45 @@ def test_the_policy_may_refuse_values_outside_their_range(frames, bus_map):
     )
     strict = with_policy(replace(bus_map, messages=messages), range="refuse")
     recording = one(frames, strict)
-    assert recording.samples is None
-    assert recording.quality.notes[-1] == "values outside their range: refused by the policy"
-    assert one(frames, replace(strict, policy=Policy())).samples is not None
-    assert one(frames, with_policy(bus_map, range="refuse")).quality.notes == ()
+    (why,) = recording.quality.refused
+    assert re.match(r"ServoTelemetry: \d+ of 500 frames with values outside their range", why)
+    assert one(frames, replace(strict, policy=Policy())).quality.refused == ()
+    assert one(frames, with_policy(bus_map, range="refuse")).quality.refused == ()
+    used = one(frames, replace(strict, policy=Policy(range="flag")))
+    (note,) = used.quality.notes
+    assert "outside their range, used as the mapping's policy says" in note
+    assert np.isfinite(used.samples.spool).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "spoil", "words"),
+    [
+        ("lost", lambda _: [], "frames lost"),
+        ("repeated", lambda f: [f, f], "frames repeated"),
+        ("length", lambda f: [replace(f, data=f.data[:5])], "frames of a wrong length"),
+        ("crc", lambda f: [flip(f, 3)], "frames with a wrong check sum"),
+    ],
+)
+def test_a_fault_is_refused_beyond_its_share_only(frames, bus_map, kind, spoil, words):
+    """5 of 500 telemetry frames are spoiled."""
+    place = [i for i, frame in enumerate(frames) if frame.can_id == TELEMETRY]
+    chosen = set(place[100:350:50])
+    spoilt = [x for i, f in enumerate(frames) for x in (spoil(f) if i in chosen else [f])]
+    assert one(spoilt, bus_map).quality.refused == ()
+    (why,) = one(spoilt, with_policy(bus_map, **{kind: "refuse"})).quality.refused
+    assert why.startswith(f"ServoTelemetry: 5 of {len(place) + 5 * (kind == 'repeated')} {words}")
+    for limit, refused in ((0.009, True), (0.01, False)):
+        shared = with_policy(bus_map, **{kind: "refuse", "limits": PolicyLimits(**{kind: limit})})
+        assert bool(one(spoilt, shared).quality.refused) is refused, limit
+
+
+def test_frames_out_of_order_may_be_refused(frames, bus_map):
+    place = [i for i, frame in enumerate(frames) if frame.can_id == TELEMETRY]
+    late = list(frames)
+    late[place[100]], late[place[101]] = late[place[101]], late[place[100]]
+    (why,) = one(late, with_policy(bus_map, out_of_order="refuse")).quality.refused
+    assert why.startswith("ServoTelemetry: 1 of 500 frames out of order")
+    assert one(late, bus_map).quality.refused == ()
 
 
 def test_a_stuck_counter_outside_the_test_is_not_noted(encoder, bus_map, truth):

@@ -165,13 +165,13 @@ def test_an_axis_tells_the_tick_of_other_frames() -> None:
         rows={},
         row=np.array([2, 4, 6]),
         tick=np.array([10, 11, 15]),
-        time_ns=np.array([0, 1, 5]) * MS,
+        time_ns=(np.array([0, 1.5, 5]) * MS).astype(np.int64),
         every={},
         turn=256,
         notes=(),
     )
     row = np.array([0, 3, 5, 9])
-    time_ns = np.array([-0.5, 0.25, 1.5, 6.0]) * MS
+    time_ns = np.array([-0.5, 0.25, 2.0, 6.0]) * MS
     fraction, following = axis.at(row, time_ns.astype(np.int64), MS)
     assert fraction.tolist() == [9.5, 10.25, 11.5, 16.0]
     assert following.tolist() == [10, 11, 15, 16]

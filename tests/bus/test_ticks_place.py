@@ -172,6 +172,26 @@ def test_a_counter_out_of_line_does_not_count_for_where_a_message_begins() -> No
     assert set(axis.rows) == {"telemetry", "command"}
 
 
+def test_others_are_placed_by_the_telemetry_even_if_commands_share_the_axis() -> None:
+    """A second command between the first one and the telemetry is of the telemetry's tick."""
+    count = np.arange(30)
+    telemetry = item("telemetry", count + 0.5, count, counts=True)
+    sent = command(count, count, counts=True)
+    second = item("second", count + 0.2, role="command.position", telemetry=False, first_row=3)
+    axis = placed(telemetry, sent, second)
+    assert axis.ticks["second"].tolist() == count.tolist()
+    assert axis.row.tolist() == sorted([*telemetry.row, *sent.row])
+    assert axis.notes == ("second: no counter to place samples by; host time stamps do",)
+
+
+def test_counted_telemetry_leads_even_if_other_telemetry_has_more_frames() -> None:
+    counted = item("counted", np.arange(0, 60, 2) + 0.1, np.arange(5, 65, 2), counts=True)
+    plain = item("plain", np.arange(60) + 0.4)
+    axis = placed(counted, plain)
+    assert axis.row.tolist() == counted.row.tolist()
+    assert axis.ticks["plain"].tolist() == list(range(5, 65))
+
+
 def test_messages_without_frames_or_without_samples_have_no_ticks() -> None:
     status = item("status", np.arange(3), role="status.state", telemetry=False)
     axis = placed(item("telemetry", np.arange(9)), command([]), status)

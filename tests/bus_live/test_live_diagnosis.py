@@ -70,6 +70,16 @@ def test_the_closed_loop_test_bears_it_too(name: str) -> None:
     assert objection(case, sound, diagnoser.judge(case).diagnosis) == ""
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["loss of 20 %", "loss in bursts of 20 frames"])
+def test_the_closed_loop_test_is_refused_where_positions_are_guessed(name: str) -> None:
+    diagnoser = Diagnoser("closed")
+    sound = diagnoser.judge(CASES[0]).diagnosis
+    case = next(item for item in CASES if item.name == name)
+    unfit = replace(case, unfit="jack positions that the control law worked on are lost")
+    assert objection(unfit, sound, diagnoser.judge(case).diagnosis) == ""
+
+
 @pytest.mark.parametrize("case", marked(LOG_CASES, QUICK_LOGS))
 def test_a_damaged_log_gives_the_stated_verdict(
     case: LogCase, diagnoser: Diagnoser, sound: Judged, tmp_path: Path
