@@ -40,6 +40,8 @@ LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 QUIET_BLOCK = 100
 """Ticks over which noise is judged."""
+QUIET_SHARE = 0.867
+"""Deviation of white noise in the quietest fifth of such blocks (0.864 to 0.869 for 2 to 5.5 s)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,4 +249,4 @@ def _noise(values: NDArray[np.float64], channel: Channel) -> float:
         return float(channel.lsb * TYPICAL_NOISE_LSB)
     power = np.sort(np.nanmean(blocks[enough] ** 2, axis=1)) / 6.0
     quiet = power[: max(1, len(power) // 5)]
-    return float(max(np.sqrt(np.median(quiet)), floor))
+    return float(max(np.sqrt(np.median(quiet)) / QUIET_SHARE, floor))

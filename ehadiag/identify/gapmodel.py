@@ -80,19 +80,13 @@ class GapModel:
         spool_rates(self.batch, x * self.scale, self.single, out)
         return out * self.batch.weight[0]
 
-    def fine(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As `many`, one at a time, with the jack's path cut finer."""
-        return np.array([self.one(x)[0] for x in points])
-
-    def slopes(self, centres: list[NDArray[np.float64]], *, fine: bool = False) -> list[Slope]:
+    def slopes(self, centres: list[NDArray[np.float64]]) -> list[Slope]:
         """Gaps and derivatives at several points, all runs of the model together."""
         sides = [_sides(x, STEP) for x in centres]
         points = np.vstack(
             [np.vstack([x[None, :], at]) for x, at in zip(centres, sides, strict=True)]
         )
-        runs = (self.fine if fine else self.many)(points).reshape(
-            len(centres), 1 + 2 * FAULT_COUNT, 2, -1
-        )
+        runs = self.many(points).reshape(len(centres), 1 + 2 * FAULT_COUNT, 2, -1)
         out = []
         for x, at, gaps in zip(centres, sides, runs, strict=True):
             jacobian, smooth = self._differences(x, gaps[0], at, gaps[1:])

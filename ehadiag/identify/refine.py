@@ -9,7 +9,7 @@ being constant they are told apart from the faults, which act alike in both dire
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,27 +144,10 @@ def describe(
     return _described(model, x, model.trusted_slope(x), converged=converged, jagged=True)
 
 
-def _corrected(model: GapModel, x: NDArray[np.float64], slope: Slope) -> NDArray[np.float64]:
-    """Take out of the optimum what the coarser pieces of the many runs have put in.
-
-    Single runs cut the jack's path finer; the optimum moves by the difference of the Gauss-Newton
-    steps of both from the same point.
-    """
-    fine = model.slopes([slope.x], fine=True)[0]
-    both = slope.used & fine.used
-    steps = [
-        _stepped(replace(item, smooth=both), LEAST_DAMPING) - slope.x for item in (fine, slope)
-    ]
-    out = x + steps[0] - steps[1]
-    out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
-    return np.asarray(out)
-
-
 def _described(
     model: GapModel, x: NDArray[np.float64], slope: Slope, *, converged: bool, jagged: bool
 ) -> Refinement:
     """Put together what is known at x; `slope` is that of a point so near that it holds there."""
-    x = _corrected(model, x, slope)
     gaps, anchored = model.one(x)
     weighted = model.batch.weight > 0.0
     used = slope.smooth & (gaps**2 < CAP) & weighted
