@@ -86,5 +86,14 @@ class ParallelLanes:
 
 
 def _like(work: LaneWork) -> LaneWork:
-    """Scratch of another thread; with the same steps of the jack."""
-    return LaneWork(work.levels, *(np.zeros_like(part) for part in work[1:]))
+    """Scratch of another thread, with the same steps of the jack."""
+    return work._replace(
+        state=work.state.copy(),
+        path=work.path.copy(),
+        coefficients=work.coefficients.copy(),
+        moving=work.moving.copy(),
+        stuck=work.stuck.copy(),
+        rows=work.rows.copy(),
+        sums=work.sums.copy(),
+        gaps=work.gaps.copy(),
+    )
