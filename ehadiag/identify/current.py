@@ -25,7 +25,7 @@ FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
 """A command frame that far (A, m) from the stored test says that another command was played."""
 LEAST_LEVELS = 100
 """Values sent that it takes to know their resolution."""
-LONG_HOLE = 10
+LONG_HOLE = 50
 """Ticks of a hole that count as guessed: amidst a longer one there is no sample either that a wrong
 current could be held against. An integral in the control law remembers all of them."""
 CONTROL_LAW_LSB = 4.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ehadiag.identify.batch import Batch, constants_of
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.laneevents import event_ticks
+from ehadiag.model.laneevents import PIECES_SIZE, event_ticks
 from ehadiag.model.lanejack import jack_lanes, pressures
 from ehadiag.model.lanelayout import (
     ANCHORED,
@@ -49,12 +49,15 @@ BOW_RATIO = 6.0
 OPENING = 10.0e-6
 TRAVEL = 0.15
 """Travel as a share of the opening, likewise."""
+CROSSING = 5.0e-6
+"""Travel (m) past the closed orifice from which the jack takes eight steps, four times that:
+sixteen."""
 
 
 class LaneWork(NamedTuple):
     """Scratch of the kernels below, one for each thread.
 
-    levels: how often the jack's ticks are halved, 0, 1 or 2, shape (N,). The same for every
+    levels: how often the jack's ticks are halved, 0 … 4, shape (N,). The same for every
         candidate, so that none's answer hangs on the others in its block.
     state, path, coefficients, moving, stuck: see `ehadiag.model.lanelayout`.
     rows: candidates of a block, shape (LANES, 5).
@@ -82,7 +85,7 @@ def lane_work(batch: Batch) -> LaneWork:
     work = LaneWork(
         levels=np.full(len(batch.current), -1, dtype=np.int64),
         state=np.zeros(STATE_ROWS * LANES),
-        path=np.zeros(PATH_ROWS * LANES),
+        path=np.zeros(PATH_ROWS * LANES + PIECES_SIZE),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
         moving=np.zeros(MOVING_SIZE),
         stuck=np.zeros(STUCK_SIZE),
@@ -112,8 +115,13 @@ def _level(path: NDArray[np.float64]) -> int:
         bow = most(magnitude(x1 - 0.75 * x0 - 0.25 * x4), magnitude(x3 - 0.25 * x0 - 0.75 * x4))
         bow = most(bow, magnitude(x2 - 0.5 * (x0 + x4)))
         need = most(bow * (OPENING / BOW), magnitude(x4 - x0) / TRAVEL)
+        crosses = where(near <= OPENING, magnitude(x4 - x0), 0.0)
+        if anywhere(crosses > 4.0 * CROSSING):
+            level = max(level, 4)
+        elif anywhere(crosses > CROSSING):
+            level = max(level, 3)
         if anywhere(need > BOW_RATIO * near):
-            level = 2
+            level = max(level, 2)
         elif anywhere(need > near):
             level = max(level, 1)
     return level

@@ -27,7 +27,9 @@ from ehadiag.model.lanelayout import (
     JACK_VELOCITY,
     LANES,
     NODES,
+    PATH_ROWS,
     PLACE,
+    SLOPE,
     SPOOL,
     SPOOL_RATE,
 )
@@ -46,9 +48,12 @@ from ehadiag.model.spoolevents import (
 )
 from ehadiag.model.transition import FINEST, SpoolScalars
 
-__all__ = ["event_ticks"]
+__all__ = ["PIECES_SIZE", "event_ticks"]
 
 WHOLE = 1 << FINEST
+MOST_PIECES = 32
+PIECES_SIZE = 4 * MOST_PIECES
+"""Room behind the rows of the path: pieces (duration in s, place at the end, velocities)."""
 
 
 @kernel
@@ -95,9 +100,7 @@ def _event_tick(
     direction, clamped = int(state[DIRECTION * LANES + i]), state[CLAMPED * LANES + i] != 0.0
     done, single = 0, False
     from_xs, from_vs, since = xs, vs, 0
-    friction = coefficients[JACK_FRICTION * LANES + i]
-    place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
-    d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
+    starts, count = False, 0
     while done < WHOLE:
         grid = GRID - (done & (GRID - 1))
         step = 1 if single else grid
@@ -174,17 +177,31 @@ def _event_tick(
             xf, wf, clamped = math.copysign(c.XFM, xf), 0.0, True
         elif event == RELEASE:
             clamped = False
-        if event > NOTHING or done & (2 * GRID - 1) == 0:
-            span = since * unit
+        starts = starts or (event > NOTHING and direction != 0 and vs == 0.0)
+        at_node = done & (2 * GRID - 1) == 0
+        if (event > NOTHING and count < MOST_PIECES - NODES) or at_node:
+            o = PATH_ROWS * LANES + 4 * count
+            path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, xs, from_vs, end_vs
+            from_vs, since = vs, 0
+            count += 1
+        if at_node:
+            path[(PLACE + done // (2 * GRID)) * LANES + i] = xs
+            path[(SLOPE + done // (2 * GRID)) * LANES + i] = vs
+    if starts:
+        friction = coefficients[JACK_FRICTION * LANES + i]
+        place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
+        d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
+        for n in range(count):
+            o = PATH_ROWS * LANES + 4 * n
+            span = path[o]
             place, velocity, d, fresh = jack_piece(
-                c, friction, span, from_xs, xs, from_vs * span, end_vs * span,
-                place, velocity, d, fresh,
+                c, friction, span, 0.0, 1.0, from_xs, path[o + 1],
+                path[o + 2] * span, path[o + 3] * span, place, velocity, d, fresh,
             )  # fmt: skip
-            from_xs, from_vs, since = xs, vs, 0
-    path[(PLACE + NODES) * LANES + i] = xs
-    state[DONE * LANES + i] = 1.0
-    state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
-    state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh
+            from_xs = path[o + 1]
+        state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
+        state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh
+        state[DONE * LANES + i] = 1.0
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = xf, wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = xs, vs
     state[DIRECTION * LANES + i] = direction

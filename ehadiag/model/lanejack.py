@@ -34,6 +34,7 @@ from ehadiag.model.lanelayout import (
 )
 from ehadiag.model.lanevector import (
     WIDTH,
+    Vector,
     anywhere,
     least,
     load,
@@ -61,24 +62,26 @@ A21, A22, A23 = (
 A31, A32, A33 = (16.0 - ROOT) / 36.0, (16.0 + ROOT) / 36.0, 1.0 / 9.0
 
 
-COARSE_TRAVEL = 10.0e-6
-"""Spool travel in a step (m, or the distance from the middle) from which a lane goes alone."""
-CORNER_TRAVEL = 3.0e-6
+MOST_HALVINGS = 4
+COARSE_TRAVEL = 8.0e-6
+"""Spool travel from first to last stage of a step (m, or the distance from the middle) from which
+a lane goes alone."""
+CORNER_TRAVEL = 4.0e-6
 """The same where the step passes the opening at which the pressure gain saturates, m."""
 
 
 def _stages() -> NDArray[np.float64]:
-    """Where the first two stages of a step stand on the spool's path, shape (3, NODES, 2, 5).
+    """Where the stages of a step stand on the spool's path, shape (5, 16, 3, 5).
 
-    For a tick cut into 1, 2 or 4 steps, and each step: the node before, and Hermite's weights of
-    place before and after and of slope (by the length of the tick) before and after.
+    For a tick cut into 1, 2, 4, 8 or 16 steps, and each step: the node before, and Hermite's
+    weights of place before and after and of slope (by the length of the tick) before and after.
     """
-    out = np.zeros((3, NODES, 2, 5))
-    for level in range(3):
+    out = np.zeros((MOST_HALVINGS + 1, 1 << MOST_HALVINGS, 3, 5))
+    for level in range(MOST_HALVINGS + 1):
         for step in range(1 << level):
-            for stage, share in enumerate((C1, C2)):
+            for stage, share in enumerate((C1, C2, 1.0)):
                 where = (step + share) / (1 << level) * NODES
-                node = int(where)
+                node = min(int(where), NODES - 1)
                 u = where - node
                 out[level, step, stage] = (
                     node,
@@ -136,6 +139,15 @@ def last_velocity(
 
 
 @packed
+def _place(path: NDArray[np.float64], o: int, stage: NDArray[np.float64], tick: float) -> Vector:
+    """Spool at a stage, lanes from `o`."""
+    a = int(stage[0]) * LANES + o
+    b = a + LANES
+    slopes = stage[3] * load(path, SLOPE * LANES + a) + stage[4] * load(path, SLOPE * LANES + b)
+    return stage[1] * load(path, a) + stage[2] * load(path, b) + tick * slopes
+
+
+@packed
 def jack_lanes(
     c: PlantConstants,
     level: int,
@@ -151,20 +163,11 @@ def jack_lanes(
     """
     any_busy = False
     h = tick / (1 << level)
-    first, second = STAGES[level, step, 0], STAGES[level, step, 1]
-    p1, q1, r1, s1 = first[1], first[2], first[3] * tick, first[4] * tick
-    p2, q2, r2, s2 = second[1], second[2], second[3] * tick, second[4] * tick
+    stages = STAGES[level, step]
     for o in range(0, LANES, WIDTH):
-        a = int(first[0]) * LANES + o
-        b = a + LANES
-        x1 = p1 * load(path, a) + q1 * load(path, b)
-        x1 = x1 + r1 * load(path, SLOPE * LANES + a) + s1 * load(path, SLOPE * LANES + b)
-        a = int(second[0]) * LANES + o
-        b = a + LANES
-        x2 = p2 * load(path, a) + q2 * load(path, b)
-        x2 = x2 + r2 * load(path, SLOPE * LANES + a) + s2 * load(path, SLOPE * LANES + b)
-        x0 = load(path, (PLACE + step * (NODES >> level)) * LANES + o)
-        x3 = load(path, (PLACE + (step + 1) * (NODES >> level)) * LANES + o)
+        x1 = _place(path, o, stages[0], tick)
+        x2 = _place(path, o, stages[1], tick)
+        x3 = _place(path, o, stages[2], tick)
         place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
         d = load(state, JACK_DIRECTION * LANES + o)
         friction = load(coefficients, JACK_FRICTION * LANES + o)
@@ -178,12 +181,12 @@ def jack_lanes(
         push = c.AJ * c.PSR * c.GQ * x3 - c.FR * divide(c, width3)
         held = magnitude(push) <= 2.0 * friction * divide(c, width3)
         # What the collocation does not follow: a fresh start, a fast way past the closed orifice.
-        near = where(x0 * x3 > 0.0, least(magnitude(x0), magnitude(x3)), 0.0)
-        travel = magnitude(x3 - x0)
+        near = where(x1 * x3 > 0.0, least(magnitude(x1), magnitude(x3)), 0.0)
+        travel = magnitude(x3 - x1)
         corner = c.PSR / c.GP
         coarse = travel > most(near, COARSE_TRAVEL)
         coarse = coarse | (
-            (near < corner) & (most(width3, magnitude(x0)) > corner) & (travel > CORNER_TRAVEL)
+            (near < corner) & (most(width1, width3) > corner) & (travel > CORNER_TRAVEL)
         )
         slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
         done = load(state, DONE * LANES + o) != 0.0

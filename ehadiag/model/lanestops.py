@@ -25,10 +25,10 @@ from ehadiag.model.lanevector import packed
 
 __all__ = ["jack_events", "jack_piece"]
 
-FINE_TRAVEL = 2.0e-6
+FINE_TRAVEL = 3.0e-6
 FINE_RATIO = 0.3
 """Spool travel within a part (m, or share of the distance from the middle)."""
-FRESH_DECAY = 1.0
+FRESH_DECAY = 3.0
 """Decay (power of e) of the jack's velocity within a part, where it starts or stops."""
 MOST_CUTS = 32
 ITERATIONS = 30
@@ -81,6 +81,8 @@ def jack_piece(
     c: PlantConstants,
     friction: float,
     span: float,
+    begin: float,
+    stop: float,
     x0: float,
     x1: float,
     rise0: float,
@@ -90,22 +92,29 @@ def jack_piece(
     d: float,
     fresh: float,
 ) -> tuple[float, float, float, float]:
-    """Jack of one lane over a piece of the spool's path: `span` in s, rises in m.
+    """Jack of one lane over the shares begin … stop of a piece of the spool's path.
+
+    span: of the whole piece, s; x0, x1: its ends, m; rise0, rise1: slopes there by span, m.
 
     d: direction of its motion, 0 at rest; fresh: not 0 if it has just started or stopped.
     Returns place, velocity, d and fresh afterwards.
     """
+    if d == 0.0:
+        up = _excess(c, 2.0 * friction, stop, x0, x1, rise0, rise1)
+        down = _excess(c, -2.0 * friction, stop, x0, x1, rise0, rise1)
+        if up <= 0.0 <= down:
+            return place, velocity, 0.0, 0.0
     near = min(abs(x0), abs(x1)) if x0 * x1 > 0.0 else 0.0
-    wanted = abs(x1 - x0) / max(FINE_TRAVEL, FINE_RATIO * near)
+    wanted = (stop - begin) * abs(x1 - x0) / max(FINE_TRAVEL, FINE_RATIO * near)
     # The collocation is slow to forget what a start or a stop leaves.
     scale = divide(c, max(near, c.PSR / c.GP))
-    decay = span * (c.AJ * c.AJ * c.PSR / scale + c.CJ) / c.MJ
+    decay = (stop - begin) * span * (c.AJ * c.AJ * c.PSR / scale + c.CJ) / c.MJ
     if d == 0.0 or fresh != 0.0:
         wanted = max(wanted, decay / FRESH_DECAY)
     cuts = min(MOST_CUTS, 1 + int(wanted))
-    q, cut, fresh = 0.0, 1, 0.0
+    q, cut, fresh = begin, 1, 0.0
     while cut <= cuts:
-        end = cut / cuts
+        end = begin + (stop - begin) * cut / cuts
         if d == 0.0:
             hold = 2.0 * friction
             up = _excess(c, hold, end, x0, x1, rise0, rise1)
@@ -177,16 +186,19 @@ def jack_events(
     coefficients: NDArray[np.float64],
 ) -> None:
     """Jack of BUSY lanes over one of the 2^level steps of a tick, piece by piece of the path."""
-    span = tick / NODES
+    span, steps = tick / NODES, 1 << level
+    begin, stop = step * NODES / steps, (step + 1) * NODES / steps
+    first, last = int(begin), math.ceil(stop)
     for i in range(LANES):
         if state[BUSY * LANES + i] == 0.0:
             continue
         place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
         d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
-        for n in range(step * (NODES >> level), (step + 1) * (NODES >> level)):
+        for n in range(first, last):
             a, b = n * LANES + i, (n + 1) * LANES + i
             place, velocity, d, fresh = jack_piece(
-                c, coefficients[JACK_FRICTION * LANES + i], span, path[a], path[b],
+                c, coefficients[JACK_FRICTION * LANES + i], span,
+                max(begin - n, 0.0), min(stop - n, 1.0), path[a], path[b],
                 span * path[SLOPE * LANES + a], span * path[SLOPE * LANES + b],
                 place, velocity, d, fresh,
             )  # fmt: skip

@@ -30,6 +30,8 @@ def item(time_ms: list[float], counter: list[int], stream: list[int] | None = No
     [
         (1.0, 7, True),
         (0.4, 7, False),  # a repeat
+        (0.5, 7, False),
+        (128.0, 7, False),
         (1.0, 8, False),
         (127.0, 7, True),
         (256.0, 7, False),  # a whole turn was lost

@@ -147,6 +147,12 @@ def test_other_telemetry_belongs_to_the_nearest_tick(late_ms: float, first: int)
     assert (axis.ticks["other"] - np.arange(5, 80)).tolist() == [first] * 75
 
 
+def test_other_telemetry_that_drifts_keeps_the_ticks_that_fit_half_of_its_frames() -> None:
+    count = np.arange(2000)
+    axis = placed(item("telemetry", np.arange(2010)), item("other", count * (1 + 1.5 / 2000)))
+    assert (axis.ticks["other"] - count).tolist() == [1] * 2000
+
+
 def test_a_message_with_a_counter_of_its_own_keeps_its_gaps() -> None:
     """Its time only says where it begins; one frame that is late by ticks moves nothing."""
     numbers = np.array([*range(20), *range(25, 60)])
@@ -180,6 +186,9 @@ def test_others_are_placed_by_the_telemetry_even_if_commands_share_the_axis() ->
     second = item("second", count + 0.2, role="command.position", telemetry=False, first_row=3)
     axis = placed(telemetry, sent, second)
     assert axis.ticks["second"].tolist() == count.tolist()
+    assert axis.ticks["second"].dtype == np.int64
+    assert axis.rows["second"].tolist() == second.row.tolist()
+    assert axis.every["second"] == 1
     assert axis.row.tolist() == sorted([*telemetry.row, *sent.row])
     assert axis.notes == ("second: no counter to place samples by; host time stamps do",)
 

@@ -81,8 +81,9 @@ def compared(frames: list[Frame], sound: diagnosis.Diagnosis, truth: tuple[float
 
 def row(name: str, outcomes: list[Outcome]) -> str:
     tested = [item for item in outcomes if item.tested]
-    refused = sum(item.guessed > LIMIT for item in outcomes)
-    low, high = (f"{100 * pick(o.guessed for o in outcomes):.1f}" for pick in (min, max))
+    guessed = np.array([item.guessed for item in outcomes])
+    refused = int((guessed > LIMIT).sum())
+    low, high = (f"{100 * pick(guessed):.1f}" for pick in (np.nanmin, np.nanmax))
     told = [max(getattr(o, key) for o in tested) for key in ("off_sound", "off_truth")]
     wrong = sum(not item.same for item in tested)
     return (

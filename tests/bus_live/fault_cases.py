@@ -313,14 +313,15 @@ CLOSED_LOSSES = """\
 | 2 % | 20 | 0.0 … 0.1 % | 20 | 0.5 | 1.8 | 0 |
 | 5 % | 20 | 0.2 … 0.4 % | 20 | 1.0 | 1.9 | 0 |
 | 10 % | 20 | 0.8 … 1.3 % | 20 | 0.8 | 2.2 | 0 |
-| 12 % | 12 | 1.1 … 1.6 % | 11 | 0.8 | 1.5 | 2 |
-| 15 % | 12 | 1.9 … 2.5 % | 10 | 21.3 | 20.5 | 12 |
+| 12 % | 28 | 1.1 … 1.8 % | 25 | 2.1 | 2.7 | some |
+| 15 % | 28 | 1.8 … 2.8 % | 23 | 21.3 | 20.5 | 28 |
 | 20 % | 20 | 3.4 … 4.4 % | 15 | 9.6 | 10.4 | 20 |
-| a hole of 50 ms | 12 | 0.2 % | 12 | 0.5 | 1.8 | 0 |
-| a hole of 100 ms | 12 | 0.2 % | 11 | 0.6 | 1.7 | 0 |
-| a hole of 200 ms | 12 | 0.2 % | 10 | 0.7 | 1.8 | 0 |
-| 20 holes of 5 ms | 12 | 1.4 … 1.5 % | 11 | 1.8 | 2.2 | 0 |
-| 40 holes of 5 ms | 12 | 2.8 … 2.9 % | 10 | 3.5 | 4.1 | 12 |
+| a hole of 50 ms | 12 | 0.9 % | 12 | 0.5 | 1.8 | 0 |
+| a hole of 100 ms | 28 | 0.9 % | 25 | 1.7 | 3.1 | 0 |
+| a hole of 200 ms | 28 | 0.9 % | 24 | 0.9 | 2.2 | 0 |
+| 20 holes of 5 ms | 28 | 1.4 … 1.5 % | 26 | 1.8 | 2.3 | 0 |
+| 40 holes of 5 ms | 28 | 2.8 … 2.9 % | 26 | 3.8 | 4.9 | 28 |
+| 10 holes of 20 ms | 16 | 3.2 … 3.5 % | 16 | 11.1 | 11.9 | 16 |
 """
 """Measured by closed_losses.py."""
 
@@ -358,7 +359,7 @@ noise of that one sample, which the control law turned into current, is not know
 error leaves it out.
 
 {CLOSED_LOSSES}
-*Guessed* are the ticks whose position was bridged over, of a hole at most 10. *Off* is the
+*Guessed* are the ticks whose position was bridged over, of a hole at most 50. *Off* is the
 largest distance of an estimate, in stated standard deviations, from that of the whole recording
 and from the truth, among the runs that the fit let pass. With 20 % lost and the positions put
 back, no estimate was more than 1.1 off: it is the bridging. Hence **a closed-loop recording with

@@ -1,15 +1,22 @@
 """The population's kernel against the scalar one, lane by lane."""
 
+import platform
+import re
 from pathlib import Path
 
+import llvmlite.binding
+import numba
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.batch import Batch, costs, residuals, workspace
 from ehadiag.identify.experiment import build_experiment, make_batch
 from ehadiag.identify.lanes import lane_costs, lane_residuals, lane_work
+from ehadiag.identify.parallel import ParallelLanes
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.lanelayout import LANES
 from ehadiag.model.monitoring import FREE_RUN, respond
@@ -201,3 +208,52 @@ def test_residuals_and_anchors_are_the_scalar_kernels(recorded_batch, population
         np.testing.assert_allclose(out[i, 0], there[0], atol=1e-6)
     costs_here = np.minimum(out**2, 25.0).sum(axis=(1, 2))
     np.testing.assert_allclose(costs_here, in_lanes(anchored, population, 25.0), rtol=1e-12)
+
+
+SHORT = 4e-3 * np.sin(np.arange(250) * 0.06)
+CUBE = st.tuples(*[st.floats(0.0, 1.0)] * 3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(one=CUBE, others=st.lists(CUBE, min_size=1, max_size=LANES + 2), place=st.integers(0, 99))
+def test_no_lane_depends_on_its_neighbours(one, others, place):
+    batch = own_batch((0.3, 0.3, 0.3), SHORT)
+    batch = batch._replace(anchor=np.array([[0.1, 1e-6, 4e-6]]))
+    work = lane_work(batch)
+    place %= len(others) + 1
+    rows = candidates_of([*others[:place], one, *others[place:]])
+    n = len(rows)
+    together, alone = np.empty((n, 2, 250)), np.empty((1, 2, 250))
+    counts, count = np.empty(n, dtype=np.int64), np.empty(1, dtype=np.int64)
+    lane_residuals(batch, rows, work, together, counts)
+    lane_residuals(batch, rows[place : place + 1], work, alone, count)
+    np.testing.assert_array_equal(together[place], alone[0])
+    assert counts[place] == count[0]
+
+
+def test_threads_give_the_digits_of_one(recorded_batch, population):
+    with ParallelLanes(recorded_batch, 1) as one, ParallelLanes(recorded_batch, 3) as three:
+        for size in (1, LANES, LANES + 1, len(population)):
+            np.testing.assert_array_equal(
+                three.costs(population[:size], 25.0), one.costs(population[:size], 25.0)
+            )
+        for here, there in zip(three.residuals(population), one.residuals(population), strict=True):
+            np.testing.assert_array_equal(here, there)
+
+
+def test_the_kernel_is_made_of_vector_instructions(tmp_path):
+    """Products and sums of doubles in the block's kernel: by vectors, not one by one."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("the names of the instructions are those of x86")
+    # Compiled anew, without a cache: code that is loaded cannot be looked at.
+    batch = own_batch((0.3, 0.3, 0.3), SHORT)
+    fresh = numba.njit(nogil=True, error_model="numpy")(lane_costs.py_func)
+    fresh(batch, candidates_of([(0.3, 0.3, 0.3)]), 25.0, lane_work(batch), np.empty(1))
+    (text,) = fresh.inspect_asm().values()
+    wide = len(re.findall(r"\bv?(?:f?n?m(?:add|sub)\d+|mul|add|sub)pd\b", text))
+    fused = len(re.findall(r"\bvf\w+pd\b.*%[yz]mm", text))
+    assert wide > 150
+    if "avx2" in llvmlite.binding.get_host_cpu_features().flatten().replace("-avx2", ""):
+        assert fused > 60
+    division = re.findall(r"\bv?divpd\b", text)
+    assert len(division) >= 2

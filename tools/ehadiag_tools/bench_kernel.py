@@ -23,6 +23,7 @@ from ehadiag.model.transition import spool_tables
 from ehadiag.storedtest import resolve_test
 from ehadiag_tools.bench_c_model import CModel, NoCompilerError
 from ehadiag_tools.bench_figures import Figure, Sizes, cpu_median
+from ehadiag_tools.bench_lanes import measure_lanes
 from ehadiag_tools.bench_problem import whole_test
 from ehadiag_tools.stiff_reference import StiffReference
 
@@ -30,6 +31,7 @@ __all__ = ["measure"]
 
 FAULTS = (0.3, 0.6, 0.3)
 SECTION = "kernel"
+IN_C = "the same in C (cc -O3 -march=native, scalar)"
 SUBSTEPS = 10
 """Sub-steps of 100 µs in a tick: times are also given for one of these."""
 POPULATIONS = (1, 8, 64)
@@ -65,7 +67,9 @@ def measure(sizes: Sizes) -> list[Figure]:
             "once for each value of Kintas and FSS",
         ),
     ]
-    return out + _growth(sizes) + _cores(sizes)
+    in_c = next((row.value for row in out if row.name == IN_C and row.value is not None), None)
+    lanes = measure_lanes(sizes, None if in_c is None else in_c * 1e-3)
+    return out + lanes + _growth(sizes) + _cores(sizes)
 
 
 class _Compiled:
@@ -116,7 +120,7 @@ def _each(seconds: float, ticks: int = 5500) -> str:
 
 
 def _against_c(compiled: _Compiled, current: np.ndarray, took: float, sizes: Sizes) -> list[Figure]:
-    name = "the same in C (cc -O3 -march=native, scalar)"
+    name = IN_C
     try:
         model = CModel(compiled.constants, compiled.tables, FAULTS[2], current)
     except NoCompilerError as error:

@@ -1,0 +1,96 @@
+"""Steps from frame to frame at their exact limits, and the host clock's own steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from firmware_iface import protection
+from firmware_iface.protection import NEAR, SLACK_RATE, SLACK_TICKS, crc8_rows
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("counter", "ticks", "modulus", "jump", "trusted"),
+    [
+        ([10, 11], 1, 256, 1, False),
+        ([10, 4], 250, 256, 250, False),  # time agrees: nearly a turn was lost
+        ([10, 4], 300, 256, -6, True),  # it does not: a frame that comes late
+        ([10, 10 - NEAR + 256], 300, 256, -NEAR, True),
+        ([10, 10 - NEAR + 255], 300, 256, 255 - NEAR, False),
+        ([10, 10 + NEAR], 60, 256, NEAR, True),
+        ([10, 11 + NEAR], 60, 256, NEAR + 1, False),
+        ([3, 15], 27, 32, 12, True),
+        ([0, 6], 10_000, 256, 9_990, False),
+        ([0, 6], 10_001, 256, 6, True),
+    ],
+)
+def test_a_step_follows_time_unless_the_counter_is_near(
+    counter: list[int], ticks: int, modulus: int, jump: int, trusted: bool
+) -> None:
+    """10 000 ticks may be off by the slack and two more."""
+    assert SLACK_TICKS + SLACK_RATE * 10_000 == 10.0
+    got = protection._steps(np.array(counter) % modulus, np.array([7, 7 + ticks]) * MS, MS, modulus)
+    assert got[0].tolist() == [jump]
+    assert got[1].tolist() == [ticks - jump]
+    assert got[2].tolist() == [ticks]
+    assert got[3].tolist() == [trusted]
+
+
+def clock(size: float, following: list[float]) -> tuple[list[float], tuple[str, ...]]:
+    """A strange step of the host's time, and the time of the steps of one count that follow."""
+    ticks = np.array([1.0, size + 1.0, *following])
+    jump = np.ones(len(ticks), dtype=np.int64)
+    rebase, notes = protection._clock_steps(np.array([1]), ticks, jump, ticks - jump, 2 * MS)
+    assert np.delete(rebase, 1).tolist() == [0.0] * (len(ticks) - 1)
+    return [float(rebase[1])], notes
+
+
+STEPPED = ("host clock stepped by +0.058 s",)
+
+
+@pytest.mark.parametrize(
+    ("size", "following", "step", "notes"),
+    [
+        (29.0, [1.0] * 30, 29.0, STEPPED),
+        (29.0, [0.1] * 30, 0.0, ()),  # a burst: the receiver had stalled
+        (29.0, [0.49] * 20 + [50.0] * 5, 0.0, ()),  # twenty frames tell
+        (29.0, [0.1] * 19 + [50.0] * 5, 29.0, STEPPED),
+        (29.0, [0.5] * 30, 29.0, STEPPED),
+        (29.0, [], 0.0, ()),
+        (29.0, [0.4], 0.0, ()),
+        (29.0, [0.6], 29.0, STEPPED),
+        (-29.0, [0.1] * 30, -29.0, ("host clock stepped by -0.058 s",)),
+        (2 * SLACK_TICKS, [1.0] * 30, 16.0, ("host clock stepped by +0.032 s",)),
+        (2 * SLACK_TICKS - 0.5, [1.0] * 30, 0.0, ()),
+        (-2 * SLACK_TICKS + 0.5, [1.0] * 30, 0.0, ()),
+    ],
+)
+def test_a_clock_step_is_told_from_a_stall_by_what_follows(
+    size: float, following: list[float], step: float, notes: tuple[str, ...]
+) -> None:
+    assert clock(size, following) == ([step], notes)
+
+
+def test_three_clock_steps_are_noted_and_all_are_taken_out() -> None:
+    ticks = np.tile([1.0, 31.0, 1.0], 5)
+    jump = np.ones(15, dtype=np.int64)
+    places = np.arange(1, 15, 3)
+    rebase, notes = protection._clock_steps(places, ticks, jump, ticks - jump, MS)
+    assert rebase.tolist() == [0.0, 30.0, 0.0] * 5
+    assert notes == ("host clock stepped by +0.030 s",) * 3
+
+
+def test_a_stall_does_not_end_the_search_for_clock_steps() -> None:
+    ticks = np.array([31.0, *[0.1] * 25, *[1.0] * 30, 31.0, *[1.0] * 25])
+    jump = np.ones(len(ticks), dtype=np.int64)
+    rebase, notes = protection._clock_steps(np.array([0, 56]), ticks, jump, ticks - jump, MS)
+    assert np.flatnonzero(rebase).tolist() == [56]
+    assert notes == ("host clock stepped by +0.030 s",)
+
+
+def test_check_sums_are_bytes_even_of_nothing() -> None:
+    sums = crc8_rows(0x110, np.zeros((3, 8), dtype=np.uint8), 0, 1)
+    assert sums.dtype == np.uint8
+    assert len(set(sums.tolist())) == 1

@@ -1,0 +1,96 @@
+"""The population's kernel: against scalar code, over lanes and recordings, on two processors."""
+
+from __future__ import annotations
+
+import os
+import time
+from functools import partial
+
+import numpy as np
+
+from ehadiag.identify.batch import Batch, costs, workspace
+from ehadiag.identify.lanes import lane_costs, lane_work
+from ehadiag.identify.objective import SEARCH_CAP
+from ehadiag.identify.parallel import ParallelLanes
+from ehadiag.model.lanelayout import LANES
+from ehadiag_tools.bench_figures import Figure, Sizes, cpu_median
+from ehadiag_tools.bench_problem import whole_test
+
+__all__ = ["measure_lanes"]
+
+SECTION = "lanes"
+SUBSTEPS = 10
+"""Sub-steps of 100 µs in a tick: times are also given for one of these."""
+POPULATIONS = (1, LANES, 4 * LANES)
+SPREAD = (0.0, 1.0)
+
+
+def measure_lanes(sizes: Sizes, in_c: float | None) -> list[Figure]:
+    """Run the section; `in_c`: time of the scalar model in C for the same test, s."""
+    batch = whole_test(sizes.logs, 1)
+    ticks = len(batch.current)
+    out, each = [], 0.0
+    for size in POPULATIONS:
+        each = _lanes(batch, size, sizes)
+        tick = each * 1e9 / ticks
+        out.append(
+            Figure(
+                SECTION,
+                f"one evaluation of the whole test, population {size}",
+                each * 1e3,
+                "ms",
+                f"{tick:.1f} ns a tick, {tick / SUBSTEPS:.2f} ns for 100 µs",
+            )
+        )
+    alone = _scalar(batch, sizes)
+    out.append(Figure(SECTION, "faster than the scalar kernel", alone / each, "times"))
+    if in_c is not None:
+        out.append(Figure(SECTION, "faster than the scalar model in C", in_c / each, "times"))
+    for tests in (2, 4):
+        several = _lanes(whole_test(sizes.logs, tests), LANES, sizes)
+        out.append(Figure(SECTION, f"the same of {tests} tests", several * 1e3, "ms"))
+    return [*out, _cores(batch, sizes)]
+
+
+def _population(size: int) -> np.ndarray:
+    rows = np.zeros((size, 5))
+    rows[:, :3] = np.random.default_rng(0).uniform(*SPREAD, (size, 3))
+    return rows
+
+
+def _lanes(batch: Batch, size: int, sizes: Sizes) -> float:
+    rows, work, out = _population(size), lane_work(batch), np.empty(size)
+    call = partial(lane_costs, batch, rows, SEARCH_CAP, work, out)
+    return cpu_median(call, sizes.repeats) / size
+
+
+def _scalar(batch: Batch, sizes: Sizes) -> float:
+    rows, out = _population(LANES), np.empty(LANES)
+    gaps = np.empty((2, len(batch.current)))
+    call = partial(costs, batch, rows, SEARCH_CAP, workspace(batch), gaps, out)
+    return cpu_median(call, max(1, sizes.repeats // 3)) / LANES
+
+
+def _cores(batch: Batch, sizes: Sizes) -> Figure:
+    """Wall time of one thread against that of two for the same population."""
+    rows = _population(16 * LANES)
+    ratios = []
+    with ParallelLanes(batch, 1) as one, ParallelLanes(batch, 2) as two:
+        for lanes in (one, two):
+            lanes.costs(rows, SEARCH_CAP)
+        for _ in range(sizes.repeats):
+            ratios.append(_wall(one, rows) / _wall(two, rows))
+    return Figure(
+        SECTION,
+        "two threads against one",
+        float(np.max(ratios)),
+        "times",
+        f"wall time, best of {len(ratios)}, median {np.median(ratios):.2f}; load "
+        f"{os.getloadavg()[0]:.1f}; needs idle cores",
+    )
+
+
+def _wall(lanes: ParallelLanes, rows: np.ndarray) -> float:
+    begin = time.perf_counter()
+    lanes.costs(rows, SEARCH_CAP)
+    return time.perf_counter() - begin
