@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_iface import protection
-from firmware_iface.protection import NEAR, SLACK_RATE, SLACK_TICKS, crc8_rows
+from firmware_iface.protection import LONGEST_RUN, NEAR, SLACK_RATE, SLACK_TICKS, crc8_rows
 
 MS = 1_000_000
 
@@ -94,3 +94,48 @@ def test_check_sums_are_bytes_even_of_nothing() -> None:
     sums = crc8_rows(0x110, np.zeros((3, 8), dtype=np.uint8), 0, 1)
     assert sums.dtype == np.uint8
     assert len(set(sums.tolist())) == 1
+
+
+@pytest.mark.parametrize(("back", "single"), [(157, True), (172, True), (173, False), (140, True)])
+def test_a_frame_out_of_line_may_be_followed_by_a_gap(back: int, single: bool) -> None:
+    """The leap back is then as long as time says: nothing is strange about it."""
+    astray = protection._astray(np.array([100, back]), np.array([-99.0, 0.0]), 256)
+    assert astray.tolist() == [False, single, False]
+
+
+def marked(jump: list[int], leaps: list[int]) -> list[int]:
+    astray = np.zeros(len(jump) + 1, dtype=np.bool_)
+    protection._mark_runs(astray, np.array(jump), np.array(leaps), 256)
+    return np.flatnonzero(astray).tolist()
+
+
+@pytest.mark.parametrize(
+    ("back", "frames"),
+    [
+        (-101, [2, 3, 4]),
+        (156, [2, 3, 4]),
+        (NEAR - 102, [2, 3, 4]),
+        (NEAR - 101, []),
+        (-NEAR - 102, [2, 3, 4]),
+        (-NEAR - 103, []),
+    ],
+)
+def test_a_run_ends_where_the_counter_leaps_back(back: int, frames: list[int]) -> None:
+    assert marked([1, 100, 1, 1, back, 1], [1, 4]) == frames
+
+
+@pytest.mark.parametrize(
+    ("length", "found"), [(1, True), (LONGEST_RUN, True), (LONGEST_RUN + 1, False)]
+)
+def test_a_run_is_short(length: int, found: bool) -> None:
+    jump = [1, 100, *[1] * (length - 1), -99, 1]
+    assert marked(jump, [1, 1 + length]) == (list(range(2, 2 + length)) if found else [])
+
+
+def test_a_leap_back_is_not_a_leap_into_another_run() -> None:
+    assert marked([1, 100, 1, 1, -99, 1, 100, 1], [1, 4, 6]) == [2, 3, 4]
+    far = [1] * 30
+    far[0], far[20], far[23], far[25] = 90, 100, -99, 100
+    assert marked(far, [0, 20, 23, 25]) == [21, 22, 23]
+    far[23] = 70
+    assert marked(far, [0, 20, 23]) == []
