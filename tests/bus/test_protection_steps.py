@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from firmware_iface import protection
-from firmware_iface.protection import LONGEST_RUN, NEAR, SLACK_RATE, SLACK_TICKS, crc8_rows
+from firmware_iface.protection import (
+    LONGEST_RUN,
+    MOST_ROUNDS,
+    NEAR,
+    OUTSIDE,
+    SLACK_RATE,
+    SLACK_TICKS,
+    crc8_rows,
+)
 
 MS = 1_000_000
 
@@ -101,6 +109,8 @@ def test_a_frame_out_of_line_may_be_followed_by_a_gap(back: int, single: bool) -
     """The leap back is then as long as time says: nothing is strange about it."""
     astray = protection._astray(np.array([100, back]), np.array([-99.0, 0.0]), 256)
     assert astray.tolist() == [False, single, False]
+    later = protection._astray(np.array([1, 100, back]), np.array([0.0, -99.0, 0.0]), 256)
+    assert later.tolist() == [False, False, single, False]
 
 
 def marked(jump: list[int], leaps: list[int]) -> list[int]:
@@ -139,3 +149,22 @@ def test_a_leap_back_is_not_a_leap_into_another_run() -> None:
     assert marked(far, [0, 20, 23, 25]) == [21, 22, 23]
     far[23] = 70
     assert marked(far, [0, 20, 23]) == []
+
+
+def test_the_search_for_frames_out_of_line_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def never_content(jump: np.ndarray, *_: object) -> np.ndarray:
+        searched.append(len(jump) + 1)
+        return np.arange(len(jump) + 1) == len(jump)
+
+    monkeypatch.setattr(protection, "_astray", never_content)
+    position, notes = protection.unwrap(np.arange(200), np.arange(200) * MS, MS)
+    assert searched == list(range(200, 199 - MOST_ROUNDS, -1))
+    assert position.tolist() == [*range(200 - MOST_ROUNDS), *[OUTSIDE] * MOST_ROUNDS]
+    assert notes == (f"{MOST_ROUNDS} frames with a counter out of line",)
+
+
+def test_no_frames_have_whole_numbers_as_positions() -> None:
+    nothing = np.empty(0, dtype=np.int64)
+    assert protection.unwrap(nothing, nothing, MS)[0].dtype == np.int64
