@@ -168,3 +168,22 @@ def test_the_search_for_frames_out_of_line_ends(monkeypatch: pytest.MonkeyPatch)
 def test_no_frames_have_whole_numbers_as_positions() -> None:
     nothing = np.empty(0, dtype=np.int64)
     assert protection.unwrap(nothing, nothing, MS)[0].dtype == np.int64
+
+
+def test_frames_lost_in_a_stall_show_when_the_burst_is_over() -> None:
+    """The gap lies within the burst, where time says nothing; what follows is a turn late."""
+    position = np.array([*range(350), *range(650, 1000)])
+    time = np.where((position >= 150) & (position < 700), 700, position)
+    assert protection.unwrap(position % 256, time * MS, MS)[0].tolist() == position.tolist()
+
+
+@pytest.mark.parametrize(
+    ("leap", "goes_on"), [(100, 100), (-NEAR - 1, -NEAR - 1), (-NEAR - 2, 254 - NEAR), (-100, 156)]
+)
+def test_a_counter_that_starts_anew_never_falls_back_by_more_than_disorder(
+    leap: int, goes_on: int
+) -> None:
+    count = np.arange(120)
+    counter = (300 + count + np.where(count >= 60, leap, 0)) % 256
+    got, _ = protection.unwrap(counter, count * MS, MS)
+    assert (got - got[0]).tolist() == (count + np.where(count >= 60, goes_on, 0)).tolist()
