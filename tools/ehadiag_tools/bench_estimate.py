@@ -6,9 +6,9 @@ import statistics
 import time
 
 from ehadiag.identify.pipeline import identify
-from ehadiag.identify.solvers import PygadGa
 from ehadiag_tools.bench_figures import Figure, Sizes
 from ehadiag_tools.bench_problem import LOG, TRUTH, experiment
+from ehadiag_tools.bench_rivals import rivals
 
 __all__ = ["measure"]
 
@@ -38,15 +38,11 @@ def measure(sizes: Sizes) -> list[Figure]:
     names = "first approximation", "genetic search", "refinement and interval"
     for index, name in enumerate(names):
         out.append(_ms(f"  {name}, wall", [stage[index] for stage in stages]))
-    cpu = time.process_time()
-    identify([experiment(sizes.logs)], solver=PygadGa())
-    spent = time.process_time() - cpu
-    share = spent / statistics.median(cpus)
+    whole = statistics.median(cpus)
     return [
         *out,
         Figure(SECTION, "largest error of the three constants", 100.0 * error, "%"),
-        Figure(SECTION, "the whole with pygad as its search, CPU", spent * 1e3, "ms"),
-        Figure(SECTION, "the whole is faster than with pygad", share, "times"),
+        *rivals(sizes, result, whole),
     ]
 
 

@@ -26,7 +26,7 @@ from ehadiag.identify.stages import DEVIATION
 from ehadiag_tools.bench_figures import Figure, Sizes
 from ehadiag_tools.bench_problem import experiment, search_window
 
-__all__ = ["measure"]
+__all__ = ["Goal", "ReachedError", "measure"]
 
 SECTION = "search"
 POPULATION = 24
@@ -37,11 +37,11 @@ SLACK = 1e-3
 Vector = NDArray[np.float64]
 
 
-class _ReachedError(BaseException):
+class ReachedError(BaseException):
     """Stops a rival that is there; pygad turns exceptions of the usual kind into an exit."""
 
 
-class _Goal(Objective):
+class Goal(Objective):
     """The objective; ends the search that reaches the goal, or has spent its evaluations."""
 
     def __init__(self, of: Objective, goal: float, budget: int) -> None:
@@ -49,10 +49,11 @@ class _Goal(Objective):
         self.goal, self.limit, self.best = goal, budget, np.inf
 
     def __call__(self, population: Vector) -> Vector:
+        """As the objective; raises ReachedError once the goal is reached."""
         values = super().__call__(population)
         self.best = min(self.best, float(values.min()))
         if self.best <= self.goal or self.evaluations >= self.limit:
-            raise _ReachedError
+            raise ReachedError
         return values
 
 
@@ -114,10 +115,10 @@ def _race(
     """Time, evaluations and arrival of each seed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        _to_end(rival, _Goal(objective, -1.0, 2 * POPULATION), start, 0, sizes.budget)
+        _to_end(rival, Goal(objective, -1.0, 2 * POPULATION), start, 0, sizes.budget)
         out = []
         for seed, goal in enumerate(goals):
-            race = _Goal(objective, goal, sizes.budget)
+            race = Goal(objective, goal, sizes.budget)
             begin = time.thread_time()
             _to_end(rival, race, start, seed, sizes.budget)
             spent = time.thread_time() - begin
@@ -127,14 +128,14 @@ def _race(
 
 def _to_end(
     rival: Callable[[Objective, Vector, int, int], None],
-    race: _Goal,
+    race: Goal,
     start: Vector,
     seed: int,
     budget: int,
 ) -> None:
     try:
         rival(race, start, seed, budget)
-    except _ReachedError:
+    except ReachedError:
         return
 
 
