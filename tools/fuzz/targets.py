@@ -80,7 +80,7 @@ def _compare(
     answers: list[BitStatus | Sample | Request | None], decoded: DecodedTable, bus: BusMap
 ) -> None:
     """One frame at a time and in columns, the same frames are good and say the same."""
-    roles = {Sample: CHANNELS[0], Request: "request.code", BitStatus: "status.state"}
+    roles = {Sample: "channels.spool", Request: "request.code", BitStatus: "status.state"}
     for kind, role in roles.items():
         found = bus.find(role)
         if found is None:
@@ -92,8 +92,7 @@ def _compare(
         if rows.tolist() != [row for row, answer in enumerate(answers) if type(answer) is kind]:
             raise AssertionError(f"{found[0].name}: the decoders accept different frames")
     messages = decoded.messages.values()
-    for name in CHANNELS:
-        key = name.partition(".")[2]
+    for name, key in CHANNELS.items():
         live = [getattr(answer, key) for answer in answers if isinstance(answer, Sample)]
         column = next(item.values[name] for item in messages if name in item.values)
         if not np.allclose(live, column, rtol=1e-12, atol=0.0):
