@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from ehadiag.errors import EhadiagError
+from ehadiag.recording import CommandMode
 from ehadiag.tomlfile import decode_toml
 from firmware_iface import busmap
 from firmware_iface.align import assemble
@@ -31,6 +32,7 @@ from firmware_iface.decode import DecodedTable, decode
 from firmware_iface.frames import MAX_PAYLOAD, Frame, FrameTable
 from firmware_iface.livedecode import CHANNELS, LiveDecoder
 from firmware_iface.livemessages import BitStatus, Request, Sample
+from firmware_iface.liveticks import LiveTicks
 from firmware_iface.logs import read_frames, read_recordings
 from firmware_iface.mapping import MappingFile
 from firmware_iface.protection import crc8
@@ -47,6 +49,7 @@ SEALED, EXTENDED, ERROR, REMOTE, SLOW = 1, 2, 4, 8, 16
 IDENTIFIERS = (0x110, 0x111, 0x120, 0x200, 0x201, 0x110, 0x111, 0x7FF)
 KINDS = (".blf", ".asc", ".csv", ".trc", "container")
 """Logs by the first byte of an input; `container` is the inside of a sound BLF file."""
+MOST_TICKS = 256
 MICROSECOND = 1000
 MILLISECOND = 1_000_000
 
@@ -65,8 +68,10 @@ def _frames(share: int) -> Callable[[bytes], None]:
 
     def check(data: bytes) -> None:
         frames = _frames_of(data)
-        decoder = LiveDecoder(bus)
+        decoder, live = LiveDecoder(bus), LiveTicks(bus, CommandMode.CURRENT)
         answers = [decoder.decode(frame) for frame in frames]
+        if any(len(live.take(frame)) > MOST_TICKS for frame in frames):
+            raise AssertionError("one frame completes more ticks than a turn of the counter has")
         if frames and _chosen(data, share):
             table = FrameTable.from_frames(frames)
             _compare(answers, decode(table, bus), bus)
