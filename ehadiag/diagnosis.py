@@ -14,9 +14,10 @@ from ehadiag.fitness import (
     remarks_on_recording,
 )
 from ehadiag.identify.experiment import Experiment, build_experiment
-from ehadiag.identify.pipeline import Identification, Progress, identify
+from ehadiag.identify.pipeline import identify
+from ehadiag.identify.result import Identification
 from ehadiag.identify.solvers import Solver
-from ehadiag.identify.stages import Memory
+from ehadiag.identify.stages import Memory, Progress
 from ehadiag.recording import Recording
 from ehadiag.storedtest import StoredTest
 from ehadiag.verdict import Levels, Verdict, judge

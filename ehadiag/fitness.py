@@ -8,7 +8,7 @@ from ehadiag.actuator import Actuator
 from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.current import CONTROL_LAW_LSB, FRAME_TOLERANCE
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.pipeline import Identification
+from ehadiag.identify.result import Identification
 from ehadiag.model.constants import REFERENCE_TEMPERATURE
 from ehadiag.recording import BitState, CommandMode, Environment, Recording, Samples
 from ehadiag.storedtest import SAME_RATE, StoredTest

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ehadiag.errors import ConfigurationError
 
 if TYPE_CHECKING:  # the command line needs levels and codes long before it loads the compiler
-    from ehadiag.identify.pipeline import Identification
+    from ehadiag.identify.result import Identification
 
 __all__ = ["Levels", "Verdict", "judge"]
 

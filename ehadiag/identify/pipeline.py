@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,12 +21,14 @@ from ehadiag.identify.first import FirstApproximation
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.objective import Objective
 from ehadiag.identify.refine import Refinement, describe, gaps_of, median_offsets, refine
+from ehadiag.identify.result import Estimate, Fit, Identification, Timing
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.stages import (
     DEVIATION_SHARE,
     LEAD_S,
     STAGES,
     Memory,
+    Progress,
     digest,
     experiment_arrays,
     first_stage,
@@ -35,7 +37,7 @@ from ehadiag.identify.stages import (
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
 
-__all__ = ["Estimate", "Fit", "Identification", "Timing", "identify"]
+__all__ = ["identify"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,86 +71,6 @@ JUDGEMENTS = 3
 NOISE_SETTLED = 0.15
 NOT_SHOWN_STD = 0.1
 BOUND = 1e-6
-
-Progress = Callable[[str, float], None]
-"""Called with the stage and its share done, 0 … 1."""
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """One fault constant as each stage left it."""
-
-    name: str
-    first: float
-    """After the first approximation."""
-    search: float
-    """After the genetic search."""
-    value: float
-    """After the refinement: the estimate."""
-    std: float
-    interval95: tuple[float, float]
-    at_bound: bool
-    """The estimate stands at 0 or 1."""
-    shown: bool
-    """Whether the test shows this constant at all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """How well the model explains the recording.
-
-    Attributes
-    ----------
-    spool_rms, pressure_rms: rms gap in units of the channel's own noise, squares capped at nine;
-        about 1 where the model explains all.
-    outliers: share of gaps beyond three deviations, both channels (0.003 for noise alone).
-    spool_noise, pressure_noise: noise of the channels, m and Pa.
-    spool_offset, pressure_offset: constant errors of the channels, m and Pa.
-    anchored: how often the model had to be put back on the measured spool.
-    """
-
-    spool_rms: float
-    pressure_rms: float
-    outliers: float
-    spool_noise: float
-    pressure_noise: float
-    spool_offset: float
-    pressure_offset: float
-    anchored: int
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """Seconds spent."""
-
-    first: float
-    search: float
-    refine: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Identification:
-    """What the recordings say about the actuator's faults."""
-
-    estimates: tuple[Estimate, ...]
-    covariance: NDArray[np.float64]
-    """Of the three constants, shape (3, 3)."""
-    fit: Fit
-    solver: str
-    seed: int
-    evaluations: int
-    """Runs of the model in all stages."""
-    generations: int
-    cost: float
-    converged: bool
-    attempts: int
-    """Searches that it took; more than one where the first did not explain the recording."""
-    timing: Timing
-
-    @property
-    def rescued(self) -> bool:
-        """Whether the first search did not explain the recording."""
-        return self.attempts > 1
 
 
 def identify(

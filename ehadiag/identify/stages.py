@@ -28,6 +28,7 @@ __all__ = [
     "LEAD_S",
     "STAGES",
     "Memory",
+    "Progress",
     "digest",
     "experiment_arrays",
     "first_ends_at",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ehadiag.diagnosis import Diagnosis
 from ehadiag.errors import InputOutputError
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.pipeline import Identification
+from ehadiag.identify.result import Identification
 from ehadiag.model.monitoring import respond
 
 __all__ = ["draw_diagnosis"]

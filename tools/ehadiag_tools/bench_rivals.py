@@ -16,7 +16,7 @@ from scipy.optimize import differential_evolution
 
 from ehadiag.identify.experiment import make_batch
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.pipeline import Identification
+from ehadiag.identify.result import Identification
 from ehadiag.identify.solvers import PygadGa
 from ehadiag_tools.bench_figures import Figure, Sizes
 from ehadiag_tools.bench_problem import experiment

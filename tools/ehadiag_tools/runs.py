@@ -14,7 +14,8 @@ from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.errors import InputOutputError
 from ehadiag.identify.experiment import Experiment, build_experiment
-from ehadiag.identify.pipeline import Identification, identify
+from ehadiag.identify.pipeline import identify
+from ehadiag.identify.result import Identification
 from ehadiag.identify.solvers import make_solver
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.monitoring import respond

@@ -1,0 +1,87 @@
+"""What an identification says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Estimate", "Fit", "Identification", "Timing"]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One fault constant as each stage left it."""
+
+    name: str
+    first: float
+    """After the first approximation."""
+    search: float
+    """After the genetic search."""
+    value: float
+    """After the refinement: the estimate."""
+    std: float
+    interval95: tuple[float, float]
+    at_bound: bool
+    """The estimate stands at 0 or 1."""
+    shown: bool
+    """Whether the test shows this constant at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well the model explains the recording.
+
+    Attributes
+    ----------
+    spool_rms, pressure_rms: rms gap in units of the channel's own noise, squares capped at nine;
+        about 1 where the model explains all.
+    outliers: share of gaps beyond three deviations, both channels (0.003 for noise alone).
+    spool_noise, pressure_noise: noise of the channels, m and Pa.
+    spool_offset, pressure_offset: constant errors of the channels, m and Pa.
+    anchored: how often the model had to be put back on the measured spool.
+    """
+
+    spool_rms: float
+    pressure_rms: float
+    outliers: float
+    spool_noise: float
+    pressure_noise: float
+    spool_offset: float
+    pressure_offset: float
+    anchored: int
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Seconds spent."""
+
+    first: float
+    search: float
+    refine: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """What the recordings say about the actuator's faults."""
+
+    estimates: tuple[Estimate, ...]
+    covariance: NDArray[np.float64]
+    """Of the three constants, shape (3, 3)."""
+    fit: Fit
+    solver: str
+    seed: int
+    evaluations: int
+    """Runs of the model in all stages."""
+    generations: int
+    cost: float
+    converged: bool
+    attempts: int
+    """Searches that it took; more than one where the first did not explain the recording."""
+    timing: Timing
+
+    @property
+    def rescued(self) -> bool:
+        """Whether the first search did not explain the recording."""
+        return self.attempts > 1
