@@ -7,6 +7,11 @@ elite competes with each of them (persistent elitism), and the vector moves towa
 weight of one individual in a virtual population. Several individuals are drawn a generation, so
 that the model runs on many at once.
 
+Three things differ from the paper. Draws outside the bounds are put on the bound, not drawn again:
+an optimum at a bound is hit, not only approached. After each generation the mean goes half way to
+the elite, and the deviation is at least a multiple of the elite's step in it: the vector shrinks
+with every loser, and would else collapse beside the optimum while the elite still moves on.
+
 The state is the vector, the elite and the random generator: a few numbers, whatever the number of
 generations or the size of the virtual population.
 """
@@ -24,8 +29,10 @@ from ehadiag.jit import kernel
 
 __all__ = ["compact_ga", "state_bytes"]
 
-REDRAWS = 16
-"""Draws outside the bounds are repeated so often, then clipped (truncated normal density)."""
+PULL = 0.5
+"""Share of its distance from the elite by which the mean moves after a generation."""
+REACH = 1.5
+"""Least deviation after a generation, in steps of the elite."""
 
 
 def state_bytes(genes: int) -> int:
@@ -93,39 +100,38 @@ def compact_ga(
     population = np.empty((samples, genes + 2))
     population[:, genes:] = offsets
     values = np.empty(samples)
-    elite, best = start.copy(), np.inf
+    elite, best, before = start.copy(), np.inf, np.empty(genes)
     used, generation = 0, 0
     while used + samples <= budget and control[0] == 0:
         for i in range(samples):
             for g in range(genes):
-                value = 0.0
-                for _ in range(REDRAWS):
-                    value = mean[g] + spread[g] * _next_normal(state)
-                    if 0.0 <= value <= 1.0:
-                        break
+                value = mean[g] + spread[g] * _next_normal(state)
                 population[i, g] = min(max(value, 0.0), 1.0)
         if generation == 0:
             population[0, :genes] = start
         lane_costs(batch, population, cap, work, values)
         used += samples
+        before[:] = elite
         for i in range(samples):
             wins = values[i] < best
             for g in range(genes):
                 winner = population[i, g] if wins else elite[g]
                 loser = elite[g] if wins else population[i, g]
-                before = mean[g]
-                mean[g] = min(max(before + (winner - loser) / virtual_population, 0.0), 1.0)
+                change = (winner - loser) / virtual_population
                 square = (
                     spread[g] ** 2
-                    + before**2
-                    - mean[g] ** 2
-                    + (winner**2 - loser**2) / virtual_population
+                    + ((winner - mean[g]) ** 2 - (loser - mean[g]) ** 2) / virtual_population
+                    - change**2
                 )
+                mean[g] = min(max(mean[g] + change, 0.0), 1.0)
                 spread[g] = math.sqrt(max(square, (0.25 * tolerance) ** 2))
                 if wins:
                     elite[g] = population[i, g]
             if wins:
                 best = values[i]
+        for g in range(genes):
+            mean[g] += PULL * (elite[g] - mean[g])
+            spread[g] = max(spread[g], REACH * abs(elite[g] - before[g]))
         history[generation] = best
         generation += 1
         control[1] = used

@@ -20,6 +20,8 @@ __all__ = ["SOLVERS", "CompactGa", "PygadGa", "SearchResult", "Solver", "make_so
 Progress = Callable[[int, int], None]
 """Called with evaluations done and budget."""
 POLL_S = 0.05
+PARENTS, ELITE, MUTATION = 3, 1, 0.8
+"""Of pygad: parents of a generation, individuals kept, probability that a gene mutates."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,10 +75,10 @@ class CompactGa:
 
     budget: int = 600
     """Evaluations at most."""
-    virtual_population: float = 40.0
+    virtual_population: float = 42.0
     samples: int = 16
     """Individuals drawn a generation."""
-    tolerance: float = 1e-5
+    tolerance: float = 1e-6
     """Done when the deviation of every gene is below."""
     name: str = field(default="cga", init=False)
 
@@ -136,10 +138,16 @@ class CompactGa:
 
 @dataclass(frozen=True, slots=True)
 class PygadGa:
-    """pygad's genetic algorithm on the same objective."""
+    """pygad's genetic algorithm on the same objective.
+
+    The mutation's range shrinks geometrically with the generations, from the deviation to
+    `finest`; pygad's own adaptive mutation changes how often a gene mutates, not how far.
+    """
 
     budget: int = 1600
-    population: int = 32
+    population: int = 16
+    finest: float = 5e-6
+    """Range of the mutation in the last generation."""
     name: str = field(default="pygad", init=False)
 
     def with_budget(self, budget: int) -> PygadGa:
@@ -165,9 +173,14 @@ class PygadGa:
         history: list[float] = []
 
         def fitness(_: Any, solutions: NDArray[np.float64], __: Any) -> NDArray[np.float64]:
-            return -objective(solutions)
+            return -objective(np.clip(solutions, 0.0, 1.0))
+
+        generations = max(1, (self.budget - self.population) // (self.population - ELITE))
 
         def after(ga: Any) -> None:
+            share = ga.generations_completed / generations
+            reach = widest * min(1.0, self.finest / widest) ** share
+            ga.random_mutation_min_val, ga.random_mutation_max_val = -reach, reach
             history.append(-float(np.max(ga.last_generation_fitness)))
             if progress is not None:
                 progress(objective.evaluations - before, self.budget)
@@ -175,18 +188,18 @@ class PygadGa:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             ga = pygad.GA(
-                num_generations=max(1, self.budget // self.population - 1),
-                num_parents_mating=self.population // 2,
+                num_generations=generations,
+                num_parents_mating=PARENTS,
                 initial_population=first,
                 fitness_func=fitness,
                 fitness_batch_size=self.population,
-                gene_space={"low": 0.0, "high": 1.0},
-                parent_selection_type="tournament",
-                keep_elitism=2,
+                # No gene_space: with one, a mutated gene is drawn from all of it.
+                parent_selection_type="sss",
+                keep_elitism=ELITE,
                 crossover_type="uniform",
                 mutation_type="random",
                 mutation_by_replacement=False,
-                mutation_probability=0.5,
+                mutation_probability=MUTATION,
                 random_mutation_min_val=-widest,
                 random_mutation_max_val=widest,
                 random_seed=seed,
@@ -197,7 +210,11 @@ class PygadGa:
             best, value, _ = ga.best_solution(ga.last_generation_fitness)
         used = objective.evaluations - before
         return SearchResult(
-            np.asarray(best, dtype=np.float64), -float(value), used, len(history), np.array(history)
+            np.clip(np.asarray(best, dtype=np.float64), 0.0, 1.0),
+            -float(value),
+            used,
+            len(history),
+            np.array(history),
         )
 
 
