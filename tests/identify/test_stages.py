@@ -84,7 +84,7 @@ def ends(test):
 def test_stages_follow_the_second_part():
     test = resolve_test("open")
     assert first_ends_at(test) == pytest.approx(3.5)
-    assert ends(test) == pytest.approx([4.0, 4.5, 5.0, 5.5])
+    assert ends(test) == pytest.approx([4.0, 4.5, 5.0, 5.4])
 
 
 def test_other_samples_are_not_answered_from_memory():
