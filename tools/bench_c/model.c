@@ -4,31 +4,14 @@
  * flapper by transition matrices with events located by halving, the jack by closed forms.
  * Build: cc -O3 -march=native -shared -fPIC model.c -lm
  */
-#include <math.h>
+#include "plant.h"
 
-enum { FINEST = 10, BASE = 3, WHOLE = 1 << FINEST, NODE_LEVEL = 5, ROOM = 128, COLUMNS = 4 };
+enum { BASE = 3, NODE_LEVEL = 5, ROOM = 128, COLUMNS = 4 };
 enum { LAST = WHOLE - (WHOLE >> BASE), MOST_PARTS = 32, BISECTIONS = 30 };
-enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELEASE };
 
 static const double BEND = 0.05e-6, LAST_BEND = 0.002e-6;
 static const double SHORTEST = 1e-9, TRAVEL = 1.0e-6, RATIO = 0.05, PART_BEND = 0.1e-6;
 static const double DRIFT = -0.45;
-
-/* In the order of ehadiag.model.constants.PlantConstants. */
-typedef struct {
-    double GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
-    double AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
-} Plant;
-
-/* In the order of ehadiag.model.transition.SpoolScalars. */
-typedef struct {
-    double force, damping, dynamic, breakaway, ring_damping, ring_rate;
-} Scalars;
-
-typedef struct {
-    double xf, wf, xs, vs;
-    int direction, clamped;
-} Spool;
 
 typedef struct {
     double spool, divide, by_divide, ease;
@@ -38,54 +21,6 @@ typedef struct {
     double p0, p1, p2, excess, rate;
 } Approach;
 
-static int held(const Plant *c, const Scalars *t, double xf, double xs)
-{
-    return fabs(xf) <= t->breakaway || (fabs(xs) >= c->XSM && xs * xf > 0.0);
-}
-
-static int clamped_event(const Plant *c, const Scalars *t, double torque, const Spool *s)
-{
-    if ((torque - c->KSF * s->xs - c->KF * s->xf) * s->xf < 0.0)
-        return RELEASE;
-    if (s->direction == 0)
-        return held(c, t, s->xf, s->xs) ? NOTHING : BREAKAWAY;
-    if (s->vs * s->direction <= 0.0)
-        return REVERSAL;
-    return fabs(s->xs) >= c->XSM && s->xs * s->direction > 0.0 ? SPOOL_STOP : NOTHING;
-}
-
-static int moving_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
-{
-    if (b->vs * a->direction <= 0.0)
-        return REVERSAL;
-    if (fabs(b->xs) >= c->XSM && b->xs * a->direction > 0.0)
-        return SPOOL_STOP;
-    if (fabs(b->xf) >= c->XFM)
-        return FLAPPER_STOP;
-    if (a->wf * b->wf < 0.0) {
-        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
-        double lowest = fmin(a->xf * a->direction, b->xf * a->direction);
-        if (lowest - t->dynamic / t->force - swing <= 0.0
-            || fmax(fabs(a->xf), fabs(b->xf)) + swing >= c->XFM)
-            return UNSURE;
-    }
-    return NOTHING;
-}
-
-static int stuck_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
-{
-    if (!held(c, t, b->xf, a->xs))
-        return BREAKAWAY;
-    if (fabs(b->xf) >= c->XFM)
-        return FLAPPER_STOP;
-    if (a->wf * b->wf < 0.0) {
-        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
-        if (fmax(fabs(a->xf), fabs(b->xf)) + swing > fmin(t->breakaway, c->XFM))
-            return UNSURE;
-    }
-    return NOTHING;
-}
-
 static int rests(const Plant *c, const Scalars *t, double torque, const Spool *s)
 {
     if (t->ring_rate <= 0.0)
@@ -94,36 +29,6 @@ static int rests(const Plant *c, const Scalars *t, double torque, const Spool *s
     double a = s->xf - rest;
     double b = (s->wf + t->ring_damping * a) / t->ring_rate;
     return fabs(rest) + sqrt(a * a + b * b) < fmin(t->breakaway, c->XFM);
-}
-
-static void change(const Plant *c, const Scalars *t, int event, Spool *s)
-{
-    switch (event) {
-    case REVERSAL:
-        s->vs = 0.0;
-        s->direction = 0;
-        if (fabs(s->xf) > t->breakaway)
-            s->direction = s->xf > 0.0 ? 1 : -1;
-        break;
-    case SPOOL_STOP:
-        s->xs = copysign(c->XSM, s->xs);
-        s->vs = 0.0;
-        s->direction = 0;
-        break;
-    case BREAKAWAY:
-        s->direction = s->xf > 0.0 ? 1 : -1;
-        break;
-    case FLAPPER_STOP:
-        s->xf = copysign(c->XFM, s->xf);
-        s->wf = 0.0;
-        s->clamped = 1;
-        break;
-    case RELEASE:
-        s->clamped = 0;
-        break;
-    default:
-        break;
-    }
 }
 
 /* One tick of the spool; returns the number of nodes (span, place, rise at both ends). */

@@ -1,0 +1,100 @@
+/* Constants of the plant, and what ends a step of flapper and spool (ehadiag/model/spoolevents.py);
+ * for all the models here. */
+#include <math.h>
+
+enum { FINEST = 10, WHOLE = 1 << FINEST };
+enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELEASE };
+
+/* In the order of ehadiag.model.constants.PlantConstants. */
+typedef struct {
+    double GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
+    double AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
+} Plant;
+
+/* In the order of ehadiag.model.transition.SpoolScalars. */
+typedef struct {
+    double force, damping, dynamic, breakaway, ring_damping, ring_rate;
+} Scalars;
+
+typedef struct {
+    double xf, wf, xs, vs;
+    int direction, clamped;
+} Spool;
+
+static int held(const Plant *c, const Scalars *t, double xf, double xs)
+{
+    return fabs(xf) <= t->breakaway || (fabs(xs) >= c->XSM && xs * xf > 0.0);
+}
+
+static int clamped_event(const Plant *c, const Scalars *t, double torque, const Spool *s)
+{
+    if ((torque - c->KSF * s->xs - c->KF * s->xf) * s->xf < 0.0)
+        return RELEASE;
+    if (s->direction == 0)
+        return held(c, t, s->xf, s->xs) ? NOTHING : BREAKAWAY;
+    if (s->vs * s->direction <= 0.0)
+        return REVERSAL;
+    return fabs(s->xs) >= c->XSM && s->xs * s->direction > 0.0 ? SPOOL_STOP : NOTHING;
+}
+
+static int moving_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
+{
+    if (b->vs * a->direction <= 0.0)
+        return REVERSAL;
+    if (fabs(b->xs) >= c->XSM && b->xs * a->direction > 0.0)
+        return SPOOL_STOP;
+    if (fabs(b->xf) >= c->XFM)
+        return FLAPPER_STOP;
+    if (a->wf * b->wf < 0.0) {
+        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
+        double lowest = fmin(a->xf * a->direction, b->xf * a->direction);
+        if (lowest - t->dynamic / t->force - swing <= 0.0
+            || fmax(fabs(a->xf), fabs(b->xf)) + swing >= c->XFM)
+            return UNSURE;
+    }
+    return NOTHING;
+}
+
+static int stuck_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
+{
+    if (!held(c, t, b->xf, a->xs))
+        return BREAKAWAY;
+    if (fabs(b->xf) >= c->XFM)
+        return FLAPPER_STOP;
+    if (a->wf * b->wf < 0.0) {
+        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
+        if (fmax(fabs(a->xf), fabs(b->xf)) + swing > fmin(t->breakaway, c->XFM))
+            return UNSURE;
+    }
+    return NOTHING;
+}
+
+static void change(const Plant *c, const Scalars *t, int event, Spool *s)
+{
+    switch (event) {
+    case REVERSAL:
+        s->vs = 0.0;
+        s->direction = 0;
+        if (fabs(s->xf) > t->breakaway)
+            s->direction = s->xf > 0.0 ? 1 : -1;
+        break;
+    case SPOOL_STOP:
+        s->xs = copysign(c->XSM, s->xs);
+        s->vs = 0.0;
+        s->direction = 0;
+        break;
+    case BREAKAWAY:
+        s->direction = s->xf > 0.0 ? 1 : -1;
+        break;
+    case FLAPPER_STOP:
+        s->xf = copysign(c->XFM, s->xf);
+        s->wf = 0.0;
+        s->clamped = 1;
+        break;
+    case RELEASE:
+        s->clamped = 0;
+        break;
+    default:
+        break;
+    }
+}
