@@ -18,7 +18,9 @@ __all__ = ["Bowl", "centre", "settle"]
 SETTLINGS = 2
 REACH = 2.0
 """Deviations to either side over which the bowl is looked at."""
-POINTS = 9
+SHARES = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
+LEAST_TRUSTED = 0.25
+"""Share of information in rows whose derivatives hold, below which the cost counts as jagged."""
 FINE_POINTS = 33
 LEAST_POINTS = 5
 LONGEST_AXIS = 0.005
@@ -59,6 +61,7 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
         runs = model.many(np.vstack([sides, *(points for _, points in lines)]))
         trusted = model.trusted(slope, runs[: len(sides)])
         costs = [capped(gaps) for gaps in runs[len(sides) :]]
+        smooth &= _trusted_share(slope, trusted) > LEAST_TRUSTED
         x = slope.x.copy()
         for axis, (shares, _) in zip(axes, lines, strict=True):
             share, rough = _vertex(
@@ -122,11 +125,19 @@ def _line(
     x: NDArray[np.float64], axis: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points beside x along an axis, within the bounds, shape (n, 5), and their shares of it."""
-    shares = np.linspace(-REACH, REACH, POINTS)
-    shares = shares[shares != 0.0]
-    points = x + shares[:, None] * axis
+    points = x + SHARES[:, None] * axis
     inside = _inside(points)
-    return shares[inside], points[inside]
+    return SHARES[inside], points[inside]
+
+
+def _trusted_share(slope: Slope, trusted: Slope) -> float:
+    """Least share of a constant's information that rows keep which can be trusted.
+
+    Where break-aways make most of it, a narrow basin among many looks smooth and well known.
+    """
+    most = (slope.jacobian[:FAULT_COUNT, slope.used] ** 2).sum(axis=1)
+    kept = (slope.jacobian[:FAULT_COUNT, trusted.used] ** 2).sum(axis=1)
+    return float((kept[most > 0.0] / most[most > 0.0]).min(initial=1.0))
 
 
 def _vertex(shares: NDArray[np.float64], costs: NDArray[np.float64]) -> tuple[float, float]:
