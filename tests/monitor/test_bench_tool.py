@@ -2,19 +2,22 @@
 
 import json
 import shutil
+from itertools import product
 
 import numpy as np
 import pytest
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import POSITION, PRESSURE, SPOOL
+from ehadiag.identify.lanes import lane_residuals, lane_work
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.monitoring import respond
 from ehadiag.model.transition import spool_tables
 from ehadiag.storedtest import resolve_test
 from ehadiag_tools import bench, bench_c_model
-from ehadiag_tools.bench_c_model import CModel
+from ehadiag_tools.bench_c_model import CLanes, CModel
 from ehadiag_tools.bench_decode import tiled
+from ehadiag_tools.bench_problem import whole_test
 from firmware_iface.logs import read_frames
 
 TINY = ["--repeats", "1", "--ticks", "5", "--seeds", "1", "--budget", "50", "--pushes", "50"]
@@ -45,6 +48,24 @@ def test_c_and_numba_are_the_same_algorithm(faults):
     np.testing.assert_allclose(model.spool, numba.spool, atol=1e-6 * SPOOL.lsb)
     np.testing.assert_allclose(model.pressure, numba.pressure, atol=1e-6 * PRESSURE.lsb)
     np.testing.assert_allclose(model.position, numba.position, atol=1e-6 * POSITION.lsb)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+@pytest.mark.parametrize(
+    "anchor", [(0.0, np.inf, np.inf), (0.1, 2.0 * SPOOL.lsb, 20.0 * SPOOL.lsb)]
+)
+def test_c_and_lanes_are_the_same_algorithm(anchor):
+    batch = whole_test(bench.LOGS, 2)._replace(anchor=np.array([anchor] * 2))
+    work = lane_work(batch)
+    corners = np.array([[*faults, 0.0, 0.0] for faults in product((0.0, 0.4, 1.0), repeat=3)])
+    gaps, anchored = np.empty((27, 2, len(batch.current))), np.empty(27, dtype=np.int64)
+    lane_residuals(batch, corners, work, gaps, anchored)
+    assert anchored.any() == np.isfinite(anchor[1])
+    model = CLanes(batch, work.levels, corners, np.inf, gaps=True)
+    model()
+    lsb = np.array([SPOOL.lsb, PRESSURE.lsb])[:, None] * batch.weight
+    assert np.all(np.abs(gaps - model.gaps) <= 1e-6 * lsb)
+    np.testing.assert_allclose(model.costs, (gaps**2).sum(axis=(1, 2)), rtol=1e-9)
 
 
 def test_without_a_compiler_c_is_left_out(monkeypatch, capsys):
