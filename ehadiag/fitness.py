@@ -63,7 +63,7 @@ def objections_to_recording(
         *recording.quality.refused,
         *_unlike_the_test(samples, test, actuator),
         *_gaps(samples, test),
-        *_out_of_range(recording.environment, samples, actuator),
+        *out_of_range(recording.environment, samples, actuator),
     ]
 
 
@@ -106,7 +106,8 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
     return out
 
 
-def _out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
+def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
+    """What the model must not be run with; holds for a running test too."""
     out = []
     for index, name in ((1, "spool"), (2, "pressure")):
         share = float(np.mean(samples.saturated[index]))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ehadiag.actuator import Actuator
-from ehadiag.identify.experiment import build_experiment
+from ehadiag.fitness import objections_to_experiment, objections_to_recording, out_of_range
+from ehadiag.identify.experiment import build_experiment, noise_is_judged_early
 from ehadiag.identify.pipeline import identify
 from ehadiag.identify.solvers import CompactGa, Solver
 from ehadiag.identify.stages import STAGES, Memory, first_ends_at, run_ahead, stage_ends_at
@@ -43,18 +44,29 @@ class OnlineIdentification:
         self._seed = seed
         self.memory = Memory()
         ends = {first_ends_at(test), *(stage_ends_at(test, i) for i in range(len(STAGES)))}
+        if not isinstance(self._solver, CompactGa) or not noise_is_judged_early(test):
+            ends = set()
         self.due_s: tuple[float, ...] = tuple(sorted(end for end in ends if end < test.duration))
-        """Instants of the test (s) at which there is something to work out."""
+        """Instants of the test (s) at which there is something to work out; none for a solver that
+        holds the interpreter, nor for a test without a quiet first part."""
 
     def take(self, recording: Recording) -> None:
-        """Work out all that the samples so far allow."""
+        """Work out all that the samples so far allow; nothing of what cannot carry a verdict."""
         samples = recording.samples
-        if samples is None or samples.ticks == 0:
+        if not self.due_s or samples is None or samples.ticks == 0:
             return
-        for values in (samples.spool, samples.pressure):
+        if recording.test_id not in (None, self._test.id):
+            return
+        if out_of_range(recording.environment, samples, self._actuator):
+            return
+        experiment = build_experiment(samples, recording.environment, self._test, self._actuator)
+        for values in (experiment.spool, experiment.pressure):
             if np.isfinite(values).mean() < LEAST_SHARE:
                 return
-        experiment = build_experiment(samples, recording.environment, self._test, self._actuator)
         run_ahead(experiment, self._solver, self._seed, self.memory)
-        if samples.ticks >= self._test.ticks:
+        if samples.ticks < self._test.ticks:
+            return
+        if objections_to_recording(recording, self._test, self._actuator):
+            return
+        if not objections_to_experiment(experiment):
             identify([experiment], solver=self._solver, seed=self._seed, memory=self.memory)

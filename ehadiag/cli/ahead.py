@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
-
-from ehadiag.errors import EhadiagError
 
 if TYPE_CHECKING:
     from ehadiag.online import OnlineIdentification
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Ahead", "working_ahead"]
 
+POLL_S = 0.05
 MARGIN_S = 0.02
 """Frames of a tick are there that long after it."""
 
@@ -30,6 +30,7 @@ class Ahead:
         self._online = online
         self._assembler = assembler
         self._due = list(online.due_s)
+        self._abandoned = False
         self._work: queue.SimpleQueue[FrameTable | None] = queue.SimpleQueue()
         self.ended_at: float | None = None
         """When the word came that the test is complete, on `time.perf_counter`."""
@@ -49,24 +50,31 @@ class Ahead:
             self._work.put(self._assembler.table())
 
     def finish(self) -> None:
-        """Wait for the work under way."""
+        """Wait for the work under way; Ctrl-C ends the wait."""
         self._work.put(None)
-        self._thread.join()
+        while self._thread.is_alive():
+            self._thread.join(POLL_S)
+
+    def abandon(self) -> None:
+        """Leave what is not done yet; what is under way ends by itself."""
+        self._abandoned = True
+        self._work.put(None)
 
     def _run(self) -> None:
         while (table := self._work.get()) is not None:
-            try:
-                self._online.take(self._assembler.recording_of(table))
-            except EhadiagError:
-                # The finished recording will tell what is wrong with it.
+            if self._abandoned:
                 return
+            # Whatever is wrong with the recording, its diagnosis will tell: this is only ahead.
+            with contextlib.suppress(Exception):
+                self._online.take(self._assembler.recording_of(table))
 
 
 @contextmanager
 def working_ahead(online: OnlineIdentification, assembler: Assembler) -> Iterator[Ahead]:
-    """Work ahead as long as the context lasts."""
+    """Work ahead; where the context ends by an exception, the work is abandoned."""
     ahead = Ahead(online, assembler)
     try:
         yield ahead
-    finally:
-        ahead.finish()
+    except BaseException:
+        ahead.abandon()
+        raise

@@ -219,6 +219,10 @@ def _acquire(
         say(outcome.degraded)
     why = "" if outcome.complete else outcome.why + _what_was_heard(recording, ours.name, listened)
     stem = path.with_suffix("") if not arguments.record else folder / path.stem
+    if why:
+        ahead.abandon()
+    else:
+        ahead.finish()
     return recording, why, stem, ahead.ended_at
 
 

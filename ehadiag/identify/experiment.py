@@ -23,6 +23,7 @@ __all__ = [
     "build_experiment",
     "judge_noise",
     "make_batch",
+    "noise_is_judged_early",
     "share_offsets",
 ]
 
@@ -40,6 +41,7 @@ LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 QUIET_BLOCK = 100
 """Ticks over which noise is judged."""
+LEAST_QUIET_BLOCKS = 20
 QUIET_SHARE = 0.867
 """Deviation of white noise in the quietest fifth of such blocks (0.864 to 0.869 for 2 to 5.5 s)."""
 
@@ -96,8 +98,8 @@ def build_experiment(
         origin = min(max(pressure_offset * leak / constants.GP, -constants.XSM), constants.XSM)
         spool_offset, pressure_offset = spool_offset - origin, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
-    # Judged before the sines only: the same while the test still runs.
-    quiet = round(min(begin for begin, _ in test.windows.refinement) * test.rate) or None
+    # Before the sines only, where that suffices: the same while the test still runs.
+    quiet = _first_part(test) if noise_is_judged_early(test) else len(spool)
     return Experiment(
         test=test,
         constants=constants,
@@ -112,6 +114,16 @@ def build_experiment(
         rested=rest >= LEAST_REST,
         origin=origin,
     )
+
+
+def _first_part(test: StoredTest) -> int:
+    """Ticks of a test before its genetic search's window."""
+    return round(min(begin for begin, _ in test.windows.refinement) * test.rate)
+
+
+def noise_is_judged_early(test: StoredTest) -> bool:
+    """Whether the test's first part is long enough to judge the noise by."""
+    return _first_part(test) >= LEAST_QUIET_BLOCKS * QUIET_BLOCK
 
 
 def _ticks_at_rest(current: NDArray[np.float64]) -> int:
@@ -236,7 +248,7 @@ def _origin(experiment: Experiment, first: int) -> float:
 
 
 def _noise(values: NDArray[np.float64], channel: Channel) -> float:
-    """Noise of a channel from second differences in the quietest blocks of the test.
+    """Noise of a channel from second differences in the quietest blocks of what is handed in.
 
     Second differences do not see a steady slope; the quietest fifth of the blocks is where the
     actuator rests or creeps. Never below what the converter's rounding alone makes.

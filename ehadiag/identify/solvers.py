@@ -94,7 +94,7 @@ class CompactGa:
         seed: int,
         progress: Progress | None = None,
     ) -> SearchResult:
-        """Search; Ctrl-C stops it between two generations."""
+        """Search; with `progress`, Ctrl-C stops it between two generations."""
         control = np.zeros(2, dtype=np.int64)
         history = np.empty(self.budget // self.samples + 1)
         outcome: list[tuple[NDArray[np.float64], float, int, int]] = []

@@ -175,7 +175,7 @@ def _grown(windows: Iterable[Window], share: float) -> list[Window]:
     left = share * sum(end - start for start, end in ordered)
     out = []
     for start, end in ordered:
-        if left > 0.0:
+        if left > 1e-9:
             out.append((start, min(end, start + left)))
         left -= end - start
     return out

@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from identify_cases import own_experiment
+from msgspec import structs
 
 from ehadiag.actuator import default_actuator
 from ehadiag.identify.pipeline import identify
@@ -110,3 +111,29 @@ def test_too_little_is_left_alone():
     empty = Recording("bus", None, 1, None, Outcome(), Environment(), Quality())
     online.take(empty)
     assert len(online.memory) == 0
+
+
+def test_what_cannot_carry_a_verdict_is_left_alone(recording):
+    """The model does not come back from a supply of nothing, or from frozen oil."""
+    test = resolve_test("open" if recording.test_id == 1 else "closed")
+    online = OnlineIdentification(test, default_actuator())
+    samples = recording.samples
+    everywhere = np.zeros_like(samples.saturated)
+    everywhere[1] = True
+    for unfit in (
+        replace(recording, environment=Environment(0.0, 0.0, 40.0)),
+        replace(recording, environment=Environment(21e6, 0.0, -100.0)),
+        replace(recording, samples=replace(samples, saturated=everywhere)),
+        replace(recording, test_id=99),
+    ):
+        online.take(unfit)
+        assert len(online.memory) == 0
+    online.take(recording)
+    assert len(online.memory) > 0
+
+
+def test_a_test_without_a_quiet_part_is_not_worked_ahead():
+    test = resolve_test("open")
+    windows = structs.replace(test.windows, refinement=((0.5, 5.5),))
+    online = OnlineIdentification(structs.replace(test, windows=windows), default_actuator())
+    assert online.due_s == ()
