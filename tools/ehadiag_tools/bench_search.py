@@ -96,7 +96,7 @@ def measure(sizes: Sizes) -> list[Figure]:
     return out + absent
 
 
-_STATE = "whatever the generations and the virtual population; 384 bytes more hold a generation"
+_STATE = "whatever the generations and the virtual population; 768 bytes more hold a generation"
 
 
 def _remark(runs: list[tuple[float, int, bool]]) -> str:
