@@ -62,7 +62,7 @@ RESCUES = (
     Plan(0.4, budget=3.0),
 )
 """One after the other where the staged search does not explain the recording."""
-POLISH = CompactGa(budget=960, virtual_population=120.0, tolerance=1e-7)
+POLISH = CompactGa(budget=1440, virtual_population=150.0, tolerance=1e-7)
 POLISH_DEVIATION = 1e-3
 POOR_FIT = 0.01
 """Share of gaps beyond three deviations that asks for another attempt."""
