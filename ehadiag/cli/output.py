@@ -86,7 +86,7 @@ def show(diagnosis: Diagnosis, arguments: argparse.Namespace, spent: Spent) -> N
     else:
         from ehadiag.report.table import print_diagnosis  # noqa: PLC0415
 
-        print_diagnosis(diagnosis, wide_console())
+        print_diagnosis(diagnosis, wide_console(), spent)
 
 
 def make_folder(name: str) -> Path:

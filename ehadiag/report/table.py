@@ -14,6 +14,7 @@ from ehadiag.verdict import Verdict
 
 if TYPE_CHECKING:
     from ehadiag.diagnosis import Diagnosis
+    from ehadiag.report.spent import Spent
 
 __all__ = ["print_diagnosis"]
 
@@ -25,7 +26,7 @@ STYLES = {
 }
 
 
-def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
+def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent) -> None:
     """Print a diagnosis."""
     serials = [str(item.serial) for item in diagnosis.recordings if item.serial is not None]
     verdict = diagnosis.verdict
@@ -47,7 +48,7 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
     for note in diagnosis.notes:
         console.print(f"  note: {note}", soft_wrap=True, highlight=False)
     if diagnosis.identification is not None:
-        console.print(f"  {_effort(diagnosis)}", soft_wrap=True, highlight=False)
+        console.print(f"  {_effort(diagnosis, spent)}", soft_wrap=True, highlight=False)
 
 
 def _constants(diagnosis: Diagnosis) -> Table:
@@ -83,11 +84,13 @@ def _quality(diagnosis: Diagnosis) -> str:
     )
 
 
-def _effort(diagnosis: Diagnosis) -> str:
+def _effort(diagnosis: Diagnosis, spent: Spent) -> str:
     found = diagnosis.identification
     assert found is not None
+    after = spent.after_test
+    took = f"{diagnosis.elapsed:.2f} s" if after is None else f"{after:.2f} s after the test"
     return (
         f"gap rms spool {found.fit.spool_rms:.2f}, pressure {found.fit.pressure_rms:.2f} of the "
         f"noise, {found.fit.outliers:.2%} outliers; solver {found.solver}, seed {found.seed}, "
-        f"{found.evaluations} model runs, {diagnosis.elapsed:.2f} s"
+        f"{found.evaluations} model runs, {took}"
     )
