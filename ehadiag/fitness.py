@@ -17,6 +17,7 @@ __all__ = [
     "objections_to_estimate",
     "objections_to_experiment",
     "objections_to_recording",
+    "out_of_range",
     "remarks_on_recording",
 ]
 

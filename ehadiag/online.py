@@ -63,10 +63,9 @@ class OnlineIdentification:
         for values in (experiment.spool, experiment.pressure):
             if np.isfinite(values).mean() < LEAST_SHARE:
                 return
-        run_ahead(experiment, self._solver, self._seed, self.memory)
         if samples.ticks < self._test.ticks:
+            run_ahead(experiment, self._solver, self._seed, self.memory)
             return
-        if objections_to_recording(recording, self._test, self._actuator):
-            return
-        if not objections_to_experiment(experiment):
+        unfit = objections_to_recording(recording, self._test, self._actuator)
+        if not unfit and not objections_to_experiment(experiment):
             identify([experiment], solver=self._solver, seed=self._seed, memory=self.memory)

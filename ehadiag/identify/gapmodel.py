@@ -93,18 +93,15 @@ class GapModel:
             out.append(Slope(x, gaps[0], capped(gaps[0]), jacobian, smooth))
         return out
 
-    def trusted_slope(self, x: NDArray[np.float64]) -> Slope:
-        """Gaps and derivatives at x, and the rows where two widths of difference agree on them."""
-        slope = self.slopes([x])[0]
-        return self.trusted(slope, self.many(wide_sides(x)))
-
-    def trusted(self, slope: Slope, runs: NDArray[np.float64]) -> Slope:
+    def trusted(self, slope: Slope, runs: NDArray[np.float64] | None = None) -> Slope:
         """Leave rows out where derivatives over a wider difference disagree.
 
         A break-away inside a difference makes a jump that looks like information but is none.
-        `runs`: gaps at `wide_sides` of the slope's point, shape (6, 2, N).
+        `runs`: gaps at `wide_sides` of the slope's point, shape (6, 2, N), if they are known.
         """
         sides = wide_sides(slope.x)
+        if runs is None:
+            runs = self.many(sides)
         wide, wide_smooth = self._differences(slope.x, slope.gaps, sides, runs)
         typical = np.sqrt(np.mean(wide**2, axis=(1, 2), keepdims=True))
         allowed = AGREEMENT * np.maximum(np.abs(slope.jacobian), np.abs(wide)) + typical

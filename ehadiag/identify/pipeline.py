@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.identify.batch import Batch
 from ehadiag.identify.experiment import (
     ANCHOR_LSB,
     Experiment,
@@ -106,9 +107,8 @@ def _identify(
     first = first_stage(experiments, memory)
     start = np.array(first.values)
     searched_at = time.perf_counter()
-    before = time.perf_counter()
     found = staged_search(experiments, start, solver, seed, memory, tell)
-    search_s = time.perf_counter() - before
+    search_s = time.perf_counter() - searched_at
     tell("refinement", 0.0)
     best = _attempt(experiments, found)
     evaluations, attempts = first.evaluations + found.evaluations + best.evaluations, 1
@@ -210,10 +210,9 @@ def _polish(experiments: Sequence[Experiment], best: Refinement) -> Refinement:
 
     The seed is fixed: the answer depends on the recording, not on the search before.
     """
-    batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
+    batch, noise = _anchored(experiments)
     objective = Objective(batch, best.offsets, cap=CAP)
     found = POLISH.minimise(objective, best.values, POLISH_DEVIATION, seed=0)
-    noise = experiments[0].spool_noise, experiments[0].pressure_noise
     start = found.best if found.cost < best.cost else best.values
     other = describe(batch, start, best.offsets, noise, converged=best.converged)
     return replace(other, evaluations=other.evaluations + found.evaluations)
@@ -222,9 +221,14 @@ def _polish(experiments: Sequence[Experiment], best: Refinement) -> Refinement:
 def _refine(
     experiments: Sequence[Experiment], start: NDArray[np.float64], offsets: NDArray[np.float64]
 ) -> Refinement:
-    batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
-    noise = experiments[0].spool_noise, experiments[0].pressure_noise
+    batch, noise = _anchored(experiments)
     return refine(batch, start, offsets, noise)
+
+
+def _anchored(experiments: Sequence[Experiment]) -> tuple[Batch, tuple[float, float]]:
+    """All of the tests, re-anchored on the spool, and the noise in which offsets are sought."""
+    batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
+    return batch, (experiments[0].spool_noise, experiments[0].pressure_noise)
 
 
 def _judged(experiments: Sequence[Experiment], gaps: NDArray[np.float64]) -> Sequence[Experiment]:

@@ -18,7 +18,8 @@ __all__ = ["Bowl", "centre", "settle"]
 SETTLINGS = 2
 REACH = 2.0
 """Deviations to either side over which the bowl is looked at."""
-SHARES = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
+SHARES = np.delete(np.linspace(-REACH, REACH, 9), 4)
+"""Points beside the middle of an axis, deviations: with the wide differences two blocks of runs."""
 LEAST_TRUSTED = 0.25
 """Share of information in rows whose derivatives hold, below which the cost counts as jagged."""
 FINE_POINTS = 33
@@ -77,7 +78,7 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
         if moved.cost > slope.cost + WORSE:
             return Bowl(slope.x, smooth, trusted)
         slope = moved
-    return Bowl(slope.x, smooth, model.trusted(slope, model.many(wide_sides(slope.x))))
+    return Bowl(slope.x, smooth, model.trusted(slope))
 
 
 def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:

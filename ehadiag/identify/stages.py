@@ -10,7 +10,8 @@ the last bit; else the stage runs again. The answer is therefore that of the rec
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -121,11 +122,11 @@ def staged_search(
 
     `start`: fault constants, shape (3,).
     """
-    results: list[SearchResult] = []
-    for stage in range(len(STAGES)):
-        tell("search", stage / len(STAGES))
-        best = results[-1].best if results else start
-        results.append(_search_stage(experiments, best, solver, seed, stage, memory))
+    tell("search", 0.0)
+    results = []
+    for result in _stages(experiments, start, solver, seed, memory):
+        results.append(result)
+        tell("search", len(results) / len(STAGES))
     return SearchResult(
         best=results[-1].best,
         cost=results[-1].cost,
@@ -141,12 +142,26 @@ def run_ahead(experiment: Experiment, solver: Solver, seed: int, memory: Memory)
     seconds = experiment.ticks * experiment.tick
     if seconds < first_ends_at(test):
         return
-    (experiment,) = share_offsets([experiment])
-    best = np.array(first_stage([experiment], memory).values)
+    ready = sum(seconds >= stage_ends_at(test, stage) for stage in range(len(STAGES)))
+    experiments = share_offsets([experiment])
+    start = np.array(first_stage(experiments, memory).values)
+    for _ in itertools.islice(_stages(experiments, start, solver, seed, memory), ready):
+        pass
+
+
+def _stages(
+    experiments: Sequence[Experiment],
+    start: NDArray[np.float64],
+    solver: Solver,
+    seed: int,
+    memory: Memory,
+) -> Iterator[SearchResult]:
+    """Results of all stages, each from the best of the one before; run as they are asked for."""
+    best = start
     for stage in range(len(STAGES)):
-        if seconds < stage_ends_at(test, stage):
-            return
-        best = _search_stage([experiment], best, solver, seed, stage, memory).best
+        result = _search_stage(experiments, best, solver, seed, stage, memory)
+        best = result.best
+        yield result
 
 
 def _search_stage(
