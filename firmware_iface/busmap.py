@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitState, CommandMode
 from ehadiag.tomlfile import decode_toml, read_toml
-from firmware_iface.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, parse_dbc, recall_dbc
+from firmware_iface.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, recall_dbc
 from firmware_iface.frames import MAX_PAYLOAD
 from firmware_iface.layout import SignalLayout
 from firmware_iface.mapping import MappingFile, Policy, Protection, SignalRef
@@ -108,7 +108,7 @@ def default_map() -> BusMap:
     where = "bundled mapping eha_fcc.toml"
     tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)
     text = folder.joinpath(tree.dbc).read_bytes()
-    return resolve_parsed(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
+    return resolve(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
 
 
 def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
@@ -133,18 +133,13 @@ def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
             text = file.read(MAX_DBC_BYTES + 1)
     except OSError as error:
         raise InputOutputError(f"DBC file {dbc}: {error.strerror or error}") from None
-    return resolve_parsed(tree, recall_dbc(text, str(dbc)), f"mapping file {path}", str(dbc))
+    return resolve(tree, recall_dbc(text, str(dbc)), f"mapping file {path}", str(dbc))
 
 
-def resolve(tree: MappingFile, dbc: bytes, where: str, dbc_name: str) -> BusMap:
-    """Resolve a mapping against DBC text; `where` begins the error texts."""
-    return resolve_parsed(tree, parse_dbc(dbc, dbc_name), where, dbc_name)
-
-
-def resolve_parsed(
+def resolve(
     tree: MappingFile, database: Mapping[str, DbcMessage], where: str, dbc_name: str
 ) -> BusMap:
-    """Resolve a mapping against the messages of a DBC."""
+    """Resolve a mapping against the messages of a DBC; `where` begins the error texts."""
     roles: dict[str, list[Role]] = {}
     for section, dimensions in DIMENSIONS.items():
         signals = getattr(tree, section)

@@ -111,7 +111,7 @@ def test_the_oldest_entries_go(folder: Path) -> None:
 
 def test_only_files_are_kept(folder: Path) -> None:
     tree = decode_toml(DATA.joinpath("eha_fcc.toml").read_bytes(), MappingFile, "default")
-    found = resolve(tree, TEXT, "here", "eha_fcc.dbc")
+    found = resolve(tree, parse_dbc(TEXT, "a"), "here", "eha_fcc.dbc")
     assert not folder.exists()
     assert found == default_map()
     assert folder.exists()

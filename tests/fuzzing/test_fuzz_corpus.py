@@ -7,21 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface import busmap, livedecode, seriallink
+from firmware_iface import livedecode, seriallink
 from firmware_iface.frames import Frame
 from fuzz import targets
 
 CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
 
 
-def keep_dbc_parser(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A target puts a cache before it; take that away again."""
-    monkeypatch.setattr(busmap, "parse_dbc", busmap.parse_dbc)
-
-
 @pytest.mark.parametrize("name", targets.TARGETS)
-def test_kept_inputs_still_pass(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    keep_dbc_parser(monkeypatch)
+def test_kept_inputs_still_pass(name: str) -> None:
     inputs = sorted((CORPUS / name).iterdir())
     assert inputs
     check = targets.target(name)
@@ -44,10 +38,9 @@ def test_an_error_that_no_user_may_see_is_a_finding(
     def broken(*_: object) -> None:
         raise IndexError
 
-    where = {"logs": (targets, "read_recordings"), "mappings": (busmap, "resolve")}[name]
-    keep_dbc_parser(monkeypatch)
-    monkeypatch.setattr(*where, broken)
     check = targets.target(name)
+    reader = {"logs": "read_recordings", "mappings": "parse_dbc"}[name]
+    monkeypatch.setattr(targets, reader, broken)
     with pytest.raises(IndexError):
         check(b"\1data")
 

@@ -11,7 +11,6 @@ input: the same input always takes the same path, and a change of one bit choose
 from __future__ import annotations
 
 import contextlib
-import functools
 import struct
 import tempfile
 import zlib
@@ -28,6 +27,7 @@ from firmware_iface import busmap
 from firmware_iface.align import assemble
 from firmware_iface.blf import CONTAINER_HEADER, FILE_HEADER, OBJECT_HEADER
 from firmware_iface.busmap import BusMap, default_map
+from firmware_iface.dbc import parse_dbc
 from firmware_iface.decode import DecodedTable, decode
 from firmware_iface.frames import MAX_PAYLOAD, Frame, FrameTable
 from firmware_iface.livedecode import CHANNELS, LiveDecoder
@@ -190,28 +190,19 @@ def _blf_around(content: bytes) -> bytes:
 def _mappings(_: int) -> Callable[[bytes], None]:
     """First byte even: a mapping against the default DBC; odd: a DBC for the default mapping."""
     data_files = resources.files("firmware_iface").joinpath("data")
-    dbc = data_files.joinpath("eha_fcc.dbc").read_bytes()
     mapping = decode_toml(data_files.joinpath("eha_fcc.toml").read_bytes(), MappingFile, "default")
-    parse = busmap.parse_dbc
-
-    @functools.lru_cache(maxsize=1)
-    def parsed_default() -> Mapping[str, object]:
-        return parse(dbc, "default")
-
-    def parse_once(text: bytes, name: str) -> object:
-        return parsed_default() if text is dbc else parse(text, name)
-
     # Ten milliseconds for the same answer every time would be nearly all of the time.
-    busmap.parse_dbc = parse_once  # type: ignore[assignment]
+    default = parse_dbc(data_files.joinpath("eha_fcc.dbc").read_bytes(), "default")
 
     def check(data: bytes) -> None:
         if not data:
             return
         with contextlib.suppress(EhadiagError):
             if data[0] % 2:
-                busmap.resolve(mapping, data[1:], "fuzz", "fuzz")
+                busmap.resolve(mapping, parse_dbc(data[1:], "fuzz"), "fuzz", "fuzz")
             else:
-                busmap.resolve(decode_toml(data[1:], MappingFile, "fuzz"), dbc, "fuzz", "fuzz")
+                tree = decode_toml(data[1:], MappingFile, "fuzz")
+                busmap.resolve(tree, default, "fuzz", "fuzz")
 
     return check
 
