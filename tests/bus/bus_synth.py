@@ -78,6 +78,11 @@ def recordings(frames, bus_map):
     return assemble(FrameTable.from_frames(frames), bus_map, "made up")
 
 
+def one(frames, bus_map):
+    (recording,) = recordings(frames, bus_map)
+    return recording
+
+
 def tick_of(frame: Frame, start_ns: int = START) -> int:
     return (frame.time_ns - start_ns) // TICK
 

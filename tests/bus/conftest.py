@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from bus_synth import play
 
 from firmware_iface.busmap import default_map
 from firmware_iface.encode import Encoder
@@ -18,6 +19,12 @@ def bus_map():
 @pytest.fixture
 def encoder(bus_map):
     return Encoder(bus_map)
+
+
+@pytest.fixture
+def frames(encoder, truth):
+    """What brings the `truth` of a module."""
+    return play(encoder, truth)
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ from bus_synth import (
     assert_truthful,
     flip,
     make_truth,
+    one,
     play,
     recordings,
     tick_of,
@@ -30,16 +31,6 @@ TICKS = 900
 @pytest.fixture(scope="module")
 def truth():
     return make_truth(TICKS)
-
-
-@pytest.fixture
-def frames(encoder, truth):
-    return play(encoder, truth)
-
-
-def one(frames, bus_map):
-    (recording,) = recordings(frames, bus_map)
-    return recording
 
 
 def present(samples):

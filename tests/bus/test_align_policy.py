@@ -13,8 +13,8 @@ from bus_synth import (
     TICK,
     flip,
     make_truth,
+    one,
     play,
-    recordings,
     tick_of,
 )
 
@@ -28,16 +28,6 @@ TICKS = 500
 @pytest.fixture(scope="module")
 def truth():
     return make_truth(TICKS)
-
-
-@pytest.fixture
-def frames(encoder, truth):
-    return play(encoder, truth)
-
-
-def one(frames, bus_map):
-    (recording,) = recordings(frames, bus_map)
-    return recording
 
 
 def without_check_sum(bus_map, name):
