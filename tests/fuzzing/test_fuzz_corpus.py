@@ -9,6 +9,7 @@ import pytest
 
 from firmware_iface import livedecode, seriallink
 from firmware_iface.frames import Frame
+from firmware_iface.liveticks import LiveTicks
 from fuzz import targets
 
 CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
@@ -66,6 +67,13 @@ def test_decoders_that_disagree_are_a_finding(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(livedecode, "_intact", lambda *_: False)
     with pytest.raises(AssertionError, match="accept different"):
         targets.target("frames")(data)
+
+
+def test_a_tick_that_is_given_out_twice_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    take = LiveTicks.take
+    monkeypatch.setattr(LiveTicks, "take", lambda self, frame: 2 * take(self, frame))
+    with pytest.raises(AssertionError, match="made up"):
+        targets.target("frames")((CORPUS / "frames" / "test").read_bytes())
 
 
 @pytest.mark.parametrize(("name", "last"), [("frames", "assemble"), ("logs", "read_recordings")])

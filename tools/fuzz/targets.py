@@ -70,8 +70,12 @@ def _frames(share: int) -> Callable[[bytes], None]:
         frames = _frames_of(data)
         decoder, live = LiveDecoder(bus), LiveTicks(bus, CommandMode.CURRENT)
         answers = [decoder.decode(frame) for frame in frames]
-        if any(len(live.take(frame)) > MOST_TICKS for frame in frames):
+        given = [len(live.take(frame)) for frame in frames]
+        if max(given, default=0) > MOST_TICKS:
             raise AssertionError("one frame completes more ticks than a turn of the counter has")
+        samples = sum(type(answer) is Sample for answer in answers)
+        if not live.lost <= sum(given) <= live.lost + samples:
+            raise AssertionError("ticks were made up or kept back")
         if frames and _chosen(data, share):
             table = FrameTable.from_frames(frames)
             _compare(answers, decode(table, bus), bus)
