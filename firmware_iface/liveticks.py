@@ -22,6 +22,8 @@ NAN = math.nan
 KEYS = ("channels.current", "channels.spool", "channels.pressure", "channels.position")
 LATE = 16
 """Ticks by which a frame may come late; its tick has been given out as lost."""
+MOST_TURN = 4096
+"""A wider counter is taken modulo this: a jump of it makes no more lost ticks than these."""
 SILENCE_NS = 1_000_000_000
 """After so long the counter says nothing any more: the ticks begin anew."""
 
@@ -49,7 +51,7 @@ class LiveTicks:
 
     Parameters
     ----------
-    bus_map: mapping; all channels must come in one message, and its counter and that of the command
+    bus_map: mapping; all channels must come in one frame, and its counter and that of the command
         must count ticks.
     mode: of the commands to take; those of the other mode count as lost.
 
@@ -75,7 +77,7 @@ class LiveTicks:
         self._counters = {self._telemetry.name: counter, self._command.name: command_counter}
         self._modes = {number for number, meaning in bus_map.modes.items() if meaning is mode}
         self._ends = tuple(_ends(self._telemetry, key) for key in KEYS)
-        self._turn = self._telemetry.modulus
+        self._turn = min(self._telemetry.modulus, MOST_TURN)
         self._commands = [NAN] * self._turn
         self._at = -1
         self._time_ns = 0
@@ -93,11 +95,11 @@ class LiveTicks:
         values = None if frame.error or frame.remote else checked_values(message, frame.data)
         if values is None:
             return []
-        count = bit_pattern(self._counters[message.name], frame.data)
+        count = bit_pattern(self._counters[message.name], frame.data) % self._turn
         out: list[LiveTick] = []
         if self._value in values:
             self._take_command(count, values, out)
-        if message is self._telemetry:
+        if KEYS[0] in values:
             self._take_telemetry(count, frame.time_ns, values, out)
         return out
 
@@ -149,20 +151,25 @@ class LiveTicks:
 
 
 def _counted(bus_map: BusMap, roles: tuple[str, ...]) -> tuple[MessageMap, SignalLayout]:
-    """Return the message that brings all these roles, and its counter of ticks."""
-    found = [bus_map.find(role) for role in roles]
-    names = {item[0].name for item in found if item is not None}
-    if None in found or len(names) != 1:
+    """Return the message of which one frame brings all these roles, and its counter of ticks."""
+    found = [item for item in map(bus_map.find, roles) if item is not None]
+    frames = {(message.name, role.signal.selectors) for message, role in found}
+    if len(found) < len(roles) or len(frames) != 1:
         raise ConfigurationError(
-            f"{bus_map.name}: to follow single ticks one message must bring {', '.join(roles)}"
+            f"{bus_map.name}: to follow single ticks one frame must bring {', '.join(roles)}"
         )
-    message = bus_map.messages[names.pop()]
-    if message.counter is None or not message.counts_ticks or message.modulus <= 2 * LATE:
+    message, role = found[0]
+    counter = message.counter if message.counts_ticks else None
+    if (
+        counter is None
+        or message.modulus <= 2 * LATE
+        or not set(counter.selectors) <= set(role.signal.selectors)
+    ):
         raise ConfigurationError(
             f"{bus_map.name}: to follow single ticks {message.name} needs a counter of ticks"
-            f" beyond {2 * LATE}"
+            f" beyond {2 * LATE} in the same frame"
         )
-    return message, message.counter
+    return message, counter
 
 
 def _ends(message: MessageMap, key: str) -> tuple[float, float]:

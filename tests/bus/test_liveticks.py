@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from functools import lru_cache
 
 import numpy as np
@@ -12,9 +13,9 @@ from hypothesis import strategies as st
 from ehadiag.channels import CHANNELS
 from ehadiag.errors import ConfigurationError
 from ehadiag.recording import CommandMode
-from firmware_iface.busmap import default_map
+from firmware_iface.busmap import default_map, load_map
 from firmware_iface.encode import Encoder
-from firmware_iface.liveticks import LiveTick, LiveTicks
+from firmware_iface.liveticks import MOST_TURN, LiveTick, LiveTicks
 
 MAP = default_map()
 TELEMETRY = MAP.messages["ServoTelemetry"].can_id
@@ -137,6 +138,86 @@ def test_after_a_long_silence_ticks_begin_anew():
     ]
     live, ticks = run([*flat(pairs[:10]), *later])
     assert (len(ticks), live.lost, live.breaks) == (15, 0, 1)
+
+
+PAGED = """VERSION ""
+BU_: A
+BO_ 640 Servo: 8 A
+ SG_ Page M : 0|4@1+ (1,0) [0|15] "" A
+ SG_ Current {page}: 4|8@1+ (0.1,-12) [0|0] "mA" A
+ SG_ Spool m0 : 12|8@1+ (0.004,-0.5) [0|0] "mm" A
+ SG_ Pressure m0 : 20|8@1+ (0.1,-10) [0|0] "MPa" A
+ SG_ Jack m0 : 28|8@1+ (0.1,-10) [0|0] "mm" A
+ SG_ Oil m1 : 28|8@1+ (1,0) [0|0] "degC" A
+ SG_ Count {count}: 36|{width}@1+ (1,0) [0|0] "" A
+BO_ 641 Command: 8 A
+ SG_ Wanted : 0|16@1- (0.001,0) [0|0] "mA" A
+ SG_ Count : 32|{width}@1+ (1,0) [0|0] "" A
+"""
+PAGED_MAP = """schema = "ehadiag.mapping/1"
+dbc = "paged.dbc"
+channels.current = { message = "Servo", signal = "Current" }
+channels.spool = { message = "Servo", signal = "Spool" }
+channels.pressure = { message = "Servo", signal = "Pressure" }
+channels.position = { message = "Servo", signal = "Jack" }
+command.current = { message = "Command", signal = "Wanted" }
+environment.oil_temperature = { message = "Servo", signal = "Oil" }
+protection.Servo = { counter = "Count", counts = "ticks" }
+protection.Command = { counter = "Count", counts = "ticks" }
+"""
+
+
+@pytest.fixture
+def paged(tmp_path):
+    """Make a bus whose telemetry is one page of two, with counters of some bits."""
+
+    def make(width=8, page="m0", count=""):
+        text = PAGED.format(width=width, page=page, count=count)
+        (tmp_path / "paged.dbc").write_text(text)
+        (tmp_path / "paged.toml").write_text(PAGED_MAP)
+        return load_map(tmp_path / "paged.toml")
+
+    return make
+
+
+def paged_ticks(bus, counts):
+    live = LiveTicks(bus, CommandMode.CURRENT)
+    encoder, out = Encoder(bus), []
+    for k, count in enumerate(counts):
+        frames = encoder.command(CommandMode.CURRENT, 1e-6 * k, 0, k * MS, count)
+        frames += encoder.environment(0.0, 0.0, 40.0, k * MS)
+        frames += encoder.telemetry([2048 + 16 * k] * 4, k * MS, count)
+        out += [tick for frame in frames for tick in live.take(frame)]
+    return live, out
+
+
+def test_other_pages_of_the_telemetry_are_no_telemetry(paged):
+    live, ticks = paged_ticks(paged(count="m0 "), range(50))
+    assert (len(ticks), live.lost) == (50, 0)
+    assert [tick.command for tick in ticks] == pytest.approx([1e-6 * k for k in range(50)])
+    spool = [CHANNELS[1].decode(2048 + 16 * k) for k in range(50)]
+    assert [tick.spool for tick in ticks] == pytest.approx(spool, abs=2.001e-6)
+
+
+def test_a_wide_counter_costs_no_memory_and_its_jump_makes_few_ticks(paged):
+    live, ticks = paged_ticks(paged(width=28), [*range(5), (1 << 27) + 1000, *range(5, 10)])
+    assert live.lost == len(ticks) - 11
+    assert live.lost < 2 * MOST_TURN
+    assert sys.getsizeof(live._commands) < 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"page": "m1"}, "one frame must bring channels.current, channels.spool"),
+        ({"page": ""}, "one frame must bring channels.current, channels.spool"),
+        ({"count": "m1 "}, "Servo needs a counter of ticks beyond 32 in the same frame"),
+        ({"width": 5}, "Servo needs a counter of ticks beyond 32"),
+    ],
+)
+def test_ticks_that_no_single_frame_tells_are_refused(paged, change, match):
+    with pytest.raises(ConfigurationError, match=match):
+        LiveTicks(paged(**change), CommandMode.CURRENT)
 
 
 def test_a_bus_without_counters_is_told():
