@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import errno
 import os
 import select
@@ -56,21 +57,23 @@ def collect(transport: Transport, count: int) -> list[Frame]:
     return got
 
 
-class Contract:
-    """Subclasses give two fixtures: what sends the frames, and the transport that gets them."""
+class Contract(abc.ABC):
+    """What every transport keeps; its subclass gives the fixtures."""
 
+    @abc.abstractmethod
     @pytest.fixture
     def receiving(self) -> Iterator[Transport]:
-        raise NotImplementedError
+        """Give the transport that gets the frames."""
 
+    @abc.abstractmethod
     @pytest.fixture
     def feed(self) -> Callable[[], None]:
-        raise NotImplementedError
+        """Return what sends the frames."""
 
+    @abc.abstractmethod
     @pytest.fixture
     def carried(self) -> list[Frame]:
         """Return the frames of a stored test as they came through the transport."""
-        raise NotImplementedError
 
     def test_a_stored_test_comes_with_the_same_samples(self, carried: list[Frame]) -> None:
         sound = stored_test.recording(stored_test.frames())
@@ -155,9 +158,10 @@ class TwoWay(Contract):
     speed = 4.0
     """At which the stored test is played."""
 
+    @abc.abstractmethod
     @pytest.fixture
     def other(self) -> Iterator[Transport]:
-        raise NotImplementedError
+        """Give the other end."""
 
     @pytest.fixture
     def feed(self, other: Transport) -> Callable[[], None]:

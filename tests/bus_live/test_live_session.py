@@ -10,8 +10,8 @@ import sys
 import textwrap
 import threading
 import uuid
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -235,13 +235,30 @@ def virtual(channel: str, *, transmit: bool) -> Transport:
     return PythonCanTransport(BusOptions("virtual", channel=channel), transmit=transmit)
 
 
+@contextmanager
+def computer_on(bus: Transport, core: FccCore) -> Iterator[None]:
+    """Run the computer in a thread while the block runs."""
+    stop = threading.Event()
+    core.step()  # compiles
+    node = threading.Thread(target=run_emulator, args=(core, bus, stop))
+    node.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        node.join()
+
+
+def recorded_test(ours: Transport, path: Path) -> tester.TesterOutcome:
+    """Request the short test and record it."""
+    return run_test(ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path))
+
+
 def session_on(
     options: BusOptions, core: FccCore, path: Path
 ) -> tuple[tester.TesterOutcome, tester.TesterOutcome]:
     """Run the short test in real time, the computer and a listener in threads beside it."""
-    stop = threading.Event()
     heard: list[tester.TesterOutcome] = []
-    core.step()
     with ExitStack() as stack:
         bus = stack.enter_context(PythonCanTransport(options, transmit=True))
         ours = stack.enter_context(PythonCanTransport(options, transmit=True))
@@ -251,18 +268,11 @@ def session_on(
             times = TimeLimits(wait=10.0)
             heard.append(run_test(third, test_id=None, duration=0.4, times=times))
 
-        node = threading.Thread(target=run_emulator, args=(core, bus, stop))
-        threads = [node, threading.Thread(target=listen)]
-        for item in threads:
-            item.start()
-        try:
-            outcome = run_test(
-                ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
-            )
-            threads[1].join()
-        finally:
-            stop.set()
-            node.join()
+        stack.enter_context(computer_on(bus, core))
+        listener = threading.Thread(target=listen)
+        listener.start()
+        outcome = recorded_test(ours, path)
+        listener.join()
     return outcome, heard[0]
 
 
@@ -301,22 +311,13 @@ def test_in_real_time_over_socketcan_with_a_listener(
 def test_in_real_time_over_the_serial_link(
     make_core: CoreFactory, short_test: StoredTest, wire: tuple[str, str], tmp_path: Path
 ) -> None:
-    core, stop = make_core(), threading.Event()
-    core.step()
     path = tmp_path / "live.blf"
     with (
         SerialTransport(wire[0], transmit=True) as bus,
         SerialTransport(wire[1], transmit=True) as ours,
+        computer_on(bus, make_core()),
     ):
-        node = threading.Thread(target=run_emulator, args=(core, bus, stop))
-        node.start()
-        try:
-            outcome = run_test(
-                ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
-            )
-        finally:
-            stop.set()
-            node.join()
+        outcome = recorded_test(ours, path)
     assert outcome.why == ""
     assert outcome.degraded == ""
     assert_whole(path, short_test)
@@ -325,23 +326,14 @@ def test_in_real_time_over_the_serial_link(
 def test_in_real_time_over_slcan(
     make_core: CoreFactory, short_test: StoredTest, wire: tuple[str, str], tmp_path: Path
 ) -> None:
-    core, stop = make_core(), threading.Event()
-    core.step()
     path = tmp_path / "live.blf"
     near, far = (BusOptions("slcan", channel=end, extra={"sleep_after_open": 0.0}) for end in wire)
     with (
         PythonCanTransport(near, transmit=True) as bus,
         PythonCanTransport(far, transmit=True) as ours,
+        computer_on(bus, make_core()),
     ):
-        node = threading.Thread(target=run_emulator, args=(core, bus, stop))
-        node.start()
-        try:
-            outcome = run_test(
-                ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path)
-            )
-        finally:
-            stop.set()
-            node.join()
+        outcome = recorded_test(ours, path)
     assert outcome.why == ""
     assert outcome.degraded == ""
     assert_whole(path, short_test)
