@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
     from ehadiag.diagnosis import Diagnosis
     from ehadiag.report.spent import Spent
+    from firmware_iface.transport import Transport
 
 __all__ = [
+    "damage",
     "make_folder",
     "progress_bar",
     "say",
@@ -37,6 +39,11 @@ IDENTIFICATION, SIMULATION = "identify", "ehadiag_sim"
 def say(text: str) -> None:
     """Print one line to standard error."""
     print(f"ehadiag: {text}", file=sys.stderr, flush=True)
+
+
+def damage(transport: Transport) -> str:
+    """What the transport lost, for the end of a sentence; empty for nothing."""
+    return f"; {transport.detail}" if transport.detail else ""
 
 
 def say_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:

@@ -6,7 +6,7 @@ import argparse
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import progress_bar, say
+from ehadiag.cli.output import damage, progress_bar, say
 
 __all__ = ["add_parser", "run"]
 
@@ -49,8 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
             stop=stop,
             progress=lambda done: display("replay", done / max(len(table), 1)),
         )
-        damage = f"; {transport.detail}" if transport.detail else ""
-    say(f"sent {sent} of {len(table)} frames on {transport.name}{damage}")
+    say(f"sent {sent} of {len(table)} frames on {transport.name}{damage(transport)}")
     return 0
 
 

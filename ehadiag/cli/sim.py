@@ -6,7 +6,7 @@ import argparse
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.output import damage, say, say_if_compiling
 
 __all__ = ["add_parser", "run"]
 
@@ -56,6 +56,5 @@ def run(arguments: argparse.Namespace) -> int:
         )
         say(f"flight-control computer on {transport.name}, tests {names}; Ctrl-C stops it")
         ticks = run_emulator(core, transport, stop, tell=say)
-        damage = f"; {transport.detail}" if transport.detail else ""
-    say(f"stopped after {ticks} ticks, {core.tests_started} tests started{damage}")
+    say(f"stopped after {ticks} ticks, {core.tests_started} tests started{damage(transport)}")
     return 0
