@@ -11,20 +11,23 @@ from ehadiag.actuator import default_actuator
 from ehadiag.channels import POSITION, PRESSURE, SPOOL
 from ehadiag.identify.lanes import lane_residuals, lane_work
 from ehadiag.model.constants import plant_constants
+from ehadiag.model.lanelayout import LANES
 from ehadiag.model.monitoring import respond
 from ehadiag.model.transition import spool_tables
 from ehadiag.storedtest import resolve_test
 from ehadiag_tools import bench, bench_c_model
-from ehadiag_tools.bench_c_model import CLanes, CModel
+from ehadiag_tools.bench_c_model import CLanes, CModel, CUnlocated
 from ehadiag_tools.bench_decode import tiled
-from ehadiag_tools.bench_problem import whole_test
+from ehadiag_tools.bench_operations import Tally, count_operations, counting
+from ehadiag_tools.bench_peak import beginning
+from ehadiag_tools.bench_problem import population, whole_test
 from firmware_iface.logs import read_frames
 
 TINY = ["--repeats", "1", "--ticks", "5", "--seeds", "1", "--budget", "50", "--pushes", "50"]
 TINY += ["--seconds", "0.02", "--frames", "2000"]
 
 
-@pytest.mark.parametrize("section", ["search", "estimate", "push", "decode"])
+@pytest.mark.parametrize("section", ["lanes", "search", "estimate", "push", "decode"])
 def test_each_section_gives_figures(section, capsys):
     assert bench.main(["--only", section, "--json", "-", *TINY]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -68,9 +71,69 @@ def test_c_and_lanes_are_the_same_algorithm(anchor):
     np.testing.assert_allclose(model.costs, (gaps**2).sum(axis=(1, 2)), rtol=1e-9)
 
 
-def test_without_a_compiler_c_is_left_out(monkeypatch, capsys):
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+@pytest.mark.parametrize("single", [False, True])
+def test_vectors_without_located_events_are_nearly_the_same_model(single):
+    """What events taken late make of most samples is an LSB or two."""
+    batch, rows = whole_test(bench.LOGS, 1), population(4)
+    work = lane_work(batch)
+    gaps = np.empty((4, 2, len(batch.current)))
+    lane_residuals(batch, rows, work, gaps, np.empty(4, dtype=np.int64))
+    # The lanes' own answer is the measurement.
+    for row, gap in zip(rows, gaps, strict=True):
+        own = batch._replace(
+            spool=batch.spool - gap[0] / batch.weight[0],
+            pressure=batch.pressure - gap[1] / batch.weight[1],
+            weight=np.repeat([[1.0 / SPOOL.lsb], [1.0 / PRESSURE.lsb]], gap.shape[1], axis=1),
+        )
+        model = CUnlocated(own, work.levels, row[None, :], 25.0, single=single)
+        model()
+        assert (model.costs == model.costs[0]).all()
+        assert 0.0 < np.sqrt(model.costs[0] / gap.size) < 2.0
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_c_in_single_precision_is_near():
+    batch, rows = whole_test(bench.LOGS, 1), population(4)
+    levels = lane_work(batch).levels
+    double, single = (CLanes(batch, levels, rows, 25.0, single=kind) for kind in (False, True))
+    double()
+    single()
+    assert (double.costs != single.costs).all()
+    np.testing.assert_allclose(single.costs, double.costs, rtol=1e-3)
+
+
+def test_numbers_count_what_is_done_with_them():
+    tally = Tally()
+    a = np.arange(1.0, 9.0).view(counting(tally))
+    b = a * a + np.float64(2.0) / a
+    assert (tally.vector, tally.divisions, tally.choices, tally.scalar) == (24, 8, 0, 0)
+    c = np.where(a > 3.0, np.minimum(a, b), -a)
+    assert (tally.vector, tally.choices) == (24, 32)
+    assert max(np.float64(3.0) * c[7] - 1.0, c[6]) / 2.0 == 11.5
+    assert (tally.vector, tally.choices, tally.scalar) == (24, 32, 3)
+
+
+def test_operations_are_counted_tick_by_tick():
+    """At rest every tick takes as many, and no lane goes alone."""
+    batch, rows = whole_test(bench.LOGS, 1), population(LANES)
+    batch = batch._replace(current=np.zeros(len(batch.current)))
+    work = lane_work(batch)
+    work.levels[:] = 0
+    counts = []
+    for ticks in (10, 20, 30):
+        found = count_operations(
+            beginning(batch, ticks), work._replace(levels=work.levels[:ticks]), rows
+        )
+        counts.append(np.array([found.vector, found.divisions, found.choices, found.scalar]))
+    np.testing.assert_array_equal(counts[2] - counts[1], counts[1] - counts[0])
+    assert (counts[1] - counts[0] > 0).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("section", ["kernel", "lanes"])
+def test_without_a_compiler_c_is_left_out(section, monkeypatch, capsys):
     monkeypatch.setattr(bench_c_model.shutil, "which", lambda _: None)
-    assert bench.main(["--only", "kernel", *TINY]) == 0
+    assert bench.main(["--only", section, *TINY]) == 0
     assert "left out: no cc on the path" in capsys.readouterr().out
 
 

@@ -3,126 +3,50 @@
  * The same steps as the lanes: the spool by quarters of a tick, or with events located on tables
  * of transitions; the jack by Radau's collocation, its number of steps in a tick handed over. As
  * scalar code may, it leaves out what a candidate does not need: a spool at rest is not moved.
- * Build: cc -O3 -march=native -shared -fPIC lanes.c -lm
+ * Build: cc -O3 -march=native -shared -fPIC lanes.c -lm; for single precision with
+ * -DREAL=float -fsingle-precision-constant.
  */
-#include "lane_jack.h"
+#include "lane_tables.h"
 
 #include <stddef.h>
 #include <stdint.h>
 
-enum { GRID = WHOLE >> 3, HALVINGS = 3, ORDER = 8, MOST_PIECES = 32 };
+enum { MOST_PIECES = 32 };
 
-static const double LEAST_DEPTH = -1e-14, CREEP = 1e-18;
-
-typedef struct {
-    Scalars t;
-    double dry, room, friction;
-    double quarter[16], rest[4];
-    double moving[GRID + 1][16], stuck[GRID + 1][4];
-} Tables;
-
-static inline void product(const double *a, const double *b, double *out, int n, double scale)
-{
-    for (int r = 0; r < n; r++)
-        for (int q = 0; q < n; q++) {
-            double total = a[r * n] * b[q];
-            for (int k = 1; k < n; k++)
-                total += a[r * n + k] * b[k * n + q];
-            out[r * n + q] = total * scale;
-        }
-}
-
-static inline void copy(const double *from, double *to, int n)
-{
-    for (int i = 0; i < n * n; i++)
-        to[i] = from[i];
-}
-
-/* exp(rates h) for 1 ... GRID finest steps, one behind the other in `out` from n * n on. */
-static inline void powers(const double *rates, int n, double tick, double *out)
-{
-    double scaled[16], term[16] = {0}, power[16] = {0}, spare[16];
-    for (int i = 0; i < n * n; i++)
-        scaled[i] = rates[i] * (tick / (WHOLE << HALVINGS));
-    for (int i = 0; i < n; i++)
-        term[i * n + i] = power[i * n + i] = 1.0;
-    for (int order = 1; order <= ORDER; order++) {
-        product(term, scaled, spare, n, 1.0 / order);
-        copy(spare, term, n);
-        for (int i = 0; i < n * n; i++)
-            power[i] += term[i];
-    }
-    for (int i = 0; i < HALVINGS; i++) {
-        product(power, power, spare, n, 1.0);
-        copy(spare, power, n);
-    }
-    copy(power, out + n * n, n);
-    for (int j = 2; j <= GRID; j++)
-        product(out + (j - 1) * n * n, out + n * n, out + j * n * n, n, 1.0);
-}
-
-/* What hangs on the recording alone: steps of a spool at rest. */
-static void tabulate_rest(const Fixed *f, Tables *m)
-{
-    const Plant *c = &f->c;
-    double ring[4] = {0.0, 1.0, -c->KF / c->JF, -c->CF / c->JF}, spare[4];
-    powers(ring, 2, f->tick, &m->stuck[0][0]);
-    copy(m->stuck[GRID], m->rest, 2);
-    for (int i = 0; i < 3; i++) {
-        product(m->rest, m->rest, spare, 2, 1.0);
-        copy(spare, m->rest, 2);
-    }
-}
-
-static void tabulate(const Fixed *f, const double *candidate, Tables *m)
-{
-    const Plant *c = &f->c;
-    double force = c->AS * c->GPF, flow_gain = c->GQF * (1.0 - 0.8 * candidate[0]);
-    double damping = c->GPF / flow_gain * c->AS * c->AS + c->CS;
-    double fixed = c->FSS0 + candidate[1] * (c->FSS1 - c->FSS0);
-    m->t = (Scalars){force, damping, 0.5 * fixed, fixed / force, 0.0, 0.0};
-    m->dry = 0.5 * fixed / force;
-    m->room = lesser(m->t.breakaway, c->XFM);
-    m->friction = c->FDJ0 + candidate[2] * (c->FDJ1 - c->FDJ0);
-    double rates[16] = {0.0, 1.0, 0.0, 0.0,
-                        -c->KF / c->JF, -c->CF / c->JF, -c->KSF / c->JF, 0.0,
-                        0.0, 0.0, 0.0, 1.0,
-                        force / c->MS, 0.0, 0.0, -damping / c->MS};
-    powers(rates, 4, f->tick, &m->moving[0][0]);
-    product(m->moving[GRID], m->moving[GRID], m->quarter, 4, 1.0);
-}
+/* What rounding makes of a spool at rest is some 1e4 times more in single precision. */
+static const real LEAST_DEPTH = sizeof(real) == sizeof(double) ? -1e-14 : -1e-11, CREEP = 1e-18;
 
 /* A tick of the spool with events; returns whether the jack has taken it too. */
-static int event_tick(const Fixed *f, const Tables *m, double torque, Spool *s, Path path, Jack *jack)
+static int event_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Path path, Jack *jack)
 {
     const Plant *c = &f->c;
     const Scalars *t = &m->t;
-    double pieces[MOST_PIECES][4], unit = f->tick / WHOLE;
-    double from_xs = s->xs, from_vs = s->vs;
+    real pieces[MOST_PIECES][4], unit = f->tick / WHOLE;
+    real from_xs = s->xs, from_vs = s->vs;
     int done = 0, single = 0, since = 0, starts = 0, count = 0;
     while (done < WHOLE) {
         int grid = GRID - (done & (GRID - 1)), step = single ? 1 : grid, settled = single, event;
         int low = 0, high = grid + 1;
-        double at_low = s->direction != 0 ? s->vs * s->direction : t->breakaway - fabs(s->xf);
-        double at_high = 1.0;
+        real at_low = s->direction != 0 ? s->vs * s->direction : t->breakaway - fabs(s->xf);
+        real at_high = 1.0;
         Spool n;
         single = 0;
         for (;;) {
-            double h = step * unit, decides = 1.0;
+            real h = step * unit, decides = 1.0;
             n = *s;
             if (s->clamped) {
                 if (s->direction != 0) {
-                    double steady = (t->force * s->xf - t->dynamic * s->direction) / t->damping;
-                    double fade = exp(-h * t->damping / c->MS);
+                    real steady = (t->force * s->xf - t->dynamic * s->direction) / t->damping;
+                    real fade = exp(-h * t->damping / c->MS);
                     n.xs += steady * h + (s->vs - steady) * (1.0 - fade) * c->MS / t->damping;
                     n.vs = steady + (s->vs - steady) * fade;
                 }
                 event = clamped_event(c, t, torque, &n);
             } else if (s->direction != 0) {
-                double rest_xf = m->dry * s->direction;
-                double rest_xs = (torque - c->KF * rest_xf) * f->by_KSF;
-                double a = s->xf - rest_xf, b = s->xs - rest_xs;
-                const double *p = m->moving[step];
+                real rest_xf = m->dry * s->direction;
+                real rest_xs = (torque - c->KF * rest_xf) * f->by_KSF;
+                real a = s->xf - rest_xf, b = s->xs - rest_xs;
+                const real *p = m->moving[step];
                 n.xf = rest_xf + p[0] * a + p[1] * s->wf + p[2] * b + p[3] * s->vs;
                 n.wf = p[4] * a + p[5] * s->wf + p[6] * b + p[7] * s->vs;
                 n.xs = rest_xs + p[8] * a + p[9] * s->wf + p[10] * b + p[11] * s->vs;
@@ -130,8 +54,8 @@ static int event_tick(const Fixed *f, const Tables *m, double torque, Spool *s, 
                 event = moving_event(c, t, h, s, &n);
                 decides = n.vs * s->direction;
             } else {
-                double rest_xf = (torque - c->KSF * s->xs) * f->by_KF, a = s->xf - rest_xf;
-                const double *p = m->stuck[step];
+                real rest_xf = (torque - c->KSF * s->xs) * f->by_KF, a = s->xf - rest_xf;
+                const real *p = m->stuck[step];
                 n.xf = rest_xf + p[0] * a + p[1] * s->wf;
                 n.wf = p[2] * a + p[3] * s->wf;
                 event = stuck_event(c, t, h, s, &n);
@@ -165,7 +89,7 @@ static int event_tick(const Fixed *f, const Tables *m, double torque, Spool *s, 
         }
         done += step;
         since += step;
-        double end_vs = n.vs;
+        real end_vs = n.vs;
         *s = n;
         change(c, t, event, s);
         starts |= event > NOTHING && s->direction != 0 && s->vs == 0.0;
@@ -185,7 +109,7 @@ static int event_tick(const Fixed *f, const Tables *m, double torque, Spool *s, 
         }
     }
     for (int n = 0; starts && n < count; n++) {
-        double span = pieces[n][0];
+        real span = pieces[n][0];
         Piece p = {span, from_xs, pieces[n][1], pieces[n][2] * span, pieces[n][3] * span};
         jack_piece(f, m->friction, &p, 0.0, 1.0, jack);
         from_xs = p.x1;
@@ -194,7 +118,7 @@ static int event_tick(const Fixed *f, const Tables *m, double torque, Spool *s, 
 }
 
 /* A tick of the spool without events; returns 0, the state as it was, where one may hide. */
-static inline int plain_tick(const Fixed *f, const Tables *m, double torque, Spool *s, Path path)
+static inline int plain_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Path path)
 {
     const Plant *c = &f->c;
     path[0][0] = s->xs;
@@ -202,8 +126,8 @@ static inline int plain_tick(const Fixed *f, const Tables *m, double torque, Spo
     if (s->clamped)
         return 0;
     if (s->direction == 0) {
-        double still = (torque - c->KSF * s->xs) * f->by_KF, room = m->room - fabs(still);
-        double a = s->xf - still, b = (s->wf + f->ring_damping * a) * f->ring_time, wf = s->wf;
+        real still = (torque - c->KSF * s->xs) * f->by_KF, room = m->room - fabs(still);
+        real a = s->xf - still, b = (s->wf + f->ring_damping * a) * f->ring_time, wf = s->wf;
         if (room <= 0.0 || a * a + b * b >= room * room)
             return 0;
         s->xf = still + m->rest[0] * a + m->rest[1] * wf;
@@ -215,16 +139,16 @@ static inline int plain_tick(const Fixed *f, const Tables *m, double torque, Spo
         }
         return 1;
     }
-    double d = s->direction, bow = f->tick / 16.0, dry = m->dry;
-    double base = (torque - c->KF * dry * d) * f->by_KSF;
-    double a = s->xf * d - dry, w = s->wf * d, b = (s->xs - base) * d, v = s->vs * d;
-    const double *p = m->quarter;
+    real d = s->direction, bow = f->tick / 16.0, dry = m->dry;
+    real base = (torque - c->KF * dry * d) * f->by_KSF;
+    real a = s->xf * d - dry, w = s->wf * d, b = (s->xs - base) * d, v = s->vs * d;
+    const real *p = m->quarter;
     for (int n = 1; n <= NODES; n++) {
-        double na = p[0] * a + p[1] * w + p[2] * b + p[3] * v;
-        double nw = p[4] * a + p[5] * w + p[6] * b + p[7] * v;
-        double nb = p[8] * a + p[9] * w + p[10] * b + p[11] * v;
-        double nv = p[12] * a + p[13] * w + p[14] * b + p[15] * v;
-        double swing = bow * greater(fabs(w), fabs(nw));
+        real na = p[0] * a + p[1] * w + p[2] * b + p[3] * v;
+        real nw = p[4] * a + p[5] * w + p[6] * b + p[7] * v;
+        real nb = p[8] * a + p[9] * w + p[10] * b + p[11] * v;
+        real nv = p[12] * a + p[13] * w + p[14] * b + p[15] * v;
+        real swing = bow * greater(fabs(w), fabs(nw));
         if (nv <= 10.0 * LEAST_DEPTH || (w * nw < 0.0 && lesser(a, na) - swing <= LEAST_DEPTH)
             || fabs(na + dry) + swing >= c->XFM)
             return 0;
@@ -248,14 +172,14 @@ static inline int plain_tick(const Fixed *f, const Tables *m, double torque, Spo
 /* Summed squared weighted gap of each candidate, each square at most `cap`.
  *
  * Arguments as the fields of ehadiag.identify.batch.Batch, the levels of LaneWork and STAGES;
- * gaps: (n, 2, ticks), or null.
+ * gaps: (n, 2, ticks), or null. All of type real but the costs.
  */
-void eha_lane_costs(const Plant *constants, const double *ticks, const int64_t *start,
-                    const double *origin, const double *current_before, const double *current,
-                    const double *spool, const double *pressure, const double *weight,
-                    const double (*anchor)[3], const int64_t *levels,
-                    const double (*stages)[16][3][5], long spans, double cap, long n,
-                    const double (*candidates)[5], double *costs, double *gaps)
+void eha_lane_costs(const Plant *constants, const real *ticks, const int64_t *start,
+                    const real *origin, const real *current_before, const real *current,
+                    const real *spool, const real *pressure, const real *weight,
+                    const real (*anchor)[3], const int64_t *levels,
+                    const real (*stages)[16][3][5], long spans, real cap, long n,
+                    const real (*candidates)[5], double *costs, real *gaps)
 {
     Tables m;
     int64_t all = start[spans];
@@ -263,16 +187,14 @@ void eha_lane_costs(const Plant *constants, const double *ticks, const int64_t *
         costs[i] = 0.0;
     for (long index = 0; index < spans; index++) {
         const Plant *c = constants + index;
-        double damping = 0.5 * c->CF / c->JF, square = c->KF / c->JF - damping * damping;
-        const Fixed f = {*c, ticks[index], damping, square > 0.0 ? 1.0 / sqrt(square) : 1e30,
-                         1.0 / c->KSF, 1.0 / c->KF, 1.0 / c->MJ, c->PSR / c->GP,
-                         1.0 / (c->PSR * c->AJ), c->GQ / c->AJ};
-        double gain = anchor[index][0], small = anchor[index][1], large = anchor[index][2];
+        const Fixed f = fixed_of(c, ticks[index]);
+        real gain = anchor[index][0], small = anchor[index][1], large = anchor[index][2];
         int anchored = isfinite(small) || isfinite(large);
         tabulate_rest(&f, &m);
         for (long i = 0; i < n; i++) {
             tabulate(&f, candidates[i], &m);
-            double held_xf = m.t.breakaway, filtered = 0.0, sum = 0.0;
+            real held_xf = m.t.breakaway, filtered = 0.0;
+            double sum = 0.0;
             Spool s = {0};
             Jack jack = {0};
             Path path;
@@ -280,12 +202,12 @@ void eha_lane_costs(const Plant *constants, const double *ticks, const int64_t *
             s.xf = (c->GM * current_before[index] - c->KSF * s.xs) / c->KF;
             s.xf = greater(lesser(s.xf, held_xf), -held_xf);
             for (int64_t k = start[index]; k < start[index + 1]; k++) {
-                double torque = c->GM * current[k];
+                real torque = c->GM * current[k];
                 int done = !plain_tick(&f, &m, torque, &s, path)
                            && event_tick(&f, &m, torque, &s, path, &jack);
-                double seen = spool[k] - candidates[i][3];
+                real seen = spool[k] - candidates[i][3];
                 if (weight[k] != 0.0 && isfinite(seen)) {
-                    double gap = (seen - s.xs) * weight[k];
+                    real gap = (seen - s.xs) * weight[k];
                     sum += lesser(gap * gap, cap);
                     if (gaps != NULL)
                         gaps[2 * i * all + k] = gap;
@@ -294,17 +216,17 @@ void eha_lane_costs(const Plant *constants, const double *ticks, const int64_t *
                 for (int step = 0; !done && step < 1 << level; step++)
                     jack_step(&f, m.friction, level, step, stages[level][step], path, &jack);
                 if (weight[all + k] != 0.0 && isfinite(pressure[k])) {
-                    double x = path[0][NODES];
-                    double p12 = c->PSR * (c->GQ * x - c->AJ * jack.velocity)
+                    real x = path[0][NODES];
+                    real p12 = c->PSR * (c->GQ * x - c->AJ * jack.velocity)
                                  / divide(c, greater(fabs(x), f.corner));
                     p12 = greater(lesser(p12, c->PSR), -c->PSR);
-                    double gap = (pressure[k] - candidates[i][4] - p12) * weight[all + k];
+                    real gap = (pressure[k] - candidates[i][4] - p12) * weight[all + k];
                     sum += lesser(gap * gap, cap);
                     if (gaps != NULL)
                         gaps[(2 * i + 1) * all + k] = gap;
                 }
                 if (anchored && isfinite(seen)) {
-                    double error = seen - s.xs, move = 0.0;
+                    real error = seen - s.xs, move = 0.0;
                     filtered += gain * (error - filtered);
                     if (fabs(error) > large)
                         move = error;

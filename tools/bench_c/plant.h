@@ -1,32 +1,38 @@
 /* Constants of the plant, and what ends a step of flapper and spool (ehadiag/model/spoolevents.py);
  * for all the models here. */
-#include <math.h>
+#include <tgmath.h>
+
+/* Type of the numbers: with -DREAL=float constants have to be of single precision too. */
+#ifndef REAL
+#define REAL double
+#endif
+typedef REAL real;
 
 enum { FINEST = 10, WHOLE = 1 << FINEST };
 enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELEASE };
 
 /* In the order of ehadiag.model.constants.PlantConstants. */
 typedef struct {
-    double GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
-    double AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
+    real GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
+    real AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
 } Plant;
 
 /* In the order of ehadiag.model.transition.SpoolScalars. */
 typedef struct {
-    double force, damping, dynamic, breakaway, ring_damping, ring_rate;
+    real force, damping, dynamic, breakaway, ring_damping, ring_rate;
 } Scalars;
 
 typedef struct {
-    double xf, wf, xs, vs;
+    real xf, wf, xs, vs;
     int direction, clamped;
 } Spool;
 
-static int held(const Plant *c, const Scalars *t, double xf, double xs)
+static int held(const Plant *c, const Scalars *t, real xf, real xs)
 {
     return fabs(xf) <= t->breakaway || (fabs(xs) >= c->XSM && xs * xf > 0.0);
 }
 
-static int clamped_event(const Plant *c, const Scalars *t, double torque, const Spool *s)
+static int clamped_event(const Plant *c, const Scalars *t, real torque, const Spool *s)
 {
     if ((torque - c->KSF * s->xs - c->KF * s->xf) * s->xf < 0.0)
         return RELEASE;
@@ -37,7 +43,7 @@ static int clamped_event(const Plant *c, const Scalars *t, double torque, const 
     return fabs(s->xs) >= c->XSM && s->xs * s->direction > 0.0 ? SPOOL_STOP : NOTHING;
 }
 
-static int moving_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
+static int moving_event(const Plant *c, const Scalars *t, real h, const Spool *a, const Spool *b)
 {
     if (b->vs * a->direction <= 0.0)
         return REVERSAL;
@@ -46,8 +52,8 @@ static int moving_event(const Plant *c, const Scalars *t, double h, const Spool 
     if (fabs(b->xf) >= c->XFM)
         return FLAPPER_STOP;
     if (a->wf * b->wf < 0.0) {
-        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
-        double lowest = fmin(a->xf * a->direction, b->xf * a->direction);
+        real swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
+        real lowest = fmin(a->xf * a->direction, b->xf * a->direction);
         if (lowest - t->dynamic / t->force - swing <= 0.0
             || fmax(fabs(a->xf), fabs(b->xf)) + swing >= c->XFM)
             return UNSURE;
@@ -55,14 +61,14 @@ static int moving_event(const Plant *c, const Scalars *t, double h, const Spool 
     return NOTHING;
 }
 
-static int stuck_event(const Plant *c, const Scalars *t, double h, const Spool *a, const Spool *b)
+static int stuck_event(const Plant *c, const Scalars *t, real h, const Spool *a, const Spool *b)
 {
     if (!held(c, t, b->xf, a->xs))
         return BREAKAWAY;
     if (fabs(b->xf) >= c->XFM)
         return FLAPPER_STOP;
     if (a->wf * b->wf < 0.0) {
-        double swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
+        real swing = 0.25 * h * fmax(fabs(a->wf), fabs(b->wf));
         if (fmax(fabs(a->xf), fabs(b->xf)) + swing > fmin(t->breakaway, c->XFM))
             return UNSURE;
     }

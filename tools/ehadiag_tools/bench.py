@@ -20,6 +20,7 @@ from ehadiag_tools import (
     bench_decode,
     bench_estimate,
     bench_kernel,
+    bench_lanes,
     bench_live,
     bench_process,
     bench_push,
@@ -31,6 +32,7 @@ __all__ = ["SECTIONS", "main"]
 
 SECTIONS: dict[str, Callable[[Sizes], list[Figure]]] = {
     "kernel": bench_kernel.measure,
+    "lanes": bench_lanes.measure,
     "search": bench_search.measure,
     "estimate": bench_estimate.measure,
     "live": bench_live.measure,

@@ -8,7 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Figure", "Sizes", "cpu_median"]
+__all__ = ["Figure", "Sizes", "cpu_median", "each"]
+
+SUBSTEPS = 10
+"""Sub-steps of 100 µs in a tick: times are also given for one of these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,3 +49,9 @@ def cpu_median(work: Callable[[], object], repeats: int) -> float:
         work()
         spent.append(time.thread_time() - begin)
     return statistics.median(spent)
+
+
+def each(seconds: float, ticks: int) -> str:
+    """Say what a time of so many ticks is for one."""
+    tick = seconds * 1e9 / ticks
+    return f"{tick:.3g} ns a tick, {tick / SUBSTEPS:.3g} ns for 100 µs"

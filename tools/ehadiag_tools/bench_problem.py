@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from ehadiag.actuator import default_actuator
 from ehadiag.identify.batch import Batch
 from ehadiag.identify.experiment import Experiment, build_experiment, make_batch
@@ -13,7 +15,17 @@ from ehadiag.recording import Recording, Samples
 from ehadiag.storedtest import resolve_test
 from firmware_iface.logs import read_recording
 
-__all__ = ["LOG", "TRUTH", "experiment", "recording", "samples", "search_window", "whole_test"]
+__all__ = [
+    "LOG",
+    "TRUTH",
+    "all_tests",
+    "experiment",
+    "population",
+    "recording",
+    "samples",
+    "search_window",
+    "whole_test",
+]
 
 LOG = "paper-open-2.blf"
 TRUTH = (0.3, 0.6, 0.3)
@@ -43,6 +55,27 @@ def experiment(logs: Path) -> Experiment:
 def whole_test(logs: Path, tests: int) -> Batch:
     """Lay it out so many times, all of the test."""
     return make_batch([experiment(logs)] * tests)
+
+
+def all_tests(logs: Path) -> list[Batch]:
+    """Lay out each recording of the paper's cases, all of the test."""
+    out = []
+    for kind in ("open", "closed"):
+        for log in sorted(logs.glob(f"paper-{kind}-*.blf")):
+            found = read_recording(log)
+            assert found.samples is not None
+            item = build_experiment(
+                found.samples, found.environment, resolve_test(kind), default_actuator()
+            )
+            out.append(make_batch([item]))
+    return out
+
+
+def population(size: int) -> np.ndarray:
+    """Candidates all over the cube, no offsets, shape (size, 5)."""
+    rows = np.zeros((size, 5))
+    rows[:, :3] = np.random.default_rng(0).uniform(0.0, 1.0, (size, 3))
+    return rows
 
 
 def search_window(logs: Path) -> Batch:

@@ -1,0 +1,149 @@
+"""Counts the lanes' operations: runs them uncompiled, on numbers that count what is done with them.
+
+As a script, with NUMBA_DISABLE_JIT=1: reads (batch, work, candidates) pickled from stdin and prints
+the counts as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ehadiag.identify.batch import Batch
+from ehadiag.identify.lanes import LaneWork, lane_costs
+from ehadiag.identify.objective import SEARCH_CAP
+
+__all__ = ["Operations", "Tally", "count_operations", "counting"]
+
+ARITHMETIC = ("add", "subtract", "multiply", "divide")
+SCALAR = {
+    "add": ("__add__", "__radd__"),
+    "subtract": ("__sub__", "__rsub__"),
+    "multiply": ("__mul__", "__rmul__"),
+    "divide": ("__truediv__", "__rtruediv__"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Operations:
+    """Of all lanes together; a sum, a product and a division count one each.
+
+    Attributes
+    ----------
+    vector: in vectors, divisions among them.
+    divisions: in vectors.
+    choices: comparisons, choices, minima and magnitudes in vectors; not among the others.
+    scalar: of lanes that take a step alone.
+    """
+
+    vector: int
+    divisions: int
+    choices: int
+    scalar: int
+
+
+def count_operations(batch: Batch, work: LaneWork, candidates: np.ndarray) -> Operations:
+    """Operations of `lane_costs` as its source is written, but for those of its tables.
+
+    The compiler may find a few of them twice. Runs in a process of its own.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", __name__],
+        env={
+            **os.environ,
+            "NUMBA_DISABLE_JIT": "1",
+            "PYTHONPATH": os.pathsep.join(item for item in sys.path if item),
+        },
+        input=pickle.dumps((batch, work, candidates)),
+        capture_output=True,
+        check=True,
+    )
+    return Operations(**json.loads(done.stdout))
+
+
+class Tally:
+    """What arrays and numbers count into."""
+
+    def __init__(self) -> None:
+        self.vector = self.divisions = self.choices = self.scalar = 0
+
+    def add_vector(self, name: str, size: int) -> None:
+        """Count a function of vectors."""
+        if name in ARITHMETIC:
+            self.vector += size
+            self.divisions += size * (name == "divide")
+        else:
+            self.choices += size
+
+    def result(self) -> Operations:
+        """Return the counts."""
+        return Operations(self.vector, self.divisions, self.choices, self.scalar)
+
+
+def counting(tally: Tally) -> type[np.ndarray]:
+    """Kind of array that counts what is done with it, and with its single elements."""
+
+    class Number(float):
+        # numpy leaves an operation with one of its numbers to the methods here.
+        __array_ufunc__ = None
+
+    def counted(name: str) -> Any:
+        plain = getattr(float, name)
+
+        def operation(self: float, other: float) -> Any:
+            tally.scalar += 1
+            return Number(plain(self, other))
+
+        return operation
+
+    for names in SCALAR.values():
+        for name in names:
+            setattr(Number, name, counted(name))
+    for name in ("__neg__", "__abs__"):
+        plain = getattr(float, name)
+        setattr(Number, name, lambda self, plain=plain: Number(plain(self)))
+
+    class Counted(np.ndarray):
+        def __getitem__(self, key: Any) -> Any:
+            found = super().__getitem__(key)
+            return found if isinstance(found, np.ndarray) else Number(found)
+
+        def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+            return wrapped(
+                ufunc.__name__, getattr(ufunc, method)(*map(plain_of, inputs), **options)
+            )
+
+        def __array_function__(self, function: Any, _kinds: Any, inputs: Any, options: Any) -> Any:
+            return wrapped(function.__name__, function(*map(plain_of, inputs), **options))
+
+    def plain_of(item: Any) -> Any:
+        return item.view(np.ndarray) if isinstance(item, Counted) else item
+
+    def wrapped(name: str, result: Any) -> Any:
+        if not isinstance(result, np.ndarray):
+            return result
+        tally.add_vector(name, result.size)
+        return result.view(Counted)
+
+    return Counted
+
+
+def main() -> None:
+    """Count what stdin asks for."""
+    batch, work, candidates = pickle.load(sys.stdin.buffer)
+    tally = Tally()
+    kind = counting(tally)
+    work = LaneWork(*(a.view(kind) if a.dtype == np.float64 else a for a in work))
+    lane_costs(batch, candidates, SEARCH_CAP, work, np.empty(len(candidates)))
+    print(json.dumps(asdict(tally.result())))
+
+
+if __name__ == "__main__":
+    main()
