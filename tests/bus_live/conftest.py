@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterator
 
 import fault_cases
 import pytest
+from live_ends import cable
 
 from ehadiag.actuator import default_actuator
 from ehadiag.storedtest import StoredTest
@@ -41,26 +41,5 @@ def _no_thread_left() -> Iterator[None]:
 
 @pytest.fixture
 def wire() -> Iterator[tuple[str, str]]:
-    """Two pty pairs, joined in the middle."""
-    if not hasattr(os, "openpty"):
-        pytest.skip("no pseudo-terminals on this system")
-    import select
-    import tty
-
-    (a, a_end), (b, b_end) = os.openpty(), os.openpty()
-    for item in (a, b, a_end, b_end):
-        tty.setraw(item)
-    stop = threading.Event()
-
-    def join() -> None:
-        while not stop.is_set():
-            for source in select.select([a, b], [], [], 0.02)[0]:
-                os.write(b if source == a else a, os.read(source, 4096))
-
-    thread = threading.Thread(target=join)
-    thread.start()
-    yield os.ttyname(a_end), os.ttyname(b_end)
-    stop.set()
-    thread.join()
-    for item in (a, b, a_end, b_end):
-        os.close(item)
+    with cable() as ends:
+        yield ends

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import errno
 import os
 import select
@@ -57,23 +56,12 @@ def collect(transport: Transport, count: int) -> list[Frame]:
     return got
 
 
-class Contract(abc.ABC):
-    """What every transport keeps; its subclass gives the fixtures."""
+class Contract:
+    """What every transport keeps. A subclass gives three fixtures:
 
-    @abc.abstractmethod
-    @pytest.fixture
-    def receiving(self) -> Iterator[Transport]:
-        """Give the transport that gets the frames."""
-
-    @abc.abstractmethod
-    @pytest.fixture
-    def feed(self) -> Callable[[], None]:
-        """Return what sends the frames."""
-
-    @abc.abstractmethod
-    @pytest.fixture
-    def carried(self) -> list[Frame]:
-        """Return the frames of a stored test as they came through the transport."""
+    `receiving`, the transport that gets the frames; `feed`, what sends them; `carried`, the frames
+    of a stored test as they came through the transport.
+    """
 
     def test_a_stored_test_comes_with_the_same_samples(self, carried: list[Frame]) -> None:
         sound = stored_test.recording(stored_test.frames())
@@ -153,15 +141,10 @@ class Contract(abc.ABC):
 
 
 class TwoWay(Contract):
-    """Transports with another end that can be written to, and read."""
+    """Transports with another end that can be written to, and read: the fixture `other`."""
 
     speed = 4.0
     """At which the stored test is played."""
-
-    @abc.abstractmethod
-    @pytest.fixture
-    def other(self) -> Iterator[Transport]:
-        """Give the other end."""
 
     @pytest.fixture
     def feed(self, other: Transport) -> Callable[[], None]:

@@ -10,18 +10,19 @@ import sys
 import textwrap
 import threading
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
+from live_ends import computer_on
 
 from ehadiag.errors import ConfigurationError, InputOutputError
 from ehadiag.recording import BitReason, BitState, CommandMode
 from ehadiag.storedtest import StoredTest
 from ehadiag_sim.busfaults import Failure
-from ehadiag_sim.emulator import EmulatorTransport, run_emulator
+from ehadiag_sim.emulator import EmulatorTransport
 from ehadiag_sim.faultybus import FaultyTransport
 from ehadiag_sim.fcc import FccCore
 from firmware_iface import tester
@@ -233,20 +234,6 @@ def test_a_log_can_be_listened_to_like_a_bus(make_core: CoreFactory, tmp_path: P
 
 def virtual(channel: str, *, transmit: bool) -> Transport:
     return PythonCanTransport(BusOptions("virtual", channel=channel), transmit=transmit)
-
-
-@contextmanager
-def computer_on(bus: Transport, core: FccCore) -> Iterator[None]:
-    """Run the computer in a thread while the block runs."""
-    stop = threading.Event()
-    core.step()  # compiles
-    node = threading.Thread(target=run_emulator, args=(core, bus, stop))
-    node.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        node.join()
 
 
 def recorded_test(ours: Transport, path: Path) -> tester.TesterOutcome:

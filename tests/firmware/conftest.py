@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import select
 import shutil
 import subprocess
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import c_side
 import pytest
+from live_ends import cable
 
 
 @pytest.fixture(scope="session")
@@ -40,34 +37,5 @@ def library(c_build: Path) -> Any:
 
 @pytest.fixture
 def wire() -> Iterator[tuple[str, str]]:
-    """Two pty pairs, joined in the middle: the two ends of a serial cable."""
-    if not hasattr(os, "openpty"):
-        pytest.skip("no pseudo-terminals on this system")
-    import tty
-
-    (a, a_end), (b, b_end) = os.openpty(), os.openpty()
-    for item in (a, b, a_end, b_end):
-        tty.setraw(item)
-    for item in (a, b):
-        os.set_blocking(item, False)
-    stop = threading.Event()
-
-    def forward(target: int, data: bytes) -> None:
-        # An end that nobody reads fills up: its writer must not hang for ever.
-        while data and not stop.is_set():
-            if select.select([], [target], [], 0.02)[1]:
-                with contextlib.suppress(BlockingIOError):
-                    data = data[os.write(target, data) :]
-
-    def join() -> None:
-        while not stop.is_set():
-            for source in select.select([a, b], [], [], 0.02)[0]:
-                forward(b if source == a else a, os.read(source, 4096))
-
-    thread = threading.Thread(target=join)
-    thread.start()
-    yield os.ttyname(a_end), os.ttyname(b_end)
-    stop.set()
-    thread.join()
-    for item in (a, b, a_end, b_end):
-        os.close(item)
+    with cable() as ends:
+        yield ends

@@ -6,18 +6,17 @@ import shutil
 import signal
 import socket
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
+from live_ends import computer_on
 
 from ehadiag.actuator import default_actuator
 from ehadiag.storedtest import Line, StoredTest, Windows
 from ehadiag_sim.conditions import Faults
-from ehadiag_sim.emulator import run_emulator
 from ehadiag_sim.fcc import FccCore
 from firmware_iface.pythoncan import BusOptions, PythonCanTransport
 from firmware_iface.transport import Transport
@@ -26,7 +25,6 @@ CHANNEL = "vcan0"
 DURATION = 0.4
 
 Peer = Callable[..., AbstractContextManager[subprocess.Popen[bytes]]]
-NodeOn = Callable[[Transport], AbstractContextManager[FccCore]]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -58,28 +56,10 @@ def core(test_of_9: StoredTest) -> FccCore:
 
 
 @pytest.fixture
-def node_on(core: FccCore) -> NodeOn:
-    """Run the emulated computer on a bus while the block runs."""
-
-    @contextmanager
-    def run(transport: Transport) -> Iterator[FccCore]:
-        stop = threading.Event()
-        thread = threading.Thread(target=run_emulator, args=(core, transport, stop))
-        thread.start()
-        try:
-            yield core
-        finally:
-            stop.set()
-            thread.join()
-
-    return run
-
-
-@pytest.fixture
-def node(node_on: NodeOn) -> Iterator[FccCore]:
+def node(core: FccCore) -> Iterator[FccCore]:
     """The emulated computer on vcan0."""
     options = BusOptions("socketcan", channel=CHANNEL)
-    with PythonCanTransport(options, transmit=True) as transport, node_on(transport) as core:
+    with PythonCanTransport(options, transmit=True) as transport, computer_on(transport, core):
         yield core
 
 

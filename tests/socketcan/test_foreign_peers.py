@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import shutil
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +15,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from live_ends import cable
 
 from ehadiag.recording import BitState, Recording
 from ehadiag_sim.emulator import EmulatorTransport
@@ -207,51 +206,26 @@ def test_python_cans_viewer_shows_our_messages(node: FccCore, until: Until) -> N
 @contextmanager
 def kernel_slcan(until: Until) -> Iterator[str]:
     """slcan0 of the kernel on a pseudo-terminal, and the path of the line's other end."""
-    import tty
-
     if shutil.which("slcand") is None:
         pytest.skip("no slcand on this machine: Debian package can-utils")
-    (a, a_end), (b, b_end) = os.openpty(), os.openpty()
-    for item in (a, b, a_end, b_end):
-        tty.setraw(item)
-    for item in (a, b):
-        os.set_blocking(item, False)
-    stop = threading.Event()
-
-    def forward(target: int, data: bytes) -> None:
-        # An end that nobody reads fills up: its writer must not hang for ever.
-        while data and not stop.is_set():
-            if select.select([], [target], [], 0.02)[1]:
-                with contextlib.suppress(BlockingIOError):
-                    data = data[os.write(target, data) :]
-
-    def join() -> None:
-        while not stop.is_set():
-            for source in select.select([a, b], [], [], 0.02)[0]:
-                forward(b if source == a else a, os.read(source, 4096))
-
-    thread = threading.Thread(target=join)
-    thread.start()
-    daemon = subprocess.Popen(
-        ["slcand", "-F", "-o", "-s8", os.ttyname(a_end), "slcan0"],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-    try:
-        link = Path("/sys/class/net/slcan0")
-        until(lambda: link.exists() or daemon.poll() is not None)
-        if daemon.poll() is not None:
-            assert daemon.stderr is not None
-            pytest.skip(f"the kernel has no SLCAN: {daemon.stderr.read().decode()!r}")
-        subprocess.run(["ip", "link", "set", "slcan0", "txqueuelen", "1000", "up"], check=True)
-        yield os.ttyname(b_end)
-    finally:
-        daemon.terminate()
-        daemon.communicate(timeout=10)
-        stop.set()
-        thread.join()
-        for item in (a, b, a_end, b_end):
-            os.close(item)
+    with cable() as (kernels, ours):
+        daemon = subprocess.Popen(
+            ["slcand", "-F", "-o", "-s8", kernels, "slcan0"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            link = Path("/sys/class/net/slcan0")
+            until(lambda: link.exists() or daemon.poll() is not None)
+            if daemon.poll() is not None:
+                assert daemon.stderr is not None
+                pytest.skip(f"the kernel has no SLCAN: {daemon.stderr.read().decode()!r}")
+            up = ["ip", "link", "set", "slcan0", "txqueuelen", "1000", "up"]
+            subprocess.run(up, check=True)
+            yield ours
+        finally:
+            daemon.terminate()
+            daemon.communicate(timeout=10)
 
 
 def test_a_recorded_test_through_the_kernels_slcan_and_a_serial_line(
