@@ -34,7 +34,7 @@ TICKS = 700
 MAP = default_map()
 TRUTH = make_truth(TICKS, 9)
 CLEAN = play(Encoder(MAP), TRUTH, idle_before=30, idle_after=30)
-SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+SETTINGS = settings(max_examples=60, suppress_health_check=list(HealthCheck))
 
 
 PLANS = st.fixed_dictionaries(
@@ -110,7 +110,7 @@ def strange_frames(draw):
     return frames
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=300, suppress_health_check=list(HealthCheck))
 @given(strange_frames())
 def test_no_frames_crash_the_assembly(frames):
     for recording in recordings(frames, MAP):
@@ -122,7 +122,7 @@ def test_no_frames_crash_the_assembly(frames):
             assert len(recording.samples.host_ns) == recording.samples.ticks
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.builds(

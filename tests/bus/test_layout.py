@@ -47,7 +47,7 @@ def parse(text):
     return message, signal_layout(plain.signals[-1], plain, "test")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(messages(), st.data())
 def test_extraction_agrees_with_cantools(made, data):
     text, size = made

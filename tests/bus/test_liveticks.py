@@ -64,7 +64,7 @@ def test_telemetry_may_come_before_its_command():
     np.testing.assert_allclose(ticks, [expected(k) for k in range(300)], rtol=1e-12, atol=1e-15)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.sets(st.integers(1, 398)), st.sets(st.integers(1, 398)))
 def test_what_is_lost_is_nan_and_nothing_else(no_command, no_telemetry):
     """Gaps up to what the counter tells: it turns after 256."""

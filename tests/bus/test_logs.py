@@ -120,9 +120,7 @@ def test_one_recording_in_every_format(tmp_path, encoder, suffix):
         assert error < 1_000_000
 
 
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_blf_agrees_with_python_can(tmp_path, data):
     kinds = st.sampled_from(["data"] * 6 + ["extended", "remote", "error", "fd", "sent"])
@@ -300,7 +298,7 @@ BLF_SEED = (LOGS / "paper-open-1.blf").read_bytes()[:6000]
 ASC_SEED = (LOGS / "hot-worn-closed.asc").read_bytes()[:1500]
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150, suppress_health_check=list(HealthCheck))
 @given(st.data(), st.sampled_from([".blf", ".asc", ".csv", ".trc"]))
 def test_no_bytes_crash_the_reader(tmp_path, data, suffix):
     seed = BLF_SEED if suffix == ".blf" else ASC_SEED

@@ -178,7 +178,7 @@ def test_scale_and_offset_come_before_the_unit(folder):
     assert role.bias == pytest.approx(3e5)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_no_bytes_crash_the_loader(tmp_path, data):
     texts = {"map.toml": TOML, "eha_fcc.dbc": DBC}

@@ -96,7 +96,7 @@ def test_proportional_law_is_rebuilt_exactly():
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.001, 0.2))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_lost_samples_have_their_exact_codes(seed, share):
     """One code of position is many codes of current, so the current tells the lost code.
 

@@ -23,7 +23,7 @@ def objective():
 
 
 @given(candidates)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_one_or_many_candidates_give_the_same_digits(objective, rows):
     together = objective(rows)
     alone = np.array([objective(row)[0] for row in rows])
@@ -31,13 +31,13 @@ def test_one_or_many_candidates_give_the_same_digits(objective, rows):
 
 
 @given(candidates)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_a_repeated_call_gives_the_same_digits(objective, rows):
     np.testing.assert_array_equal(objective(rows), objective(rows))
 
 
 @given(candidates)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_cost_is_at_most_the_cap_of_each_sample(objective, rows):
     samples = np.count_nonzero(objective.batch.weight)
     cost = objective(rows)

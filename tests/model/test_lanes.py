@@ -214,7 +214,7 @@ SHORT = 4e-3 * np.sin(np.arange(250) * 0.06)
 CUBE = st.tuples(*[st.floats(0.0, 1.0)] * 3)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(one=CUBE, others=st.lists(CUBE, min_size=1, max_size=LANES + 2), place=st.integers(0, 99))
 def test_no_lane_depends_on_its_neighbours(one, others, place):
     batch = own_batch((0.3, 0.3, 0.3), SHORT)

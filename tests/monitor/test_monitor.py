@@ -185,7 +185,7 @@ values = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(values, values, values, values, values), max_size=40),
     st.sampled_from(CommandMode),

@@ -42,7 +42,7 @@ effects = st.builds(
 currents = st.lists(st.floats(-10e-3, 10e-3), min_size=1, max_size=25).map(np.array)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(faults, effects, currents)
 def test_nothing_leaves_its_limits(fault, effect, drive):
     plant = Dynamics(ACTUATOR, fault, effect, COARSE)
@@ -57,7 +57,7 @@ def test_nothing_leaves_its_limits(fault, effect, drive):
         assert abs(state[BALL] - state[XS]) <= effect.backlash + 1e-18
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(faults, effects, currents)
 def test_mirrored_current_gives_mirrored_response(fault, effect, drive):
     there = respond(ACTUATOR, drive, fault, effect, COARSE)
@@ -65,7 +65,7 @@ def test_mirrored_current_gives_mirrored_response(fault, effect, drive):
     np.testing.assert_array_equal(there, -back)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(faults, st.floats(-0.99, 0.99))
 def test_friction_holds_a_spool_at_rest(fault, share):
     """Flapper at a still place whose spool force is just below static friction."""
@@ -105,7 +105,7 @@ def test_dry_friction_never_drives(velocity, force, damping, static, step):
         assert abs(rough) <= abs(slick)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(faults, st.floats(0.01, 2.0), st.floats(0.001, 0.3))
 def test_undriven_masses_only_lose_energy(fault, spool_speed, jack_speed):
     """Flapper and feedback are cut off, so that nothing feeds the spool and the jack."""
