@@ -10,6 +10,7 @@ import pytest
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import POSITION, PRESSURE, SPOOL
 from ehadiag.identify.lanes import lane_residuals, lane_work
+from ehadiag.identify.objective import Objective
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.lanelayout import LANES
 from ehadiag.model.monitoring import respond
@@ -21,6 +22,8 @@ from ehadiag_tools.bench_decode import tiled
 from ehadiag_tools.bench_operations import Tally, count_operations, counting
 from ehadiag_tools.bench_peak import beginning
 from ehadiag_tools.bench_problem import population, whole_test
+from ehadiag_tools.bench_rivals import OneByOne
+from ehadiag_tools.bench_search import ReachedError
 from firmware_iface.logs import read_frames
 
 TINY = ["--repeats", "1", "--ticks", "5", "--seeds", "1", "--budget", "50", "--pushes", "50"]
@@ -101,6 +104,22 @@ def test_c_in_single_precision_is_near():
     single()
     assert (double.costs != single.costs).all()
     np.testing.assert_allclose(single.costs, double.costs, rtol=1e-3)
+
+
+def test_one_by_one_is_the_same_objective():
+    """But for what the jack of the lanes is nearer the finest steps, and it ends where it should."""
+    objective, rows = Objective(whole_test(bench.LOGS, 1)), population(4)[:, :3]
+    race = OneByOne(objective, -np.inf, 9)
+    values = race(rows)
+    np.testing.assert_allclose(values, objective(rows), rtol=1e-2)
+    assert race(rows[2]) == values[2]
+    assert race.evaluations == 5
+    with pytest.raises(ReachedError):
+        race(rows)
+    easy = OneByOne(objective, float(values.min()), 9)
+    with pytest.raises(ReachedError):
+        easy(rows)
+    assert easy.best == values.min()
 
 
 def test_numbers_count_what_is_done_with_them():

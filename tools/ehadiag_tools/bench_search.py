@@ -50,7 +50,10 @@ class Goal(Objective):
 
     def __call__(self, population: Vector) -> Vector:
         """As the objective; raises ReachedError once the goal is reached."""
-        values = super().__call__(population)
+        return self.judged(super().__call__(population))
+
+    def judged(self, values: Vector) -> Vector:
+        """Return the costs, unless the search is to end."""
         self.best = min(self.best, float(values.min()))
         if self.best <= self.goal or self.evaluations >= self.limit:
             raise ReachedError
