@@ -2,6 +2,7 @@
 
 import platform
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import llvmlite.binding
@@ -16,7 +17,6 @@ from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.batch import Batch, costs, residuals, workspace
 from ehadiag.identify.experiment import build_experiment, make_batch
 from ehadiag.identify.lanes import lane_costs, lane_residuals, lane_work
-from ehadiag.identify.parallel import ParallelLanes
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.lanelayout import LANES
 from ehadiag.model.monitoring import FREE_RUN, respond
@@ -231,14 +231,19 @@ def test_no_lane_depends_on_its_neighbours(one, others, place):
     assert counts[place] == count[0]
 
 
-def test_threads_give_the_digits_of_one(recorded_batch, population):
-    with ParallelLanes(recorded_batch, 1) as one, ParallelLanes(recorded_batch, 3) as three:
-        for size in (1, LANES, LANES + 1, len(population)):
-            np.testing.assert_array_equal(
-                three.costs(population[:size], 25.0), one.costs(population[:size], 25.0)
-            )
-        for here, there in zip(three.residuals(population), one.residuals(population), strict=True):
-            np.testing.assert_array_equal(here, there)
+def test_two_threads_do_not_disturb_each_other(recorded_batch, population):
+    """Each has scratch of its own; the batch is for both."""
+    works = [lane_work(recorded_batch) for _ in range(2)]
+    halves = population[::2], population[1::2]
+
+    def again_and_again(rows, work):
+        return [in_lanes(recorded_batch, rows, 25.0, work) for _ in range(8)]
+
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(again_and_again, halves, works))
+    for rows, beside in zip(halves, together, strict=True):
+        alone = in_lanes(recorded_batch, rows, 25.0, works[0])
+        np.testing.assert_array_equal(beside, [alone] * 8)
 
 
 def test_the_kernel_is_made_of_vector_instructions(tmp_path):
