@@ -107,7 +107,7 @@ def test_c_in_single_precision_is_near():
 
 
 def test_one_by_one_is_the_same_objective():
-    """But for what the jack of the lanes is nearer the finest steps, and it ends where it should."""
+    """But for the jack's last tenth of an LSB; and the race ends where it should."""
     objective, rows = Objective(whole_test(bench.LOGS, 1)), population(4)[:, :3]
     race = OneByOne(objective, -np.inf, 9)
     values = race(rows)

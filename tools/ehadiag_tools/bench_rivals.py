@@ -1,9 +1,9 @@
 """The whole estimate against others' solvers on the same compiled objective.
 
 They get what this package would be without its method: model and objective of the whole test, but
-the whole cube to search, and neither a first approximation nor a refinement. Each is run twice: with
-candidates evaluated one by one, by the scalar kernel, as both libraries do unless told otherwise;
-and told to hand over a whole generation, which the lanes evaluate.
+the whole cube to search, and neither a first approximation nor a refinement. Each is run twice:
+with candidates evaluated one by one, by the scalar kernel, as both libraries do unless told
+otherwise; and told to hand over a whole generation, which the lanes evaluate.
 """
 
 from __future__ import annotations
