@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import asdict
 from itertools import product
 
 import numpy as np
@@ -139,12 +140,11 @@ def test_operations_are_counted_tick_by_tick():
     batch = batch._replace(current=np.zeros(len(batch.current)))
     work = lane_work(batch)
     work.levels[:] = 0
-    counts = []
-    for ticks in (10, 20, 30):
-        found = count_operations(
-            beginning(batch, ticks), work._replace(levels=work.levels[:ticks]), rows
-        )
-        counts.append(np.array([found.vector, found.divisions, found.choices, found.scalar]))
+    jobs = [
+        (beginning(batch, ticks), work._replace(levels=work.levels[:ticks]), rows)
+        for ticks in (10, 20, 30)
+    ]
+    counts = [np.array(list(asdict(found).values())) for found in count_operations(jobs)]
     np.testing.assert_array_equal(counts[2] - counts[1], counts[1] - counts[0])
     assert (counts[1] - counts[0] > 0).tolist() == [True, True, True, False]
 

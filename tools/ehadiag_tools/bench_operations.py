@@ -1,7 +1,7 @@
 """Counts the lanes' operations: runs them uncompiled, on numbers that count what is done with them.
 
-As a script, with NUMBA_DISABLE_JIT=1: reads (batch, work, candidates) pickled from stdin and prints
-the counts as JSON.
+As a script, with NUMBA_DISABLE_JIT=1: reads a list of jobs, pickled, from stdin and prints the
+counts as JSON.
 """
 
 from __future__ import annotations
@@ -11,16 +11,18 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch
 from ehadiag.identify.lanes import LaneWork, lane_costs
 from ehadiag.identify.objective import SEARCH_CAP
 
-__all__ = ["Operations", "Tally", "count_operations", "counting"]
+__all__ = ["Job", "Operations", "Tally", "count_operations", "counting"]
 
 ARITHMETIC = ("add", "subtract", "multiply", "divide")
 SCALAR = {
@@ -33,14 +35,14 @@ SCALAR = {
 
 @dataclass(frozen=True, slots=True)
 class Operations:
-    """Of all lanes together; a sum, a product and a division count one each.
+    """Of all candidates together; a sum, a product and a division count one each.
 
     Attributes
     ----------
     vector: in vectors, divisions among them.
     divisions: in vectors.
     choices: comparisons, choices, minima and magnitudes in vectors; not among the others.
-    scalar: of lanes that take a step alone.
+    scalar: one by one, divisions among them.
     """
 
     vector: int
@@ -49,8 +51,12 @@ class Operations:
     scalar: int
 
 
-def count_operations(batch: Batch, work: LaneWork, candidates: np.ndarray) -> Operations:
-    """Operations of `lane_costs` as its source is written, but for those of its tables.
+Job = tuple[Batch, LaneWork, NDArray[np.float64]]
+"""Recordings, scratch with the jack's steps known, and candidates."""
+
+
+def count_operations(jobs: Sequence[Job]) -> list[Operations]:
+    """Operations of `lane_costs` for each job as its source says, but for those of its tables.
 
     The compiler may find a few of them twice. Runs in a process of its own.
     """
@@ -61,11 +67,11 @@ def count_operations(batch: Batch, work: LaneWork, candidates: np.ndarray) -> Op
             "NUMBA_DISABLE_JIT": "1",
             "PYTHONPATH": os.pathsep.join(item for item in sys.path if item),
         },
-        input=pickle.dumps((batch, work, candidates)),
+        input=pickle.dumps(list(jobs)),
         capture_output=True,
         check=True,
     )
-    return Operations(**json.loads(done.stdout))
+    return [Operations(**item) for item in json.loads(done.stdout)]
 
 
 class Tally:
@@ -137,12 +143,14 @@ def counting(tally: Tally) -> type[np.ndarray]:
 
 def main() -> None:
     """Count what stdin asks for."""
-    batch, work, candidates = pickle.load(sys.stdin.buffer)
-    tally = Tally()
-    kind = counting(tally)
-    work = LaneWork(*(a.view(kind) if a.dtype == np.float64 else a for a in work))
-    lane_costs(batch, candidates, SEARCH_CAP, work, np.empty(len(candidates)))
-    print(json.dumps(asdict(tally.result())))
+    found = []
+    for batch, work, candidates in pickle.load(sys.stdin.buffer):
+        tally = Tally()
+        kind = counting(tally)
+        own = LaneWork(*(a.view(kind) if a.dtype == np.float64 else a for a in work))
+        lane_costs(batch, candidates, SEARCH_CAP, own, np.empty(len(candidates)))
+        found.append(asdict(tally.result()))
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":
