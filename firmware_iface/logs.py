@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -75,11 +77,6 @@ def read_frames(path: Path | str) -> FrameTable:
 def read_frames_noted(path: Path | str) -> tuple[FrameTable, tuple[str, ...]]:
     """Read all frames of a log, with notes on the reading."""
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ConfigurationError(
-            f"log {path}: unknown kind {suffix or 'without a suffix'}; known: {', '.join(SUFFIXES)}"
-        )
     try:
         if not path.is_file():
             raise InputOutputError(
@@ -90,6 +87,11 @@ def read_frames_noted(path: Path | str) -> tuple[FrameTable, tuple[str, ...]]:
             pass
     except OSError as error:
         raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ConfigurationError(
+            f"log {path}: unknown kind {suffix or 'without a suffix'}; known: {', '.join(SUFFIXES)}"
+        )
     if size > MAX_LOG_BYTES:
         raise InputOutputError(f"log {path}: larger than {MAX_LOG_BYTES >> 20} MiB; split it")
     if size == 0:
@@ -113,11 +115,15 @@ def _collect(path: Path, suffix: str) -> tuple[FrameTable, tuple[str, ...]]:
 
 
 class _Complaints(logging.Handler):
-    """Counts what python-can's readers skip with no more than a line in its own log."""
+    """Counts what python-can's readers skip with no more than a line in its own log.
+
+    And keeps quiet the destructor of asammdf, which fails where its constructor failed.
+    """
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.count = 0
+        self._hook = sys.unraisablehook
 
     def emit(self, _: logging.LogRecord) -> None:
         """Count a complaint."""
@@ -125,10 +131,16 @@ class _Complaints(logging.Handler):
 
     def __enter__(self) -> Self:
         logging.getLogger("can").addHandler(self)
+        sys.unraisablehook = self._tell
         return self
 
     def __exit__(self, *_: object) -> None:
         logging.getLogger("can").removeHandler(self)
+        sys.unraisablehook = self._hook
+
+    def _tell(self, what: Any) -> None:
+        if not getattr(what.object, "__module__", "").startswith("asammdf."):
+            self._hook(what)
 
 
 def _read_text(path: Path, suffix: str, columns: ColumnBuilder) -> str:
@@ -144,6 +156,7 @@ def _read_text(path: Path, suffix: str, columns: ColumnBuilder) -> str:
 
 def _read_with(path: Path, suffix: str, columns: ColumnBuilder, *, dated: bool) -> str:
     reader: Any = None
+    failed = ""
     try:
         reader = _reader(path, suffix, dated)
         for message in reader:
@@ -153,15 +166,15 @@ def _read_with(path: Path, suffix: str, columns: ColumnBuilder, *, dated: bool) 
     except InputOutputError:
         raise
     except Exception as error:  # the readers raise whatever a bad file leads them to
-        if len(columns) == 0:
-            reason = " ".join(str(error).split())[:160] or type(error).__name__
-            kind = suffix[1:].upper()
-            raise InputOutputError(f"log {path}: not a readable {kind} log: {reason}") from None
-        return "the log breaks off or is damaged"
+        failed = " ".join(str(error).split())[:160] or type(error).__name__
     finally:
         if reader is not None:
             reader.stop()
-    return ""
+    if failed and suffix == ".mf4":
+        gc.collect()  # or the destructor is heard of later
+    if failed and len(columns) == 0:
+        raise InputOutputError(f"log {path}: not a readable {suffix[1:].upper()} log: {failed}")
+    return "the log breaks off or is damaged" if failed else ""
 
 
 def _reader(path: Path, suffix: str, dated: bool) -> Any:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import gc
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -311,3 +313,22 @@ def test_no_bytes_crash_the_reader(tmp_path, data, suffix):
     with contextlib.suppress(EhadiagError):
         recording = read_recording(path)
         assert recording.quality.total("accepted") <= recording.quality.total("received")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_cut_mf4_file_is_told_in_one_line(share, tmp_path, monkeypatch):
+    """Its library's destructor fails after its constructor; nobody is to hear of that."""
+    pytest.importorskip("asammdf", reason="MF4 needs the extra ehadiag[mf4]")
+    path = write(
+        tmp_path / "cut.mf4", [Frame(START + k * 1_000_000, k, bytes(8)) for k in range(50)]
+    )
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    heard = []
+    monkeypatch.setattr(sys, "unraisablehook", heard.append)
+    with pytest.raises(InputOutputError, match=r"cut\.mf4: not a readable MF4 log") as error:
+        read_frames(path)
+    assert one_line(error)
+    gc.collect()
+    # That the library leaves its file to the collector is a warning of development only.
+    assert [item for item in heard if item.exc_type is not ResourceWarning] == []
