@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from firmware_iface.logs import read_frames  # noqa: PLC0415
     from firmware_iface.receiver import Receiver  # noqa: PLC0415
 
-    if arguments.log:
+    if arguments.log is not None:
         table = read_frames(arguments.log)
         print(f"log {arguments.log}")
     else:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import NoReturn
 
 from ehadiag.cli import bit, checkbus, diagnose, replay, sim, tests, warmup
@@ -37,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ------
     SystemExit: wrong usage (code 2), `--help` and `--version`.
     """
+    _fill_closed_streams()
     arguments = _parser().parse_args(argv)
     try:
         code = arguments.run(arguments)
@@ -56,6 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("ehadiag: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _fill_closed_streams() -> None:
+    """Open what the caller closed: else the next file opened is taken for a standard stream."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -223,6 +223,8 @@ def has_bus(arguments: argparse.Namespace) -> bool:
 
 def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transport:
     """Open the bus or serial port that was named."""
+    if arguments.serial and arguments.interface not in (None, os.environ.get("CAN_INTERFACE")):
+        raise ConfigurationError("--serial and --interface exclude each other: name one bus")
     if arguments.serial:
         from firmware_iface.seriallink import SerialTransport  # noqa: PLC0415
 

@@ -194,3 +194,41 @@ def test_read_only_installation_without_home(
     told = "compiling the model's kernels, once for this installation" in done.stderr
     assert told is not warm
     assert any((temporary / f"ehadiag-{os.getuid()}").glob("kernels-*/*.nbi"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="streams are closed by a POSIX shell")
+@pytest.mark.parametrize(
+    ("closed", "code"),
+    [("<&-", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0), (">&- --csv nothing", 2)],
+)
+def test_closed_streams_are_no_failure(
+    closed: str, code: int, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    done = subprocess.run(
+        ["sh", "-c", f'"$0" -m ehadiag.cli.main tests {closed}', sys.executable],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (done.stdout == "") == (">&-" in closed.replace("2>&-", ""))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="streams are closed by a POSIX shell")
+def test_what_is_said_does_not_go_to_another_stream(
+    tmp_path: Path, environment: dict[str, str]
+) -> None:
+    done = subprocess.run(
+        ["sh", "-c", '"$0" -m ehadiag.cli.main diagnose gone.blf 2>&-', sys.executable],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (3, "")

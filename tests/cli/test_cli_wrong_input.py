@@ -24,9 +24,11 @@ def changed(text: str, old: str, new: str) -> str:
     return text.replace(old, new, 1)
 
 
-def test_missing_file(run: Run) -> None:
-    result = run("diagnose", "missing.blf")
-    assert (result.code, result.message) == (3, "ehadiag: log missing.blf: no such file")
+@pytest.mark.parametrize("name", ["missing.blf", "missing"])
+def test_missing_file(name: str, run: Run) -> None:
+    result = run("diagnose", name)
+    assert (result.code, result.message) == (3, f"ehadiag: log {name}: no such file")
+    assert run("check-bus", "--log", "").message == "ehadiag: log .: not a file"
 
 
 @pytest.mark.parametrize(
@@ -51,10 +53,12 @@ def test_what_is_no_log(
         assert words in result.message
 
 
-def test_folder_for_a_log(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "folder.blf").mkdir()
-    result = run("diagnose", "folder.blf")
-    assert (result.code, result.message) == (3, "ehadiag: log folder.blf: not a file")
+@pytest.mark.parametrize("name", ["folder.blf", "folder"])
+def test_folder_for_a_log(name: str, run: Run, tmp_path: Path) -> None:
+    (tmp_path / name).mkdir()
+    for command in (["diagnose"], ["check-bus", "--log"]):
+        result = run(*command, name)
+        assert (result.code, result.message) == (3, f"ehadiag: log {name}: not a file")
 
 
 def test_log_without_telemetry(run: Run, tmp_path: Path) -> None:
@@ -206,6 +210,7 @@ def test_a_recording_is_never_overwritten(run: Run, tmp_path: Path) -> None:
         (["diagnose", "--advisory", "2", LOG], "need 0 < advisory < limit <= 1, not 2 and 0.75"),
         (["check-bus"], "no bus named"),
         (["check-bus", "-i", "virtual", "--duration", "0"], "need a number above 0"),
+        (["check-bus", "-i", "virtual", "--serial", "loop://"], "exclude each other: name one bus"),
         (["replay", LOG], "no bus named"),
         (["replay", LOG, "-i", "virtual", "--speed", "-1"], "need a number above 0"),
         (["sim"], "no bus named"),
