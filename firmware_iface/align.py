@@ -81,9 +81,7 @@ def _recording(
     notes: tuple[str, ...],
     rows: int,
 ) -> Recording:
-    begin, end = 0, rows
-    if bounds is not None and episode.ticks > 0:
-        begin, end = bounds.rows(episode, rows)
+    begin, end = bounds.rows(episode, rows) if bounds is not None else (0, rows)
     axis = bounds.axis if bounds is not None else None
     extra: list[str] = []
     samples = None
@@ -266,8 +264,7 @@ def _command(grid: _Grid) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
     mode = bus_map.fixed_mode
     modes = grid.fill("command.mode")
     if modes is not None:
-        numbers = modes.value[np.isfinite(modes.value)].astype(np.int64)
-        known = numbers[np.isin(numbers, list(bus_map.modes))]
+        known = modes.value[np.isin(modes.value, list(bus_map.modes))]
         if len(known):
             values, count = np.unique(known, return_counts=True)
             mode = bus_map.modes[int(values[np.argmax(count)])]
