@@ -23,7 +23,7 @@ from numba.core.runtime import rtsys
 
 from ehadiag.cachefolder import private_folder
 
-__all__ = ["cache_folder", "inlined", "kernel"]
+__all__ = ["brief_kernel", "cache_folder", "inlined", "inlined_exact", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -58,6 +58,11 @@ def inlined(function: F) -> F:
     return numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})(
         function
     )
+
+
+def inlined_exact(function: F) -> F:
+    """Compile like `inlined`, with each product and each sum rounded by itself."""
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
 
 
 @cache

@@ -11,12 +11,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import brief_kernel, inlined, kernel
+from ehadiag.jit import brief_kernel, inlined, inlined_exact
 from ehadiag.model.anchor import re_anchored
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.jacktick import jack_tick
 from ehadiag.model.spooltick import NODE_COLUMNS, NODES_PER_TICK, spool_tick
 from ehadiag.model.transition import FINEST, SpoolScalars
+from ehadiag.monitor.address import array_at
 from ehadiag.monitor.layout import (
     ANCHOR_GAIN,
     ANCHOR_LARGE,
@@ -47,6 +48,7 @@ from ehadiag.monitor.layout import (
     LOST,
     MOVING,
     NODES,
+    NUMBER,
     OFFSETS,
     PREDICTED,
     REFERENCE,
@@ -74,7 +76,7 @@ LONGEST = 5.0
 """Ticks that a lost command is taken to go on straight; then it stands."""
 
 
-@kernel
+@inlined
 def _plant(p: Vector) -> PlantConstants:
     return PlantConstants(
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11], p[12],
@@ -82,13 +84,13 @@ def _plant(p: Vector) -> PlantConstants:
     )  # fmt: skip
 
 
-@kernel
+@inlined
 def _scalars(p: Vector) -> SpoolScalars:
     a = SCALARS
     return SpoolScalars(p[a], p[a + 1], p[a + 2], p[a + 3], p[a + 4], p[a + 5])
 
 
-@kernel
+@inlined
 def _followed(s: Vector, command: float) -> tuple[float, bool]:
     """Command of the tick, and whether it is known: a lost one goes on straight for some ticks."""
     if math.isfinite(command):
@@ -101,7 +103,7 @@ def _followed(s: Vector, command: float) -> tuple[float, bool]:
     return float(s[COMMAND]), False
 
 
-@kernel
+@inlined_exact
 def _position_seen(p: Vector, s: Vector, command: float, current: float) -> float:
     """Digitised jack position that the control law of this tick worked on, m."""
     if math.isfinite(s[SEEN]):
@@ -115,7 +117,7 @@ def _position_seen(p: Vector, s: Vector, command: float, current: float) -> floa
     return float(place)
 
 
-@kernel
+@inlined_exact
 def _control_law(p: Vector, s: Vector, error: float) -> float:
     """Demanded current, A, unlimited by the converter; as `ehadiag.identify.current` has it."""
     wanted = p[GAP] * error
@@ -132,7 +134,7 @@ def _control_law(p: Vector, s: Vector, error: float) -> float:
     return float(out)
 
 
-@kernel
+@inlined_exact
 def _commanded(p: Vector, s: Vector, command: float, current: float, position: float) -> float:
     """Servovalve current of the tick, A.
 
@@ -153,14 +155,20 @@ def _commanded(p: Vector, s: Vector, command: float, current: float, position: f
 
 
 @inlined
-def _spool(p: Vector, s: Vector, torque: float, nodes: Vector) -> int:
+def _part(address: int, place: int, shape: tuple[int, ...]) -> Vector:
+    """What begins at a place of the layout; to cut it out of an array calls the runtime."""
+    return array_at(address + NUMBER * place, shape)
+
+
+@inlined
+def _spool(address: int, p: Vector, s: Vector, torque: float, nodes: Vector) -> int:
     """Flapper and spool over the tick; returns the number of nodes of the path."""
     xf, wf, xs, vs, direction, clamped, count = spool_tick(
         _plant(p),
         _scalars(p),
-        p[MOVING:STUCK].reshape((FINEST + 1, 4, 4)),
-        p[STUCK:DECAY].reshape((FINEST + 1, 2, 2)),
-        p[DECAY:NODES],
+        _part(address, MOVING, (FINEST + 1, 4, 4)),
+        _part(address, STUCK, (FINEST + 1, 2, 2)),
+        _part(address, DECAY, (FINEST + 1,)),
         torque,
         p[TICK],
         s[XF],
@@ -196,7 +204,7 @@ def _jack(p: Vector, s: Vector, nodes: Vector, count: int) -> float:
     return pressure
 
 
-@kernel
+@inlined
 def _accumulate(p: Vector, s: Vector, channel: int) -> int:
     """Advance both sums of a channel; a sum that gives alarm begins anew, a lost sample rests.
 
@@ -217,29 +225,23 @@ def _accumulate(p: Vector, s: Vector, channel: int) -> int:
 
 
 @brief_kernel
-def push_tick(
-    memory: Vector,
-    command: float,
-    current: float,
-    spool: float,
-    pressure: float,
-    position: float,
-) -> int:
+def push_tick(address: int, sample: tuple[float, float, float, float, float]) -> int:
     """Advance model and sums by one tick, in place.
 
     Parameters
     ----------
-    memory: see `ehadiag.monitor.layout`.
-    command, current, spool, pressure, position: the tick's sample, SI, NaN where lost.
+    address: of the SIZE numbers of `ehadiag.monitor.layout`.
+    sample: command, current, spool, pressure and position of the tick, SI, NaN where lost.
 
     Returns
     -------
     The sums that gave alarm: 1 spool's upper, 2 its lower, 4 pressure's upper, 8 its lower one.
     """
-    p = s = memory
+    command, current, spool, pressure, position = sample
+    p = s = _part(address, 0, (SIZE,))
+    nodes = _part(address, NODES, (NODES_PER_TICK, NODE_COLUMNS))
     torque = _plant(p).GM * _commanded(p, s, command, current, position)
-    nodes = memory[NODES:SIZE].reshape((NODES_PER_TICK, NODE_COLUMNS))
-    count = _spool(p, s, torque, nodes)
+    count = _spool(address, p, s, torque, nodes)
     s[PREDICTED] = s[XS]
     gap = spool - p[OFFSETS] - s[XS]
     s[RESIDUAL] = gap * p[WEIGHTS]

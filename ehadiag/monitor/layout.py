@@ -1,8 +1,4 @@
-"""Where the numbers of a monitor stand in its one flat array.
-
-Every array that is handed to a kernel costs an allocation while the call lasts, and a named tuple
-is looked through field by field; one flat array is had at once.
-"""
+"""Where the numbers of a monitor stand in its one flat array, whose address its kernel is given."""
 
 from __future__ import annotations
 
@@ -10,6 +6,8 @@ from typing import Final
 
 from ehadiag.model.spooltick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.transition import FINEST
+
+NUMBER: Final = 8  # bytes
 
 # Parameters: constants of the plant, scalars of the spool (ehadiag.model), then:
 SCALARS: Final = 25

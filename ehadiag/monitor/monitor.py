@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, NoReturn, TypeVar
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from ehadiag.actuator import Actuator, Controller
@@ -17,6 +18,7 @@ from ehadiag.model.constants import plant_constants
 from ehadiag.model.monitoring import Anchor
 from ehadiag.model.transition import spool_tables
 from ehadiag.monitor import layout
+from ehadiag.monitor.address import entry_point
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
 from ehadiag.recording import CommandMode, Environment
@@ -138,7 +140,8 @@ class Monitor:
         p[layout.MOVING : layout.STUCK] = tables.moving.ravel()
         p[layout.STUCK : layout.DECAY] = tables.stuck.ravel()
         p[layout.DECAY : layout.NODES] = tables.decay
-        self._memory = p
+        self._memory, self._address = p, p.ctypes.data
+        self._tick = entry_point(push_tick, types.intp, types.UniTuple(types.float64, 5))
         self._alarms = 0
         self._alarmed = np.zeros((2, 2), dtype=np.bool_)
         self.reading: Reading = Reading(
@@ -155,20 +158,23 @@ class Monitor:
         """Advance by one tick, a `Tick` or its five numbers; returns `reading`, always the same.
 
         Call it for every tick: a tick that did not arrive is `Tick` of five NaN.
+
+        Raises
+        ------
+        TypeError: not a tuple of five numbers; the monitor is as it was.
         """
-        command, current, spool, pressure, position = sample
-        alarms = push_tick(
-            self._memory,
-            float(command),
-            float(current),
-            float(spool),
-            float(pressure),
-            float(position),
-        )
+        try:
+            alarms = self._tick(self._address, sample)
+        except (TypeError, ValueError):
+            raise TypeError(f"a tick is a tuple of five numbers, not {sample!r}") from None
         if alarms != self._alarms:
             self._alarms = alarms
             self._alarmed[:] = ALARMS[alarms]
         return self.reading
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be copied: the copy would go on in the memory of this one."""
+        raise TypeError("a monitor cannot be copied; make another one")
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""
