@@ -130,8 +130,12 @@ def test_numbers_count_what_is_done_with_them():
     assert (tally.vector, tally.divisions, tally.choices, tally.scalar) == (24, 8, 0, 0)
     c = np.where(a > 3.0, np.minimum(a, b), -a)
     assert (tally.vector, tally.choices) == (24, 32)
-    assert max(np.float64(3.0) * c[7] - 1.0, c[6]) / 2.0 == 11.5
+    assert max(np.float64(3.0) * c[7] - 1.0, abs(c[6])) / c[1] == -11.5
     assert (tally.vector, tally.choices, tally.scalar) == (24, 32, 3)
+    assert (c[7] - c).tolist() == (8.0 - np.asarray(c)).tolist()
+    assert (c * c[1] > c[2]).any()
+    assert (tally.vector, tally.choices, tally.scalar) == (40, 40, 3)
+    assert tally.result().arithmetic == 43
 
 
 def test_operations_are_counted_tick_by_tick():

@@ -7,6 +7,7 @@ counts as JSON.
 from __future__ import annotations
 
 import json
+import operator
 import os
 import pickle
 import subprocess
@@ -25,12 +26,13 @@ from ehadiag.identify.objective import SEARCH_CAP
 __all__ = ["Job", "Operations", "Tally", "count_operations", "counting"]
 
 ARITHMETIC = ("add", "subtract", "multiply", "divide")
-SCALAR = {
-    "add": ("__add__", "__radd__"),
-    "subtract": ("__sub__", "__rsub__"),
-    "multiply": ("__mul__", "__rmul__"),
-    "divide": ("__truediv__", "__rtruediv__"),
+COUNTED = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "truediv": operator.truediv,
 }
+NOT_COUNTED = ("lt", "le", "gt", "ge", "eq", "ne")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,11 @@ class Operations:
     divisions: int
     choices: int
     scalar: int
+
+    @property
+    def arithmetic(self) -> int:
+        """All that are counted as operations."""
+        return self.vector + self.scalar
 
 
 Job = tuple[Batch, LaneWork, NDArray[np.float64]]
@@ -100,21 +107,25 @@ def counting(tally: Tally) -> type[np.ndarray]:
         # numpy leaves an operation with one of its numbers to the methods here.
         __array_ufunc__ = None
 
-    def counted(name: str) -> Any:
-        plain = getattr(float, name)
-
-        def operation(self: float, other: float) -> Any:
-            tally.scalar += 1
-            return Number(plain(self, other))
+    def method(function: Any, count: int, *, turned: bool = False) -> Any:
+        def operation(self: float, other: Any) -> Any:
+            other = float(other) if isinstance(other, Number) else other
+            result = function(other, float(self)) if turned else function(float(self), other)
+            if isinstance(result, np.ndarray):
+                return result  # the array has counted it
+            tally.scalar += count
+            return Number(result) if count else result
 
         return operation
 
-    for names in SCALAR.values():
-        for name in names:
-            setattr(Number, name, counted(name))
-    for name in ("__neg__", "__abs__"):
-        plain = getattr(float, name)
-        setattr(Number, name, lambda self, plain=plain: Number(plain(self)))
+    for name, function in COUNTED.items():
+        setattr(Number, f"__{name}__", method(function, 1))
+        setattr(Number, f"__r{name}__", method(function, 1, turned=True))
+    for name in NOT_COUNTED:
+        setattr(Number, f"__{name}__", method(getattr(operator, name), 0))
+    for name in ("neg", "abs"):
+        function = getattr(operator, name)
+        setattr(Number, f"__{name}__", lambda self, f=function: Number(f(float(self))))
 
     class Counted(np.ndarray):
         def __getitem__(self, key: Any) -> Any:
@@ -130,6 +141,8 @@ def counting(tally: Tally) -> type[np.ndarray]:
             return wrapped(function.__name__, function(*map(plain_of, inputs), **options))
 
     def plain_of(item: Any) -> Any:
+        if isinstance(item, list):
+            return [plain_of(part) for part in item]
         return item.view(np.ndarray) if isinstance(item, Counted) else item
 
     def wrapped(name: str, result: Any) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch
-from ehadiag.identify.lanes import LaneWork, lane_costs, lane_work
+from ehadiag.identify.lanes import lane_costs, lane_work
 from ehadiag.identify.objective import SEARCH_CAP
 from ehadiag.model.lanelayout import LANES
 from ehadiag_tools.bench_c_model import CPeak
@@ -21,6 +21,8 @@ __all__ = ["against_peak", "beginning"]
 SECTION = "lanes"
 ROUNDS = 300_000
 """Of the chains: some 10 ms."""
+SLOW = 2e-3
+"""Largest current (A) of a test with next to no events: the jack keeps off its stops."""
 COUNTED = 20
 """Ticks in which operations are counted, for each tick that a slow oracle takes."""
 
@@ -35,12 +37,19 @@ def against_peak(batch: Batch, took: float, sizes: Sizes) -> list[Figure]:
     peak, width = _rate("products", sizes)
     divided, _ = _rate("divisions", sizes)
     work, rows, ticks = lane_work(batch), population(LANES), len(batch.current)
-    # At rest there are no events; the steps are those of the test.
-    still = batch._replace(current=np.zeros(ticks))
-    call = partial(lane_costs, still, rows, SEARCH_CAP, work, np.empty(LANES))
-    resting = cpu_median(call, sizes.repeats) / LANES
-    total, vector, divisions, choices = _operations(batch, work, rows, sizes)
-    rate, vector_rate = total * ticks / took, vector * ticks / resting
+    slow = batch._replace(current=_triangle(ticks))
+    call = partial(lane_costs, slow, rows, SEARCH_CAP, work, np.empty(LANES))
+    together = cpu_median(call, sizes.repeats) / LANES
+    counted = min(ticks, COUNTED * sizes.ticks)
+    quarter = -(-counted // 4)
+    jobs: list[Job] = [
+        (beginning(batch, counted), work._replace(levels=work.levels[:counted]), rows),
+        # Steps of the jack as in the whole test, on average.
+        (beginning(slow, quarter), work._replace(levels=work.levels[:counted:4].copy()), rows),
+    ]
+    whole, part = count_operations(jobs)
+    total, per = whole.arithmetic / (counted * LANES), 1.0 / (quarter * LANES)
+    rate, slow_rate = total * ticks / took, part.arithmetic * per * ticks / together
     figures = [
         (
             "vector peak of one core, float64",
@@ -52,8 +61,8 @@ def against_peak(batch: Batch, took: float, sizes: Sizes) -> list[Figure]:
             "operations of a candidate in a tick",
             total,
             "",
-            f"{vector:.0f} of all lanes together, {total - vector:.0f} of lanes that go alone; "
-            "no more than half of the peak where product and sum do not fuse",
+            f"{whole.vector / (counted * LANES):.0f} of them in vectors; no more than half of the "
+            "peak where product and sum do not fuse",
         ),
         (
             "share of the vector peak",
@@ -61,46 +70,35 @@ def against_peak(batch: Batch, took: float, sizes: Sizes) -> list[Figure]:
             "%",
             f"{rate * 1e-9:.1f} GFLOP/s; a division counts as one operation, a choice as none",
         ),
-        ("lanes together", resting * 1e3, "ms", f"{each(resting, ticks)}; a test without events"),
         (
-            "share of the vector peak, lanes together",
-            100.0 * vector_rate / peak,
-            "%",
-            f"{vector_rate * 1e-9:.1f} GFLOP/s; beside them {choices:.0f} comparisons and choices, "
-            f"as dear as a sum each, and {divisions:.1f} divisions, at the least "
-            f"{divisions / divided * 1e9:.1f} ns a tick",
+            "one evaluation of a slow triangle of the same length",
+            together * 1e3,
+            "ms",
+            f"{each(together, ticks)}; next to no events, the same steps",
         ),
         (
-            "share of time for lanes that go alone",
-            100.0 * (1.0 - resting / took),
+            "share of the vector peak, slow triangle",
+            100.0 * slow_rate / peak,
             "%",
-            f"for {100.0 * (1.0 - vector / total):.0f} % of the operations: each waits for the "
-            "one before, behind branches",
+            f"{slow_rate * 1e-9:.1f} GFLOP/s; beside {part.arithmetic * per:.0f} operations in a "
+            f"tick {part.choices * per:.0f} comparisons and choices, as dear as a sum each; "
+            f"{part.divisions * per:.1f} are divisions, at the least "
+            f"{part.divisions * per / divided * 1e9:.1f} ns",
+        ),
+        (
+            "share of the test's time for events",
+            100.0 * (1.0 - together / took),
+            "%",
+            "against the slow triangle; each operation waits for the one before, behind branches",
         ),
     ]
     return [Figure(SECTION, *row) for row in figures]
 
 
-def _operations(
-    batch: Batch, work: LaneWork, rows: NDArray[np.float64], sizes: Sizes
-) -> tuple[float, float, float, float]:
-    """Of a candidate in a tick: all; of all lanes together all, divisions, and choices."""
-    counted = min(len(batch.current), COUNTED * sizes.ticks)
-    levels = work.levels[:counted]
-    still = batch._replace(current=np.zeros(len(batch.current)))
-    jobs: list[Job] = [(beginning(batch, counted), work._replace(levels=levels), rows)]
-    # With these the work of a tick, of a further step of the jack and of no tick come apart.
-    for ticks, level in ((10, 0), (20, 0), (20, 1)):
-        steps = np.full(ticks, level, dtype=np.int64)
-        jobs.append((beginning(still, ticks), work._replace(levels=steps), rows))
-    found = count_operations(jobs)
-    few, more, finer = (
-        np.array([item.vector, item.divisions, item.choices]) / LANES for item in found[1:]
-    )
-    tick, step = (more - few) / 10.0, (finer - more) / 20.0
-    vector, divisions, choices = tick + step * (np.mean(2.0**levels) - 1.0)
-    total = (found[0].vector + found[0].scalar) / (counted * LANES)
-    return total, float(vector), float(divisions), float(choices)
+def _triangle(ticks: int) -> NDArray[np.float64]:
+    """Current that moves spool and jack all the time, to and fro once, A."""
+    turns = np.arange(ticks) / ticks
+    return np.asarray(SLOW * 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * turns)))
 
 
 def _rate(kind: str, sizes: Sizes) -> tuple[float, int]:
