@@ -23,7 +23,14 @@ from numba.core.runtime import rtsys
 
 from ehadiag.cachefolder import private_folder
 
-__all__ = ["brief_kernel", "cache_folder", "inlined", "inlined_exact", "kernel"]
+__all__ = [
+    "bare_kernel",
+    "brief_kernel",
+    "cache_folder",
+    "inlined",
+    "inlined_exact",
+    "kernel",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -33,6 +40,11 @@ KERNEL_FOLDERS = ("ehadiag/model", "ehadiag/identify", "ehadiag/monitor", "ehadi
 def kernel(function: F) -> F:
     """Compile on first call: no interpreter lock, IEEE division, cached on disk."""
     return _cached(numba.njit(nogil=True, error_model="numpy")(function), function)
+
+
+def bare_kernel(function: F) -> F:
+    """Compile like `kernel` what allocates nothing: numba then counts no references to arrays."""
+    return _cached(numba.njit(nogil=True, error_model="numpy", _nrt=False)(function), function)
 
 
 def brief_kernel(function: F) -> F:
@@ -55,9 +67,9 @@ def inlined(function: F) -> F:
 
     A product and a sum may become one instruction with one rounding, nothing else is loosened.
     """
-    return numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})(
-        function
-    )
+    return numba.njit(
+        nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"}, _nrt=False
+    )(function)
 
 
 def inlined_exact(function: F) -> F:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ehadiag.identify.batch import Batch, constants_of
 from ehadiag.jit import kernel
 from ehadiag.model.constants import PlantConstants
-from ehadiag.model.laneevents import PIECES_SIZE, event_ticks
+from ehadiag.model.laneevents import SCRATCH_SIZE, event_ticks
 from ehadiag.model.lanejack import jack_lanes, pressures
 from ehadiag.model.lanelayout import (
     ANCHORED,
@@ -58,7 +58,8 @@ class LaneWork(NamedTuple):
     """Scratch of the kernels below, one for each thread.
 
     levels: how often the jack's ticks are halved, 0 … 4, shape (N,). The same for every
-        candidate, so that none's answer hangs on the others in its block.
+        candidate, so that none's answer hangs on the others in its block. Of no meaning where no
+        pressure counts: there the jack is left out.
     state, path, coefficients, moving, stuck: see `ehadiag.model.lanelayout`.
     rows: candidates of a block, shape (LANES, 5).
     sums: shape (LANES,).
@@ -85,7 +86,7 @@ def lane_work(batch: Batch) -> LaneWork:
     work = LaneWork(
         levels=np.full(len(batch.current), -1, dtype=np.int64),
         state=np.zeros(STATE_ROWS * LANES),
-        path=np.zeros(PATH_ROWS * LANES + PIECES_SIZE),
+        path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
         moving=np.zeros(MOVING_SIZE),
         stuck=np.zeros(STUCK_SIZE),
@@ -96,10 +97,13 @@ def lane_work(batch: Batch) -> LaneWork:
         uncounted=np.zeros(0, dtype=np.int64),
         no_gaps=np.zeros((0, 2, 0)),
     )
-    scattered = np.zeros((LANES, 5))
-    scattered[:, 0] = np.linspace(0.0, 1.0, LANES)
-    scattered[:, 1] = scattered[:, 0] * 7.0 % 1.0
-    lane_costs(batch, scattered, 1.0, work, np.empty(LANES))
+    if batch.weight[1].any():
+        scattered = np.zeros((LANES, 5))
+        scattered[:, 0] = np.linspace(0.0, 1.0, LANES)
+        scattered[:, 1] = scattered[:, 0] * 7.0 % 1.0
+        # Without weights the jack is left out, and the spool's path is all that is looked at.
+        spool_only = batch._replace(weight=np.zeros_like(batch.weight))
+        lane_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
     return work
 
 
@@ -185,6 +189,9 @@ def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -
         square = c.KF / c.JF - damping * damping
         # A flapper that does not ring is never taken to rest: slower, not wrong.
         ring_time = 1.0 / math.sqrt(square) if square > 0.0 else 1e30
+        last = start[index + 1] - 1
+        while last >= start[index] and weight[1, last] == 0.0:
+            last -= 1
         for k in range(start[index], start[index + 1]):
             torque = c.GM * current[k]
             if spool_lanes(c, torque, tick, damping, ring_time, state, path, coefficients):
@@ -199,7 +206,8 @@ def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -
                     out[i, 0, k] = gaps[i]
             if levels[k] < 0:
                 levels[k] = _level(path)
-            _jack_tick(c, tick, levels[k], state, path, coefficients)
+            if k <= last:  # nothing hangs on the jack but the pressure
+                _jack_tick(c, tick, levels[k], state, path, coefficients)
             if weight[1, k] != 0.0 and math.isfinite(pressure[k]):
                 pressures(c, state, path)
                 _gaps(

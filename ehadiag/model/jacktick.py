@@ -2,8 +2,8 @@
 
 Given the spool's path as pieces (`ehadiag.model.spooltick`), the jack velocity approaches its
 steady value exponentially, tau = MJ / (AJ² g R + CJ) with g = 1 / (1 + R CLK) (model.md section 1,
-the second-stage equation solved for P12). The steady value moves linearly over a piece; tau is that
-of the piece's middle. Sticking and break-away are located inside the piece.
+the second-stage equation solved for P12). Over a part of a piece the steady value is taken as a
+parabola and tau as a straight line. Sticking and break-away are located inside it.
 """
 
 from __future__ import annotations

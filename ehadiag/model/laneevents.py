@@ -1,13 +1,16 @@
-"""First stage and spool of one lane over a tick with events, and the jack beside them."""
+"""First stage and spool of one lane over a tick with events, and the jack beside them.
+
+The vectors that else hold candidates hold instants here: the state after 1 … WIDTH steps of one
+length, each by a transition of its own from the same start. The first of them that lies past an
+event is looked into with shorter steps, down to the finest.
+"""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import inlined, kernel
+from ehadiag.jit import bare_kernel, inlined
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.lanelayout import (
     BREAK,
@@ -29,34 +32,50 @@ from ehadiag.model.lanelayout import (
     NODES,
     PATH_ROWS,
     PLACE,
+    ROOM,
     SLOPE,
     SPOOL,
     SPOOL_RATE,
 )
 from ehadiag.model.lanestops import jack_piece
-from ehadiag.model.lanetables import GRID
+from ehadiag.model.lanetables import MOVING_ROWS, SHIFTS, STUCK_ROWS
+from ehadiag.model.lanevector import (
+    WIDTH,
+    Mask,
+    behind,
+    first_place,
+    least,
+    load,
+    magnitude,
+    most,
+    packed,
+    store,
+)
 from ehadiag.model.spoolevents import (
     BREAKAWAY,
     FLAPPER_STOP,
     NOTHING,
-    RELEASE,
     REVERSAL,
     SPOOL_STOP,
     clamped_event,
-    moving_event,
-    stuck_event,
+    held,
+    switch,
 )
 from ehadiag.model.transition import FINEST, SpoolScalars
 
-__all__ = ["PIECES_SIZE", "event_ticks"]
+__all__ = ["SCRATCH_SIZE", "event_ticks"]
 
 WHOLE = 1 << FINEST
+QUARTER = WHOLE // NODES
 MOST_PIECES = 32
-PIECES_SIZE = 4 * MOST_PIECES
-"""Room behind the rows of the path: pieces (duration in s, place at the end, velocities)."""
+PIECES = PATH_ROWS * LANES
+"""Behind the rows of the path: pieces (duration in s, place at the end, velocities) …"""
+INSTANTS = PIECES + 4 * MOST_PIECES
+"""… and flapper, its rate, spool and its rate at the instants of a vector."""
+SCRATCH_SIZE = 4 * MOST_PIECES + 4 * WIDTH
 
 
-@kernel
+@bare_kernel
 def event_ticks(
     c: PlantConstants,
     torque: float,
@@ -67,15 +86,96 @@ def event_ticks(
     moving: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> None:
-    """Flapper and spool of BUSY lanes over a tick with events, located to tick / 2^FINEST.
-
-    A step to the next node that ends with an event is shortened, by regula falsi on the quantity
-    that decides the event where there is one and by halving else, until the event is one finest
-    step away; then that step is taken.
-    """
+    """Flapper and spool of BUSY lanes over a tick with events, located to tick / 2^FINEST."""
     for i in range(LANES):
         if state[BUSY * LANES + i] != 0.0:
             _event_tick(c, i, torque, tick, state, path, coefficients, moving, stuck)
+
+
+@packed
+def _moving_instants(
+    c: PlantConstants, table: NDArray[np.float64], place: int, h: float, fine: bool, dry: float,
+    base: float, d: float, xf: float, wf: float, xs: float, vs: float, path: NDArray[np.float64],
+) -> Mask:  # fmt: skip
+    """Moving spool and flapper after 1 … WIDTH steps of `h` seconds, into the path's scratch.
+
+    All is positive along the motion d, about the point (dry, base d) where both would rest.
+    Returns where an event has come or, steps not being the finest, may hide.
+    """
+    a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
+    k = place * MOVING_ROWS * WIDTH
+    na = load(table, k) * a + load(table, k + WIDTH) * w
+    na = na + load(table, k + 2 * WIDTH) * b + load(table, k + 3 * WIDTH) * v
+    nw = load(table, k + 4 * WIDTH) * a + load(table, k + 5 * WIDTH) * w
+    nw = nw + load(table, k + 6 * WIDTH) * b + load(table, k + 7 * WIDTH) * v
+    nb = load(table, k + 8 * WIDTH) * a + load(table, k + 9 * WIDTH) * w
+    nb = nb + load(table, k + 10 * WIDTH) * b + load(table, k + 11 * WIDTH) * v
+    nv = load(table, k + 12 * WIDTH) * a + load(table, k + 13 * WIDTH) * w
+    nv = nv + load(table, k + 14 * WIDTH) * b + load(table, k + 15 * WIDTH) * v
+    store(path, INSTANTS, (na + dry) * d)
+    store(path, INSTANTS + WIDTH, nw * d)
+    store(path, INSTANTS + 2 * WIDTH, nb * d + base)
+    store(path, INSTANTS + 3 * WIDTH, nv * d)
+    size = magnitude(na + dry)
+    found = (nv <= 0.0) | (nb >= c.XSM - base * d) | (size >= c.XFM)
+    if not fine:
+        # Where an extreme of the flapper lies inside a step the spool may stop, the flapper touch.
+        before_a, before_w = behind(a, na), behind(w, nw)
+        swing = 0.25 * h * most(magnitude(before_w), magnitude(nw))
+        low = least(before_a, na) - swing <= 0.0
+        far = most(behind(abs(a + dry), size), size) + swing >= c.XFM
+        found = found | ((before_w * nw < 0.0) & (low | far))
+    return found
+
+
+@packed
+def _stuck_instants(
+    c: PlantConstants, table: NDArray[np.float64], place: int, h: float, fine: bool, still: float,
+    room: float, limit: float, side: float, xf: float, wf: float, path: NDArray[np.float64],
+) -> Mask:  # fmt: skip
+    """As `_moving_instants` for a spool at rest, whose flapper rings about `still`, m.
+
+    The spool breaks away beyond `limit`, but not to the side on which its stop holds it; within
+    `room` nothing happens, m.
+    """
+    a = xf - still
+    k = place * STUCK_ROWS * WIDTH
+    new_xf = load(table, k) * a + load(table, k + WIDTH) * wf + still
+    new_wf = load(table, k + 2 * WIDTH) * a + load(table, k + 3 * WIDTH) * wf
+    store(path, INSTANTS, new_xf)
+    store(path, INSTANTS + WIDTH, new_wf)
+    size = magnitude(new_xf)
+    found = ((size > limit) & (side * new_xf <= 0.0)) | (size >= c.XFM)
+    if not fine:
+        before = behind(wf, new_wf)
+        swing = 0.25 * h * most(magnitude(before), magnitude(new_wf))
+        far = most(behind(abs(xf), size), size) + swing > room
+        found = found | ((before * new_wf < 0.0) & far)
+    return found
+
+
+@packed
+def _clamped_instants(
+    c: PlantConstants, t: SpoolScalars, table: NDArray[np.float64], place: int, torque: float,
+    d: float, xf: float, xs: float, vs: float, path: NDArray[np.float64],
+) -> Mask:  # fmt: skip
+    """As `_moving_instants` with the flapper on its stop; the spool may be at rest (d = 0)."""
+    k = (place * MOVING_ROWS + 16) * WIDTH
+    time, fade = load(table, k), load(table, k + WIDTH)
+    steady = (t.force * xf - t.dynamic * d) / t.damping
+    if d == 0.0:
+        steady = 0.0
+    excess = vs - steady
+    new_xs = time * steady + (1.0 - fade) * (excess * c.MS / t.damping) + xs
+    new_vs = fade * excess + steady
+    store(path, INSTANTS, xf)
+    store(path, INSTANTS + WIDTH, 0.0)
+    store(path, INSTANTS + 2 * WIDTH, new_xs)
+    store(path, INSTANTS + 3 * WIDTH, new_vs)
+    leaves = (torque - c.KF * xf - c.KSF * new_xs) * xf < 0.0
+    if d == 0.0:
+        return leaves if held(c, t, xf, xs) else new_vs <= 0.0  # all of them: it rests
+    return leaves | (new_vs * d <= 0.0) | (new_xs * d >= c.XSM)
 
 
 @inlined
@@ -93,116 +193,113 @@ def _event_tick(
     """Lane `i`."""
     force, unit = c.AS * c.GPF, tick / WHOLE
     damping, dry = coefficients[DAMPING * LANES + i], coefficients[DRY * LANES + i]
-    limit = coefficients[BREAK * LANES + i]
+    limit, room = coefficients[BREAK * LANES + i], coefficients[ROOM * LANES + i]
     t = SpoolScalars(force, damping, coefficients[DYNAMIC * LANES + i], limit, 0.0, 0.0)
     xf, wf = state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i]
     xs, vs = state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i]
     direction, clamped = int(state[DIRECTION * LANES + i]), state[CLAMPED * LANES + i] != 0.0
-    done, single = 0, False
     from_xs, from_vs, since = xs, vs, 0
     starts, count = False, 0
+    done, level, finest = 0, 0, len(SHIFTS) - 1
     while done < WHOLE:
-        grid = GRID - (done & (GRID - 1))
-        step = 1 if single else grid
-        settled, single = single, False
-        low, high = 0, grid + 1
-        at_low = vs * direction if direction != 0 else limit - abs(xf)
-        at_high = 1.0
-        while True:
-            new_xf, new_wf, new_xs, new_vs = xf, wf, xs, vs
-            h = step * unit
-            decides = 1.0
-            if clamped:
-                if direction != 0:
-                    steady = (force * xf - t.dynamic * direction) / damping
-                    fade = math.exp(-h * damping / c.MS)
-                    new_xs += steady * h + (vs - steady) * (1.0 - fade) * c.MS / damping
-                    new_vs = steady + (vs - steady) * fade
-                event = clamped_event(c, t, torque, xf, new_xs, new_vs, direction)
-            elif direction != 0:
-                rest_xf = dry * direction
-                rest_xs = (torque - c.KF * rest_xf) / c.KSF
-                a, b = xf - rest_xf, xs - rest_xs
-                m = (i * (GRID + 1) + step) * 16
-                new_xf = rest_xf + moving[m] * a + moving[m + 1] * wf
-                new_xf += moving[m + 2] * b + moving[m + 3] * vs
-                new_wf = moving[m + 4] * a + moving[m + 5] * wf
-                new_wf += moving[m + 6] * b + moving[m + 7] * vs
-                new_xs = rest_xs + moving[m + 8] * a + moving[m + 9] * wf
-                new_xs += moving[m + 10] * b + moving[m + 11] * vs
-                new_vs = moving[m + 12] * a + moving[m + 13] * wf
-                new_vs += moving[m + 14] * b + moving[m + 15] * vs
-                event = moving_event(c, t, h, xf, wf, new_xf, new_wf, new_xs, new_vs, direction)
-                decides = new_vs * direction
-            else:
-                rest_xf = (torque - c.KSF * xs) / c.KF
-                a = xf - rest_xf
-                new_xf = rest_xf + stuck[step * 4] * a + stuck[step * 4 + 1] * wf
-                new_wf = stuck[step * 4 + 2] * a + stuck[step * 4 + 3] * wf
-                event = stuck_event(c, t, h, xf, wf, new_xf, new_wf, xs)
-                decides = limit - abs(new_xf)
-            if settled:
-                break
-            if event == NOTHING:
-                if step == grid:
-                    break
-                low, at_low = step, decides
-                at_high *= 0.5
-            else:
-                high, at_high = step, decides
-                at_low *= 0.5
-            if high - low == 1:
-                settled = True
-                if low == 0:
-                    break
-                step, single = low, True
-            elif at_low > 0.0 and at_high < 0.0:
-                guess = low + int((high - low) * at_low / (at_low - at_high) + 0.5)
-                step = min(max(guess, low + 1), high - 1)
-            else:
-                step = (low + high) >> 1
-        done += step
-        since += step
-        end_vs = new_vs
-        xf, wf, xs, vs = new_xf, new_wf, new_xs, new_vs
-        if event == REVERSAL:
-            vs, direction = 0.0, 0
-            if abs(xf) > limit:
-                direction = 1 if xf > 0.0 else -1
-        elif event == SPOOL_STOP:
-            xs, vs, direction = math.copysign(c.XSM, xs), 0.0, 0
-        elif event == BREAKAWAY:
-            direction = 1 if xf > 0.0 else -1
-        elif event == FLAPPER_STOP:
-            xf, wf, clamped = math.copysign(c.XFM, xf), 0.0, True
-        elif event == RELEASE:
-            clamped = False
-        starts = starts or (event > NOTHING and direction != 0 and vs == 0.0)
-        at_node = done & (2 * GRID - 1) == 0
-        if (event > NOTHING and count < MOST_PIECES - NODES) or at_node:
-            o = PATH_ROWS * LANES + 4 * count
-            path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, xs, from_vs, end_vs
-            from_vs, since = vs, 0
-            count += 1
-        if at_node:
-            path[(PLACE + done // (2 * GRID)) * LANES + i] = xs
-            path[(SLOPE + done // (2 * GRID)) * LANES + i] = vs
-    if starts:
-        friction = coefficients[JACK_FRICTION * LANES + i]
-        place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
-        d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
-        for n in range(count):
-            o = PATH_ROWS * LANES + 4 * n
-            span = path[o]
-            place, velocity, d, fresh = jack_piece(
-                c, friction, span, 0.0, 1.0, from_xs, path[o + 1],
-                path[o + 2] * span, path[o + 3] * span, place, velocity, d, fresh,
+        # Steps begin at whole numbers of their length.
+        while done & ((1 << SHIFTS[level]) - 1) != 0:
+            level += 1
+        shift, fine = SHIFTS[level], level == finest
+        whole = WIDTH - ((done >> shift) & (WIDTH - 1))
+        h = unit * (1 << shift)
+        if clamped:
+            found = _clamped_instants(
+                c, t, moving, i * len(SHIFTS) + level, torque, float(direction), xf, xs, vs, path
+            )
+        elif direction != 0:
+            base = (torque - c.KF * dry * direction) / c.KSF
+            found = _moving_instants(
+                c, moving, i * len(SHIFTS) + level, h, fine, dry, base, float(direction),
+                xf, wf, xs, vs, path,
             )  # fmt: skip
-            from_xs = path[o + 1]
-        state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
-        state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh
-        state[DONE * LANES + i] = 1.0
+        else:
+            still = (torque - c.KSF * xs) / c.KF
+            side = xs if abs(xs) >= c.XSM else 0.0
+            found = _stuck_instants(
+                c, stuck, level, h, fine, still, room, limit, side, xf, wf, path
+            )
+            store(path, INSTANTS + 2 * WIDTH, xs)
+            store(path, INSTANTS + 3 * WIDTH, 0.0)
+        first = first_place(found)
+        event = NOTHING
+        if first < whole and fine:
+            o = INSTANTS + first
+            new_xf, new_xs, new_vs = path[o], path[o + 2 * WIDTH], path[o + 3 * WIDTH]
+            if clamped:
+                event = clamped_event(c, t, torque, new_xf, new_xs, new_vs, direction)
+            else:
+                event = _event(c, t, new_xf, new_xs, new_vs, direction)
+        steps = whole if first >= whole else first + 1 if fine else first
+        for n in range(steps):
+            o = INSTANTS + n
+            xf, wf, xs, vs = path[o], path[o + WIDTH], path[o + 2 * WIDTH], path[o + 3 * WIDTH]
+            end_vs = vs
+            done += 1 << shift
+            since += 1 << shift
+            switches = event > NOTHING and n == steps - 1
+            if switches:
+                xf, wf, xs, vs, direction, clamped = switch(
+                    c, t, event, xf, wf, xs, vs, direction, clamped
+                )
+                starts = starts or (direction != 0 and vs == 0.0)
+            at_node = done & (QUARTER - 1) == 0
+            if at_node or (switches and count < MOST_PIECES - NODES):
+                o = PIECES + 4 * count
+                path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, xs, from_vs, end_vs
+                from_vs, since = vs, 0
+                count += 1
+            if at_node:
+                path[(PLACE + done // QUARTER) * LANES + i] = xs
+                path[(SLOPE + done // QUARTER) * LANES + i] = vs
+        level = 0 if fine or steps == whole else level + 1
+    if starts:
+        _jack_beside(c, i, from_xs, count, state, path, coefficients)
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = xf, wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = xs, vs
     state[DIRECTION * LANES + i] = direction
     state[CLAMPED * LANES + i] = 1.0 if clamped else 0.0
+
+
+@inlined
+def _event(
+    c: PlantConstants, t: SpoolScalars, xf: float, xs: float, vs: float, direction: int
+) -> int:
+    """Which event has come at an instant that is past one."""
+    if direction == 0:
+        return FLAPPER_STOP if held(c, t, xf, xs) else BREAKAWAY
+    if vs * direction <= 0.0:
+        return REVERSAL
+    return FLAPPER_STOP if abs(xf) >= c.XFM else SPOOL_STOP
+
+
+@inlined
+def _jack_beside(
+    c: PlantConstants,
+    i: int,
+    from_xs: float,
+    count: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+) -> None:
+    """Jack of lane `i` over the tick, by `count` pieces of the spool's path."""
+    friction = coefficients[JACK_FRICTION * LANES + i]
+    place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
+    d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
+    for n in range(count):
+        o = PIECES + 4 * n
+        span = path[o]
+        place, velocity, d, fresh = jack_piece(
+            c, friction, span, 0.0, 1.0, from_xs, path[o + 1],
+            path[o + 2] * span, path[o + 3] * span, place, velocity, d, fresh,
+        )  # fmt: skip
+        from_xs = path[o + 1]
+    state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
+    state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh
+    state[DONE * LANES + i] = 1.0

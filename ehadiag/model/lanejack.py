@@ -71,7 +71,7 @@ CORNER_TRAVEL = 4.0e-6
 
 
 def _stages() -> NDArray[np.float64]:
-    """Where the stages of a step stand on the spool's path, shape (5, 16, 3, 5).
+    """Where the stages of a step stand on the spool's path, shape (5, 16, 3, 5), flat.
 
     For a tick cut into 1, 2, 4, 8 or 16 steps, and each step: the node before, and Hermite's
     weights of place before and after and of slope (by the length of the tick) before and after.
@@ -90,7 +90,7 @@ def _stages() -> NDArray[np.float64]:
                     u * (1.0 - u) ** 2 / NODES,
                     u * u * (u - 1.0) / NODES,
                 )
-    return out
+    return out.ravel()
 
 
 STAGES = _stages()
@@ -139,12 +139,13 @@ def last_velocity(
 
 
 @packed
-def _place(path: NDArray[np.float64], o: int, stage: NDArray[np.float64], tick: float) -> Vector:
-    """Spool at a stage, lanes from `o`."""
-    a = int(stage[0]) * LANES + o
+def _place(path: NDArray[np.float64], o: int, k: int, tick: float) -> Vector:
+    """Spool at the stage whose place in STAGES is `k`, lanes from `o`."""
+    a = int(STAGES[k]) * LANES + o
     b = a + LANES
-    slopes = stage[3] * load(path, SLOPE * LANES + a) + stage[4] * load(path, SLOPE * LANES + b)
-    return stage[1] * load(path, a) + stage[2] * load(path, b) + tick * slopes
+    slopes = load(path, SLOPE * LANES + a) * STAGES[k + 3]
+    slopes = slopes + load(path, SLOPE * LANES + b) * STAGES[k + 4]
+    return STAGES[k + 1] * load(path, a) + STAGES[k + 2] * load(path, b) + tick * slopes
 
 
 @packed
@@ -163,37 +164,41 @@ def jack_lanes(
     """
     any_busy = False
     h = tick / (1 << level)
-    stages = STAGES[level, step]
+    k = ((level << MOST_HALVINGS) + step) * 15
     for o in range(0, LANES, WIDTH):
-        x1 = _place(path, o, stages[0], tick)
-        x2 = _place(path, o, stages[1], tick)
-        x3 = _place(path, o, stages[2], tick)
         place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
         d = load(state, JACK_DIRECTION * LANES + o)
         friction = load(coefficients, JACK_FRICTION * LANES + o)
-        width1, width2, width3 = opening(c, x1), opening(c, x2), opening(c, x3)
-        later = last_velocity(
-            c, h, c.FR + d * friction, velocity, x1, x2, x3, width1, width2, width3
-        )
-        moved = place + 0.5 * h * (velocity + later)
-        slides = (later * d > 0.0) & (magnitude(moved) < c.XJM)
+        x3 = _place(path, o, k + 10, tick)
+        width3 = opening(c, x3)
         # At rest: the force of the second stage, times D, against what holds.
         push = c.AJ * c.PSR * c.GQ * x3 - c.FR * divide(c, width3)
         held = magnitude(push) <= 2.0 * friction * divide(c, width3)
-        # What the collocation does not follow: a fresh start, a fast way past the closed orifice.
-        near = where(x1 * x3 > 0.0, least(magnitude(x1), magnitude(x3)), 0.0)
-        travel = magnitude(x3 - x1)
-        corner = c.PSR / c.GP
-        coarse = travel > most(near, COARSE_TRAVEL)
-        coarse = coarse | (
-            (near < corner) & (most(width1, width3) > corner) & (travel > CORNER_TRAVEL)
-        )
-        slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
         done = load(state, DONE * LANES + o) != 0.0
-        slides = slides & ~done
-        fine = slides | done | ((d == 0.0) & held)
-        store(state, JACK * LANES + o, where(slides, moved, place))
-        store(state, JACK_VELOCITY * LANES + o, where(slides, later, velocity))
+        fine = done | ((d == 0.0) & held)
+        if anywhere(d != 0.0):
+            x1 = _place(path, o, k, tick)
+            x2 = _place(path, o, k + 5, tick)
+            width1, width2 = opening(c, x1), opening(c, x2)
+            later = last_velocity(
+                c, h, c.FR + d * friction, velocity, x1, x2, x3, width1, width2, width3
+            )
+            moved = place + 0.5 * h * (velocity + later)
+            slides = (later * d > 0.0) & (magnitude(moved) < c.XJM)
+            # What the collocation does not follow: a fresh start, a fast way past the closed
+            # orifice.
+            near = where(x1 * x3 > 0.0, least(magnitude(x1), magnitude(x3)), 0.0)
+            travel = magnitude(x3 - x1)
+            corner = c.PSR / c.GP
+            coarse = travel > most(near, COARSE_TRAVEL)
+            coarse = coarse | (
+                (near < corner) & (most(width1, width3) > corner) & (travel > CORNER_TRAVEL)
+            )
+            slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
+            slides = slides & ~done
+            store(state, JACK * LANES + o, where(slides, moved, place))
+            store(state, JACK_VELOCITY * LANES + o, where(slides, later, velocity))
+            fine = fine | slides
         store(state, BUSY * LANES + o, where(fine, 0.0, 1.0))
         if anywhere(~fine):
             any_busy = True

@@ -129,46 +129,56 @@ def spool_lanes(
         k = REST * LANES + o
         rest_xf = still + load(coefficients, k) * ra + load(coefficients, k + LANES) * wf
         rest_wf = load(coefficients, k + 2 * LANES) * ra + load(coefficients, k + 3 * LANES) * wf
-        # Moving, about the point where both would rest.
-        k = MOVE * LANES + o
-        m = (
-            load(coefficients, k), load(coefficients, k + LANES),
-            load(coefficients, k + 2 * LANES), load(coefficients, k + 3 * LANES),
-            load(coefficients, k + 4 * LANES), load(coefficients, k + 5 * LANES),
-            load(coefficients, k + 6 * LANES), load(coefficients, k + 7 * LANES),
-            load(coefficients, k + 8 * LANES), load(coefficients, k + 9 * LANES),
-            load(coefficients, k + 10 * LANES), load(coefficients, k + 11 * LANES),
-            load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
-            load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
-        )  # fmt: skip
-        base = (torque - c.KF * dry * d) * by_KSF
-        a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
-        s, n, x = d * 0.0 + BIG, d * 0.0 + BIG, d * 0.0
-        a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
-        x1, v1 = base + d * b, d * v
-        a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
-        x2, v2 = base + d * b, d * v
-        a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
-        x3, v3 = base + d * b, d * v
-        a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
-        x4, v4 = base + d * b, d * most(v, CREEP)
-        moves = (d != 0.0) & free & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
-        moves = moves & (x < c.XFM) & (d * x4 < c.XSM)
-        fine = moves | rests
-        w = where(magnitude(w) > CREEP, w, 0.0)
-        x4, v4 = where(moves, x4, xs), where(moves, v4, vs)
+        new_xf, new_wf = where(rests, rest_xf, xf), where(rests, rest_wf, wf)
+        zero = d * 0.0
+        x1, x2, x3, x4 = xs, xs, xs, xs
+        v1, v2, v3, v4 = zero, zero, zero, vs
+        fine = rests
+        if anywhere(d != 0.0):
+            # Moving, about the point where both would rest.
+            k = MOVE * LANES + o
+            m = (
+                load(coefficients, k), load(coefficients, k + LANES),
+                load(coefficients, k + 2 * LANES), load(coefficients, k + 3 * LANES),
+                load(coefficients, k + 4 * LANES), load(coefficients, k + 5 * LANES),
+                load(coefficients, k + 6 * LANES), load(coefficients, k + 7 * LANES),
+                load(coefficients, k + 8 * LANES), load(coefficients, k + 9 * LANES),
+                load(coefficients, k + 10 * LANES), load(coefficients, k + 11 * LANES),
+                load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
+                load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
+            )  # fmt: skip
+            base = (torque - c.KF * dry * d) * by_KSF
+            a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
+            s, n, x = zero + BIG, zero + BIG, zero
+            a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
+            b1, u1 = base + d * b, d * v
+            a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
+            b2, u2 = base + d * b, d * v
+            a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
+            b3, u3 = base + d * b, d * v
+            a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
+            b4, u4 = base + d * b, d * most(v, CREEP)
+            moves = (d != 0.0) & free & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
+            moves = moves & (x < c.XFM) & (d * b4 < c.XSM)
+            w = where(magnitude(w) > CREEP, w, 0.0)
+            x1, x2 = where(moves, b1, xs), where(moves, b2, xs)
+            x3, x4 = where(moves, b3, xs), where(moves, b4, xs)
+            v1, v2 = where(moves, u1, 0.0), where(moves, u2, 0.0)
+            v3, v4 = where(moves, u3, 0.0), where(moves, u4, vs)
+            new_xf, new_wf = where(moves, (a + dry) * d, new_xf), where(moves, w * d, new_wf)
+            fine = moves | rests
         store(path, PLACE * LANES + o, xs)
         store(path, SLOPE * LANES + o, vs)
-        store(path, (PLACE + 1) * LANES + o, where(moves, x1, xs))
-        store(path, (PLACE + 2) * LANES + o, where(moves, x2, xs))
-        store(path, (PLACE + 3) * LANES + o, where(moves, x3, xs))
+        store(path, (PLACE + 1) * LANES + o, x1)
+        store(path, (PLACE + 2) * LANES + o, x2)
+        store(path, (PLACE + 3) * LANES + o, x3)
         store(path, (PLACE + 4) * LANES + o, x4)
-        store(path, (SLOPE + 1) * LANES + o, where(moves, v1, 0.0))
-        store(path, (SLOPE + 2) * LANES + o, where(moves, v2, 0.0))
-        store(path, (SLOPE + 3) * LANES + o, where(moves, v3, 0.0))
-        store(path, (SLOPE + 4) * LANES + o, where(moves, v4, 0.0))
-        store(state, FLAPPER * LANES + o, where(moves, (a + dry) * d, where(rests, rest_xf, xf)))
-        store(state, FLAPPER_RATE * LANES + o, where(moves, w * d, where(rests, rest_wf, wf)))
+        store(path, (SLOPE + 1) * LANES + o, v1)
+        store(path, (SLOPE + 2) * LANES + o, v2)
+        store(path, (SLOPE + 3) * LANES + o, v3)
+        store(path, (SLOPE + 4) * LANES + o, v4)
+        store(state, FLAPPER * LANES + o, new_xf)
+        store(state, FLAPPER_RATE * LANES + o, new_wf)
         store(state, SPOOL * LANES + o, x4)
         store(state, SPOOL_RATE * LANES + o, v4)
         store(state, BUSY * LANES + o, where(fine, 0.0, 1.0))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import kernel
+from ehadiag.jit import bare_kernel
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.lanejack import C1, C2, divide, last_velocity
 from ehadiag.model.lanelayout import (
@@ -34,6 +34,8 @@ MOST_CUTS = 32
 ITERATIONS = 30
 SHORTEST = 1e-6
 """Share of a piece that counts as nothing."""
+SLOWEST = 1e-12
+"""Velocity that counts as none, m/s."""
 
 
 @packed
@@ -76,7 +78,44 @@ def _excess(
     return c.AJ * c.PSR * c.GQ * x - (c.FR + hold) * divide(c, max(abs(x), c.PSR / c.GP))
 
 
-@kernel
+@packed
+def _stop(
+    c: PlantConstants, load: float, velocity: float, d: float, later: float, span: float,
+    begin: float, end: float, x0: float, x1: float, rise0: float, rise1: float,
+) -> float:  # fmt: skip
+    """Share of a piece at which the jack stops, `velocity` at `begin`, `later` at `end`.
+
+    Chandrupatla, "A new hybrid quadratic/bisection algorithm", Advances in Engineering Software
+    28(3), 1997.
+    """
+    newest, other, at_newest, at_other = end, begin, later * d, velocity * d
+    share = at_newest / (at_newest - at_other)
+    for _ in range(ITERATIONS):
+        q = newest + share * (other - newest)
+        value = _velocity(c, load, velocity, span, begin, q, x0, x1, rise0, rise1) * d
+        if (value > 0.0) == (at_newest > 0.0):
+            oldest, at_oldest = newest, at_newest
+        else:
+            oldest, at_oldest = other, at_other
+            other, at_other = newest, at_newest
+        newest, at_newest = q, value
+        least = SHORTEST / abs(other - newest)
+        if least > 0.5 or abs(value) < SLOWEST:
+            return newest
+        x = (newest - other) / (oldest - other)
+        y = (at_newest - at_other) / (at_oldest - at_other)
+        share = 0.5
+        if y * y < x and (1.0 - y) * (1.0 - y) < 1.0 - x:
+            share = at_newest / (at_other - at_newest) * at_oldest / (at_other - at_oldest)
+            share += (
+                (oldest - newest) / (other - newest)
+                * at_newest / (at_oldest - at_newest) * at_other / (at_oldest - at_other)
+            )  # fmt: skip
+        share = min(max(share, least), 1.0 - least)
+    return newest
+
+
+@bare_kernel
 def jack_piece(
     c: PlantConstants,
     friction: float,
@@ -151,22 +190,7 @@ def jack_piece(
             q, cut = end, cut + 1
             continue
         if velocity != 0.0:
-            low, high, at_low, at_high = q, end, velocity * d, later * d
-            for _ in range(ITERATIONS):
-                if at_low == at_high:
-                    break
-                t = low + (high - low) * at_low / (at_low - at_high)
-                value = _velocity(c, load, velocity, span, q, t, x0, x1, rise0, rise1) * d
-                if value > 0.0:
-                    low, at_low = t, value
-                    at_high *= 0.5
-                else:
-                    high, at_high = t, value
-                    at_low *= 0.5
-                if high - low < SHORTEST or abs(value) < 1e-12:
-                    high = t
-                    break
-            q = high
+            q = _stop(c, load, velocity, d, later, span, q, end, x0, x1, rise0, rise1)
         else:
             q = end
         velocity, d, fresh = 0.0, 0.0, 1.0
@@ -175,7 +199,7 @@ def jack_piece(
     return place, velocity, d, fresh
 
 
-@kernel
+@bare_kernel
 def jack_events(
     c: PlantConstants,
     level: int,

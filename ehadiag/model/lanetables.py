@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,12 +25,18 @@ from ehadiag.model.lanelayout import (
 from ehadiag.model.lanevector import WIDTH, load, store
 from ehadiag.model.transition import FINEST, TAYLOR_HALVINGS
 
-__all__ = ["GRID", "MOVING_SIZE", "STUCK_SIZE", "tabulate"]
+__all__ = ["MOVING_SIZE", "SHIFTS", "STUCK_SIZE", "tabulate"]
 
-GRID = 1 << FINEST >> 3
-"""Finest steps in an eighth of a tick: the longest step of a tick with events."""
-MOVING_SIZE = LANES * (GRID + 1) * 16
-STUCK_SIZE = (GRID + 1) * 4
+SHIFTS = (FINEST - 3, FINEST - 6, 0)
+"""Lengths of the steps of a tick with events, as powers of two of the finest: an eighth of the
+tick, an eighth of that, and the finest; WIDTH of each, one behind the other."""
+PLACES = 3
+"""WIDTH as a power of two."""
+MOVING_ROWS, STUCK_ROWS = 18, 4
+"""Vectors for steps of one length: 4 x 4 transitions, time in s, decay of the spool's velocity with
+the flapper on its stop; 2 x 2 transitions."""
+MOVING_SIZE = LANES * len(SHIFTS) * MOVING_ROWS * WIDTH
+STUCK_SIZE = len(SHIFTS) * STUCK_ROWS * WIDTH
 TAYLOR_ORDER = 8
 
 
@@ -67,6 +75,39 @@ def _smallest(rates: NDArray[np.float64], n: int, tick: float) -> NDArray[np.flo
 
 
 @kernel
+def _powers(
+    rates: NDArray[np.float64], n: int, tick: float, lanes: int, rows: int,
+    table: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Transitions over the steps of `SHIFTS`, of the first lanes.
+
+    table: out, shape (lanes, 3, rows, WIDTH), flat; the first n² rows are written.
+    Returns transitions of all lanes over a quarter of a tick and over a whole one.
+    """
+    size = n * n
+    one, power = _smallest(rates, n, tick), np.empty_like(rates)
+    spare, quarter = np.empty_like(rates), np.empty_like(rates)
+    for level in range(len(SHIFTS) - 1, -1, -1):
+        power[:] = one
+        for step in range(WIDTH):
+            for i in range(lanes):
+                for e in range(size):
+                    place = ((i * len(SHIFTS) + level) * rows + e) * WIDTH + step
+                    table[place] = power[e * LANES + i]
+            if level == 0 and step == 1:
+                quarter[:] = power
+            if step < WIDTH - 1:
+                _product(power, one, spare, n, 1.0)
+                power, spare = spare, power
+        if level > 0:
+            for _ in range(SHIFTS[level - 1] - SHIFTS[level] - PLACES):
+                _product(power, power, spare, n, 1.0)
+                power, spare = spare, power
+            one, power = power, one
+    return quarter, power
+
+
+@kernel
 def tabulate(
     c: PlantConstants,
     tick: float,
@@ -81,9 +122,9 @@ def tabulate(
     ----------
     candidates: (Kintas, FSS, FDJ, spool offset in m, pressure offset in Pa), shape (LANES, 5).
     coefficients: out, shape (COEFFICIENT_ROWS * LANES,).
-    moving: out, transition over j finest steps with the spool moving, lane by lane, shape
-        (LANES * (GRID + 1) * 16,).
-    stuck: out, the same with the spool at rest, for all lanes, shape ((GRID + 1) * 4,).
+    moving: out, what goes on over 1 … WIDTH steps of each length of `SHIFTS` with the spool moving,
+        shape (LANES, 3, MOVING_ROWS, WIDTH), flat.
+    stuck: out, the same with the spool at rest, of all lanes, shape (3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
     force = c.AS * c.GPF
@@ -111,26 +152,14 @@ def tabulate(
             -c.KF / c.JF,
             -c.CF / c.JF,
         )
-    one, spare = _smallest(rates, 4, tick), np.empty(16 * LANES)
-    power = one.copy()
-    for j in range(1, GRID + 1):
-        for i in range(LANES):
-            for e in range(16):
-                moving[(i * (GRID + 1) + j) * 16 + e] = power[e * LANES + i]
-        if j < GRID:
-            _product(power, one, spare, 4, 1.0)
-            power, spare = spare, power
-    _product(power, power, spare, 4, 1.0)
-    coefficients[MOVE * LANES : (MOVE + 16) * LANES] = spare
-    one, spare = _smallest(ring, 2, tick), np.empty(4 * LANES)
-    power = one.copy()
-    for j in range(1, GRID + 1):
-        for e in range(4):
-            stuck[j * 4 + e] = power[e * LANES]
-        if j < GRID:
-            _product(power, one, spare, 2, 1.0)
-            power, spare = spare, power
-    for _ in range(3):
-        _product(power, power, spare, 2, 1.0)
-        power, spare = spare, power
-    coefficients[REST * LANES : (REST + 4) * LANES] = power
+    quarter, _ = _powers(rates, 4, tick, LANES, MOVING_ROWS, moving)
+    coefficients[MOVE * LANES : (MOVE + 16) * LANES] = quarter
+    for i in range(LANES):
+        for level, shift in enumerate(SHIFTS):
+            for step in range(WIDTH):
+                time = tick / (1 << FINEST) * ((step + 1) << shift)
+                place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH + step
+                moving[place] = time
+                moving[place + WIDTH] = math.exp(-time * coefficients[DAMPING * LANES + i] / c.MS)
+    _, whole = _powers(ring, 2, tick, 1, STUCK_ROWS, stuck)
+    coefficients[REST * LANES : (REST + 4) * LANES] = whole

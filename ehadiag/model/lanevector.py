@@ -30,6 +30,8 @@ __all__ = [
     "Mask",
     "Vector",
     "anywhere",
+    "behind",
+    "first_place",
     "least",
     "load",
     "magnitude",
@@ -51,9 +53,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def packed(function: F) -> F:
     """Compile as a part of the kernels that call it, for vectors or for numbers."""
-    return numba.njit(nogil=True, error_model="numpy", fastmath=set(FLAGS), forceinline=True)(
-        function
-    )
+    return numba.njit(
+        nogil=True, error_model="numpy", forceinline=True, fastmath=set(FLAGS), _nrt=False
+    )(function)
 
 
 def load(array: NDArray[np.float64], start: int) -> Vector:
@@ -89,6 +91,16 @@ def magnitude(a: Any) -> Vector:
 def anywhere(mask: Mask) -> bool:
     """Whether the mask is true in any lane."""
     return bool(np.any(mask))
+
+
+def first_place(mask: Mask) -> int:
+    """First lane in which the mask is true, WIDTH if it is in none."""
+    return int(np.argmax(mask)) if np.any(mask) else WIDTH
+
+
+def behind(first: float, vector: Vector) -> Vector:
+    """Put every number one lane further on, `first` into the first lane; the last is lost."""
+    return np.concatenate([[first], vector[:-1]])
 
 
 class _VectorType(types.Type):
@@ -245,6 +257,30 @@ def _typed_anywhere(_context: Any) -> Any:
 def _anywhere(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
     packed = builder.bitcast(arguments[0], ir.IntType(WIDTH))
     return builder.icmp_unsigned("!=", packed, ir.Constant(ir.IntType(WIDTH), 0))
+
+
+@type_callable(first_place)
+def _typed_first_place(_context: Any) -> Any:
+    return lambda mask: types.int64 if mask is _MASK else None
+
+
+@lower_builtin(first_place, _MASK)
+def _first_place(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+    whole = ir.IntType(64)
+    lanes = builder.zext(builder.bitcast(arguments[0], ir.IntType(WIDTH)), whole)
+    beyond = builder.or_(lanes, ir.Constant(whole, 1 << WIDTH))
+    return builder.cttz(beyond, ir.Constant(ir.IntType(1), 1))
+
+
+@type_callable(behind)
+def _typed_behind(_context: Any) -> Any:
+    return lambda first, vector: _VECTOR if vector is _VECTOR and _numeric(first) else None
+
+
+@lower_builtin(behind, types.Float, _VECTOR)
+def _behind(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+    places = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0, *range(WIDTH, 2 * WIDTH - 1)])
+    return builder.shuffle_vector(_wide(builder, arguments[0]), arguments[1], places)
 
 
 def _pointer(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

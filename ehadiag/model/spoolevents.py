@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ehadiag.jit import inlined
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.transition import SpoolScalars
@@ -18,6 +20,7 @@ __all__ = [
     "held",
     "moving_event",
     "stuck_event",
+    "switch",
 ]
 
 NOTHING = 0
@@ -106,3 +109,31 @@ def stuck_event(
         if max(abs(before_xf), abs(xf)) + swing > min(t.breakaway, c.XFM):
             return UNSURE
     return NOTHING
+
+
+@inlined
+def switch(
+    c: PlantConstants,
+    t: SpoolScalars,
+    event: int,
+    xf: float,
+    wf: float,
+    xs: float,
+    vs: float,
+    direction: int,
+    clamped: bool,
+) -> tuple[float, float, float, float, int, bool]:
+    """State after an event."""
+    if event == REVERSAL:
+        vs, direction = 0.0, 0
+        if abs(xf) > t.breakaway:
+            direction = 1 if xf > 0.0 else -1
+    elif event == SPOOL_STOP:
+        xs, vs, direction = math.copysign(c.XSM, xs), 0.0, 0
+    elif event == BREAKAWAY:
+        direction = 1 if xf > 0.0 else -1
+    elif event == FLAPPER_STOP:
+        xf, wf, clamped = math.copysign(c.XFM, xf), 0.0, True
+    elif event == RELEASE:
+        clamped = False
+    return xf, wf, xs, vs, direction, clamped

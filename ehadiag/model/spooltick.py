@@ -18,15 +18,11 @@ from numpy.typing import NDArray
 from ehadiag.jit import inlined
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.spoolevents import (
-    BREAKAWAY,
-    FLAPPER_STOP,
     NOTHING,
-    RELEASE,
-    REVERSAL,
-    SPOOL_STOP,
     clamped_event,
     moving_event,
     stuck_event,
+    switch,
 )
 from ehadiag.model.transition import FINEST, SpoolScalars
 
@@ -94,34 +90,6 @@ def _ring(
     rest_xf = (torque - c.KSF * xs) / c.KF
     a = xf - rest_xf
     return rest_xf + n[0, 0] * a + n[0, 1] * wf, n[1, 0] * a + n[1, 1] * wf
-
-
-@inlined
-def _switch(
-    c: PlantConstants,
-    t: SpoolScalars,
-    event: int,
-    xf: float,
-    wf: float,
-    xs: float,
-    vs: float,
-    direction: int,
-    clamped: bool,
-) -> tuple[float, float, float, float, int, bool]:
-    """State after an event."""
-    if event == REVERSAL:
-        vs, direction = 0.0, 0
-        if abs(xf) > t.breakaway:
-            direction = 1 if xf > 0.0 else -1
-    elif event == SPOOL_STOP:
-        xs, vs, direction = math.copysign(c.XSM, xs), 0.0, 0
-    elif event == BREAKAWAY:
-        direction = 1 if xf > 0.0 else -1
-    elif event == FLAPPER_STOP:
-        xf, wf, clamped = math.copysign(c.XFM, xf), 0.0, True
-    elif event == RELEASE:
-        clamped = False
-    return xf, wf, xs, vs, direction, clamped
 
 
 @inlined
@@ -212,7 +180,7 @@ def spool_tick(
             level += 1
             continue
         end = new_vs
-        xf, wf, xs, vs, direction, clamped = _switch(
+        xf, wf, xs, vs, direction, clamped = switch(
             c, t, event, new_xf, new_wf, new_xs, new_vs, direction, clamped
         )
         done += WHOLE >> level
