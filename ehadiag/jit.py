@@ -67,9 +67,9 @@ def inlined(function: F) -> F:
 
     A product and a sum may become one instruction with one rounding, nothing else is loosened.
     """
-    return numba.njit(
-        nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"}, _nrt=False
-    )(function)
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})(
+        function
+    )
 
 
 def inlined_exact(function: F) -> F:

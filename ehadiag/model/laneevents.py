@@ -178,7 +178,7 @@ def _clamped_instants(
     return leaves | (new_vs * d <= 0.0) | (new_xs * d >= c.XSM)
 
 
-@inlined
+@packed
 def _event_tick(
     c: PlantConstants,
     i: int,
@@ -278,7 +278,7 @@ def _event(
     return FLAPPER_STOP if abs(xf) >= c.XFM else SPOOL_STOP
 
 
-@inlined
+@packed
 def _jack_beside(
     c: PlantConstants,
     i: int,

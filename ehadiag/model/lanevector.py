@@ -52,7 +52,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def packed(function: F) -> F:
-    """Compile as a part of the kernels that call it, for vectors or for numbers."""
+    """Compile as a part of the kernels that call it, for vectors or for numbers.
+
+    Nothing is allocated in it, so that no references to arrays need be counted.
+    """
     return numba.njit(
         nogil=True, error_model="numpy", forceinline=True, fastmath=set(FLAGS), _nrt=False
     )(function)

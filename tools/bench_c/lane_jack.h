@@ -7,7 +7,8 @@
 enum { NODES = 4, MOST_CUTS = 32, ITERATIONS = 30 };
 
 static const real COARSE_TRAVEL = 8.0e-6, CORNER_TRAVEL = 4.0e-6;
-static const real FINE_TRAVEL = 3.0e-6, FINE_RATIO = 0.3, FRESH_DECAY = 3.0, SHORTEST = 1e-6;
+static const real FINE_TRAVEL = 3.0e-6, FINE_RATIO = 0.3, FRESH_DECAY = 3.0, SHORTEST = 1e-6,
+                  SLOWEST = 1e-12;
 #define ROOT 2.449489742783178098
 static const real C1 = (4.0 - ROOT) / 10.0, C2 = (4.0 + ROOT) / 10.0;
 static const real A11 = (88.0 - 7.0 * ROOT) / 360.0, A12 = (296.0 - 169.0 * ROOT) / 1800.0;
@@ -85,6 +86,42 @@ static inline real excess(const Fixed *f, const Piece *p, real hold, real q)
            - (f->c.FR + hold) * divide(&f->c, greater(fabs(x), f->corner));
 }
 
+/* Share of a piece at which the jack stops (Chandrupatla 1997). */
+static real stop_share(const Fixed *f, const Piece *p, real load, real velocity, real d, real later,
+                       real begin, real end)
+{
+    real newest = end, other = begin, at_newest = later * d, at_other = velocity * d;
+    real share = at_newest / (at_newest - at_other);
+    for (int i = 0; i < ITERATIONS; i++) {
+        real oldest, at_oldest, q = newest + share * (other - newest);
+        real value = piece_velocity(f, p, load, velocity, begin, q) * d;
+        if ((value > 0.0) == (at_newest > 0.0)) {
+            oldest = newest;
+            at_oldest = at_newest;
+        } else {
+            oldest = other;
+            at_oldest = at_other;
+            other = newest;
+            at_other = at_newest;
+        }
+        newest = q;
+        at_newest = value;
+        real least = SHORTEST / fabs(other - newest);
+        if (least > 0.5 || fabs(value) < SLOWEST)
+            return newest;
+        real x = (newest - other) / (oldest - other);
+        real y = (at_newest - at_other) / (at_oldest - at_other);
+        share = 0.5;
+        if (y * y < x && (1.0 - y) * (1.0 - y) < 1.0 - x) {
+            share = at_newest / (at_other - at_newest) * at_oldest / (at_other - at_oldest);
+            share += (oldest - newest) / (other - newest) * at_newest / (at_oldest - at_newest)
+                     * at_other / (at_oldest - at_other);
+        }
+        share = lesser(greater(share, least), 1.0 - least);
+    }
+    return newest;
+}
+
 /* Jack over the shares begin ... stop of a piece; it may stop and start there. */
 static void jack_piece(const Fixed *f, real friction, const Piece *p, real begin, real stop,
                        Jack *j)
@@ -154,25 +191,7 @@ static void jack_piece(const Fixed *f, real friction, const Piece *p, real begin
             continue;
         }
         if (j->velocity != 0.0) {
-            real low = q, high = end, at_low = j->velocity * j->d, at_high = later * j->d;
-            for (int i = 0; i < ITERATIONS && at_low != at_high; i++) {
-                real t = low + (high - low) * at_low / (at_low - at_high);
-                real value = piece_velocity(f, p, load, j->velocity, q, t) * j->d;
-                if (value > 0.0) {
-                    low = t;
-                    at_low = value;
-                    at_high *= 0.5;
-                } else {
-                    high = t;
-                    at_high = value;
-                    at_low *= 0.5;
-                }
-                if (high - low < SHORTEST || fabs(value) < 1e-12) {
-                    high = t;
-                    break;
-                }
-            }
-            q = high;
+            q = stop_share(f, p, load, j->velocity, j->d, later, q, end);
         } else {
             q = end;
         }
