@@ -89,7 +89,7 @@ def against_peak(batch: Batch, took: float, sizes: Sizes) -> list[Figure]:
             "share of the test's time for events",
             100.0 * (1.0 - together / took),
             "%",
-            "against the slow triangle; each operation waits for the one before, behind branches",
+            "against the slow triangle; each lane that has one goes alone, behind branches",
         ),
     ]
     return [Figure(SECTION, *row) for row in figures]
