@@ -14,6 +14,7 @@ from ehadiag.recording import BitState, CommandMode, Environment, Recording, Sam
 from ehadiag.storedtest import SAME_RATE, StoredTest
 
 __all__ = [
+    "nothing_is_missing",
     "objections_to_estimate",
     "objections_to_experiment",
     "objections_to_recording",
@@ -43,6 +44,21 @@ NOISE_SHARE = 2.0
 """Gap of the current, in units of noise, that noise does not make."""
 MOST_OUTLIERS = 0.015
 MOST_RMS = 1.25
+
+
+def nothing_is_missing(recording: Recording, test: StoredTest) -> bool:
+    """Whether a recording has every sample of a test, and its end."""
+    samples = recording.samples
+    if samples is None or samples.ticks != test.ticks:
+        return False
+    if recording.test_id not in (None, test.id):
+        return False
+    if recording.outcome.state is not BitState.COMPLETE:
+        return False
+    values = (
+        samples.current, samples.spool, samples.pressure, samples.position, samples.command,
+    )  # fmt: skip
+    return all(bool(np.isfinite(item).all()) for item in values)
 
 
 def objections_to_recording(

@@ -75,7 +75,7 @@ class TimeLimits:
     finish: float = 1.0
     """End of the test's duration to the word that it is complete."""
     trail: float = 0.03
-    """Listening after the end, for frames still under way."""
+    """Listening after the end, for frames still under way, where some are missing."""
     abort: float = 1.0
     """Abort to the word that it was obeyed."""
     repeat: float = 0.1
@@ -210,6 +210,11 @@ class Handshake:
             case Phase.ARMING | Phase.RUNNING:
                 return self._abort(why, now)
         return []
+
+    def all_there(self) -> None:
+        """Listen no longer for frames still under way: none is missing."""
+        if self.phase is Phase.TRAILING:
+            self._end("")
 
     def stop(self, now: int, why: str) -> list[Action]:
         """End the test early: the user wants it, or the host cannot go on."""

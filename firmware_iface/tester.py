@@ -27,7 +27,7 @@ POLL = 0.02
 """s; longest wait for a frame before the time limits are looked at."""
 STALL_NS = 100_000_000
 """A wait so much longer than POLL: this process did not run, which is no silence of the bus."""
-PROGRESS_NS = 100_000_000
+PROGRESS_NS = 20_000_000
 """Between two progress reports of one phase."""
 
 
@@ -41,11 +41,6 @@ class Progress:
     duration: float
     frames: int
     sample: Sample | None
-
-    @property
-    def ended(self) -> bool:
-        """Whether the test is complete, but for frames still under way."""
-        return self.phase is Phase.TRAILING
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +85,7 @@ def run_test(
     on_frame: Callable[[Frame], None] | None = None,
     stop: threading.Event | None = None,
     progress: Callable[[Progress], None] | None = None,
+    all_there: Callable[[], bool] | None = None,
 ) -> TesterOutcome:
     """Run one test, or with `transmit` false wait for one that someone else starts.
 
@@ -102,6 +98,8 @@ def run_test(
         the end, whatever happens.
     on_frame: gets every frame in order, in the caller's thread.
     stop: when set, the test is aborted.
+    all_there: asked once, when the computer has said that the test is complete: whether no frame of
+        it is missing, so that there is nothing left to listen for.
 
     The end of a bus, the stop, an exceeded limit and a computer that does not answer are outcomes,
     not exceptions.
@@ -124,7 +122,7 @@ def run_test(
         limits=limits or Limits(),
     )
     session = _Session(transport, recorder, bus_map or default_map(), machine)
-    session.on_frame, session.progress = on_frame, progress
+    session.on_frame, session.progress, session.all_there = on_frame, progress, all_there
     try:
         return session.run(stop or threading.Event())
     finally:
@@ -150,6 +148,7 @@ class _Session:
         self._shown_phase: Phase | None = None
         self.on_frame: Callable[[Frame], None] | None = None
         self.progress: Callable[[Progress], None] | None = None
+        self.all_there: Callable[[], bool] | None = None
 
     def run(self, stop: threading.Event) -> TesterOutcome:
         """Run to the end of the handshake."""
@@ -197,11 +196,18 @@ class _Session:
                 if content.serial is not None:
                     self._serial = content.serial
                 self._act(self._machine.on_status(now, content))
+                self._look_whether_all_is_there()
             case Sample():
                 self._sample = content
                 self._act(self._machine.on_sample(now, content))
             case Request():
                 self._act(self._machine.on_foreign_request(now))
+
+    def _look_whether_all_is_there(self) -> None:
+        if self._machine.phase is Phase.TRAILING and self.all_there is not None:
+            ask, self.all_there = self.all_there, None
+            if ask():
+                self._machine.all_there()
 
     def _act(self, actions: list[Action]) -> None:
         for action in actions:

@@ -11,9 +11,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ehadiag.online import OnlineIdentification
+    from ehadiag.recording import Recording
+    from ehadiag.storedtest import StoredTest
     from firmware_iface.assembler import Assembler
-    from firmware_iface.frames import FrameTable
     from firmware_iface.tester import Progress
 
 __all__ = ["Ahead", "working_ahead"]
@@ -26,14 +29,19 @@ MARGIN_S = 0.02
 class Ahead:
     """Takes snapshots of a running test, and has them worked on."""
 
-    def __init__(self, online: OnlineIdentification, assembler: Assembler) -> None:
+    def __init__(
+        self, online: OnlineIdentification, assembler: Assembler, test: StoredTest
+    ) -> None:
         self._online = online
         self._assembler = assembler
+        self._test = test
         self._due = list(online.due_s)
         self._abandoned = False
-        self._work: queue.SimpleQueue[FrameTable | None] = queue.SimpleQueue()
+        self._work: queue.SimpleQueue[Callable[[], Recording] | None] = queue.SimpleQueue()
         self.ended_at: float | None = None
         """When the word came that the test is complete, on `time.perf_counter`."""
+        self.whole: Recording | None = None
+        """The test as it was then, if nothing was missing."""
         self._thread = threading.Thread(target=self._run, name="ehadiag-ahead", daemon=True)
         self._thread.start()
 
@@ -43,11 +51,20 @@ class Ahead:
         while self._due and progress.elapsed >= self._due[0] + MARGIN_S:
             self._due.pop(0)
             due = True
-        if progress.ended and self.ended_at is None:
-            self.ended_at = time.perf_counter()
-            due = True
         if due:
-            self._work.put(self._assembler.table())
+            table = self._assembler.table()
+            self._work.put(lambda: self._assembler.recording_of(table))
+
+    def all_there(self) -> bool:
+        """Hand over the complete test; return whether nothing of it is still under way."""
+        from ehadiag.fitness import nothing_is_missing  # noqa: PLC0415 - loads numba
+
+        self.ended_at = time.perf_counter()
+        recording = self._assembler.recording()
+        self._work.put(lambda: recording)
+        if nothing_is_missing(recording, self._test):
+            self.whole = recording
+        return self.whole is not None
 
     def finish(self) -> None:
         """Wait for the work under way; Ctrl-C ends the wait."""
@@ -61,18 +78,20 @@ class Ahead:
         self._work.put(None)
 
     def _run(self) -> None:
-        while (table := self._work.get()) is not None:
+        while (recording := self._work.get()) is not None:
             if self._abandoned:
                 return
             # Whatever is wrong with the recording, its diagnosis will tell: this is only ahead.
             with contextlib.suppress(Exception):
-                self._online.take(self._assembler.recording_of(table))
+                self._online.take(recording())
 
 
 @contextmanager
-def working_ahead(online: OnlineIdentification, assembler: Assembler) -> Iterator[Ahead]:
+def working_ahead(
+    online: OnlineIdentification, assembler: Assembler, test: StoredTest
+) -> Iterator[Ahead]:
     """Work ahead; where the context ends by an exception, the work is abandoned."""
-    ahead = Ahead(online, assembler)
+    ahead = Ahead(online, assembler, test)
     try:
         yield ahead
     except BaseException:

@@ -188,7 +188,7 @@ def _acquire(
         display = stack.enter_context(progress_bar())
 
         assembler = Assembler(str(path), bus_map)
-        ahead = stack.enter_context(working_ahead(online, assembler))
+        ahead = stack.enter_context(working_ahead(online, assembler, test))
 
         def tell(progress: Progress) -> None:
             ahead.watch(progress)
@@ -210,9 +210,13 @@ def _acquire(
             on_frame=assembler.add,
             stop=stop,
             progress=tell,
+            all_there=ahead.all_there,
         )
         listened = time.monotonic() - began
-    recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
+    if ahead.whole is not None:
+        recording = ahead.whole
+    else:
+        recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
     if recording.serial is None:
         recording = replace(recording, serial=outcome.serial)
     if outcome.degraded:

@@ -79,6 +79,19 @@ def test_nothing_is_sent_before_the_bus_was_listened_to() -> None:
     assert driver.sent == []
 
 
+def test_nothing_missing_ends_the_listening_at_once() -> None:
+    driver = Driver().running().wait(1.0).hear(status(BitState.COMPLETE))
+    assert driver.machine.phase is Phase.TRAILING
+    driver.machine.all_there()
+    assert driver.ended() == ""
+
+
+def test_nothing_missing_ends_no_test_that_is_not_complete() -> None:
+    driver = Driver().running()
+    driver.machine.all_there()
+    assert driver.machine.phase is Phase.RUNNING
+
+
 @pytest.mark.parametrize("reason", list(BitReason))
 def test_a_refusal_ends_with_its_reason(reason: BitReason) -> None:
     driver = Driver().requested().hear(status(BitState.REFUSED, reason=reason))

@@ -96,6 +96,24 @@ def test_the_same_seed_gives_the_same_recording_to_the_byte(
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_the_trail_is_listened_to_where_something_is_missing(
+    whole: bool, make_core: CoreFactory
+) -> None:
+    asked: list[int] = []
+
+    def all_there() -> bool:
+        asked.append(transport.now_ns())
+        return whole
+
+    with EmulatorTransport(make_core()) as transport:
+        outcome = run_test(transport, test_id=9, duration=0.4, transmit=True, all_there=all_there)
+        listened = (transport.now_ns() - asked[0]) / 1e9
+    assert outcome.complete
+    assert len(asked) == 1
+    assert (listened < TimeLimits().trail) == whole
+
+
 def test_two_tests_in_a_row_on_one_bus(make_core: CoreFactory) -> None:
     with EmulatorTransport(make_core()) as transport:
         for _ in range(2):

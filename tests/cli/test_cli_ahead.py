@@ -1,0 +1,63 @@
+"""Working ahead of the end of a test: when there is nothing left to listen for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cli_result import LOGS
+
+from ehadiag.actuator import default_actuator
+from ehadiag.cli.ahead import working_ahead
+from ehadiag.diagnosis import diagnose
+from ehadiag.fitness import nothing_is_missing
+from ehadiag.online import OnlineIdentification
+from ehadiag.recording import BitState
+from ehadiag.storedtest import resolve_test
+from firmware_iface.assembler import Assembler
+from firmware_iface.frames import Frame
+from firmware_iface.logs import read_frames
+
+TEST = resolve_test("open")
+
+
+def heard(name: str, *, until: BitState = BitState.COMPLETE, without: int = 0) -> Assembler:
+    """Frames of a log up to the first status that says so; of telemetry the last ones left out."""
+    table = read_frames(LOGS / name)
+    states = np.where(table.can_id == 0x201, table.data[:, 0] & 15, -1)
+    end = int(np.flatnonzero(states == until)[0]) + 1
+    telemetry = np.flatnonzero(table.can_id[:end] == 0x110)
+    left_out = set(telemetry[len(telemetry) - without :].tolist())
+    assembler = Assembler(name)
+    for row in sorted(set(range(end)) - left_out):
+        data = table.data[row, : table.length[row]].tobytes()
+        assembler.add(Frame(int(table.time_ns[row]), can_id=int(table.can_id[row]), data=data))
+    return assembler
+
+
+def test_a_test_that_is_all_there_needs_no_more_listening() -> None:
+    online = OnlineIdentification(TEST, default_actuator())
+    with working_ahead(online, heard("paper-open-1.blf"), TEST) as ahead:
+        assert ahead.all_there()
+        ahead.finish()
+    assert ahead.whole is not None
+    assert ahead.ended_at is not None
+    reused = online.memory.reused
+    diagnose([ahead.whole], default_actuator(), [TEST], memory=online.memory)
+    assert online.memory.reused == reused + 1
+
+
+@pytest.mark.parametrize("without", [1, 40])
+def test_frames_that_are_missing_may_be_under_way(without: int) -> None:
+    online = OnlineIdentification(TEST, default_actuator())
+    with working_ahead(online, heard("paper-open-1.blf", without=without), TEST) as ahead:
+        assert not ahead.all_there()
+        ahead.abandon()
+    assert ahead.whole is None
+
+
+def test_what_is_missing() -> None:
+    assert nothing_is_missing(heard("paper-open-1.blf").recording(), TEST)
+    assert not nothing_is_missing(heard("paper-open-1.blf").recording(), resolve_test("closed"))
+    assert not nothing_is_missing(heard("lossy-open.blf").recording(), TEST)
+    running = heard("paper-open-1.blf", until=BitState.RUNNING).recording()
+    assert not nothing_is_missing(running, TEST)
