@@ -7,9 +7,9 @@ import numpy as np
 from ehadiag.actuator import Actuator
 from ehadiag.fitness import objections_to_experiment, objections_to_recording, out_of_range
 from ehadiag.identify.experiment import build_experiment, noise_is_judged_early
-from ehadiag.identify.pipeline import identify
+from ehadiag.identify.pipeline import identify, run_ahead
 from ehadiag.identify.solvers import CompactGa, Solver
-from ehadiag.identify.stages import STAGES, Memory, first_ends_at, run_ahead, stage_ends_at
+from ehadiag.identify.stages import STAGES, Memory, first_ends_at, stage_ends_at
 from ehadiag.recording import Recording
 from ehadiag.storedtest import StoredTest
 

@@ -93,6 +93,14 @@ class GapModel:
             out.append(Slope(x, gaps[0], capped(gaps[0]), jacobian, smooth))
         return out
 
+    def trusted_slope(self, x: NDArray[np.float64]) -> Slope:
+        """Gaps and derivatives at a point, rows left out as by `trusted`; in one block of runs."""
+        at = _sides(x, STEP)
+        runs = self.many(np.vstack([x[None, :], at, wide_sides(x)]))
+        jacobian, smooth = self._differences(x, runs[0], at, runs[1 : 1 + len(at)])
+        slope = Slope(x, runs[0], capped(runs[0]), jacobian, smooth)
+        return self.trusted(slope, runs[1 + len(at) :])
+
     def trusted(self, slope: Slope, runs: NDArray[np.float64] | None = None) -> Slope:
         """Leave rows out where derivatives over a wider difference disagree.
 

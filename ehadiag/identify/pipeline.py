@@ -5,23 +5,22 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.batch import Batch
 from ehadiag.identify.experiment import (
-    ANCHOR_LSB,
     Experiment,
-    judge_noise,
     make_batch,
     share_offsets,
 )
 from ehadiag.identify.first import FirstApproximation
 from ehadiag.identify.gapmodel import CAP
+from ehadiag.identify.lastpart import add_last_part
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.refine import Refinement, describe, gaps_of, median_offsets, refine
+from ehadiag.identify.prefix import refine_prefix
+from ehadiag.identify.refine import Refinement, gaps_of, median_offsets
 from ehadiag.identify.result import Estimate, Fit, Identification, Timing
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.stages import (
@@ -32,13 +31,16 @@ from ehadiag.identify.stages import (
     Progress,
     digest,
     experiment_arrays,
+    first_ends_at,
     first_stage,
+    search_stages,
+    stage_ends_at,
     staged_search,
 )
 from ehadiag.identify.uncertainty import covariance, interval95
 from ehadiag.parameters import FAULTS
 
-__all__ = ["identify"]
+__all__ = ["identify", "run_ahead"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +65,8 @@ RESCUES = (
     Plan(0.4, budget=3.0),
 )
 """One after the other where the staged search does not explain the recording."""
-POLISH = CompactGa(budget=1440, virtual_population=150.0, tolerance=1e-7)
-POLISH_DEVIATION = 1e-3
 POOR_FIT = 0.01
 """Share of gaps beyond three deviations that asks for another attempt."""
-JUDGEMENTS = 3
-"""How often at most the noise is judged anew."""
-NOISE_SETTLED = 0.15
 NOT_SHOWN_STD = 0.1
 BOUND = 1e-6
 
@@ -110,7 +107,7 @@ def _identify(
     found = staged_search(experiments, start, solver, seed, memory, tell)
     search_s = time.perf_counter() - searched_at
     tell("refinement", 0.0)
-    best = _attempt(experiments, found)
+    best = _attempt(experiments, found, memory)
     evaluations, attempts = first.evaluations + found.evaluations + best.evaluations, 1
     for plan in RESCUES:
         if _outliers(best.refined) <= POOR_FIT:
@@ -121,7 +118,7 @@ def _identify(
         )
         search_s += time.perf_counter() - before
         tell("refinement", 0.0)
-        attempt = _attempt(experiments, found)
+        attempt = _attempt(experiments, found, memory)
         evaluations += found.evaluations + attempt.evaluations
         attempts += 1
         if attempt.score < best.score:
@@ -141,6 +138,21 @@ def _identify(
         attempts=attempts,
         timing=Timing(searched_at - begin, search_s, end - searched_at - search_s),
     )
+
+
+def run_ahead(experiment: Experiment, solver: Solver, seed: int, memory: Memory) -> None:
+    """Run the stages for which the samples of a running test suffice, into memory."""
+    test = experiment.test
+    seconds = experiment.ticks * experiment.tick
+    if seconds < first_ends_at(test):
+        return
+    ready = sum(seconds >= stage_ends_at(test, stage) for stage in range(len(STAGES)))
+    experiments = share_offsets([experiment])
+    best = np.array(first_stage(experiments, memory).values)
+    for result in itertools.islice(search_stages(experiments, best, solver, seed, memory), ready):
+        best = result.best
+    if ready == len(STAGES):
+        refine_prefix(experiments, best, memory)
 
 
 def _rescue(
@@ -180,69 +192,14 @@ class _Attempt:
     """Twice the negative logarithm of the likelihood: comparable where the noise differs."""
 
 
-def _attempt(experiments: Sequence[Experiment], found: SearchResult) -> _Attempt:
-    """Refine the optimum of a search, weighing by the noise that the gaps show."""
-    free = make_batch(experiments)
-    gaps = gaps_of(free, found.best)
-    offsets = median_offsets(free, gaps)
-    experiments = _judged(experiments, gaps)
-    best = _refine(experiments, found.best, offsets)
-    evaluations = 1 + best.evaluations
-    for _ in range(JUDGEMENTS):
-        before = [(item.spool_noise, item.pressure_noise) for item in experiments]
-        judged = _judged(experiments, best.gaps)
-        after = [(item.spool_noise, item.pressure_noise) for item in judged]
-        if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
-            break
-        experiments = judged
-        best = _refine(experiments, best.values, best.offsets)
-        evaluations += best.evaluations
-    if best.jagged:
-        best = _polish(experiments, best)
-        evaluations += best.evaluations
+def _attempt(experiments: Sequence[Experiment], found: SearchResult, memory: Memory) -> _Attempt:
+    """Refine the optimum of a search."""
+    prefix = refine_prefix(experiments, found.best, memory)
+    experiments = prefix.judged(experiments)
+    best = add_last_part(experiments, prefix)
     weight = make_batch(experiments).weight
     score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())
-    return _Attempt(found, best, experiments, evaluations, score)
-
-
-def _polish(experiments: Sequence[Experiment], best: Refinement) -> Refinement:
-    """Search the neighbourhood where steps in the cost may have held up the descent.
-
-    The seed is fixed: the answer depends on the recording, not on the search before.
-    """
-    batch, noise = _anchored(experiments)
-    objective = Objective(batch, best.offsets, cap=CAP)
-    found = POLISH.minimise(objective, best.values, POLISH_DEVIATION, seed=0)
-    start = found.best if found.cost < best.cost else best.values
-    other = describe(batch, start, best.offsets, noise, converged=best.converged)
-    return replace(other, evaluations=other.evaluations + found.evaluations)
-
-
-def _refine(
-    experiments: Sequence[Experiment], start: NDArray[np.float64], offsets: NDArray[np.float64]
-) -> Refinement:
-    batch, noise = _anchored(experiments)
-    return refine(batch, start, offsets, noise)
-
-
-def _anchored(experiments: Sequence[Experiment]) -> tuple[Batch, tuple[float, float]]:
-    """All of the tests, re-anchored on the spool, and the noise in which offsets are sought."""
-    batch = make_batch(experiments, anchor_lsb=ANCHOR_LSB)
-    return batch, (experiments[0].spool_noise, experiments[0].pressure_noise)
-
-
-def _judged(experiments: Sequence[Experiment], gaps: NDArray[np.float64]) -> Sequence[Experiment]:
-    """Weigh all experiments by the noise that their gaps show, shape (2, N)."""
-    return [
-        judge_noise(experiment, gaps[:, a:b])
-        for experiment, (a, b) in zip(experiments, _bounds(experiments), strict=True)
-    ]
-
-
-def _bounds(experiments: Sequence[Experiment]) -> list[tuple[int, int]]:
-    """Where each experiment stands in a batch of whole tests."""
-    ends = np.cumsum([0] + [experiment.ticks for experiment in experiments])
-    return [(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+    return _Attempt(found, best, experiments, prefix.evaluations + best.evaluations, score)
 
 
 def _outliers(refinement: Refinement) -> float:

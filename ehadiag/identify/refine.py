@@ -141,8 +141,7 @@ def describe(
     """
     model = GapModel(batch, noise)
     x = centre(model, model.slopes([np.concatenate([values, offsets / np.array(noise)])])[0])
-    slope = model.trusted(model.slopes([x])[0])
-    return _described(model, x, slope, converged=converged, jagged=True)
+    return _described(model, x, model.trusted_slope(x), converged=converged, jagged=True)
 
 
 def _described(

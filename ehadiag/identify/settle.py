@@ -26,10 +26,15 @@ FINE_POINTS = 33
 LEAST_POINTS = 5
 LONGEST_AXIS = 0.005
 """Fault constants; a constant that the test hardly shows is not followed further."""
+MIDDLE_WORSE = 1.0
+"""Cost by which the middle of level ground may lie above its best point: further up there is a step
+between two basins."""
 WORSE = 4.0
 """Cost by which the bowl's vertex may lie above a chance minimum beside it."""
 NEAR = 1e-4
 """Fault constants over which derivatives do not change."""
+FAR = 1.0
+"""Deviations by which a descent may miss the vertex; steps must have held it up if it is more."""
 ROUGH = 3.0
 """Distance of the cost from a parabola from which it counts as jagged."""
 
@@ -63,7 +68,7 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
         trusted = model.trusted(slope, runs[: len(sides)])
         costs = [capped(gaps) for gaps in runs[len(sides) :]]
         smooth &= _trusted_share(slope, trusted) > LEAST_TRUSTED
-        x = slope.x.copy()
+        x, far = slope.x.copy(), 0.0
         for axis, (shares, _) in zip(axes, lines, strict=True):
             share, rough = _vertex(
                 np.append(shares, 0.0), np.append(costs[: len(shares)], slope.cost)
@@ -71,14 +76,15 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
             costs = costs[len(shares) :]
             smooth &= rough < ROUGH
             x += share * axis
+            far = max(far, abs(share))
         x[:FAULT_COUNT] = np.clip(x[:FAULT_COUNT], 0.0, 1.0)
-        if smooth and np.abs(x - slope.x)[:FAULT_COUNT].max() < NEAR:
+        if smooth and far < FAR and np.abs(x - slope.x)[:FAULT_COUNT].max() < NEAR:
             return Bowl(x, True, trusted)
         moved = model.slopes([x])[0]
         if moved.cost > slope.cost + WORSE:
-            return Bowl(slope.x, smooth, trusted)
+            return Bowl(slope.x, False, trusted)
         slope = moved
-    return Bowl(slope.x, smooth, model.trusted(slope))
+    return Bowl(slope.x, smooth and far < FAR, model.trusted(slope))
 
 
 def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
@@ -93,7 +99,7 @@ def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
     values = np.array([capped(gaps) for gaps in model.many(points[inside])])
     weight = np.exp(-0.5 * (values - values.min()))
     middle = x + float(shares[inside] @ weight / weight.sum()) * axes[0]
-    return middle if capped(model.one(middle)[0]) < slope.cost + WORSE else x
+    return middle if capped(model.one(middle)[0]) < slope.cost + MIDDLE_WORSE else x
 
 
 def _inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:

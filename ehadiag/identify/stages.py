@@ -10,14 +10,13 @@ the last bit; else the stage runs again. The answer is therefore that of the rec
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.experiment import Experiment, make_batch, share_offsets
+from ehadiag.identify.experiment import Experiment, make_batch
 from ehadiag.identify.first import FirstApproximation, first_approximation, first_inputs
 from ehadiag.identify.objective import Objective
 from ehadiag.identify.solvers import SearchResult, Solver
@@ -34,7 +33,7 @@ __all__ = [
     "experiment_arrays",
     "first_ends_at",
     "first_stage",
-    "run_ahead",
+    "search_stages",
     "stage_ends_at",
     "staged_search",
 ]
@@ -43,12 +42,12 @@ T = TypeVar("T")
 Progress = Callable[[str, float], None]
 """Called with the stage and its share done, 0 … 1."""
 
-STAGES = (0.25, 0.5, 0.75, 0.95)
+STAGES = (0.25, 0.5, 0.75)
 """Shares of the window of the genetic search that its stages see.
 
-The last one runs while the test ends; the refinement sees all.
+What comes later is for the last step of the refinement, so that all else is done before the end.
 """
-BUDGET = 0.5
+BUDGET = 0.375
 """Budgets of the solver, for all stages together."""
 DEVIATION = 0.004
 """Of the first stage about the first approximation, fault constants."""
@@ -124,7 +123,7 @@ def staged_search(
     """
     tell("search", 0.0)
     results = []
-    for result in _stages(experiments, start, solver, seed, memory):
+    for result in search_stages(experiments, start, solver, seed, memory):
         results.append(result)
         tell("search", len(results) / len(STAGES))
     return SearchResult(
@@ -136,20 +135,7 @@ def staged_search(
     )
 
 
-def run_ahead(experiment: Experiment, solver: Solver, seed: int, memory: Memory) -> None:
-    """Run the stages for which the samples of a running test suffice, into memory."""
-    test = experiment.test
-    seconds = experiment.ticks * experiment.tick
-    if seconds < first_ends_at(test):
-        return
-    ready = sum(seconds >= stage_ends_at(test, stage) for stage in range(len(STAGES)))
-    experiments = share_offsets([experiment])
-    start = np.array(first_stage(experiments, memory).values)
-    for _ in itertools.islice(_stages(experiments, start, solver, seed, memory), ready):
-        pass
-
-
-def _stages(
+def search_stages(
     experiments: Sequence[Experiment],
     start: NDArray[np.float64],
     solver: Solver,

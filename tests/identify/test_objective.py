@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from identify_cases import own_experiment, own_samples, recorded
 
 from ehadiag.actuator import default_actuator
-from ehadiag.identify.experiment import build_experiment, make_batch
+from ehadiag.identify.experiment import ANCHOR_LSB, build_experiment, make_batch
 from ehadiag.identify.objective import SEARCH_CAP, Objective
-from ehadiag.identify.pipeline import ANCHOR_LSB
 from ehadiag.recording import Environment
 from ehadiag.storedtest import resolve_test
 

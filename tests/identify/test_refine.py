@@ -5,8 +5,7 @@ import pytest
 from identify_cases import NOISE, own_experiment, recorded
 
 from ehadiag.channels import PRESSURE, SPOOL
-from ehadiag.identify.experiment import make_batch
-from ehadiag.identify.pipeline import ANCHOR_LSB
+from ehadiag.identify.experiment import ANCHOR_LSB, make_batch
 from ehadiag.identify.refine import gaps_of, median_offsets, refine
 from ehadiag.identify.uncertainty import covariance
 

@@ -1,0 +1,75 @@
+"""The last part of a test, added to the optimum of the rest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from identify_cases import own_experiment
+
+from ehadiag.identify.lastpart import add_last_part
+from ehadiag.identify.prefix import anchored, prefix_ticks, refine_prefix
+from ehadiag.identify.refine import refine
+from ehadiag.identify.stages import Memory
+from ehadiag.identify.uncertainty import covariance, normal_matrix
+
+FAULTS = (0.4, 0.5, 0.6)
+
+
+def parts(experiments):
+    prefix = refine_prefix(experiments, np.array(FAULTS) + 1e-4, Memory())
+    return prefix, prefix.judged(experiments)
+
+
+def deviations(experiments):
+    """Distance of the last step's optimum, and of the first part's, from that of one descent."""
+    prefix, judged = parts(experiments)
+    batch, noise = anchored(judged)
+    whole = refine(batch, np.array(FAULTS), np.zeros(2), noise)
+    std = np.sqrt(np.diag(covariance(whole)))
+    found = add_last_part(judged, prefix)
+    return (found.values - whole.values) / std, (prefix.refined.values - whole.values) / std
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_one_step_leads_where_a_descent_on_the_whole_test_leads(seed):
+    step, without = deviations([own_experiment(FAULTS, seed=seed)])
+    assert np.abs(without).max() > 0.5
+    assert np.abs(step).max() < 0.2
+
+
+def test_so_it_does_for_two_tests_together():
+    step, without = deviations([own_experiment(FAULTS, seed=seed) for seed in (0, 4)])
+    assert np.abs(without).max() > 0.5
+    assert np.abs(step).max() < 0.2
+
+
+def test_the_last_part_adds_its_information_and_its_gaps():
+    (experiment,) = pair = [own_experiment(FAULTS)]
+    prefix, judged = parts(pair)
+    found = add_last_part(judged, prefix)
+    assert found.gaps.shape == (2, experiment.ticks)
+    assert np.all(np.diag(normal_matrix(found)) > np.diag(normal_matrix(prefix.refined)))
+    assert found.used[:, prefix_ticks(experiment) :].mean() > 0.9
+    assert not np.any(found.jacobian[:, ~found.used])
+
+
+def test_corners_are_not_left_by_noise():
+    corner = [own_experiment((0.0, 0.0, 1.0))]
+    prefix = refine_prefix(corner, np.array([0.0, 0.0, 1.0]), Memory())
+    found = add_last_part(prefix.judged(corner), prefix)
+    assert ((found.values >= 0.0) & (found.values <= 1.0)).all()
+    np.testing.assert_allclose(found.values, (0.0, 0.0, 1.0), atol=6e-4)
+
+
+def test_a_recording_that_ends_early_has_no_last_part():
+    experiment = own_experiment(FAULTS)
+    short = replace(
+        experiment,
+        trace=replace(experiment.trace, current=experiment.trace.current[:4900]),
+        spool=experiment.spool[:4900],
+        pressure=experiment.pressure[:4900],
+    )
+    prefix, judged = parts([short])
+    found = add_last_part(judged, prefix)
+    np.testing.assert_array_equal(found.values, prefix.refined.values)
+    np.testing.assert_array_equal(found.gaps, prefix.refined.gaps)
