@@ -30,6 +30,7 @@ __all__ = [
     "inlined",
     "inlined_exact",
     "kernel",
+    "merged",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -70,6 +71,14 @@ def inlined(function: F) -> F:
     return numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})(
         function
     )
+
+
+def merged(function: F) -> F:
+    """Make it a part of the one kernel that calls it, with that one's options.
+
+    Unlike `inlined` it is not compiled by itself before, and what it calls with it.
+    """
+    return cast("F", numba.njit(inline="always")(function))
 
 
 def inlined_exact(function: F) -> F:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch
-from ehadiag.identify.lanes import LaneWork, lane_costs
+from ehadiag.identify.lanes import LaneWork, run_blocks
 from ehadiag.jit import kernel
 
 __all__ = ["compact_ga", "state_bytes"]
@@ -78,7 +78,7 @@ def compact_ga(
 
     Parameters
     ----------
-    batch, work, cap: see `ehadiag.identify.lanes.lane_costs`.
+    batch, work, cap: see `ehadiag.identify.lanes.run_blocks`.
     offsets: sensor offsets, held, shape (2,).
     start, deviation: mean and deviation of the first probability vector, shape (3,).
     virtual_population: size N_p of the population that the vector stands for.
@@ -98,7 +98,8 @@ def compact_ga(
     state[0] = np.uint64(seed)
     mean, spread = start.copy(), deviation.copy()
     population = np.empty((samples, genes + 2))
-    population[:, genes:] = offsets
+    for i in range(samples):
+        population[i, genes], population[i, genes + 1] = offsets[0], offsets[1]
     values = np.empty(samples)
     elite, best, before = start.copy(), np.inf, np.empty(genes)
     used, generation = 0, 0
@@ -109,9 +110,10 @@ def compact_ga(
                 population[i, g] = min(max(value, 0.0), 1.0)
         if generation == 0:
             population[0, :genes] = start
-        lane_costs(batch, population, cap, work, values)
+        run_blocks(batch, population, cap, work, values, work.uncounted, work.no_gaps)
         used += samples
-        before[:] = elite
+        for g in range(genes):
+            before[g] = elite[g]
         for i in range(samples):
             wins = values[i] < best
             for g in range(genes):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, constants_of
-from ehadiag.jit import kernel
+from ehadiag.jit import kernel, merged
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.laneevents import SCRATCH_SIZE, event_ticks
 from ehadiag.model.lanejack import jack_lanes, pressures
@@ -39,7 +39,7 @@ from ehadiag.model.lanevector import (
     where,
 )
 
-__all__ = ["LaneWork", "lane_costs", "lane_residuals", "lane_work"]
+__all__ = ["LaneWork", "lane_costs", "lane_residuals", "lane_work", "run_blocks"]
 
 BOW = 0.008e-6
 """Distance (m) of the spool's path from its chord from which the jack takes two steps a tick, where
@@ -166,7 +166,7 @@ def _jack_tick(
             jack_events(c, level, step, tick, state, path, coefficients)
 
 
-@kernel
+@merged
 def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -> None:
     """Costs of the candidates in `work.rows` into `work.sums`, gaps of the first ones into `out`.
 
@@ -221,7 +221,7 @@ def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -
 
 
 @kernel
-def _blocks(
+def run_blocks(
     batch: Batch,
     candidates: NDArray[np.float64],
     cap: float,
@@ -235,7 +235,8 @@ def _blocks(
     for first in range(0, n, LANES):
         here = min(LANES, n - first)
         for i in range(LANES):
-            work.rows[i] = candidates[min(first + i, n - 1)]
+            for j in range(5):
+                work.rows[i, j] = candidates[min(first + i, n - 1), j]
         _block(batch, cap, work, gaps[first : first + here])
         for i in range(min(here, costs.shape[0] - first)):
             costs[first + i] = work.sums[i]
@@ -243,7 +244,6 @@ def _blocks(
             anchored[first + i] = int(work.state[ANCHORED * LANES + i])
 
 
-@kernel
 def lane_costs(
     batch: Batch,
     candidates: NDArray[np.float64],
@@ -256,10 +256,9 @@ def lane_costs(
     As `ehadiag.identify.batch.costs`; `candidates` has shape (n, 5). Blocks of LANES candidates
     run at once; a last block that is not full takes as long as a full one.
     """
-    _blocks(batch, candidates, cap, work, out, work.uncounted, work.no_gaps)
+    run_blocks(batch, candidates, cap, work, out, work.uncounted, work.no_gaps)
 
 
-@kernel
 def lane_residuals(
     batch: Batch,
     candidates: NDArray[np.float64],
@@ -273,4 +272,4 @@ def lane_residuals(
     anchored: out, how often the model was re-anchored, shape (n,).
     """
     out[:] = 0.0
-    _blocks(batch, candidates, math.inf, work, work.no_costs, anchored, out)
+    run_blocks(batch, candidates, math.inf, work, work.no_costs, anchored, out)

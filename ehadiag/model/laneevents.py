@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import bare_kernel, inlined
+from ehadiag.jit import bare_kernel, inlined, merged
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.lanelayout import (
     BREAK,
@@ -178,7 +178,7 @@ def _clamped_instants(
     return leaves | (new_vs * d <= 0.0) | (new_xs * d >= c.XSM)
 
 
-@packed
+@merged
 def _event_tick(
     c: PlantConstants,
     i: int,
@@ -278,7 +278,7 @@ def _event(
     return FLAPPER_STOP if abs(xf) >= c.XFM else SPOOL_STOP
 
 
-@packed
+@merged
 def _jack_beside(
     c: PlantConstants,
     i: int,

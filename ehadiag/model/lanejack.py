@@ -174,6 +174,7 @@ def jack_lanes(
         # At rest: the force of the second stage, times D, against what holds.
         push = c.AJ * c.PSR * c.GQ * x3 - c.FR * divide(c, width3)
         held = magnitude(push) <= 2.0 * friction * divide(c, width3)
+        held = held | ((magnitude(place) >= c.XJM) & (place * push > 0.0))
         done = load(state, DONE * LANES + o) != 0.0
         fine = done | ((d == 0.0) & held)
         if anywhere(d != 0.0):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import kernel
+from ehadiag.jit import bare_kernel, kernel
 from ehadiag.model.constants import PlantConstants
 from ehadiag.model.lanelayout import (
     BREAK,
@@ -22,7 +22,7 @@ from ehadiag.model.lanelayout import (
     ROOM,
     SPOOL_OFFSET,
 )
-from ehadiag.model.lanevector import WIDTH, load, store
+from ehadiag.model.lanevector import WIDTH, load, packed, store
 from ehadiag.model.transition import FINEST, TAYLOR_HALVINGS
 
 __all__ = ["MOVING_SIZE", "SHIFTS", "STUCK_SIZE", "tabulate"]
@@ -40,7 +40,21 @@ STUCK_SIZE = len(SHIFTS) * STUCK_ROWS * WIDTH
 TAYLOR_ORDER = 8
 
 
-@kernel
+@packed
+def _copy(source: NDArray[np.float64], target: NDArray[np.float64], start: int) -> None:
+    """Write all of `source` into `target` from `start`."""
+    for o in range(0, source.shape[0], WIDTH):
+        store(target, start + o, load(source, o))
+
+
+@packed
+def _add(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    """Add `source` to `target`."""
+    for o in range(0, source.shape[0], WIDTH):
+        store(target, o, load(target, o) + load(source, o))
+
+
+@bare_kernel
 def _product(
     a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.float64], n: int, scale: float
 ) -> None:
@@ -67,7 +81,7 @@ def _smallest(rates: NDArray[np.float64], n: int, tick: float) -> NDArray[np.flo
     for order in range(1, TAYLOR_ORDER + 1):
         _product(term, scaled, spare, n, 1.0 / order)
         term, spare = spare, term
-        power += term
+        _add(term, power)
     for _ in range(TAYLOR_HALVINGS):
         _product(power, power, spare, n, 1.0)
         power, spare = spare, power
@@ -88,14 +102,14 @@ def _powers(
     one, power = _smallest(rates, n, tick), np.empty_like(rates)
     spare, quarter = np.empty_like(rates), np.empty_like(rates)
     for level in range(len(SHIFTS) - 1, -1, -1):
-        power[:] = one
+        _copy(one, power, 0)
         for step in range(WIDTH):
             for i in range(lanes):
                 for e in range(size):
                     place = ((i * len(SHIFTS) + level) * rows + e) * WIDTH + step
                     table[place] = power[e * LANES + i]
             if level == 0 and step == 1:
-                quarter[:] = power
+                _copy(power, quarter, 0)
             if step < WIDTH - 1:
                 _product(power, one, spare, n, 1.0)
                 power, spare = spare, power
@@ -153,7 +167,7 @@ def tabulate(
             -c.CF / c.JF,
         )
     quarter, _ = _powers(rates, 4, tick, LANES, MOVING_ROWS, moving)
-    coefficients[MOVE * LANES : (MOVE + 16) * LANES] = quarter
+    _copy(quarter, coefficients, MOVE * LANES)
     for i in range(LANES):
         for level, shift in enumerate(SHIFTS):
             for step in range(WIDTH):
@@ -162,4 +176,4 @@ def tabulate(
                 moving[place] = time
                 moving[place + WIDTH] = math.exp(-time * coefficients[DAMPING * LANES + i] / c.MS)
     _, whole = _powers(ring, 2, tick, 1, STUCK_ROWS, stuck)
-    coefficients[REST * LANES : (REST + 4) * LANES] = whole
+    _copy(whole, coefficients, REST * LANES)

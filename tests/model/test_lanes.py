@@ -16,7 +16,7 @@ from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.batch import Batch, costs, residuals, workspace
 from ehadiag.identify.experiment import build_experiment, make_batch
-from ehadiag.identify.lanes import lane_costs, lane_residuals, lane_work
+from ehadiag.identify.lanes import lane_costs, lane_residuals, lane_work, run_blocks
 from ehadiag.model.constants import plant_constants
 from ehadiag.model.lanelayout import LANES
 from ehadiag.model.monitoring import FREE_RUN, respond
@@ -252,8 +252,10 @@ def test_the_kernel_is_made_of_vector_instructions(tmp_path):
         pytest.skip("the names of the instructions are those of x86")
     # Compiled anew, without a cache: code that is loaded cannot be looked at.
     batch = own_batch((0.3, 0.3, 0.3), SHORT)
-    fresh = numba.njit(nogil=True, error_model="numpy")(lane_costs.py_func)
-    fresh(batch, candidates_of([(0.3, 0.3, 0.3)]), 25.0, lane_work(batch), np.empty(1))
+    fresh = numba.njit(nogil=True, error_model="numpy")(run_blocks.py_func)
+    work = lane_work(batch)
+    rows, none = candidates_of([(0.3, 0.3, 0.3)]), (work.uncounted, work.no_gaps)
+    fresh(batch, rows, 25.0, work, np.empty(1), *none)
     (text,) = fresh.inspect_asm().values()
     wide = len(re.findall(r"\bv?(?:f?n?m(?:add|sub)\d+|mul|add|sub)pd\b", text))
     fused = len(re.findall(r"\bvf\w+pd\b.*%[yz]mm", text))

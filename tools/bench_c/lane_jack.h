@@ -231,8 +231,9 @@ static inline void jack_step(const Fixed *f, real friction, int level, int step,
     const Plant *c = &f->c;
     real x3 = stage_place(path, stages[2], f->tick), w3 = greater(fabs(x3), f->corner);
     if (j->d == 0.0) {
-        real hold = divide(c, w3);
-        if (fabs(c->AJ * c->PSR * c->GQ * x3 - c->FR * hold) > 2.0 * friction * hold)
+        real hold = divide(c, w3), push = c->AJ * c->PSR * c->GQ * x3 - c->FR * hold;
+        int blocked = fabs(j->place) >= c->XJM && j->place * push > 0.0;
+        if (fabs(push) > 2.0 * friction * hold && !blocked)
             jack_events(f, friction, level, step, path, j);
         return;
     }
