@@ -17,6 +17,8 @@ __all__ = ["BusReport", "MessageReport", "RangeUse", "render", "report_bus"]
 
 MAX_FOREIGN = 20
 """Foreign identifiers that are listed, the most frequent ones."""
+LONGEST_GAP_S = 0.25
+"""Span without a sample that a diagnosis bears within a test."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ class BusReport:
     foreign: identifier, whether extended, frames; the most frequent first.
     delay: median time from a command to the telemetry of its tick, s; None if unknown.
     problems: what stands in the way of a diagnosis, one sentence each; empty if nothing.
-    remarks: what a diagnosis has to assume, one sentence each.
+    remarks: what a diagnosis has to assume, or may stumble over, one sentence each.
     """
 
     duration: float
@@ -107,7 +109,7 @@ def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
         foreign=_foreign(table, decoded.foreign),
         delay=_delay(decoded.messages, axis),
         problems=_problems(messages, len(table)),
-        remarks=_remarks(decoded.messages, len(table)),
+        remarks=(*_pauses(messages), *_remarks(decoded.messages, len(table))),
     )
 
 
@@ -222,6 +224,17 @@ def _problems(messages: tuple[MessageReport, ...], frames: int) -> tuple[str, ..
         if item.lost:
             problems.append(f"{item.name}: {item.lost} frames lost")
     return tuple(problems)
+
+
+def _pauses(messages: tuple[MessageReport, ...]) -> tuple[str, ...]:
+    """Silences too long for a test; a counter that turns meanwhile does not tell of them."""
+    return tuple(
+        f"{item.name}: nothing for {item.longest_gap:.3g} s; within a test a diagnosis bears"
+        f" {LONGEST_GAP_S:g} s"
+        for item in messages
+        if item.longest_gap > LONGEST_GAP_S
+        and any(role.startswith("channels.") for role in item.roles)
+    )
 
 
 def _remarks(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:

@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
             stop=stop,
             progress=lambda done: display("replay", done / max(len(table), 1)),
         )
-    say(f"sent {sent} of {len(table)} frames on {transport.name}{damage(transport)}")
+    say(f"played {sent} of {len(table)} frames on {transport.name}{damage(transport)}")
     return 0
 
 

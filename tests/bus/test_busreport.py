@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from bus_synth import COMMAND, START, TELEMETRY, TICK, flip, make_truth, play, tick_of
 
-from firmware_iface.busreport import render, report_bus
+from ehadiag import fitness
+from firmware_iface.busreport import LONGEST_GAP_S, render, report_bus
 from firmware_iface.frames import Frame, FrameTable
 from firmware_iface.logs import read_frames
 
@@ -80,6 +81,23 @@ def test_gap_and_saturation(encoder, bus_map):
     assert by_name(report)["ServoTelemetry"].lost == 30
     assert report.ranges[3].saturated == 3
     assert report.ranges[3].highest_code == 4095
+
+
+def test_a_pause_in_which_the_counter_turns_is_told(encoder, bus_map):
+    """256 ticks: the counter goes on as if nothing were missing."""
+    frames = play(encoder, make_truth(600))
+    paused = [f for f in frames if not 200 <= tick_of(f) < 456]
+    report = report_bus(FrameTable.from_frames(paused), bus_map)
+    assert by_name(report)["ServoTelemetry"].lost == 0
+    (remark,) = report.remarks
+    assert remark == ("ServoTelemetry: nothing for 0.257 s; within a test a diagnosis bears 0.25 s")
+    assert remark in render(report).splitlines()
+    short = [f for f in frames if not 200 <= tick_of(f) < 449]
+    assert report_bus(FrameTable.from_frames(short), bus_map).remarks == ()
+
+
+def test_the_pause_that_is_borne_is_the_diagnosis_own():
+    assert LONGEST_GAP_S == fitness.LONGEST_GAP_S
 
 
 def test_silent_bus(bus_map):

@@ -236,7 +236,7 @@ def test_replay_puts_every_frame_on_the_bus(run: Run, channel: str) -> None:
         while (message := listener.recv(0)) is not None:
             heard.append((message.arbitration_id, bytes(message.data)))
     assert result.code == 0
-    assert result.message == f"ehadiag: sent 11331 of 11331 frames on virtual {channel}"
+    assert result.message == f"ehadiag: played 11331 of 11331 frames on virtual {channel}"
     with can.BLFReader(log) as reader:
         assert heard == [(item.arbitration_id, bytes(item.data)) for item in reader]
 
