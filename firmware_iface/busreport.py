@@ -109,7 +109,7 @@ def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
         foreign=_foreign(table, decoded.foreign),
         delay=_delay(decoded.messages, axis),
         problems=_problems(messages, len(table)),
-        remarks=(*_pauses(messages), *_remarks(decoded.messages, len(table))),
+        remarks=(*_pauses(messages), *_unsaid(decoded.messages, len(table))),
     )
 
 
@@ -237,17 +237,19 @@ def _pauses(messages: tuple[MessageReport, ...]) -> tuple[str, ...]:
     )
 
 
-def _remarks(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:
-    """What the bus does not say of oil and supply."""
+def _unsaid(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:
+    """What the mapping does not name of the command, and the bus does not say of oil and supply."""
     if not frames:
         return ()
+    commands = "no command is mapped: a test in closed loop cannot be judged without"
+    unmapped = () if any(_commands(item.message) for item in messages.values()) else (commands,)
     said = {
         name
         for item in messages.values()
         for name, value in item.values.items()
         if np.isfinite(value).any()
     }
-    return tuple(
+    return unmapped + tuple(
         f"{name} is not on the bus: a diagnosis assumes the actuator file's"
         for name in DIMENSIONS["environment"]
         if f"environment.{name}" not in said

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from bus_synth import COMMAND, START, TELEMETRY, TICK, flip, make_truth, play, tick_of
 
@@ -98,6 +100,16 @@ def test_a_pause_in_which_the_counter_turns_is_told(encoder, bus_map):
 
 def test_the_pause_that_is_borne_is_the_diagnosis_own():
     assert LONGEST_GAP_S == fitness.LONGEST_GAP_S
+
+
+def test_a_mapping_without_a_command_is_told(encoder, bus_map):
+    messages = {k: v for k, v in bus_map.messages.items() if k != "ServoCommand"}
+    table = FrameTable.from_frames(play(encoder, make_truth(200)))
+    report = report_bus(table, replace(bus_map, messages=messages))
+    assert report.problems == ()
+    assert report.remarks == (
+        "no command is mapped: a test in closed loop cannot be judged without",
+    )
 
 
 def test_silent_bus(bus_map):
