@@ -1,8 +1,8 @@
 """The monitoring model against independent solutions of the contract's equations."""
 
-import msgspec
 import numpy as np
 import pytest
+from other_actuator import with_data
 from scipy.linalg import expm
 
 from ehadiag.actuator import default_actuator
@@ -15,15 +15,6 @@ from ehadiag_tools.stiff_reference import StiffReference
 TICK = 1e-3
 LSB = np.array([[SPOOL.lsb], [PRESSURE.lsb], [POSITION.lsb]])
 CORNERS = [(0, 0, 0), (1, 1, 1), (0, 1, 0), (1, 0, 1), (0.3, 0.6, 0.3), (0.9, 0.1, 0.5)]
-
-
-def with_data(servovalve=None, jack=None):
-    actuator = default_actuator()
-    return msgspec.structs.replace(
-        actuator,
-        servovalve=msgspec.structs.replace(actuator.servovalve, **(servovalve or {})),
-        jack=msgspec.structs.replace(actuator.jack, **(jack or {})),
-    )
 
 
 def model(actuator, faults, current):

@@ -1,8 +1,8 @@
 """Kernels against the independent stiff solver with event location."""
 
-import msgspec
 import numpy as np
 import pytest
+from other_actuator import with_data
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import POSITION, PRESSURE, SPOOL
@@ -13,15 +13,6 @@ from ehadiag_tools.stiff_reference import StiffReference
 LSB = np.array([[SPOOL.lsb], [PRESSURE.lsb], [POSITION.lsb]])
 STEPS = np.array([8e-6, 4e-6, 2e-6, 1e-6, 0.5e-6])
 TIME = np.arange(200) * 1e-3
-
-
-def with_data(servovalve=None, jack=None):
-    actuator = default_actuator()
-    return msgspec.structs.replace(
-        actuator,
-        servovalve=msgspec.structs.replace(actuator.servovalve, **(servovalve or {})),
-        jack=msgspec.structs.replace(actuator.jack, **(jack or {})),
-    )
 
 
 def errors(actuator, currents, fault, steps):
