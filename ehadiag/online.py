@@ -1,13 +1,13 @@
-"""Identification of a test while it runs: finished, but for a last look, when the test is."""
+"""Identification of a test while it runs: finished, but for its last step, when the test is."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ehadiag.actuator import Actuator
-from ehadiag.fitness import objections_to_experiment, objections_to_recording, out_of_range
+from ehadiag.fitness import out_of_range
 from ehadiag.identify.experiment import build_experiment, noise_is_judged_early
-from ehadiag.identify.pipeline import identify, run_ahead
+from ehadiag.identify.pipeline import run_ahead
 from ehadiag.identify.solvers import CompactGa, Solver
 from ehadiag.identify.stages import STAGES, Memory, first_ends_at, stage_ends_at
 from ehadiag.recording import Recording
@@ -22,10 +22,10 @@ LEAST_SHARE = 0.75
 class OnlineIdentification:
     """Works ahead on the samples of a running test.
 
-    Call `take` with the recording as it is so far, after each instant of `due_s` and once all
-    samples are there; then hand `memory` to `ehadiag.diagnosis.diagnose` with the finished
-    recording. What was worked out ahead is used where the finished recording has the same samples
-    to the last bit, so that the answer is that of the recording alone, only sooner.
+    Call `take` with the recording as it is so far, after each instant of `due_s`; then hand
+    `memory` to `ehadiag.diagnosis.diagnose` with the finished recording. What was worked out ahead
+    is used where the finished recording has the same samples to the last bit, so that the answer
+    is that of the recording alone, only sooner.
 
     For one thread at a time.
     """
@@ -63,9 +63,4 @@ class OnlineIdentification:
         for values in (experiment.spool, experiment.pressure):
             if np.isfinite(values).mean() < LEAST_SHARE:
                 return
-        if samples.ticks < self._test.ticks:
-            run_ahead(experiment, self._solver, self._seed, self.memory)
-            return
-        unfit = objections_to_recording(recording, self._test, self._actuator)
-        if not unfit and not objections_to_experiment(experiment):
-            identify([experiment], solver=self._solver, seed=self._seed, memory=self.memory)
+        run_ahead(experiment, self._solver, self._seed, self.memory)

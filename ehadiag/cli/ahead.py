@@ -11,12 +11,11 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from ehadiag.online import OnlineIdentification
     from ehadiag.recording import Recording
     from ehadiag.storedtest import StoredTest
     from firmware_iface.assembler import Assembler
+    from firmware_iface.frames import FrameTable
     from firmware_iface.tester import Progress
 
 __all__ = ["Ahead", "working_ahead"]
@@ -37,7 +36,7 @@ class Ahead:
         self._test = test
         self._due = list(online.due_s)
         self._abandoned = False
-        self._work: queue.SimpleQueue[Callable[[], Recording] | None] = queue.SimpleQueue()
+        self._work: queue.SimpleQueue[FrameTable | None] = queue.SimpleQueue()
         self.ended_at: float | None = None
         """When the word came that the test is complete, on `time.perf_counter`."""
         self.whole: Recording | None = None
@@ -52,16 +51,14 @@ class Ahead:
             self._due.pop(0)
             due = True
         if due:
-            table = self._assembler.table()
-            self._work.put(lambda: self._assembler.recording_of(table))
+            self._work.put(self._assembler.table())
 
     def all_there(self) -> bool:
-        """Hand over the complete test; return whether nothing of it is still under way."""
+        """Put the complete test together; return whether nothing of it is still under way."""
         from ehadiag.fitness import nothing_is_missing  # noqa: PLC0415 - loads numba
 
         self.ended_at = time.perf_counter()
         recording = self._assembler.recording()
-        self._work.put(lambda: recording)
         if nothing_is_missing(recording, self._test):
             self.whole = recording
         return self.whole is not None
@@ -78,12 +75,12 @@ class Ahead:
         self._work.put(None)
 
     def _run(self) -> None:
-        while (recording := self._work.get()) is not None:
+        while (table := self._work.get()) is not None:
             if self._abandoned:
                 return
             # Whatever is wrong with the recording, its diagnosis will tell: this is only ahead.
             with contextlib.suppress(Exception):
-                self._online.take(recording())
+                self._online.take(self._assembler.recording_of(table))
 
 
 @contextmanager

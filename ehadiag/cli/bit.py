@@ -13,7 +13,15 @@ from ehadiag.actuator import Actuator
 from ehadiag.cli import options
 from ehadiag.cli.ahead import working_ahead
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
+from ehadiag.cli.output import (
+    load_report,
+    make_folder,
+    progress_bar,
+    say,
+    say_if_compiling,
+    show,
+    write_report,
+)
 from ehadiag.errors import ConfigurationError
 from ehadiag.recording import Environment, Outcome, Quality, Recording
 from ehadiag.report.spent import Spent
@@ -108,6 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Before the test: a verdict must not wait for the compiler.
     warm_up(actuator, test)
+    load_report(arguments)
     begin = time.perf_counter()
     solver = make_solver(arguments.solver)
     online = OnlineIdentification(test, actuator, solver=solver, seed=arguments.seed)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "damage",
+    "load_report",
     "make_folder",
     "progress_bar",
     "say",
@@ -82,6 +83,16 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as display:
         task = display.add_task("", total=1.0)
         yield lambda stage, share: display.update(task, description=stage, completed=share)
+
+
+def load_report(arguments: argparse.Namespace) -> None:
+    """Load what `show` needs: a verdict must not wait for it."""
+    if arguments.json:
+        import ehadiag.report.jsonline  # noqa: PLC0415
+    else:
+        import ehadiag.report.table  # noqa: F401, PLC0415
+
+        wide_console()
 
 
 def show(diagnosis: Diagnosis, arguments: argparse.Namespace, spent: Spent) -> None:

@@ -66,20 +66,6 @@ def test_working_ahead_does_not_change_the_answer(recording):
     assert same(alone, ahead)
 
 
-def test_a_finished_test_is_identified_ahead_as_a_whole(recording):
-    from ehadiag.diagnosis import diagnose
-
-    test = resolve_test("open" if recording.test_id == 1 else "closed")
-    online = OnlineIdentification(test, default_actuator())
-    online.take(recording)
-    before = online.memory.reused
-    result = diagnose([recording], default_actuator(), [test], memory=online.memory)
-    assert online.memory.reused == before + 1
-    assert same(
-        result.identification, diagnose([recording], default_actuator(), [test]).identification
-    )
-
-
 def ends(test):
     return [stage_ends_at(test, stage) for stage in range(len(STAGES))]
 
