@@ -14,7 +14,7 @@ from ehadiag.recording import BitState, CommandMode, Environment, Recording, Sam
 from ehadiag.storedtest import SAME_RATE, StoredTest
 
 __all__ = [
-    "nothing_is_missing",
+    "nothing_is_under_way",
     "objections_to_estimate",
     "objections_to_experiment",
     "objections_to_recording",
@@ -22,6 +22,8 @@ __all__ = [
     "remarks_on_recording",
 ]
 
+LATEST_S = 0.05
+"""A frame that comes later than this after its tick does not come."""
 MOST_LOST = 0.25
 """Share of samples of a channel that may be missing."""
 LONGEST_GAP_S = 0.25
@@ -46,8 +48,12 @@ MOST_OUTLIERS = 0.015
 MOST_RMS = 1.25
 
 
-def nothing_is_missing(recording: Recording, test: StoredTest) -> bool:
-    """Whether a recording has every sample of a test, and its end."""
+def nothing_is_under_way(recording: Recording, test: StoredTest) -> bool:
+    """Whether a recording has the end of a test, and no frame of it may still come.
+
+    What is missing longer than `LATEST_S` before the end is lost; a channel of which there is
+    nothing at all is not on this bus.
+    """
     samples = recording.samples
     if samples is None or samples.ticks != test.ticks:
         return False
@@ -55,10 +61,18 @@ def nothing_is_missing(recording: Recording, test: StoredTest) -> bool:
         return False
     if recording.outcome.state is not BitState.COMPLETE:
         return False
-    values = (
-        samples.current, samples.spool, samples.pressure, samples.position, samples.command,
-    )  # fmt: skip
-    return all(bool(np.isfinite(item).all()) for item in values)
+    end = slice(-round(LATEST_S * test.rate) or None, None)
+    for values in (
+        samples.current,
+        samples.spool,
+        samples.pressure,
+        samples.position,
+        samples.command,
+    ):
+        seen = np.isfinite(values)
+        if seen.any() and not seen[end].all():
+            return False
+    return True
 
 
 def objections_to_recording(

@@ -75,7 +75,7 @@ class TimeLimits:
     finish: float = 1.0
     """End of the test's duration to the word that it is complete."""
     trail: float = 0.03
-    """Listening after the end, for frames still under way, where some are missing."""
+    """Listening after the end, for frames still under way, where there may be some."""
     abort: float = 1.0
     """Abort to the word that it was obeyed."""
     repeat: float = 0.1
@@ -212,7 +212,7 @@ class Handshake:
         return []
 
     def all_there(self) -> None:
-        """Listen no longer for frames still under way: none is missing."""
+        """Listen no longer for frames still under way: there are none."""
         if self.phase is Phase.TRAILING:
             self._end("")
 

@@ -99,7 +99,7 @@ def run_test(
     on_frame: gets every frame in order, in the caller's thread.
     stop: when set, the test is aborted.
     all_there: asked once, when the computer has said that the test is complete: whether no frame of
-        it is missing, so that there is nothing left to listen for.
+        it may still come, so that there is nothing left to listen for.
 
     The end of a bus, the stop, an exceeded limit and a computer that does not answer are outcomes,
     not exceptions.

@@ -40,7 +40,7 @@ class Ahead:
         self.ended_at: float | None = None
         """When the word came that the test is complete, on `time.perf_counter`."""
         self.whole: Recording | None = None
-        """The test as it was then, if nothing was missing."""
+        """The test as it was then, if nothing was still under way."""
         self._thread = threading.Thread(target=self._run, name="ehadiag-ahead", daemon=True)
         self._thread.start()
 
@@ -55,11 +55,11 @@ class Ahead:
 
     def all_there(self) -> bool:
         """Put the complete test together; return whether nothing of it is still under way."""
-        from ehadiag.fitness import nothing_is_missing  # noqa: PLC0415 - loads numba
+        from ehadiag.fitness import nothing_is_under_way  # noqa: PLC0415 - loads numba
 
         self.ended_at = time.perf_counter()
         recording = self._assembler.recording()
-        if nothing_is_missing(recording, self._test):
+        if nothing_is_under_way(recording, self._test):
             self.whole = recording
         return self.whole is not None
 

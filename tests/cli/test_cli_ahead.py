@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cli_result import LOGS
 
 from ehadiag.actuator import default_actuator
 from ehadiag.cli.ahead import working_ahead
-from ehadiag.fitness import nothing_is_missing
+from ehadiag.fitness import nothing_is_under_way
 from ehadiag.online import OnlineIdentification
 from ehadiag.recording import BitState
 from ehadiag.storedtest import resolve_test
@@ -21,13 +23,19 @@ from firmware_iface.tester import Progress
 TEST = resolve_test("open")
 
 
-def heard(name: str, *, until: BitState = BitState.COMPLETE, without: int = 0) -> Assembler:
-    """Frames of a log up to the first status that says so; of telemetry the last ones left out."""
+def heard(
+    name: str, *, until: BitState = BitState.COMPLETE, without: int = 0, before: int = 0
+) -> Assembler:
+    """Frames of a log up to the first status that says so.
+
+    Of the telemetry so many are left out, and so many come after them.
+    """
     table = read_frames(LOGS / name)
     states = np.where(table.can_id == 0x201, table.data[:, 0] & 15, -1)
     end = int(np.flatnonzero(states == until)[0]) + 1
     telemetry = np.flatnonzero(table.can_id[:end] == 0x110)
-    left_out = set(telemetry[len(telemetry) - without :].tolist())
+    last = len(telemetry) - before
+    left_out = set(telemetry[last - without : last].tolist())
     assembler = Assembler(name)
     for row in sorted(set(range(end)) - left_out):
         data = table.data[row, : table.length[row]].tobytes()
@@ -55,18 +63,27 @@ def test_a_test_that_is_all_there_needs_no_more_listening() -> None:
     assert ahead.ended_at is not None
 
 
-@pytest.mark.parametrize("without", [1, 40])
-def test_frames_that_are_missing_may_be_under_way(without: int) -> None:
+@pytest.mark.parametrize(("without", "before"), [(1, 0), (1, 49), (40, 0)])
+def test_frames_that_are_missing_may_be_under_way(without: int, before: int) -> None:
     online = OnlineIdentification(TEST, default_actuator())
-    with working_ahead(online, heard("paper-open-1.blf", without=without), TEST) as ahead:
+    log = heard("paper-open-1.blf", without=without, before=before)
+    with working_ahead(online, log, TEST) as ahead:
         assert not ahead.all_there()
         ahead.abandon()
     assert ahead.whole is None
 
 
-def test_what_is_missing() -> None:
-    assert nothing_is_missing(heard("paper-open-1.blf").recording(), TEST)
-    assert not nothing_is_missing(heard("paper-open-1.blf").recording(), resolve_test("closed"))
-    assert not nothing_is_missing(heard("lossy-open.blf").recording(), TEST)
+def test_what_may_be_under_way() -> None:
+    assert nothing_is_under_way(heard("paper-open-1.blf").recording(), TEST)
+    assert not nothing_is_under_way(heard("paper-open-1.blf").recording(), resolve_test("closed"))
+    lossy = heard("lossy-open.blf").recording()
+    assert np.isnan(lossy.samples.spool).sum() > 50
+    assert nothing_is_under_way(lossy, TEST), "none of its last samples is lost"
+    lost = heard("paper-open-1.blf", without=3, before=50).recording()
+    assert not np.isfinite(lost.samples.spool).all()
+    assert nothing_is_under_way(lost, TEST), "lost for good"
+    blind = heard("paper-open-1.blf").recording()
+    blind = replace(blind, samples=replace(blind.samples, position=np.full(TEST.ticks, np.nan)))
+    assert nothing_is_under_way(blind, TEST), "a channel that is not on this bus"
     running = heard("paper-open-1.blf", until=BitState.RUNNING).recording()
-    assert not nothing_is_missing(running, TEST)
+    assert not nothing_is_under_way(running, TEST)
