@@ -21,7 +21,7 @@ from ehadiag.identify.stages import STAGES, Memory, digest, stage_ends_at
 
 __all__ = ["Prefix", "anchored", "prefix_ticks", "refine_prefix"]
 
-POLISH = CompactGa(budget=480, virtual_population=70.0, tolerance=1e-7)
+POLISH = CompactGa(budget=640, virtual_population=70.0, tolerance=1e-7)
 POLISH_REACH = 4.0
 """Deviations, of each constant, over which the polish begins to draw."""
 POLISH_SPREAD = (2e-4, 2e-3)

@@ -22,8 +22,8 @@ __all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
 
 ITERATIONS = 20
 CONVERGED = 1e-6
-LEAST_GAIN = 0.1
-"""Cost; the optimum is then nearer than some tenths of a deviation, and found by what follows."""
+LEAST_GAIN = 1e-3
+"""Cost; the optimum is then nearer than some hundredths of a deviation."""
 LEAST_DAMPING = 1e-6
 CAUTIOUS_DAMPING = 0.3
 """Two steps are tried at once, the second one damped at least so much."""
@@ -140,8 +140,11 @@ def describe(
     The point is moved to the middle of the ground that the steps leave.
     """
     model = GapModel(batch, noise)
-    x = centre(model, model.slopes([np.concatenate([values, offsets / np.array(noise)])])[0])
-    return _described(model, x, model.trusted_slope(x), converged=converged, jagged=True)
+    slope = model.trusted_slope(np.concatenate([values, offsets / np.array(noise)]))
+    x = centre(model, slope)
+    if x is not slope.x:
+        slope = model.trusted_slope(x)
+    return _described(model, x, slope, converged=converged, jagged=True)
 
 
 def _described(

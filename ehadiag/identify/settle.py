@@ -22,7 +22,8 @@ SHARES = np.delete(np.linspace(-REACH, REACH, 9), 4)
 """Points beside the middle of an axis, deviations: with the wide differences two blocks of runs."""
 LEAST_TRUSTED = 0.25
 """Share of information in rows whose derivatives hold, below which the cost counts as jagged."""
-FINE_POINTS = 33
+FINE_SHARES = np.delete(np.linspace(-REACH, REACH, 33), 16)
+"""Points beside the middle of the longest axis, deviations: two blocks of runs."""
 LEAST_POINTS = 5
 LONGEST_AXIS = 0.005
 """Fault constants; a constant that the test hardly shows is not followed further."""
@@ -62,7 +63,7 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
     smooth = True
     for _ in range(SETTLINGS):
         axes = _axes(slope)
-        lines = [_line(slope.x, axis) for axis in axes]
+        lines = [_line(slope.x, axis, SHARES) for axis in axes]
         sides = wide_sides(slope.x)
         runs = model.many(np.vstack([sides, *(points for _, points in lines)]))
         trusted = model.trusted(slope, runs[: len(sides)])
@@ -77,14 +78,16 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
             smooth &= rough < ROUGH
             x += share * axis
             far = max(far, abs(share))
+        if not smooth:
+            return Bowl(slope.x, False, trusted)
         x[:FAULT_COUNT] = np.clip(x[:FAULT_COUNT], 0.0, 1.0)
-        if smooth and far < FAR and np.abs(x - slope.x)[:FAULT_COUNT].max() < NEAR:
+        if far < FAR and np.abs(x - slope.x)[:FAULT_COUNT].max() < NEAR:
             return Bowl(x, True, trusted)
         moved = model.slopes([x])[0]
         if moved.cost > slope.cost + WORSE:
             return Bowl(slope.x, False, trusted)
         slope = moved
-    return Bowl(slope.x, smooth and far < FAR, model.trusted(slope))
+    return Bowl(slope.x, far < FAR, model.trusted(slope))
 
 
 def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
@@ -93,12 +96,10 @@ def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
     x = slope.x
     if not axes:
         return x
-    shares = np.linspace(-REACH, REACH, FINE_POINTS)
-    points = x + shares[:, None] * axes[0]
-    inside = _inside(points)
-    values = np.array([capped(gaps) for gaps in model.many(points[inside])])
+    shares, points = _line(x, axes[0], FINE_SHARES)
+    values = np.append([capped(gaps) for gaps in model.many(points)], slope.cost)
     weight = np.exp(-0.5 * (values - values.min()))
-    middle = x + float(shares[inside] @ weight / weight.sum()) * axes[0]
+    middle = x + float(np.append(shares, 0.0) @ weight / weight.sum()) * axes[0]
     return middle if capped(model.one(middle)[0]) < slope.cost + MIDDLE_WORSE else x
 
 
@@ -129,12 +130,12 @@ def _axes(slope: Slope) -> list[NDArray[np.float64]]:
 
 
 def _line(
-    x: NDArray[np.float64], axis: NDArray[np.float64]
+    x: NDArray[np.float64], axis: NDArray[np.float64], shares: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points beside x along an axis, within the bounds, shape (n, 5), and their shares of it."""
-    points = x + SHARES[:, None] * axis
+    """Shares of an axis that lead from x to points within the bounds, and these, shape (n, 5)."""
+    points = x + shares[:, None] * axis
     inside = _inside(points)
-    return SHARES[inside], points[inside]
+    return shares[inside], points[inside]
 
 
 def _trusted_share(slope: Slope, trusted: Slope) -> float:
