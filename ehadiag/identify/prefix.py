@@ -21,8 +21,8 @@ from ehadiag.identify.stages import STAGES, Memory, digest, stage_ends_at
 
 __all__ = ["Prefix", "anchored", "prefix_ticks", "refine_prefix"]
 
-POLISH = CompactGa(budget=640, virtual_population=70.0, tolerance=1e-7)
-POLISH_REACH = 4.0
+POLISH = CompactGa(budget=800, virtual_population=70.0, tolerance=1e-7)
+POLISH_REACH = 6.0
 """Deviations, of each constant, over which the polish begins to draw."""
 POLISH_SPREAD = (2e-4, 2e-3)
 """Fault constants: out of a narrow basin, which looks well known, and not further than is shown."""
