@@ -150,7 +150,11 @@ class _Bounds:
         return cls(axis, np.maximum.accumulate(axis.tick), lowest)
 
     def rows(self, episode: Episode, rows: int) -> tuple[int, int]:
-        """Rows of the table that belong to a test: from neighbour to neighbour."""
+        """Rows of the table that belong to a test: from neighbour to neighbour.
+
+        They end with the word that the test has ended, if it has all its frames then: a live test
+        is judged on that word, and its recording goes on for a while.
+        """
         stop = episode.first + episode.ticks
         low = int(np.searchsorted(self.highest, episode.first))
         high = int(np.searchsorted(self.lowest, stop))
@@ -161,6 +165,8 @@ class _Bounds:
         first, last = low + int(hits[0]), low + int(hits[-1])
         begin = int(self.axis.row[first - 1]) + 1 if first > 0 else 0
         end = int(self.axis.row[last + 1]) if last + 1 < len(self.axis.row) else rows
+        if episode.ended is not None:
+            end = min(end, max(episode.ended, int(self.axis.row[last])) + 1)
         return begin, end
 
 

@@ -23,6 +23,8 @@ BLIP = 2
 MAX_TICKS = 1_000_000
 """Longest test that is unfolded onto a tick grid."""
 
+ENDS = (BitState.COMPLETE, BitState.ABORTED)
+
 
 @dataclass(frozen=True, slots=True)
 class Episode:
@@ -34,6 +36,7 @@ class Episode:
     ticks: length; 0 if the test never ran.
     test_id, serial: None if the bus does not say.
     outcome: how it ended.
+    ended: row of the status frame that told of the end; None without one.
     notes: what a reader should know.
     """
 
@@ -42,6 +45,7 @@ class Episode:
     test_id: int | None
     serial: int | None
     outcome: Outcome
+    ended: int | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -223,6 +227,7 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
         test_id=span.test_id,
         serial=_most_common(serials[serials >= 0]) if np.any(serials >= 0) else None,
         outcome=outcome,
+        ended=int(status.row[final]) if final is not None and outcome.state in ENDS else None,
         notes=tuple(notes),
     )
 
@@ -241,10 +246,7 @@ def _outcome(mine: NDArray[np.int64], status: Status) -> tuple[Outcome, int | No
     state = status.state[mine]
     begun = np.flatnonzero(state == BitState.RUNNING)
     begin = int(begun[0]) if len(begun) else 0
-    ends = np.flatnonzero(
-        ((state == BitState.COMPLETE) | (state == BitState.ABORTED))
-        & (np.arange(len(state)) >= begin)
-    )
+    ends = np.flatnonzero(np.isin(state, ENDS) & (np.arange(len(state)) >= begin))
     if len(ends):
         final = int(mine[ends[0]])
         return Outcome(BitState(int(status.state[final])), _reason(status, final)), final

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -131,6 +131,45 @@ def test_idle_frames_loss_and_no_status(encoder, bus_map, truth, seed):
     recording = one(kept, bus_map)
     assert_truthful(recording.samples, truth)
     assert recording.outcome.state is None
+
+
+def content(recording):
+    samples = recording.samples
+    arrays = [getattr(samples, field.name) for field in fields(samples)]
+    rest = replace(recording, samples=None)
+    return repr(rest), [np.asarray(item).tolist() for item in arrays]
+
+
+@pytest.mark.parametrize("idle_after", [0, 3], ids=["silent", "idle"])
+@pytest.mark.parametrize("end", [BitState.COMPLETE, BitState.ABORTED])
+def test_what_comes_after_the_word_of_the_end_changes_nothing(encoder, bus_map, end, idle_after):
+    """A live test is judged on that word; the file of it holds what came until it was closed."""
+    truth = make_truth(300)
+    frames = play(encoder, truth, end=end, idle_after=idle_after)
+    word = max(i for i, f in enumerate(frames) if f.can_id == STATUS)
+    assert frames[word].data[0] & 15 == end
+    then = frames[word].time_ns
+    hot = [
+        frame
+        for k in range(1, 6)
+        for frame in encoder.environment(25e6, 1e6, 90.0, then + 10_000 * k)
+    ]
+    again = encoder.status(end, BitReason.NONE, 1, 0.3, 77, then + 80_000)
+    foreign = Frame(then + 90_000, 0x321, bytes(8))
+    late = [*frames[: word + 1], *hot, *again, foreign, *frames[word + 1 :]]
+    live = one(frames[: word + 1], bus_map)
+    assert live.outcome.state is end
+    assert live.samples.ticks == 300
+    assert content(one(late, bus_map)) == content(live)
+
+
+def test_frames_that_come_after_the_word_of_the_end_belong_to_the_test(encoder, bus_map, truth):
+    frames = play(encoder, truth)
+    early = [*frames[:-41], frames[-1], *frames[-41:-1]]
+    recording = one(early, bus_map)
+    assert counts(recording).received == TICKS
+    assert_truthful(recording.samples, truth)
+    assert len(present(recording.samples)) == TICKS
 
 
 def test_uncertain_start_is_noted(encoder, bus_map, truth):

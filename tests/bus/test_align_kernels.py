@@ -30,12 +30,15 @@ def axis_of(row: list[int], tick: list[int], ticks: dict[str, list[int]] | None 
     )
 
 
-def span(first: int, ticks: int) -> Any:
-    return SimpleNamespace(first=first, ticks=ticks)
+def span(first: int, ticks: int, ended: int | None = None) -> Any:
+    return SimpleNamespace(first=first, ticks=ticks, ended=ended)
 
 
 def test_a_test_reaches_from_its_neighbour_before_to_its_neighbour_after() -> None:
-    """Rows between axis frames, disorder and holes: against a search of every frame."""
+    """Rows between axis frames, disorder and holes: against a search of every frame.
+
+    No further than the word of the end where it came after the last frame.
+    """
     rng = np.random.default_rng(3)
     for _ in range(1000):
         count = int(rng.integers(1, 12))
@@ -50,6 +53,10 @@ def test_a_test_reaches_from_its_neighbour_before_to_its_neighbour_after() -> No
             end = row[hits[-1] + 1]
         bounds = align._Bounds.of(axis_of(row, tick))
         assert bounds.rows(span(first, length), 70) == (begin, end)
+        ended = int(rng.integers(0, 70))
+        if hits:
+            end = min(end, max(ended, row[hits[-1]]) + 1)
+        assert bounds.rows(span(first, length, ended), 70) == (begin, end)
 
 
 def test_the_bounds_of_an_axis_are_running_extremes() -> None:
