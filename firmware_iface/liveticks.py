@@ -22,8 +22,6 @@ NAN = math.nan
 KEYS = ("channels.current", "channels.spool", "channels.pressure", "channels.position")
 LATE = 16
 """Ticks by which a frame may come late; its tick has been given out as lost."""
-MOST_TURN = 4096
-"""A wider counter is taken modulo this: a jump of it makes no more lost ticks than these."""
 SILENCE_NS = 1_000_000_000
 """After so long the counter says nothing any more: the ticks begin anew."""
 
@@ -77,7 +75,7 @@ class LiveTicks:
         self._counters = {self._telemetry.name: counter, self._command.name: command_counter}
         self._modes = {number for number, meaning in bus_map.modes.items() if meaning is mode}
         self._ends = tuple(_ends(self._telemetry, key) for key in KEYS)
-        self._turn = min(self._telemetry.modulus, MOST_TURN)
+        self._turn = min(self._telemetry.modulus, _longest_turn(bus_map.tick_ns))
         self._commands = [NAN] * self._turn
         self._at = -1
         self._time_ns = 0
@@ -148,6 +146,15 @@ class LiveTicks:
     def _taken(self, count: int) -> float:
         command, self._commands[count] = self._commands[count], NAN
         return command
+
+
+def _longest_turn(tick_ns: int) -> int:
+    """Counts that tell how long a pause was that is no silence yet; a wider counter is cut.
+
+    A power of two, for that divides the turn of any counter. What a counter jumps by makes no more
+    lost ticks than these, and they cost their memory.
+    """
+    return 1 << (2 * SILENCE_NS // tick_ns + 2 * LATE).bit_length()
 
 
 def _counted(bus_map: BusMap, roles: tuple[str, ...]) -> tuple[MessageMap, SignalLayout]:

@@ -15,7 +15,7 @@ from ehadiag.errors import ConfigurationError
 from ehadiag.recording import CommandMode
 from firmware_iface.busmap import default_map, load_map
 from firmware_iface.encode import Encoder
-from firmware_iface.liveticks import MOST_TURN, LiveTick, LiveTicks
+from firmware_iface.liveticks import LiveTick, LiveTicks
 
 MAP = default_map()
 TELEMETRY = MAP.messages["ServoTelemetry"].can_id
@@ -171,22 +171,23 @@ protection.Command = { counter = "Count", counts = "ticks" }
 def paged(tmp_path):
     """Make a bus whose telemetry is one page of two, with counters of some bits."""
 
-    def make(width=8, page="m0", count=""):
+    def make(width=8, page="m0", count="", tick_ms=1.0):
         text = PAGED.format(width=width, page=page, count=count)
         (tmp_path / "paged.dbc").write_text(text)
-        (tmp_path / "paged.toml").write_text(PAGED_MAP)
+        (tmp_path / "paged.toml").write_text(PAGED_MAP.replace("\n", f"\ntick_ms = {tick_ms}\n", 1))
         return load_map(tmp_path / "paged.toml")
 
     return make
 
 
-def paged_ticks(bus, counts):
+def paged_ticks(bus, counts, times=None):
     live = LiveTicks(bus, CommandMode.CURRENT)
     encoder, out = Encoder(bus), []
     for k, count in enumerate(counts):
-        frames = encoder.command(CommandMode.CURRENT, 1e-6 * k, 0, k * MS, count)
-        frames += encoder.environment(0.0, 0.0, 40.0, k * MS)
-        frames += encoder.telemetry([2048 + 16 * k] * 4, k * MS, count)
+        now = k * MS if times is None else times[k]
+        frames = encoder.command(CommandMode.CURRENT, 1e-6 * k, 0, now, count)
+        frames += encoder.environment(0.0, 0.0, 40.0, now)
+        frames += encoder.telemetry([2048 + 16 * k] * 4, now, count)
         out += [tick for frame in frames for tick in live.take(frame)]
     return live, out
 
@@ -202,8 +203,22 @@ def test_other_pages_of_the_telemetry_are_no_telemetry(paged):
 def test_a_wide_counter_costs_no_memory_and_its_jump_makes_few_ticks(paged):
     live, ticks = paged_ticks(paged(width=28), [*range(5), (1 << 27) + 1000, *range(5, 10)])
     assert live.lost == len(ticks) - 11
-    assert live.lost < 2 * MOST_TURN
+    assert live.lost < 8192
     assert sys.getsizeof(live._commands) < 1 << 20
+
+
+@pytest.mark.parametrize("tick_ms", [0.05, 0.1, 0.25, 1.0, 25.0, 250.0])
+def test_a_pause_that_is_no_silence_keeps_its_ticks(paged, tick_ms):
+    """The silence counts after a second: until then the counter has to tell, at any rate."""
+    bus = paged(width=16, tick_ms=tick_ms)
+    pause = int(990 / tick_ms)
+    counts = [*range(65530, 65540), *range(65540 + pause, 65550 + pause)]
+    times = [round(count * tick_ms * MS) for count in counts]
+    live, ticks = paged_ticks(bus, [count % 65536 for count in counts], times)
+    assert (len(ticks), live.lost, live.breaks) == (20 + pause, pause, 0)
+    assert np.isnan([tick.spool for tick in ticks[10:-10]]).all()
+    assert np.isfinite([tick.spool for tick in ticks[-10:]]).all()
+    assert sys.getsizeof(live._commands) <= 1 << 20
 
 
 @pytest.mark.parametrize(
