@@ -2,8 +2,9 @@
 
 The optimum of the first part stands with its information, the normal matrix of its gaps; one
 Gauss-Newton step on the gaps of the last part, weighed by the information of both, leads to the
-optimum of the whole (a measurement update of the information filter). The last part is small, so
-the step is a fraction of a deviation, over which derivatives hold.
+optimum of the whole (a measurement update of the information filter). Where the last part is
+small the step is a fraction of a deviation, over which derivatives hold; a longer one, or one that
+does not lead down, is not taken.
 """
 
 from __future__ import annotations
@@ -20,12 +21,18 @@ from ehadiag.identify.gapmodel import CAP, FAULT_COUNT, GapModel, Slope, capped
 from ehadiag.identify.prefix import Prefix, anchored, prefix_ticks
 from ehadiag.identify.refine import Refinement
 from ehadiag.identify.stages import LEAD_S
+from ehadiag.identify.step import bounded_step
 
 __all__ = ["add_last_part"]
 
+FARTHEST = 3.0
+"""Length of the step, in deviations of the first part, beyond which it is none of a small part."""
+WORSE = 4.0
+"""Cost by which the step may lead up: what break-aways make of a way down."""
 
-def add_last_part(experiments: Sequence[Experiment], prefix: Prefix) -> Refinement:
-    """Optimum on all of the tests, from that on their first parts.
+
+def add_last_part(experiments: Sequence[Experiment], prefix: Prefix) -> Refinement | None:
+    """Optimum on all of the tests, from that on their first parts; None where a step is not enough.
 
     `experiments`: with the noise as the prefix judged it.
     """
@@ -37,18 +44,24 @@ def add_last_part(experiments: Sequence[Experiment], prefix: Prefix) -> Refineme
     jacobian = np.zeros((len(x), *whole.weight.shape))
     used = np.zeros(whole.weight.shape, dtype=np.bool_)
     jacobian[:, :, rows.first], used[:, rows.first] = first.jacobian, first.used
-    evaluations = 0
+    gaps, work = np.empty(whole.weight.shape), workspace(whole)
+    count, evaluations = residuals(whole, x * scale, work, gaps), 1
     if len(rows.last):
         model = GapModel(anchored(experiments, rows.spans, LEAD_S)[0], noise)
         slope = model.trusted_slope(x)
-        evaluations = model.evaluations
         taken = slope.used & (model.batch.weight > 0.0)
-        x = _stepped(x, first, slope, taken)
+        moved = _stepped(x, first, slope, taken)
+        step = first.jacobian[:, first.used].T @ (moved - x)
+        if step @ step > FARTHEST**2:
+            return None
+        before = capped(gaps)
+        x, count = moved, residuals(whole, moved * scale, work, gaps)
+        if capped(gaps) > before + WORSE:
+            return None
+        evaluations += model.evaluations + 1
         jacobian[:, :, rows.last] = slope.jacobian[:, :, rows.counted]
         used[:, rows.last] = taken[:, rows.counted]
-    gaps, rates = np.empty(whole.weight.shape), np.empty(len(whole.current))
-    work = workspace(whole)
-    count = residuals(whole, x * scale, work, gaps)
+    rates = np.empty(len(whole.current))
     spool_rates(whole, x * scale, work, rates)
     used &= gaps**2 < CAP
     return replace(
@@ -61,7 +74,7 @@ def add_last_part(experiments: Sequence[Experiment], prefix: Prefix) -> Refineme
         spool_rate=rates * whole.weight[0],
         used=used,
         weighted=whole.weight > 0.0,
-        evaluations=evaluations + 1,
+        evaluations=evaluations,
         anchored=count,
     )
 
@@ -75,13 +88,8 @@ def _stepped(
     # At the optimum of the first part nothing pulls, but into a bound.
     bound = np.zeros(len(x), dtype=np.bool_)
     bound[:FAULT_COUNT] = (x[:FAULT_COUNT] == 0.0) | (x[:FAULT_COUNT] == 1.0)
-    gradient = np.where(bound, stands, 0.0) + pulls
-    free = ~bound | np.where(x == 0.0, gradient < 0.0, gradient > 0.0)
     normal = before @ before.T + now @ now.T + 1e-12 * np.eye(len(x))
-    out = x.copy()
-    out[free] -= np.linalg.solve(normal[np.ix_(free, free)], gradient[free])
-    out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
-    return out
+    return bounded_step(x, normal, np.where(bound, stands, 0.0) + pulls)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from ehadiag.identify.first import FirstApproximation
 from ehadiag.identify.gapmodel import CAP
 from ehadiag.identify.lastpart import add_last_part
 from ehadiag.identify.objective import Objective
-from ehadiag.identify.prefix import refine_prefix
+from ehadiag.identify.prefix import refine_prefix, refine_whole
 from ehadiag.identify.refine import Refinement, gaps_of, median_offsets
 from ehadiag.identify.result import Estimate, Fit, Identification, Timing
 from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
@@ -195,11 +195,16 @@ class _Attempt:
 def _attempt(experiments: Sequence[Experiment], found: SearchResult, memory: Memory) -> _Attempt:
     """Refine the optimum of a search."""
     prefix = refine_prefix(experiments, found.best, memory)
-    experiments = prefix.judged(experiments)
-    best = add_last_part(experiments, prefix)
+    judged = prefix.judged(experiments)
+    best = add_last_part(judged, prefix)
+    if best is None:
+        whole = refine_whole(experiments, prefix.refined.values)
+        judged, best = whole.judged(experiments), whole.refined
+        best = replace(best, evaluations=whole.evaluations)
+    experiments, evaluations = judged, prefix.evaluations + best.evaluations
     weight = make_batch(experiments).weight
     score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())
-    return _Attempt(found, best, experiments, prefix.evaluations + best.evaluations, score)
+    return _Attempt(found, best, experiments, evaluations, score)
 
 
 def _outliers(refinement: Refinement) -> float:

@@ -1,4 +1,4 @@
-"""Deterministic refinement: robust least squares on all of the test, and what it leaves.
+"""Deterministic refinement: robust least squares on a test, and what it leaves.
 
 Damped Gauss-Newton on the weighted gaps of spool and pressure, the model re-anchored on the
 measured spool. Gaps beyond three times the noise are left out of a step (their square is capped),
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ehadiag.identify.batch import Batch, residuals, workspace
 from ehadiag.identify.gapmodel import CAP, FAULT_COUNT, GapModel, Slope, capped
 from ehadiag.identify.settle import centre, settle
+from ehadiag.identify.step import bounded_step
 
 __all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
 
@@ -116,15 +117,9 @@ def _stepped(slope: Slope, damping: float) -> NDArray[np.float64]:
     """Point that a damped Gauss-Newton step leads to, within the bounds."""
     x, used = slope.x, slope.used
     rows = slope.jacobian[:, used]
-    normal, gradient = rows @ rows.T, rows @ slope.gaps[used]
-    free = ~((x == 0.0) & (gradient > 0.0) | (x == 1.0) & (gradient < 0.0))
-    free[FAULT_COUNT:] = True
-    step = np.zeros(len(x))
-    damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
-    step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
-    out = x + step
-    out[:FAULT_COUNT] = np.clip(out[:FAULT_COUNT], 0.0, 1.0)
-    return np.asarray(out)
+    normal = rows @ rows.T
+    normal += np.diag(damping * np.diag(normal) + 1e-12)
+    return bounded_step(x, normal, rows @ slope.gaps[used])
 
 
 def describe(

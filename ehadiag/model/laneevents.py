@@ -199,7 +199,7 @@ def _event_tick(
     xs, vs = state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i]
     direction, clamped = int(state[DIRECTION * LANES + i]), state[CLAMPED * LANES + i] != 0.0
     from_xs, from_vs, since = xs, vs, 0
-    starts, count = False, 0
+    kinks, count = False, 0
     done, level, finest = 0, 0, len(SHIFTS) - 1
     while done < WHOLE:
         # Steps begin at whole numbers of their length.
@@ -247,7 +247,7 @@ def _event_tick(
                 xf, wf, xs, vs, direction, clamped = switch(
                     c, t, event, xf, wf, xs, vs, direction, clamped
                 )
-                starts = starts or (direction != 0 and vs == 0.0)
+                kinks = kinks or event == SPOOL_STOP or (direction != 0 and vs == 0.0)
             at_node = done & (QUARTER - 1) == 0
             if at_node or (switches and count < MOST_PIECES - NODES):
                 o = PIECES + 4 * count
@@ -258,7 +258,7 @@ def _event_tick(
                 path[(PLACE + done // QUARTER) * LANES + i] = xs
                 path[(SLOPE + done // QUARTER) * LANES + i] = vs
         level = 0 if fine or steps == whole else level + 1
-    if starts:
+    if kinks:
         _jack_beside(c, i, from_xs, count, state, path, coefficients)
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = xf, wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = xs, vs

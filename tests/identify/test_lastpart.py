@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from identify_cases import own_experiment
@@ -15,8 +16,8 @@ from ehadiag.identify.uncertainty import covariance, normal_matrix
 FAULTS = (0.4, 0.5, 0.6)
 
 
-def parts(experiments):
-    prefix = refine_prefix(experiments, np.array(FAULTS) + 1e-4, Memory())
+def parts(experiments, faults=FAULTS):
+    prefix = refine_prefix(experiments, np.clip(np.array(faults) + 1e-4, 0.0, 1.0), Memory())
     return prefix, prefix.judged(experiments)
 
 
@@ -53,12 +54,38 @@ def test_the_last_part_adds_its_information_and_its_gaps():
     assert not np.any(found.jacobian[:, ~found.used])
 
 
-def test_corners_are_not_left_by_noise():
-    corner = [own_experiment((0.0, 0.0, 1.0))]
-    prefix = refine_prefix(corner, np.array([0.0, 0.0, 1.0]), Memory())
-    found = add_last_part(prefix.judged(corner), prefix)
-    assert ((found.values >= 0.0) & (found.values <= 1.0)).all()
-    np.testing.assert_allclose(found.values, (0.0, 0.0, 1.0), atol=6e-4)
+@pytest.mark.parametrize("bound", [0.0, 1.0])
+def test_a_constant_at_its_bound_stays_where_the_first_part_pulls_it_out(bound):
+    experiments = [own_experiment((0.5, bound, 0.5), seed=3)]
+    prefix, judged = parts(experiments, (0.5, bound, 0.5))
+    found = add_last_part(judged, prefix)
+    outward = 1.0 if bound else -1.0
+    first = prefix.refined
+    # A hundred times what the last part can say.
+    pulling = 100.0 * outward * first.jacobian[1] / np.abs(first.jacobian[1]).max()
+    pulled = replace(first, values=np.array([0.5, bound, 0.5]), gaps=first.gaps - pulling)
+    held = add_last_part(judged, replace(prefix, refined=pulled))
+    assert held is not None
+    assert held.values[1] == bound
+    assert np.abs(found.values - (0.5, bound, 0.5)).max() < 1e-3
+
+
+def test_a_first_part_that_is_off_is_not_mended_by_one_step():
+    experiments = [own_experiment(FAULTS)]
+    prefix, judged = parts(experiments)
+    std = np.sqrt(np.diag(covariance(prefix.refined)))
+    off = replace(prefix.refined, values=prefix.refined.values + 60.0 * std)
+    assert add_last_part(judged, replace(prefix, refined=off)) is None
+
+
+def test_the_first_part_holds_all_windows_in_whatever_order():
+    experiment = own_experiment(FAULTS)
+    windows = msgspec.structs.replace(
+        experiment.test.windows, FSS=((4.2, 5.4),), refinement=((0.2, 1.2),)
+    )
+    test = msgspec.structs.replace(experiment.test, windows=windows)
+    assert prefix_ticks(experiment) == 5000
+    assert prefix_ticks(replace(experiment, test=test)) == 5400
 
 
 def test_a_recording_that_ends_early_has_no_last_part():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from other_actuator import with_data
 
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
@@ -34,9 +35,11 @@ def candidates_of(rows):
     return population
 
 
-def own_batch(faults, current, *, channels=(True, True), offsets=(0.0, 0.0), tick=1e-3):
+def own_batch(
+    faults, current, *, channels=(True, True), offsets=(0.0, 0.0), tick=1e-3, actuator=None
+):
     """Weights in LSB, the model's own answer as the measurement."""
-    constants = plant_constants(default_actuator())
+    constants = plant_constants(actuator or default_actuator())
     truth = respond(constants, np.asarray(faults), current, tick)
     n = len(current)
     return Batch(
@@ -147,6 +150,25 @@ def test_stops_are_met():
         batch = own_batch(faults, current)
         gap = np.sqrt(in_lanes(batch, candidates_of([faults]), cap=1.0)[0] / len(current))
         assert gap < 0.1
+
+
+@pytest.mark.parametrize("faults", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.3, 0.5, 0.4)])
+def test_the_jack_feels_a_spool_that_meets_its_stop(faults):
+    """Against sixteen times the ticks: a spool that stops makes a kink in its path."""
+    stroke = default_actuator().servovalve.XSM
+    actuator = with_data({"XSM": stroke / 4.0})
+    current, finer = 10e-3 * np.sin(2.0 * np.pi * 20e-3 * np.arange(120)), 16
+    fine = respond(
+        plant_constants(actuator), np.array(faults), np.repeat(current, finer), 1e-3 / finer
+    )
+    assert np.mean(np.abs(fine.spool) == stroke / 4.0) > 0.3
+    batch = own_batch(faults, current, actuator=actuator)
+    batch = batch._replace(pressure=fine.pressure[finer - 1 :: finer])
+    gaps = np.empty((1, 2, len(current)))
+    lane_residuals(
+        batch, candidates_of([faults]), lane_work(batch), gaps, np.empty(1, dtype=np.int64)
+    )
+    assert np.abs(gaps[0, 1]).max() < 0.5
 
 
 def test_offsets_and_missing_samples_count_as_in_the_scalar_kernel():

@@ -23,7 +23,7 @@ static int event_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Pa
     const Scalars *t = &m->t;
     real pieces[MOST_PIECES][4], unit = f->tick / WHOLE;
     real from_xs = s->xs, from_vs = s->vs;
-    int done = 0, single = 0, since = 0, starts = 0, count = 0;
+    int done = 0, single = 0, since = 0, kinks = 0, count = 0;
     while (done < WHOLE) {
         int grid = GRID - (done & (GRID - 1)), step = single ? 1 : grid, settled = single, event;
         int low = 0, high = grid + 1;
@@ -92,7 +92,7 @@ static int event_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Pa
         real end_vs = n.vs;
         *s = n;
         change(c, t, event, s);
-        starts |= event > NOTHING && s->direction != 0 && s->vs == 0.0;
+        kinks |= event == SPOOL_STOP || (event > NOTHING && s->direction != 0 && s->vs == 0.0);
         int at_node = (done & (2 * GRID - 1)) == 0;
         if ((event > NOTHING && count < MOST_PIECES - NODES) || at_node) {
             pieces[count][0] = since * unit;
@@ -108,13 +108,13 @@ static int event_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Pa
             path[1][done / (2 * GRID)] = s->vs;
         }
     }
-    for (int n = 0; starts && n < count; n++) {
+    for (int n = 0; kinks && n < count; n++) {
         real span = pieces[n][0];
         Piece p = {span, from_xs, pieces[n][1], pieces[n][2] * span, pieces[n][3] * span};
         jack_piece(f, m->friction, &p, 0.0, 1.0, jack);
         from_xs = p.x1;
     }
-    return starts;
+    return kinks;
 }
 
 /* A tick of the spool without events; returns 0, the state as it was, where one may hide. */
