@@ -64,7 +64,16 @@ class Ahead:
         return self.whole is not None
 
     def finish(self) -> None:
-        """Wait for the work under way; Ctrl-C ends the wait."""
+        """Wait for the work under way, and for that on the newest snapshot; Ctrl-C ends the wait.
+
+        The newest one holds all that those before it hold.
+        """
+        newest = None
+        with contextlib.suppress(queue.Empty):
+            while True:
+                newest = self._work.get_nowait()
+        if newest is not None:
+            self._work.put(newest)
         self._work.put(None)
         while self._thread.is_alive():
             self._thread.join(POLL_S)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from ehadiag.actuator import Actuator
 from ehadiag.cli import options
 from ehadiag.cli.ahead import working_ahead
+from ehadiag.cli.beforehand import refuse_beforehand
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import (
     load_report,
@@ -22,10 +23,9 @@ from ehadiag.cli.output import (
     show,
     write_report,
 )
-from ehadiag.errors import ConfigurationError
 from ehadiag.recording import Environment, Outcome, Quality, Recording
 from ehadiag.report.spent import Spent
-from ehadiag.storedtest import SAME_RATE, StoredTest, resolve_test
+from ehadiag.storedtest import StoredTest, resolve_test
 from ehadiag.verdict import Levels
 
 if TYPE_CHECKING:
@@ -105,8 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
     test = resolve_test(arguments.test)
     levels = Levels(arguments.advisory, arguments.limit)
     bus_map = options.the_bus_map(arguments)
-    _refuse_contradictions(arguments)
-    _refuse_other_rates(test, actuator, bus_map)
+    refuse_beforehand(arguments, test, actuator, bus_map)
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
     from ehadiag.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
@@ -143,35 +142,6 @@ def run(arguments: argparse.Namespace) -> int:
     return int(result.verdict)
 
 
-def _refuse_other_rates(test: StoredTest, actuator: Actuator, bus_map: BusMap) -> None:
-    """Say before the surface moves that its test could not be judged."""
-    rates = {
-        f"test {test.name!r}": test.rate,
-        f"controller of actuator {actuator.name!r}": actuator.controller.rate,
-        "mapping of the bus": 1e9 / bus_map.tick_ns,
-    }
-    if max(rates.values()) > min(rates.values()) * (1.0 + SAME_RATE):
-        each = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
-        raise ConfigurationError(f"different rates: {each}")
-
-
-def _refuse_contradictions(arguments: argparse.Namespace) -> None:
-    if arguments.simulate and arguments.listen:
-        raise ConfigurationError("--simulate and --listen exclude each other")
-    if arguments.fast and not arguments.simulate:
-        raise ConfigurationError("--fast: only the simulated actuator can hurry, add --simulate")
-    if arguments.fast and options.has_bus(arguments):
-        raise ConfigurationError("--fast: a bus has its own time, leave --interface out")
-    if arguments.simulate and arguments.serial:
-        raise ConfigurationError(
-            "--simulate: a serial link has two ends, run ehadiag sim on the other one"
-        )
-    if not arguments.simulate and not options.has_bus(arguments):
-        raise ConfigurationError(
-            "no bus named: give --interface and --channel, or --serial, or --simulate"
-        )
-
-
 def _acquire(
     arguments: argparse.Namespace,
     actuator: Actuator,
@@ -190,52 +160,52 @@ def _acquire(
 
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
-    with ExitStack() as stack:
-        ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
-        stop = stack.enter_context(stop_on_signals())
-        say(f"test {test.name!r} on {ours.name}, recording to {path}")
-        display = stack.enter_context(progress_bar())
+    assembler = Assembler(str(path), bus_map)
+    with working_ahead(online, assembler, test) as ahead:
+        with ExitStack() as stack:
+            ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
+            stop = stack.enter_context(stop_on_signals())
+            say(f"test {test.name!r} on {ours.name}, recording to {path}")
+            display = stack.enter_context(progress_bar())
 
-        assembler = Assembler(str(path), bus_map)
-        ahead = stack.enter_context(working_ahead(online, assembler, test))
+            def tell(progress: Progress) -> None:
+                ahead.watch(progress)
+                display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
 
-        def tell(progress: Progress) -> None:
-            ahead.watch(progress)
-            display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
-
-        began = time.monotonic()
-        outcome = run_test(
-            ours,
-            test_id=test.id,
-            duration=test.duration,
-            transmit=not arguments.listen,
-            recorder=recorder,
-            bus_map=bus_map,
-            limits=Limits(
-                position=_scaled(arguments.max_position, 1e-3),
-                pressure=_scaled(arguments.max_pressure, 1e6),
-                current=_scaled(arguments.max_current, 1e-3),
-            ),
-            on_frame=assembler.add,
-            stop=stop,
-            progress=tell,
-            all_there=ahead.all_there,
-        )
-        listened = time.monotonic() - began
-    if ahead.whole is not None:
-        recording = ahead.whole
-    else:
-        recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
-    if recording.serial is None:
-        recording = replace(recording, serial=outcome.serial)
-    if outcome.degraded:
-        say(outcome.degraded)
-    why = "" if outcome.complete else outcome.why + _what_was_heard(recording, ours.name, listened)
+            began = time.monotonic()
+            outcome = run_test(
+                ours,
+                test_id=test.id,
+                duration=test.duration,
+                transmit=not arguments.listen,
+                recorder=recorder,
+                bus_map=bus_map,
+                limits=Limits(
+                    position=_scaled(arguments.max_position, 1e-3),
+                    pressure=_scaled(arguments.max_pressure, 1e6),
+                    current=_scaled(arguments.max_current, 1e-3),
+                ),
+                on_frame=assembler.add,
+                stop=stop,
+                progress=tell,
+                all_there=ahead.all_there,
+            )
+            listened = time.monotonic() - began
+        if ahead.whole is not None:
+            recording = ahead.whole
+        else:
+            recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
+        if recording.serial is None:
+            recording = replace(recording, serial=outcome.serial)
+        if outcome.degraded:
+            say(outcome.degraded)
+        why = outcome.why
+        if outcome.complete:
+            ahead.finish()
+        else:
+            ahead.abandon()
+            why += _what_was_heard(recording, ours.name, listened)
     stem = path.with_suffix("") if not arguments.record else folder / path.stem
-    if why:
-        ahead.abandon()
-    else:
-        ahead.finish()
     return recording, why, stem, ahead.ended_at
 
 

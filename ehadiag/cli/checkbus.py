@@ -40,6 +40,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Listen and report."""
+    if arguments.log is None:
+        options.need_one_bus(arguments)
     bus_map = options.the_bus_map(arguments)
     from firmware_iface.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.busreport import render, report_bus  # noqa: PLC0415

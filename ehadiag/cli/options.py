@@ -23,8 +23,10 @@ __all__ = [
     "add_mapping_options",
     "has_bus",
     "known_tests",
+    "need_one_bus",
     "open_transport",
     "positive",
+    "refuse_two_buses",
     "the_actuator",
     "the_bus_map",
 ]
@@ -221,16 +223,25 @@ def has_bus(arguments: argparse.Namespace) -> bool:
     return bool(arguments.interface or arguments.serial)
 
 
-def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transport:
-    """Open the bus or serial port that was named."""
+def refuse_two_buses(arguments: argparse.Namespace) -> None:
+    """Raise ConfigurationError where a serial port and a bus of python-can were both named."""
     if arguments.serial and arguments.interface not in (None, os.environ.get("CAN_INTERFACE")):
         raise ConfigurationError("--serial and --interface exclude each other: name one bus")
+
+
+def need_one_bus(arguments: argparse.Namespace) -> None:
+    """Raise ConfigurationError unless one bus or serial port was named."""
+    refuse_two_buses(arguments)
+    if not has_bus(arguments):
+        raise ConfigurationError("no bus named: give --interface and --channel, or --serial")
+
+
+def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transport:
+    """Open the bus or serial port that was named; one of them was, see `need_one_bus`."""
     if arguments.serial:
         from firmware_iface.seriallink import SerialTransport  # noqa: PLC0415
 
         return SerialTransport(arguments.serial, baudrate=arguments.baud, transmit=transmit)
-    if not arguments.interface:
-        raise ConfigurationError("no bus named: give --interface and --channel, or --serial")
     from firmware_iface.pythoncan import BusOptions, PythonCanTransport  # noqa: PLC0415
 
     options = BusOptions(

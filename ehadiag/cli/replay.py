@@ -33,6 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the log."""
+    options.need_one_bus(arguments)
     from firmware_iface.logs import read_frames  # noqa: PLC0415 - loads python-can
     from firmware_iface.replay import play  # noqa: PLC0415
 

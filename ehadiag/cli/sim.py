@@ -39,6 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run until stopped."""
+    options.need_one_bus(arguments)
     actuator = options.the_actuator(arguments)
     tests = options.known_tests(arguments.test)
     bus_map = options.the_bus_map(arguments)

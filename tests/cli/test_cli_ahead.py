@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from cli_result import LOGS
+from cli_result import LOGS, Run
 
 from ehadiag.actuator import default_actuator
-from ehadiag.cli.ahead import working_ahead
+from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.fitness import nothing_is_under_way
 from ehadiag.online import OnlineIdentification
-from ehadiag.recording import BitState
+from ehadiag.recording import BitState, Recording
 from ehadiag.storedtest import resolve_test
 from firmware_iface.assembler import Assembler
 from firmware_iface.frames import Frame
@@ -43,14 +45,97 @@ def heard(
     return assembler
 
 
-def test_stages_run_when_they_are_due() -> None:
+def test_stages_run_when_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
     online = OnlineIdentification(TEST, default_actuator())
+    due = len(online.due_s)
+    taken = threading.Semaphore(0)
+    work = online.take
+
+    def take(recording: Recording) -> None:
+        work(recording)
+        taken.release()
+
+    monkeypatch.setattr(online, "take", take)
     with working_ahead(online, heard("paper-open-1.blf"), TEST) as ahead:
         for tenth in range(54):
             ahead.watch(Progress(Phase.RUNNING, tenth / 10.0, TEST.duration, 0, None))
+        assert all(taken.acquire(timeout=60.0) for _ in range(due))
         ahead.finish()
+    assert due == 4
     assert len(online.memory) == 5, "first approximation, three stages of search, refinement"
     assert online.memory.reused == 3 * 5, "the log has all of them at the first of four instants"
+
+
+class Blocked:
+    """An identification that is at its first snapshot until it may go on."""
+
+    due_s = (0.1, 0.2, 0.3, 0.4)
+
+    def __init__(self) -> None:
+        self.begun, self.go_on = threading.Event(), threading.Event()
+        self.taken: list[int] = []
+
+    def take(self, number: int) -> None:
+        self.taken.append(number)
+        self.begun.set()
+        assert self.go_on.wait(60.0)
+
+
+class Numbered:
+    """An assembler whose tables are numbers."""
+
+    def __init__(self) -> None:
+        self.tables = 0
+
+    def table(self) -> int:
+        self.tables += 1
+        return self.tables
+
+    def recording_of(self, table: int) -> int:
+        return table
+
+
+def watched(ahead: Ahead, online: Blocked) -> None:
+    """Let every snapshot fall due; the first one is at work then, the others wait."""
+    for at in online.due_s:
+        ahead.watch(Progress(Phase.RUNNING, at + 0.05, 1.0, 0, None))
+        assert online.begun.wait(60.0)
+
+
+def test_the_end_does_not_wait_for_stale_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
+    online: Any = Blocked()
+    assembler: Any = Numbered()
+    with working_ahead(online, assembler, TEST) as ahead:
+        watched(ahead, online)
+        join = ahead._thread.join
+
+        def waiting(timeout: float | None = None) -> None:
+            online.go_on.set()
+            join(timeout)
+
+        monkeypatch.setattr(ahead._thread, "join", waiting)
+        ahead.finish()
+    assert online.taken == [1, 4]
+
+
+def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+
+    def interrupted(_: Ahead) -> None:
+        told.append("finish")
+        raise KeyboardInterrupt
+
+    def abandon(ahead: Ahead) -> None:
+        told.append("abandon")
+        leave(ahead)
+
+    leave = Ahead.abandon
+    monkeypatch.setattr(Ahead, "finish", interrupted)
+    monkeypatch.setattr(Ahead, "abandon", abandon)
+    result = run("bit", "--simulate", "--fast", "--test", "open", "--record", "a.blf")
+    assert (result.code, told) == (130, ["finish", "abandon"])
 
 
 def test_a_test_that_is_all_there_needs_no_more_listening() -> None:

@@ -224,6 +224,65 @@ def test_wrong_usage(arguments: list[str], words: str, run: Run) -> None:
     assert words in result.message
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [("bit", "--test", "open"), ("sim",), ("replay", LOG), ("check-bus",)],
+    ids=lambda item: item[0],
+)
+def test_two_buses_are_refused_before_anything_is_done(
+    arguments: tuple[str, ...], run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for place in ("bit.make_folder", "sim.say_if_compiling"):
+        monkeypatch.setattr(f"ehadiag.cli.{place}", forbidden)
+    monkeypatch.setattr("firmware_iface.logs.read_frames", forbidden)
+    result = run(*arguments, "-i", "virtual", "--serial", "loop://")
+    assert (result.code, result.out) == (2, "")
+    assert "--serial and --interface exclude each other: name one bus" in result.message
+    assert not list(tmp_path.iterdir())
+
+
+def forbidden(*_: object, **__: object) -> None:
+    raise AssertionError("done before the options were looked at")
+
+
+def test_a_serial_link_beside_the_bus_of_the_environment(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """CAN_INTERFACE is a default, not a second bus."""
+    monkeypatch.setenv("CAN_INTERFACE", "virtual")
+    result = run("bit", "--test", "open", "--serial", "spam://x")
+    assert "serial spam://x: " in result.message
+
+
+REQUEST = """[request]
+code = { message = "BitRequest", signal = "RequestCode" }
+test_id = { message = "BitRequest", signal = "RequestTestId" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("request_section", "words"),
+    [
+        ("", "the mapping has no [request]"),
+        (REQUEST + "codes = { start = 1 }\n", "no request code 'abort'"),
+    ],
+)
+def test_a_bus_without_a_request_is_refused_before_a_recording_is_begun(
+    request_section: str, words: str, run: Run, tmp_path: Path
+) -> None:
+    data = resources.files("firmware_iface").joinpath("data")
+    (tmp_path / "eha_fcc.dbc").write_bytes(data.joinpath("eha_fcc.dbc").read_bytes())
+    text = data.joinpath("eha_fcc.toml").read_text()
+    text = text[: text.index("[protection.")]
+    (tmp_path / "mine.toml").write_text(changed(text, REQUEST, request_section))
+    options = ("--test", "open", "--mapping", "mine.toml", "-i", "virtual", "--record", "a.blf")
+    result = run("bit", *options)
+    assert (result.code, result.out) == (2, "")
+    assert words in result.message
+    assert not (tmp_path / "a.blf").exists()
+    assert not (tmp_path / "ehadiag-out").exists()
+
+
 def test_multicast_stays_on_the_machine_unless_asked(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
