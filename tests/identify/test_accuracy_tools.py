@@ -12,7 +12,7 @@ from ehadiag_tools.bound import cramer_rao
 from ehadiag_tools.cases import PAPER, random_faults
 from ehadiag_tools.figures import figures_of
 from ehadiag_tools.resume import key_of, perform_all
-from ehadiag_tools.runs import Run, experiments_of
+from ehadiag_tools.runs import Run, experiments_of, identified
 
 
 def test_random_cases_visit_the_whole_surface():
@@ -173,3 +173,12 @@ def test_paper_tables_write_their_pictures(tmp_path, capsys):
     pictures = sorted(path.name for path in tmp_path.glob("*.png"))
     assert len(pictures) == 5
     assert all((tmp_path / name).stat().st_size > 20_000 for name in pictures)
+
+
+@pytest.mark.slow
+def test_a_basin_in_which_the_model_must_be_put_back_is_left():
+    """In this run the refinement stands 0.18 % off, the model put back on the spool 20 times."""
+    run = Run(test="closed", faults=(0.6, 0.6, 0.6), noise_seed=8)
+    found = identified(run, experiments_of(run))
+    assert found.fit.anchored <= 4
+    np.testing.assert_allclose([item.value for item in found.estimates], run.faults, atol=5e-4)
