@@ -1,4 +1,9 @@
-/* Coefficients of a candidate as in ehadiag/model/lanetables.py. */
+/* Coefficients of a candidate by the series of ehadiag/model/lanetables.py, on a table of its own.
+ *
+ * The lanes tabulate 24 steps, eight of each of three lengths, to look at eight instants at once.
+ * Here stand all steps up to an eighth of the tick, for scalar code that looks at one instant after
+ * the other.
+ */
 #include "lane_jack.h"
 
 enum { GRID = WHOLE >> 3, HALVINGS = 3, ORDER = 8 };

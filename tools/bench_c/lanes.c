@@ -1,8 +1,11 @@
 /* The population's kernel (ehadiag/identify/lanes.py) in C, one candidate at a time.
  *
- * The same steps as the lanes: the spool by quarters of a tick, or with events located on tables
- * of transitions; the jack by Radau's collocation, its number of steps in a tick handed over. As
- * scalar code may, it leaves out what a candidate does not need: a spool at rest is not moved.
+ * The same steps as the lanes: the spool by quarters of a tick, or with events on tables of
+ * transitions; the jack by Radau's collocation, its number of steps in a tick handed over. Events
+ * fall on the same finest steps but are found otherwise: the lanes look at eight instants at once
+ * on tables of 24 transitions, here regula falsi looks at one after the other on a finer table,
+ * which suits scalar code better. As scalar code may, it leaves out what a candidate does not need:
+ * a spool at rest is not moved.
  * Build: cc -O3 -march=native -shared -fPIC lanes.c -lm; for single precision with
  * -DREAL=float -fsingle-precision-constant.
  */

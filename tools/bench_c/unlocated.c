@@ -137,7 +137,9 @@ static void pressure_gaps(const Fixed *f, real measured, real weight, real cap,
 
 /* Summed squared weighted gap of each of a block of candidates, each square at most `cap`.
  *
- * Arguments as of eha_lane_costs; samples with a weight have to be finite.
+ * Arguments as of eha_lane_costs, without origin, current_before and anchor: a recording begins at
+ * zero, and the spool is not re-anchored. One block of candidates, no gaps. Samples with a weight
+ * have to be finite.
  */
 void eha_unlocated_costs(const Plant *constants, const real *ticks, const int64_t *start,
                          const real *current, const real *spool, const real *pressure,

@@ -59,7 +59,7 @@ def measure(sizes: Sizes) -> list[Figure]:
 
 
 def _in_c(batch: Batch, sizes: Sizes) -> float:
-    """Time of one candidate by the same algorithm in C, s."""
+    """Time of one candidate by the lanes' steps in scalar C, s."""
     rows = population(POPULATIONS[-1])
     return cpu_median(
         CLanes(batch, lane_work(batch).levels, rows, SEARCH_CAP), sizes.repeats
@@ -67,7 +67,7 @@ def _in_c(batch: Batch, sizes: Sizes) -> float:
 
 
 def _against_c(batch: Batch, in_c: float, took: float, sizes: Sizes) -> list[Figure]:
-    """Lanes, `took` s a candidate, against C of the same algorithm and the scalar model's."""
+    """Lanes, `took` s a candidate, against C of the same steps and the scalar model's."""
     rows, work = population(POPULATIONS[-1]), lane_work(batch)
     model = CLanes(batch, work.levels, rows, math.inf, gaps=True)
     model()
@@ -77,13 +77,16 @@ def _against_c(batch: Batch, in_c: float, took: float, sizes: Sizes) -> list[Fig
     used = batch.weight > 0.0
     lsb = batch.weight * np.array([[SPOOL.lsb], [PRESSURE.lsb]])
     apart = (np.abs(gaps - model.gaps)[:, used] / lsb[used]).max()
-    name = "the lanes' algorithm in C (cc -O3 -march=native, scalar)"
-    remark = f"population {len(rows)}; C leaves out what a candidate at rest does not need"
+    name = "the lanes' steps in scalar C (cc -O3 -march=native)"
+    remark = (
+        f"population {len(rows)}; C finds events by regula falsi and leaves out what a candidate at"
+        " rest does not need"
+    )
     other = "another algorithm: closed forms, events by halving"
     alone = _scalar_in_c(sizes)
     return [
         Figure(SECTION, name, in_c * 1e3, "ms", each(in_c, len(batch.current))),
-        Figure(SECTION, "faster than the same algorithm in C", in_c / took, "times", remark),
+        Figure(SECTION, "faster than the lanes' steps in scalar C", in_c / took, "times", remark),
         Figure(
             SECTION, "largest gap between both", apart, "LSB", "spool or pressure, all candidates"
         ),
