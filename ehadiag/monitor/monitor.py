@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from ehadiag.actuator import Actuator, Controller
 from ehadiag.channels import CURRENT, POSITION, PRESSURE, SPOOL
 from ehadiag.errors import ConfigurationError
-from ehadiag.model.constants import plant_constants
+from ehadiag.model.constants import PlantConstants, plant_constants
 from ehadiag.model.monitoring import Anchor
-from ehadiag.model.transition import spool_tables
+from ehadiag.model.transition import SpoolScalars, spool_tables
 from ehadiag.monitor import layout
 from ehadiag.monitor.address import entry_point
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
@@ -157,11 +157,14 @@ class Monitor:
     def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
         """Advance by one tick, a `Tick` or its five numbers; returns `reading`, always the same.
 
-        Call it for every tick: a tick that did not arrive is `Tick` of five NaN.
+        Call it for every tick: a tick that did not arrive is `Tick` of five NaN. To look at types
+        takes time that this call does not have: what `float` takes for a number, a text too, is
+        taken.
 
         Raises
         ------
-        TypeError: not a tuple of five numbers; the monitor is as it was.
+        TypeError: not a tuple of five of these, or whatever a `__float__` raised; the monitor is as
+            it was.
         """
         try:
             alarms = self._tick(self._address, sample)
@@ -179,13 +182,13 @@ class Monitor:
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""
         p = self._memory
-        bound, breakaway = p[11], p[layout.SCALARS + 3]
-        stiffness, wire = p[3], p[4]
+        constants = PlantConstants(*p[: layout.SCALARS])
+        breakaway = SpoolScalars(*p[layout.SCALARS : layout.TICK]).breakaway
         p[layout.XF : layout.MOVING] = 0.0
         self._alarms, self._alarmed[:] = 0, False
-        xs = min(max(spool, -bound), bound)
+        xs = min(max(spool, -constants.XSM), constants.XSM)
         p[layout.XS] = p[layout.JACK_SPOOL] = xs
-        p[layout.XF] = min(max(-wire * xs / stiffness, -breakaway), breakaway)
+        p[layout.XF] = min(max(-constants.KSF * xs / constants.KF, -breakaway), breakaway)
         p[layout.SEEN] = math.nan
 
 

@@ -265,7 +265,15 @@ def test_readings_cannot_be_written():
         reading.cusum[0, 0] = 0.0
 
 
-@pytest.mark.parametrize("sample", [(1.0,) * 4, (1.0,) * 6, (None,) * 5, None])
+class Unreadable:
+    def __float__(self):
+        raise KeyError("no number")
+
+
+@pytest.mark.parametrize(
+    "sample",
+    [(1.0,) * 4, (1.0,) * 6, (None,) * 5, None, ("one",) * 5, (1.0,) * 4 + (Unreadable(),)],
+)
 def test_what_is_no_tick_leaves_the_monitor(sample):
     monitor, ticks = monitor_for("healthy-open.blf", (0.0, 0.0, 0.0))
     for tick in ticks[:300]:
@@ -274,6 +282,30 @@ def test_what_is_no_tick_leaves_the_monitor(sample):
         monitor.push(sample)
     for name in ("predicted", "residual", "cusum"):
         np.testing.assert_array_equal(getattr(monitor.reading, name), getattr(before, name))
+
+
+def test_what_float_takes_is_a_number():
+    """To look at types would cost every push its time (docs/how-to/monitor.md)."""
+    monitor, ticks = monitor_for("healthy-open.blf", (0.0, 0.0, 0.0))
+    numbers = monitor.push(ticks[300]).copy()
+    monitor.reset()
+    texts = monitor.push(tuple(str(float(value)) for value in ticks[300]))
+    np.testing.assert_array_equal(texts.predicted, numbers.predicted)
+    np.testing.assert_array_equal(texts.residual, numbers.residual)
+
+
+@pytest.mark.parametrize("place", [-2e-4, 1e-6, 1.2e-5, 3e-4, 1.0])
+def test_a_reset_puts_the_spool_at_rest_there(place):
+    """Near its centre friction holds it, further out the feedback wire takes it away."""
+    actuator, faults = default_actuator(), (0.2, 0.4, 0.6)
+    monitor = Monitor(actuator, faults, anchor=FREE_RUN)
+    monitor.reset(place)
+    predicted, _, _ = run(monitor, [Tick(0.0, 0.0, NAN, NAN, NAN)] * 100)
+    origin = min(place, actuator.servovalve.XSM)
+    whole = respond(plant_constants(actuator), np.array(faults), np.zeros(100), 1e-3, origin=origin)
+    assert (np.ptp(whole.spool) > 0.0) == (abs(place) > 1.5e-5)
+    np.testing.assert_allclose(predicted[:, 0], whole.spool, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(predicted[:, 1], whole.pressure, rtol=1e-9, atol=1.0)
 
 
 @pytest.mark.parametrize("way", [copy.copy, copy.deepcopy, pickle.dumps])
