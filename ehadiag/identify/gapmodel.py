@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.batch import Batch, Workspace, residuals, spool_rates, workspace
-from ehadiag.identify.lanes import LaneWork, lane_residuals, lane_work
+from ehadiag.identify.cores import residuals_on_cores
+from ehadiag.identify.lanes import LaneWork, lane_work
 
 __all__ = ["CAP", "FAULT_COUNT", "STEP", "GapModel", "Slope", "capped", "wide_sides"]
 
@@ -63,7 +64,7 @@ class GapModel:
         """Weighted gaps of points, shape (n, 2, N) for points of shape (n, 5)."""
         out = np.empty((len(points), 2, len(self.batch.current)))
         anchored = np.empty(len(points), dtype=np.int64)
-        lane_residuals(self.batch, points * self.scale, self.work, out, anchored)
+        residuals_on_cores(self.batch, points * self.scale, self.work, out, anchored)
         self.evaluations += len(points)
         return out
 

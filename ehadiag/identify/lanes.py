@@ -39,7 +39,7 @@ from ehadiag.model.lanevector import (
     where,
 )
 
-__all__ = ["LaneWork", "lane_costs", "lane_residuals", "lane_work", "run_blocks"]
+__all__ = ["LaneWork", "lane_costs", "lane_residuals", "lane_work", "run_blocks", "work_beside"]
 
 BOW = 0.008e-6
 """Distance (m) of the spool's path from its chord from which the jack takes two steps a tick, where
@@ -105,6 +105,20 @@ def lane_work(batch: Batch) -> LaneWork:
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
         lane_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
     return work
+
+
+def work_beside(work: LaneWork) -> LaneWork:
+    """Scratch of another thread, with the same steps of the jack."""
+    return work._replace(
+        state=work.state.copy(),
+        path=work.path.copy(),
+        coefficients=work.coefficients.copy(),
+        moving=work.moving.copy(),
+        stuck=work.stuck.copy(),
+        rows=work.rows.copy(),
+        sums=work.sums.copy(),
+        gaps=work.gaps.copy(),
+    )
 
 
 @packed

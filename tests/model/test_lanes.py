@@ -2,7 +2,6 @@
 
 import platform
 import re
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import llvmlite.binding
@@ -16,6 +15,7 @@ from other_actuator import with_data
 from ehadiag.actuator import default_actuator
 from ehadiag.channels import PRESSURE, SPOOL
 from ehadiag.identify.batch import Batch, costs, residuals, workspace
+from ehadiag.identify.cores import residuals_on_cores
 from ehadiag.identify.experiment import build_experiment, make_batch
 from ehadiag.identify.lanes import lane_costs, lane_residuals, lane_work, run_blocks
 from ehadiag.model.constants import plant_constants
@@ -253,19 +253,22 @@ def test_no_lane_depends_on_its_neighbours(one, others, place):
     assert counts[place] == count[0]
 
 
-def test_two_threads_do_not_disturb_each_other(recorded_batch, population):
-    """Each has scratch of its own; the batch is for both."""
-    works = [lane_work(recorded_batch) for _ in range(2)]
-    halves = population[::2], population[1::2]
-
-    def again_and_again(rows, work):
-        return [in_lanes(recorded_batch, rows, 25.0, work) for _ in range(8)]
-
-    with ThreadPoolExecutor(2) as pool:
-        together = list(pool.map(again_and_again, halves, works))
-    for rows, beside in zip(halves, together, strict=True):
-        alone = in_lanes(recorded_batch, rows, 25.0, works[0])
-        np.testing.assert_array_equal(beside, [alone] * 8)
+@pytest.mark.parametrize("count", [5, 16, 17, 32, 50])
+def test_several_cores_give_the_digits_of_one(recorded_batch, count):
+    """Whatever is left over for the last of them."""
+    rows = candidates_of(np.random.default_rng(1).random((count, 3)))
+    work = lane_work(recorded_batch)
+    found = []
+    for cores in (1, 2, 3):
+        gaps = np.full((count, 2, len(recorded_batch.current)), np.nan)
+        anchored = np.full(count, -1)
+        residuals_on_cores(recorded_batch, rows, work, gaps, anchored, cores)
+        found.append((gaps, anchored))
+    for gaps, anchored in found[1:]:
+        np.testing.assert_array_equal(gaps, found[0][0])
+        np.testing.assert_array_equal(anchored, found[0][1])
+    assert np.isfinite(found[0][0]).all()
+    assert (found[0][1] >= 0).all()
 
 
 def test_the_kernel_is_made_of_vector_instructions(tmp_path):
