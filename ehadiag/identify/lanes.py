@@ -109,16 +109,7 @@ def lane_work(batch: Batch) -> LaneWork:
 
 def work_beside(work: LaneWork) -> LaneWork:
     """Scratch of another thread, with the same steps of the jack."""
-    return work._replace(
-        state=work.state.copy(),
-        path=work.path.copy(),
-        coefficients=work.coefficients.copy(),
-        moving=work.moving.copy(),
-        stuck=work.stuck.copy(),
-        rows=work.rows.copy(),
-        sums=work.sums.copy(),
-        gaps=work.gaps.copy(),
-    )
+    return LaneWork._make(part.copy() for part in work)
 
 
 @packed

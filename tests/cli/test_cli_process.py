@@ -196,6 +196,21 @@ def test_read_only_installation_without_home(
     assert any((temporary / f"ehadiag-{os.getuid()}").glob("kernels-*/*.nbi"))
 
 
+def in_shell(
+    command: str, folder: Path, environment: dict[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run ehadiag with arguments and redirections as a shell reads them."""
+    return subprocess.run(
+        ["sh", "-c", f'"$0" -m ehadiag.cli.main {command}', sys.executable],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
 @pytest.mark.skipif(os.name != "posix", reason="streams are closed by a POSIX shell")
 @pytest.mark.parametrize(
     ("closed", "code"),
@@ -204,15 +219,7 @@ def test_read_only_installation_without_home(
 def test_closed_streams_are_no_failure(
     closed: str, code: int, tmp_path: Path, environment: dict[str, str]
 ) -> None:
-    done = subprocess.run(
-        ["sh", "-c", f'"$0" -m ehadiag.cli.main tests {closed}', sys.executable],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = in_shell(f"tests {closed}", tmp_path, environment)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     assert (done.stdout == "") == (">&-" in closed.replace("2>&-", ""))
@@ -222,13 +229,5 @@ def test_closed_streams_are_no_failure(
 def test_what_is_said_does_not_go_to_another_stream(
     tmp_path: Path, environment: dict[str, str]
 ) -> None:
-    done = subprocess.run(
-        ["sh", "-c", '"$0" -m ehadiag.cli.main diagnose gone.blf 2>&-', sys.executable],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = in_shell("diagnose gone.blf 2>&-", tmp_path, environment)
     assert (done.returncode, done.stdout) == (3, "")
