@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ehadiag.online import OnlineIdentification
-    from ehadiag.recording import Recording
-    from ehadiag.storedtest import StoredTest
-    from firmware_iface.assembler import Assembler
-    from firmware_iface.frames import FrameTable
-    from firmware_iface.tester import Progress
+    from ehadiag.assess.online import OnlineIdentification
+    from ehadiag.core.recording import Recording
+    from ehadiag.core.stored_test import StoredTest
+    from firmware_iface.session.assembler import Assembler
+    from firmware_iface.session.tester import Progress
+    from firmware_iface.transport.frames import FrameTable
 
 __all__ = ["Ahead", "working_ahead"]
 
@@ -55,7 +55,7 @@ class Ahead:
 
     def all_there(self) -> bool:
         """Put the complete test together; return whether nothing of it is still under way."""
-        from ehadiag.fitness import nothing_is_under_way  # noqa: PLC0415 - loads numba
+        from ehadiag.assess.acceptance import nothing_is_under_way  # noqa: PLC0415 - loads numba
 
         self.ended_at = time.perf_counter()
         recording = self._assembler.recording()

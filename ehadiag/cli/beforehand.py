@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ehadiag.actuator import Actuator
 from ehadiag.cli import options
-from ehadiag.errors import ConfigurationError
-from ehadiag.storedtest import SAME_RATE, StoredTest
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.stored_test import SAME_RATE, StoredTest
 
 if TYPE_CHECKING:
-    from firmware_iface.busmap import BusMap
+    from firmware_iface.mapping.bus_map import BusMap
 
 __all__ = ["refuse_beforehand"]
 
@@ -63,7 +63,7 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
 
 
 def _refuse_what_cannot_be_requested(test: StoredTest, bus_map: BusMap) -> None:
-    from firmware_iface.encode import Encoder  # noqa: PLC0415
+    from firmware_iface.codec.encode import Encoder  # noqa: PLC0415
 
     encoder = Encoder(bus_map)
     for code in ("start", "abort"):

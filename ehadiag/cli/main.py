@@ -10,8 +10,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn
 
-from ehadiag.cli import bit, checkbus, diagnose, replay, sim, tests, warmup
-from ehadiag.errors import EhadiagError, InputOutputError
+from ehadiag.cli.commands import bit, diagnose, replay, sim, tests, warmup
+from ehadiag.cli.commands import check_bus as checkbus
+from ehadiag.core.errors import EhadiagError, InputOutputError
 
 __all__ = ["main"]
 

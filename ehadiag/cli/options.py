@@ -7,13 +7,13 @@ import math
 import os
 from typing import TYPE_CHECKING, Any
 
-from ehadiag.actuator import Actuator, default_actuator, load_actuator
-from ehadiag.errors import ConfigurationError
-from ehadiag.storedtest import StoredTest, bundled_tests, resolve_test
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 
 if TYPE_CHECKING:
-    from firmware_iface.busmap import BusMap
-    from firmware_iface.transport import Transport
+    from firmware_iface.mapping.bus_map import BusMap
+    from firmware_iface.transport.interface import Transport
 
 __all__ = [
     "add_actuator_options",
@@ -200,7 +200,7 @@ def the_actuator(arguments: argparse.Namespace) -> Actuator:
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    from firmware_iface.busmap import default_map, load_map  # noqa: PLC0415
+    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
 
     if arguments.mapping:
         return load_map(arguments.mapping, arguments.dbc)
@@ -239,10 +239,10 @@ def need_one_bus(arguments: argparse.Namespace) -> None:
 def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transport:
     """Open the bus or serial port that was named; one of them was, see `need_one_bus`."""
     if arguments.serial:
-        from firmware_iface.seriallink import SerialTransport  # noqa: PLC0415
+        from firmware_iface.transport.serial_link import SerialTransport  # noqa: PLC0415
 
         return SerialTransport(arguments.serial, baudrate=arguments.baud, transmit=transmit)
-    from firmware_iface.pythoncan import BusOptions, PythonCanTransport  # noqa: PLC0415
+    from firmware_iface.transport.python_can import BusOptions, PythonCanTransport  # noqa: PLC0415
 
     options = BusOptions(
         interface=arguments.interface,

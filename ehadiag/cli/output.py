@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ehadiag.diagnosis import Diagnosis
+    from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.report.spent import Spent
-    from firmware_iface.transport import Transport
+    from firmware_iface.transport.interface import Transport
 
 __all__ = [
     "damage",
@@ -33,8 +33,8 @@ __all__ = [
 
 LEAST_WIDTH = 100
 PIPE_WIDTH = 200
-IDENTIFICATION, SIMULATION = "identify", "ehadiag_sim"
-"""Folders of kernels, as the names of their cache files end in them."""
+IDENTIFICATION, SIMULATION = "ehadiag_identify", "ehadiag_sim"
+"""Packages of kernels, as the names of their cache files hold them."""
 
 
 def say(text: str) -> None:
@@ -49,10 +49,10 @@ def damage(transport: Transport) -> str:
 
 def say_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:
     """Tell that the first run takes longer, where what it needs is not in the cache."""
-    from ehadiag.jit import cache_folder  # noqa: PLC0415 - loads numba
+    from ehadiag.compile.kernels import cache_folder  # noqa: PLC0415 - loads numba
 
     needed = [SIMULATION] * simulation + [IDENTIFICATION] * identification
-    if not all(any(cache_folder().glob(f"*-{kind}-*.nbi")) for kind in needed):
+    if not all(any(cache_folder().glob(f"*{kind}*.nbi")) for kind in needed):
         say("compiling the model's kernels, once for this installation (up to half a minute)")
 
 
@@ -88,7 +88,7 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 def load_report(arguments: argparse.Namespace) -> None:
     """Load what `show` needs: a verdict must not wait for it."""
     if arguments.json:
-        import ehadiag.report.jsonline  # noqa: PLC0415
+        import ehadiag.report.json_line  # noqa: PLC0415
     else:
         import ehadiag.report.table  # noqa: F401, PLC0415
 
@@ -98,7 +98,7 @@ def load_report(arguments: argparse.Namespace) -> None:
 def show(diagnosis: Diagnosis, arguments: argparse.Namespace, spent: Spent) -> None:
     """Print a diagnosis as JSON or as a table."""
     if arguments.json:
-        from ehadiag.report.jsonline import json_line  # noqa: PLC0415
+        from ehadiag.report.json_line import json_line  # noqa: PLC0415
 
         print(json_line(diagnosis, spent, arguments.solver, arguments.seed), flush=True)
     else:
@@ -131,7 +131,7 @@ def write_report(
     ------
     InputOutputError: one of them cannot be written.
     """
-    from ehadiag.report.jsonline import json_line  # noqa: PLC0415
+    from ehadiag.report.json_line import json_line  # noqa: PLC0415
 
     line = json_line(diagnosis, spent, arguments.solver, arguments.seed)
     path = stem.with_name(stem.name + ".json")
@@ -141,7 +141,7 @@ def write_report(
         raise InputOutputError(f"result {path}: {error.strerror or error}") from None
     written = [path]
     if diagnosis.identification is not None:
-        from ehadiag.jit import cache_folder  # noqa: PLC0415 - loads numba
+        from ehadiag.compile.kernels import cache_folder  # noqa: PLC0415 - loads numba
 
         # Its own folder cannot be written without a home, which it would say at length.
         os.environ.setdefault("MPLCONFIGDIR", str(cache_folder().parent / "matplotlib"))

@@ -7,14 +7,14 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from ehadiag.actuator import Actuator
-from ehadiag.errors import EhadiagError
-from ehadiag.storedtest import StoredTest
-from ehadiag_sim.conditions import Effects, Faults, Sensors
-from ehadiag_sim.emulator import run_emulator
-from ehadiag_sim.fcc import FccCore
-from firmware_iface.busmap import BusMap
-from firmware_iface.transport import Transport
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.errors import EhadiagError
+from ehadiag.core.stored_test import StoredTest
+from ehadiag_sim.fcc.computer import FccCore
+from ehadiag_sim.fcc.emulator import run_emulator
+from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from firmware_iface.mapping.bus_map import BusMap
+from firmware_iface.transport.interface import Transport
 
 __all__ = ["emulator_beside", "make_core"]
 

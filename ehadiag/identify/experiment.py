@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.actuator import Actuator
-from ehadiag.channels import PRESSURE, SPOOL, Channel
-from ehadiag.identify.batch import Batch
-from ehadiag.identify.current import CurrentTrace, commanded_current
-from ehadiag.model.constants import PlantConstants, plant_constants
-from ehadiag.model.monitoring import FREE_RUN, Anchor
-from ehadiag.recording import Environment, Samples
-from ehadiag.storedtest import StoredTest, Window
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import PRESSURE, SPOOL, Channel
+from ehadiag.core.recording import Environment, Samples
+from ehadiag.core.stored_test import StoredTest, Window
+from ehadiag.identify.commanded_current import CurrentTrace, commanded_current
+from ehadiag.model.plant import PlantConstants, plant_constants
+from ehadiag.model.scalar.residuals import Batch
+from ehadiag.model.scalar.response import FREE_RUN, Anchor
 
 __all__ = [
     "ANCHOR_LSB",

@@ -15,15 +15,15 @@ from ehadiag.identify.experiment import (
     make_batch,
     share_offsets,
 )
-from ehadiag.identify.first import FirstApproximation
-from ehadiag.identify.gapmodel import CAP
-from ehadiag.identify.lastpart import add_last_part
-from ehadiag.identify.objective import Objective
-from ehadiag.identify.prefix import refine_prefix, refine_whole
-from ehadiag.identify.refine import Refinement, gaps_of, median_offsets
+from ehadiag.identify.refine.first_part import refine_prefix, refine_whole
+from ehadiag.identify.refine.least_squares import Refinement, gaps_of, median_offsets
+from ehadiag.identify.refine.residual_model import CAP
+from ehadiag.identify.refine.update import add_last_part
 from ehadiag.identify.result import Estimate, Fit, Identification, Timing
-from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
-from ehadiag.identify.stages import (
+from ehadiag.identify.search.first_approximation import FirstApproximation
+from ehadiag.identify.search.objective import Objective
+from ehadiag.identify.search.solvers import CompactGa, SearchResult, Solver
+from ehadiag.identify.search.stages import (
     DEVIATION_SHARE,
     LEAD_S,
     STAGES,
@@ -38,7 +38,7 @@ from ehadiag.identify.stages import (
     staged_search,
 )
 from ehadiag.identify.uncertainty import covariance, interval95
-from ehadiag.parameters import FAULTS
+from ehadiag.model.parameters import FAULTS
 
 __all__ = ["identify", "run_ahead"]
 
@@ -85,7 +85,7 @@ def identify(
     """Estimate the fault constants from one or more recordings of one actuator.
 
     The same seed gives the same answer on the same machine, with results of `memory` (see
-    `ehadiag.identify.stages`) or without.
+    `ehadiag.identify.search.stages`) or without.
     """
     solver = solver or CompactGa()
     tell = progress or (lambda _stage, _share: None)

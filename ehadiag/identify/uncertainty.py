@@ -7,8 +7,8 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.gapmodel import CAP, FAULT_COUNT
-from ehadiag.identify.refine import Refinement
+from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.refine.residual_model import CAP, FAULT_COUNT
 
 __all__ = ["covariance", "interval95", "normal_matrix"]
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ehadiag.actuator import Actuator
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.recording import CommandMode, Environment, Samples
+from ehadiag.core.stored_test import Line, StoredTest, Windows
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.pipeline import identify
-from ehadiag.identify.solvers import CompactGa
-from ehadiag.recording import CommandMode, Environment, Samples
-from ehadiag.storedtest import Line, StoredTest, Windows
+from ehadiag.identify.search.solvers import CompactGa
 
 __all__ = ["warm_up"]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import inlined
+from ehadiag.compile.kernels import inlined
 
 __all__ = ["FREE_RUN", "Anchor", "re_anchored"]
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ehadiag.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError
 
 __all__ = ["SUMS", "CusumDesign", "design_cusum", "mean_run_length"]
 

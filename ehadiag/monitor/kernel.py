@@ -11,13 +11,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.jit import brief_kernel, inlined, inlined_exact
+from ehadiag.compile.address import array_at
+from ehadiag.compile.kernels import brief_kernel, inlined, inlined_exact
 from ehadiag.model.anchor import re_anchored
-from ehadiag.model.constants import PlantConstants
-from ehadiag.model.jacktick import jack_tick
-from ehadiag.model.spooltick import NODE_COLUMNS, NODES_PER_TICK, spool_tick
-from ehadiag.model.transition import FINEST, SpoolScalars
-from ehadiag.monitor.address import array_at
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.jack_tick import jack_tick
+from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, spool_tick
+from ehadiag.model.scalar.transition import FINEST, SpoolScalars
 from ehadiag.monitor.layout import (
     ANCHOR_GAIN,
     ANCHOR_LARGE,
@@ -119,7 +119,7 @@ def _position_seen(p: Vector, s: Vector, command: float, current: float) -> floa
 
 @inlined_exact
 def _control_law(p: Vector, s: Vector, error: float) -> float:
-    """Demanded current, A, unlimited by the converter; as `ehadiag.identify.current` has it."""
+    """Demanded current, A; as `ehadiag.identify.commanded_current` has it."""
     wanted = p[GAP] * error
     if s[STARTED] != 0.0:
         wanted += p[GAD] * (error - s[ERROR_BEFORE]) / p[TICK]

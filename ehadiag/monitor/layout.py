@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from ehadiag.model.spooltick import NODE_COLUMNS, NODES_PER_TICK
-from ehadiag.model.transition import FINEST
+from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
+from ehadiag.model.scalar.transition import FINEST
 
 NUMBER: Final = 8  # bytes
 
@@ -13,7 +13,7 @@ NUMBER: Final = 8  # bytes
 SCALARS: Final = 25
 TICK: Final = 31  # s
 DYNAMIC: Final = 32  # dry friction of the moving jack, N
-IM: Final = 33  # control law, see ehadiag.actuator.Controller
+IM: Final = 33  # control law, see ehadiag.core.actuator.Controller
 GAP: Final = 34
 GAI: Final = 35
 GAD: Final = 36
@@ -56,7 +56,7 @@ LOST: Final = 69
 PREDICTED: Final = 70  # spool, pressure, position
 RESIDUAL: Final = 73  # spool, pressure
 CUSUM: Final = 75  # spool upper, lower; pressure upper, lower
-MOVING: Final = 79  # ehadiag.model.transition.SpoolTables
+MOVING: Final = 79  # ehadiag.model.scalar.transition.SpoolTables
 STUCK: Final = MOVING + 16 * (FINEST + 1)
 DECAY: Final = STUCK + 4 * (FINEST + 1)
 NODES: Final = DECAY + FINEST + 1  # path of the spool, scratch

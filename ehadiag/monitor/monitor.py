@@ -11,17 +11,17 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from ehadiag.actuator import Actuator, Controller
-from ehadiag.channels import CURRENT, POSITION, PRESSURE, SPOOL
-from ehadiag.errors import ConfigurationError
-from ehadiag.model.constants import PlantConstants, plant_constants
-from ehadiag.model.monitoring import Anchor
-from ehadiag.model.transition import SpoolScalars, spool_tables
+from ehadiag.compile.address import entry_point
+from ehadiag.core.actuator import Actuator, Controller
+from ehadiag.core.channels import CURRENT, POSITION, PRESSURE, SPOOL
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.recording import CommandMode, Environment
+from ehadiag.model.plant import PlantConstants, plant_constants
+from ehadiag.model.scalar.response import Anchor
+from ehadiag.model.scalar.transition import SpoolScalars, spool_tables
 from ehadiag.monitor import layout
-from ehadiag.monitor.address import entry_point
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
-from ehadiag.recording import CommandMode, Environment
 
 __all__ = ["Monitor", "Reading", "Tick"]
 

@@ -10,11 +10,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ehadiag.diagnosis import Diagnosis
-from ehadiag.errors import InputOutputError
+from ehadiag.assess.diagnosis import Diagnosis
+from ehadiag.core.errors import InputOutputError
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
-from ehadiag.model.monitoring import respond
+from ehadiag.model.scalar.response import respond
 
 __all__ = ["draw_diagnosis"]
 

@@ -8,12 +8,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ehadiag.parameters import FAULTS
-from ehadiag.report.jsonline import source_name, test_name
-from ehadiag.verdict import Verdict
+from ehadiag.assess.verdict import Verdict
+from ehadiag.model.parameters import FAULTS
+from ehadiag.report.json_line import source_name, test_name
 
 if TYPE_CHECKING:
-    from ehadiag.diagnosis import Diagnosis
+    from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.report.spent import Spent
 
 __all__ = ["print_diagnosis"]

@@ -11,9 +11,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from ehadiag_sim.emulator import run_emulator
-from ehadiag_sim.fcc import FccCore
-from firmware_iface.transport import Transport
+from ehadiag_sim.fcc.computer import FccCore
+from ehadiag_sim.fcc.emulator import run_emulator
+from firmware_iface.transport.interface import Transport
 
 
 @contextmanager

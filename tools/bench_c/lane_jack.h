@@ -1,4 +1,4 @@
-/* Second stage and jack as in ehadiag/model/lanejack.py and lanestops.py, one candidate at a time.
+/* Second stage and jack as in ehadiag/model/simd/jack.py and lanestops.py, one candidate at a time.
  *
  * What does not change within a recording is in Fixed: the lanes divide once for a whole block.
  */

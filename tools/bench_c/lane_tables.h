@@ -1,4 +1,4 @@
-/* Coefficients of a candidate by the series of ehadiag/model/lanetables.py, on a table of its own.
+/* Coefficients of a candidate by the series of ehadiag/model/simd/coefficients.py, on a table of its own.
  *
  * The lanes tabulate 24 steps, eight of each of three lengths, to look at eight instants at once.
  * Here stand all steps up to an eighth of the tick, for scalar code that looks at one instant after

@@ -1,4 +1,4 @@
-/* The population's kernel (ehadiag/identify/lanes.py) in C, one candidate at a time.
+/* The population's kernel (ehadiag/model/simd/residuals.py) in C, one candidate at a time.
  *
  * The same steps as the lanes: the spool by quarters of a tick, or with events on tables of
  * transitions; the jack by Radau's collocation, its number of steps in a tick handed over. Events
@@ -174,7 +174,7 @@ static inline int plain_tick(const Fixed *f, const Tables *m, real torque, Spool
 
 /* Summed squared weighted gap of each candidate, each square at most `cap`.
  *
- * Arguments as the fields of ehadiag.identify.batch.Batch, the levels of LaneWork and STAGES;
+ * Arguments as the fields of ehadiag.model.scalar.residuals.Batch, the levels of LaneWork and STAGES;
  * gaps: (n, 2, ticks), or null. All of type real but the costs.
  */
 void eha_lane_costs(const Plant *constants, const real *ticks, const int64_t *start,

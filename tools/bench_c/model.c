@@ -1,6 +1,6 @@
 /* The monitoring model in C, to measure the project's kernels against.
  *
- * The same algorithm as ehadiag/model/spooltick.py and jacktick.py, run free: spool and
+ * The same algorithm as ehadiag/model/scalar/spool_tick.py and jacktick.py, run free: spool and
  * flapper by transition matrices with events located by halving, the jack by closed forms.
  * Build: cc -O3 -march=native -shared -fPIC model.c -lm
  */

@@ -1,4 +1,4 @@
-/* Constants of the plant, and what ends a step of flapper and spool (ehadiag/model/spoolevents.py);
+/* Constants of the plant, and what ends a step of flapper and spool (ehadiag/model/scalar/spool_events.py);
  * for all the models here. */
 #include <tgmath.h>
 
@@ -11,13 +11,13 @@ typedef REAL real;
 enum { FINEST = 10, WHOLE = 1 << FINEST };
 enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELEASE };
 
-/* In the order of ehadiag.model.constants.PlantConstants. */
+/* In the order of ehadiag.model.plant.PlantConstants. */
 typedef struct {
     real GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
     real AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
 } Plant;
 
-/* In the order of ehadiag.model.transition.SpoolScalars. */
+/* In the order of ehadiag.model.scalar.transition.SpoolScalars. */
 typedef struct {
     real force, damping, dynamic, breakaway, ring_damping, ring_rate;
 } Scalars;

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from targets import KINDS, RECORD, SEALED
 
-from firmware_iface.encode import Encoder
-from firmware_iface.frames import Frame
-from firmware_iface.recorder import Recorder
-from firmware_iface.seriallink import packet_of
+from firmware_iface.codec.encode import Encoder
+from firmware_iface.logs.recorder import Recorder
+from firmware_iface.transport.frames import Frame
+from firmware_iface.transport.serial_link import packet_of
 
 
 def _bus(ticks: int) -> list[Frame]:

@@ -20,23 +20,23 @@ from pathlib import Path
 
 import numpy as np
 
-from ehadiag.errors import EhadiagError
-from ehadiag.recording import CommandMode
-from ehadiag.tomlfile import decode_toml
-from firmware_iface import busmap
-from firmware_iface.align import assemble
-from firmware_iface.blf import CONTAINER_HEADER, FILE_HEADER, OBJECT_HEADER
-from firmware_iface.busmap import BusMap, default_map
-from firmware_iface.dbc import parse_dbc
-from firmware_iface.decode import DecodedTable, decode
-from firmware_iface.frames import MAX_PAYLOAD, Frame, FrameTable
-from firmware_iface.livedecode import CHANNELS, LiveDecoder
-from firmware_iface.livemessages import BitStatus, Request, Sample
-from firmware_iface.liveticks import LiveTicks
-from firmware_iface.logs import read_frames, read_recordings
-from firmware_iface.mapping import MappingFile
-from firmware_iface.protection import crc8
-from firmware_iface.seriallink import LONGEST_CODED, Framer, packet_of
+from ehadiag.core.errors import EhadiagError
+from ehadiag.core.recording import CommandMode
+from ehadiag.core.toml_file import decode_toml
+from firmware_iface.alignment.align import assemble
+from firmware_iface.alignment.live_ticks import LiveTicks
+from firmware_iface.codec.decode import DecodedTable, decode
+from firmware_iface.codec.live_decode import CHANNELS, LiveDecoder
+from firmware_iface.codec.live_messages import BitStatus, Request, Sample
+from firmware_iface.codec.protection import crc8
+from firmware_iface.logs.blf import CONTAINER_HEADER, FILE_HEADER, OBJECT_HEADER
+from firmware_iface.logs.reader import read_frames, read_recordings
+from firmware_iface.mapping import bus_map as busmap
+from firmware_iface.mapping.bus_map import BusMap, default_map
+from firmware_iface.mapping.dbc import parse_dbc
+from firmware_iface.mapping.file import MappingFile
+from firmware_iface.transport.frames import MAX_PAYLOAD, Frame, FrameTable
+from firmware_iface.transport.serial_link import LONGEST_CODED, Framer, packet_of
 
 __all__ = ["SHARE", "TARGETS", "target"]
 

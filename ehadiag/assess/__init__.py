@@ -1,0 +1,1 @@
+"""Assessment: whether data and fit can carry a verdict, and which verdict."""

@@ -1,0 +1,239 @@
+"""Whether a recording, and what was identified from it, can carry a verdict at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import PRESSURE, SPOOL
+from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
+from ehadiag.core.stored_test import SAME_RATE, StoredTest
+from ehadiag.identify.commanded_current import CONTROL_LAW_LSB, FRAME_TOLERANCE
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.result import Identification
+from ehadiag.model.plant import REFERENCE_TEMPERATURE
+
+__all__ = [
+    "nothing_is_under_way",
+    "objections_to_estimate",
+    "objections_to_experiment",
+    "objections_to_recording",
+    "out_of_range",
+    "remarks_on_recording",
+]
+
+LATEST_S = 0.05
+"""A frame that comes later than this after its tick does not come."""
+MOST_LOST = 0.25
+"""Share of samples of a channel that may be missing."""
+LONGEST_GAP_S = 0.25
+"""Longest span without a sample."""
+LEAST_COMMANDS = 100
+"""Command frames that tell at which resolution the control law got its command."""
+MOST_GUESSED = 0.015
+"""Share of ticks in closed loop whose current had to be guessed (docs/reference/bus-faults.md)."""
+LEAST_MISSED_S = 0.01
+"""A shorter piece missing at an end of the test is a lost frame like others."""
+LEAST_SHARE = 0.5
+"""Share of the samples of a window that a search needs."""
+MOST_SATURATED = 0.02
+"""Share of samples at a converter's end."""
+TEMPERATURES = (-54.0, 135.0)
+"""degC; the range in which the oil's law is used."""
+LEAST_SUPPLY = 0.5
+"""Share of the actuator's own supply pressure."""
+NOISE_SHARE = 2.0
+"""Gap of the current, in units of noise, that noise does not make."""
+MOST_OUTLIERS = 0.015
+MOST_RMS = 1.25
+
+
+def nothing_is_under_way(recording: Recording, test: StoredTest) -> bool:
+    """Whether a recording has the end of a test, and no frame of it may still come.
+
+    What is missing longer than `LATEST_S` before the end is lost; a channel of which there is
+    nothing at all is not on this bus.
+    """
+    samples = recording.samples
+    if samples is None or samples.ticks != test.ticks:
+        return False
+    if recording.test_id not in (None, test.id):
+        return False
+    if recording.outcome.state is not BitState.COMPLETE:
+        return False
+    end = slice(-round(LATEST_S * test.rate) or None, None)
+    for values in (
+        samples.current,
+        samples.spool,
+        samples.pressure,
+        samples.position,
+        samples.command,
+    ):
+        seen = np.isfinite(values)
+        if seen.any() and not seen[end].all():
+            return False
+    return True
+
+
+def objections_to_recording(
+    recording: Recording, test: StoredTest | None, actuator: Actuator
+) -> list[str]:
+    """Why a recording cannot be diagnosed; empty if it can."""
+    if recording.outcome.state is BitState.REFUSED:
+        return [f"refused by the flight-control computer: {_words(recording.outcome.reason.name)}"]
+    if recording.outcome.state is BitState.ABORTED:
+        return ["the test was aborted"]
+    samples = recording.samples
+    if samples is None:
+        return ["no telemetry of a test in the recording"]
+    if test is None and recording.test_id is None:
+        return ["the recording does not say which test it is of: name the test by --test"]
+    if test is None:
+        return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
+    return [
+        *recording.quality.refused,
+        *_unlike_the_test(samples, test, actuator),
+        *_gaps(samples, test),
+        *out_of_range(recording.environment, samples, actuator),
+    ]
+
+
+def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
+    out = []
+    commands = int(np.isfinite(samples.command).sum())
+    if test.closed_loop and commands < LEAST_COMMANDS:
+        out.append(
+            f"{commands or 'no'} command frames in the recording, and closed loop cannot be judged"
+            " without them: record the message with the command too, and name it in the mapping"
+        )
+    elif samples.mode is not (CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT):
+        out.append(
+            f"the command is a {samples.mode.name.lower()}, test {test.name!r} needs another"
+        )
+    if abs(samples.period_ns * 1e-9 * test.rate - 1.0) > SAME_RATE:
+        out.append(f"telemetry every {samples.period_ns / 1e6:g} ms, test at {test.rate:g} Hz")
+    elif abs(actuator.controller.rate / test.rate - 1.0) > SAME_RATE:
+        out.append(f"controller at {actuator.controller.rate:g} Hz, test at {test.rate:g} Hz")
+    return out
+
+
+def _gaps(samples: Samples, test: StoredTest) -> list[str]:
+    out = []
+    for name, values in (("spool", samples.spool), ("pressure", samples.pressure)):
+        present = np.flatnonzero(np.isfinite(values[: test.ticks]))
+        share = 1.0 - len(present) / test.ticks
+        edges = np.concatenate([[-1], present, [test.ticks]])
+        gap = float(np.diff(edges).max() - 1) / test.rate
+        if share > MOST_LOST:
+            out.append(f"{share:.0%} of the {name} samples are missing (limit {MOST_LOST:.0%})")
+        elif gap > LONGEST_GAP_S:
+            out.append(f"no {name} sample for {gap:.2f} s (limit {LONGEST_GAP_S:g} s)")
+    both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])
+    for search in ("FDJ", "Kintas", "FSS", "refinement"):
+        for start, end in getattr(test.windows, search):
+            inside = both[round(start * test.rate) : round(end * test.rate)]
+            if inside.sum() < LEAST_SHARE * (end - start) * test.rate:
+                out.append(f"samples are missing in {start:g} … {end:g} s, which {search} needs")
+    return out
+
+
+def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
+    """What the model must not be run with; holds for a running test too."""
+    out = []
+    for index, name in ((1, "spool"), (2, "pressure")):
+        share = float(np.mean(samples.saturated[index]))
+        if share > MOST_SATURATED:
+            out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
+    temperature = environment.oil_temperature
+    if temperature is not None and not TEMPERATURES[0] <= temperature <= TEMPERATURES[1]:
+        out.append(
+            f"oil at {temperature:g} degC, outside {TEMPERATURES[0]:g} … {TEMPERATURES[1]:g}"
+        )
+    if environment.supply_pressure is not None and environment.return_pressure is not None:
+        supply = environment.supply_pressure - environment.return_pressure
+        if supply < LEAST_SUPPLY * actuator.servovalve.PSR:
+            out.append(
+                f"supply {supply / 1e6:.1f} MPa above return, "
+                f"the actuator's data say {actuator.servovalve.PSR / 1e6:.1f} MPa"
+            )
+    return out
+
+
+def objections_to_experiment(experiment: Experiment) -> list[str]:
+    """Why the inputs of a test are not what they should be; empty if they are."""
+    out = []
+    trace, test = experiment.trace, experiment.test
+    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+    if trace.command_gap > FRAME_TOLERANCE[mode]:
+        unit = "mm" if test.closed_loop else "mA"
+        out.append(
+            f"the command differs from test {test.name!r} by up to "
+            f"{trace.command_gap * 1e3:.3g} {unit}: another test was played"
+        )
+    # The current's own noise is not to be had in closed loop; the other converters' stands for it.
+    noise_lsb = min(experiment.spool_noise / SPOOL.lsb, experiment.pressure_noise / PRESSURE.lsb)
+    limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
+    if trace.gap_lsb > limit_lsb:
+        out.append(
+            f"servovalve current {trace.gap_lsb:.1f} LSB rms from what the "
+            f"{'control law' if test.closed_loop else 'command'} gives (limit "
+            f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
+        )
+    if trace.guessed > MOST_GUESSED:
+        out.append(
+            f"{trace.guessed:.1%} of the jack positions that the control law worked on are lost "
+            f"(limit {MOST_GUESSED:.1%}): the servovalve current cannot be rebuilt"
+        )
+    for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
+        seen = values[np.isfinite(values)]
+        if seen.size and float(np.ptp(seen)) == 0.0:
+            out.append(f"the {name} signal is frozen")
+    return out
+
+
+def objections_to_estimate(identification: Identification) -> list[str]:
+    """Why estimates cannot carry a verdict; empty if they can."""
+    fit = identification.fit
+    out = []
+    rms = max(fit.spool_rms, fit.pressure_rms)
+    if fit.outliers > MOST_OUTLIERS or not rms <= MOST_RMS:
+        out.append(
+            f"the model does not explain the recording: {fit.outliers:.1%} of the gaps beyond "
+            f"three times the noise (limit {MOST_OUTLIERS:.1%}), rms gap {rms:.2f} (limit "
+            f"{MOST_RMS:g}): other actuator data, or an effect that the three faults leave out"
+        )
+    hidden = [item.name for item in identification.estimates if not item.shown]
+    if hidden:
+        out.append(f"the test does not show {', '.join(hidden)}")
+    return out
+
+
+def remarks_on_recording(
+    recording: Recording, test: StoredTest | None, actuator: Actuator
+) -> tuple[str, ...]:
+    """What was assumed and what is missing, where a verdict can be given all the same."""
+    samples = recording.samples
+    if samples is None:
+        return ()
+    out = []
+    environment = recording.environment
+    if environment.oil_temperature is None:
+        out.append(f"no oil temperature on the bus: {REFERENCE_TEMPERATURE:g} degC assumed")
+    if environment.supply_pressure is None or environment.return_pressure is None:
+        supply = actuator.servovalve.PSR / 1e6
+        out.append(f"no supply pressure on the bus: the actuator file's {supply:g} MPa assumed")
+    present = np.flatnonzero(np.isfinite(samples.spool))
+    if test is not None and len(present):
+        first = float(present[0]) / test.rate
+        last = max(test.ticks - 1 - float(present[-1]), 0.0) / test.rate
+        if first >= LEAST_MISSED_S:
+            out.append(f"the first {first:.3f} s of the test are missing")
+        if last >= LEAST_MISSED_S:
+            out.append(f"the last {last:.3f} s of the test are missing: the recording ends early")
+        elif recording.outcome.state is BitState.RUNNING:
+            out.append("the recording ends before the computer's word that the test is complete")
+    return tuple(out)
+
+
+def _words(name: str) -> str:
+    return name.lower().replace("_", " ")

@@ -1,0 +1,1 @@
+"""The subcommands of `ehadiag`, one module each."""

@@ -1,0 +1,73 @@
+"""`ehadiag check-bus`: listens, and reports what of a bus can be used."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from ehadiag.cli import options
+from ehadiag.cli.interrupt import stop_on_signals
+from ehadiag.cli.output import progress_bar
+
+__all__ = ["add_parser", "run"]
+
+NOT_USABLE = 30
+POLL_S = 0.05
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "check-bus",
+        help="listen to a bus and report what maps, rates, gaps, range use",
+        description="Listen to a bus (or read a recording) without sending anything, and report"
+        " what maps, what is missing, rates, gaps, and the range use of each channel."
+        " Exit code 30 where something stands in the way of a diagnosis.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--log", metavar="LOG", help="check a recording instead of a bus")
+    parser.add_argument(
+        "--duration",
+        type=options.positive,
+        default=3.0,
+        metavar="S",
+        help="how long to listen (default 3)",
+    )
+    options.add_mapping_options(parser)
+    options.add_bus_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Listen and report."""
+    if arguments.log is None:
+        options.need_one_bus(arguments)
+    bus_map = options.the_bus_map(arguments)
+    from firmware_iface.logs.reader import read_frames  # noqa: PLC0415
+    from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
+    from firmware_iface.session.bus_report import render, report_bus  # noqa: PLC0415
+    from firmware_iface.transport.receiver import Receiver  # noqa: PLC0415
+
+    if arguments.log is not None:
+        table = read_frames(arguments.log)
+        print(f"log {arguments.log}")
+    else:
+        with (
+            options.open_transport(arguments, transmit=False) as transport,
+            Receiver(transport) as receiver,
+            stop_on_signals(after_s=arguments.duration) as stop,
+            progress_bar() as display,
+        ):
+            collected = Assembler(transport.name, bus_map)
+            begin = time.monotonic()
+            while not stop.is_set():
+                frame = receiver.receive(POLL_S)
+                if frame is not None:
+                    collected.add(frame)
+                display("listening", (time.monotonic() - begin) / arguments.duration)
+            listened = time.monotonic() - begin
+        table = collected.table()
+        print(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
+    report = report_bus(table, bus_map)
+    print(render(report))
+    return NOT_USABLE if report.problems else 0

@@ -1,0 +1,138 @@
+"""`ehadiag diagnose`: recordings in, verdicts out."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ehadiag.assess.verdict import Levels
+from ehadiag.cli import options
+from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
+from ehadiag.core.errors import EhadiagError
+from ehadiag.core.stored_test import resolve_test
+from ehadiag.report.spent import Spent
+
+if TYPE_CHECKING:
+    from ehadiag.core.recording import Recording
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "diagnose",
+        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4)",
+        description="Diagnose actuators from recordings of their bus.",
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        metavar="LOG",
+        help="recording; a log with several tests gives its last complete one",
+    )
+    parser.add_argument(
+        "--test",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="test (file) that a log may be of, besides the stored ones; repeatable."
+        " Given once, it also stands for logs that carry no test number",
+    )
+    parser.add_argument(
+        "--joint",
+        action="store_true",
+        help="the logs are of one actuator: one estimate from all of them",
+    )
+    parser.add_argument("--all", action="store_true", help="every test in a log, not its last one")
+    parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
+    options.add_actuator_options(parser)
+    options.add_mapping_options(parser)
+    options.add_diagnosis_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Diagnose each log; return the worst exit code."""
+    # What is wrong with the options is said before anything slow is loaded.
+    diagnosis = _Diagnosis(arguments)
+    codes = [0]
+    together: list[Recording] = []
+    spent = 0.0
+    for log in arguments.logs:
+        begin = time.perf_counter()
+        try:
+            found = diagnosis.read(log)
+        except EhadiagError as error:
+            say(str(error))
+            codes.append(error.exit_code)
+            continue
+        read_s = time.perf_counter() - begin
+        if arguments.joint:
+            together += found
+            spent += read_s
+            continue
+        for number, recording in enumerate(found, start=1):
+            suffix = f"-{number}" if len(found) > 1 else ""
+            codes.append(diagnosis.finish([recording], read_s, Path(log).stem + suffix))
+    if arguments.joint and max(codes) > 0:
+        say("no joint estimate: not all of the logs could be read")
+    elif arguments.joint:
+        codes.append(diagnosis.finish(together, spent, "joint"))
+    return max(codes)
+
+
+class _Diagnosis:
+    """What all logs of one call have in common."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._actuator = options.the_actuator(arguments)
+        self._tests = options.known_tests(arguments.test)
+        only = arguments.test[0] if len(arguments.test) == 1 else None
+        self._default = resolve_test(only) if only else None
+        self._levels = Levels(arguments.advisory, arguments.limit)
+        self._bus_map = options.the_bus_map(arguments)
+        self._folder = make_folder(arguments.out) if arguments.out else None
+        self._names: set[str] = set()
+        say_if_compiling()
+
+    def read(self, log: str) -> list[Recording]:
+        """Read what is to be diagnosed of one log."""
+        from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - loads cantools
+
+        found = read_recordings(log, self._bus_map)
+        return list(found) if self._arguments.all else [choose(found)]
+
+    def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
+        """Diagnose, print and write one result; return its exit code."""
+        from ehadiag.assess.diagnosis import diagnose  # noqa: PLC0415 - loads numba
+        from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
+
+        with progress_bar() as progress:
+            result = diagnose(
+                recordings,
+                self._actuator,
+                self._tests,
+                default=self._default,
+                levels=self._levels,
+                solver=make_solver(self._arguments.solver),
+                seed=self._arguments.seed,
+                progress=progress,
+            )
+        show(result, self._arguments, Spent(read_s))
+        if self._folder is not None:
+            write_report(result, self._folder / self._unused(name), self._arguments, Spent(read_s))
+        return int(result.verdict)
+
+    def _unused(self, name: str) -> str:
+        """Return a name that no other log of this call has: folders may hold equal file names."""
+        candidates = (name if n == 1 else f"{name}-{n}" for n in itertools.count(1))
+        free = next(item for item in candidates if item not in self._names)
+        self._names.add(free)
+        return free

@@ -1,0 +1,58 @@
+"""`ehadiag replay`: plays a recording onto a bus."""
+
+from __future__ import annotations
+
+import argparse
+
+from ehadiag.cli import options
+from ehadiag.cli.interrupt import stop_on_signals
+from ehadiag.cli.output import damage, progress_bar, say
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "replay",
+        help="play a recording onto a bus",
+        description="Play a recording onto a bus in its own rhythm. This transmits.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("log", metavar="LOG")
+    parser.add_argument(
+        "--speed",
+        type=_speed,
+        default=1.0,
+        metavar="X",
+        help="times its own rhythm (default 1); 0: as fast as the bus takes it",
+    )
+    options.add_bus_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Play the log."""
+    options.need_one_bus(arguments)
+    from firmware_iface.logs.reader import read_frames  # noqa: PLC0415 - loads python-can
+    from firmware_iface.logs.replay import play  # noqa: PLC0415
+
+    table = read_frames(arguments.log)
+    with (
+        options.open_transport(arguments, transmit=True) as transport,
+        stop_on_signals() as stop,
+        progress_bar() as display,
+    ):
+        sent = play(
+            table,
+            transport,
+            speed=arguments.speed or None,
+            stop=stop,
+            progress=lambda done: display("replay", done / max(len(table), 1)),
+        )
+    say(f"played {sent} of {len(table)} frames on {transport.name}{damage(transport)}")
+    return 0
+
+
+def _speed(text: str) -> float:
+    return 0.0 if text.strip() in ("0", "0.0") else options.positive(text)

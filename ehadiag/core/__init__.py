@@ -1,0 +1,1 @@
+"""Data that every layer shares: channels, actuator, stored test, recording, errors."""

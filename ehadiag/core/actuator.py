@@ -1,0 +1,127 @@
+"""Data of an actuator: what the contract calls `actuator.toml`, validated."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.toml_file import decode_toml, read_toml
+
+__all__ = ["Actuator", "Controller", "Jack", "Servovalve", "default_actuator", "load_actuator"]
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Position controller of the flight-control computer (model.md section 1)."""
+
+    IM: Positive
+    """Rated current and saturation, A."""
+    GAP: NonNegative
+    """Proportional gain, A/m."""
+    GAI: float = 0.0
+    """Integral gain, A/(m s)."""
+    GAD: float = 0.0
+    """Derivative gain, A s/m."""
+    rate: Positive = 1000.0
+    """Control rate, Hz."""
+
+
+class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Two-stage flapper-nozzle servovalve, SI units (model.md section 2)."""
+
+    GM: Positive
+    """Torque-motor gain, N m/A."""
+    JF: Positive
+    """Flapper inertia, N m/(m/s²)."""
+    CF: NonNegative
+    """Flapper damping, N m/(m/s)."""
+    KF: Positive
+    """Net flapper stiffness, N m/m."""
+    KSF: Positive
+    """Feedback-wire stiffness, N m/m."""
+    XFM: Positive
+    """Flapper stop, m."""
+    GQF: Positive
+    """First-stage flow gain as new, m²/s."""
+    GPF: Positive
+    """First-stage pressure gain, Pa/m."""
+    AS: Positive
+    """Spool end area, m²."""
+    MS: Positive
+    """Spool mass, kg."""
+    CS: NonNegative
+    """Spool viscous coefficient at 40 °C, N s/m."""
+    XSM: Positive
+    """Spool stop, m."""
+    FSS0: NonNegative
+    """Static spool friction as new, N."""
+    FSS1: Positive
+    """Static spool friction at the limit of damage, N."""
+    PSR: Positive
+    """Supply minus return pressure, Pa."""
+    GP: Positive
+    """Pressure gain, Pa/m."""
+    GQ: Positive
+    """Flow gain, m²/s."""
+    CLK: NonNegative
+    """Leakage, m³/(s Pa)."""
+
+
+class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Jack and control surface, SI units (model.md section 2)."""
+
+    AJ: Positive
+    """Active area, m²."""
+    MJ: Positive
+    """Equivalent mass of jack and surface, kg."""
+    CJ: NonNegative
+    """Viscous coefficient at 40 °C, N s/m."""
+    XJM: Positive
+    """Stop, m."""
+    FDJ0: NonNegative
+    """Dynamic friction as new, N."""
+    FDJ1: Positive
+    """Dynamic friction at the limit of damage, N."""
+    FR: float = 0.0
+    """External load, N."""
+
+
+class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One actuator: its name, controller, servovalve and jack."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
+    controller: Controller
+    servovalve: Servovalve
+    jack: Jack
+
+
+def load_actuator(path: Path | str) -> Actuator:
+    """Read an actuator file.
+
+    Raises
+    ------
+    InputOutputError: the file cannot be read.
+    ConfigurationError: not TOML, a key unknown or missing, a value out of its range.
+    """
+    return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
+
+
+def default_actuator() -> Actuator:
+    """Return the reference actuator that the package brings along."""
+    text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
+    return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
+
+
+def _checked(actuator: Actuator, source: str) -> Actuator:
+    """Check what one key alone cannot tell."""
+    if actuator.servovalve.FSS1 <= actuator.servovalve.FSS0:
+        raise ConfigurationError(f"{source}: servovalve.FSS1 must be greater than servovalve.FSS0")
+    if actuator.jack.FDJ1 <= actuator.jack.FDJ0:
+        raise ConfigurationError(f"{source}: jack.FDJ1 must be greater than jack.FDJ0")
+    return actuator

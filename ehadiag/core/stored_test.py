@@ -1,0 +1,217 @@
+"""Stored tests: the command that a flight-control computer plays, as data.
+
+A test is a list of segments (straight lines through points, sines) and the windows of time that
+each stage of the diagnosis uses. A rig's computer may store others: a test is a file, not code.
+"""
+
+from __future__ import annotations
+
+import itertools
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.toml_file import decode_toml, read_toml
+
+__all__ = [
+    "SAME_RATE",
+    "Line",
+    "Sine",
+    "StoredTest",
+    "Window",
+    "bundled_tests",
+    "load_test",
+    "resolve_test",
+]
+
+MAX_DURATION_S = 600.0
+SAME_RATE = 1e-6
+"""Relative difference up to which two rates are one."""
+LEAST_WINDOW = 10
+"""Ticks."""
+SLACK_S = 5e-10
+"""Tick times are not exact in binary: times nearer than this are one."""
+UNITS = {"current": {"A": 1.0, "mA": 1e-3}, "position": {"m": 1.0, "mm": 1e-3}}
+
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Window = tuple[NonNegative, NonNegative]
+"""Start and end of a span of the test, s."""
+
+
+class Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="line"):
+    """Straight lines through points (time in s, value); a time given twice is a step."""
+
+    points: Annotated[tuple[tuple[NonNegative, float], ...], msgspec.Meta(min_length=2)]
+
+    @property
+    def start(self) -> float:
+        """First time, s."""
+        return self.points[0][0]
+
+    @property
+    def end(self) -> float:
+        """Last time, s."""
+        return self.points[-1][0]
+
+    def values(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Value at each time; at a step still the value before it."""
+        times = np.array([point[0] for point in self.points])
+        levels = np.array([point[1] for point in self.points])
+        right = np.clip(np.searchsorted(times, time - SLACK_S, side="left"), 1, len(times) - 1)
+        t0, t1 = times[right - 1], times[right]
+        weight = np.divide(time - t0, t1 - t0, out=np.zeros_like(time), where=t1 > t0)
+        return levels[right - 1] + (levels[right] - levels[right - 1]) * weight
+
+
+class Sine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="sine"):
+    """`amplitude * sin(2 pi frequency (t - start))` from start to end."""
+
+    start: NonNegative
+    end: NonNegative
+    amplitude: float
+    frequency: Positive
+    """Hz."""
+
+    def values(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Value at each time."""
+        return self.amplitude * np.sin(2.0 * np.pi * self.frequency * (time - self.start))
+
+
+class Windows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which spans of the test serve which search (s)."""
+
+    FDJ: tuple[Window, ...]
+    Kintas: tuple[Window, ...]
+    FSS: tuple[Window, ...]
+    refinement: tuple[Window, ...]
+
+
+class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One stored test of a flight-control computer."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+    id: Annotated[int, msgspec.Meta(ge=1, le=255)]
+    mode: Literal["current", "position"]
+    unit: str
+    rate: Positive = 1000.0
+    """Control rate, Hz."""
+    description: str = ""
+    segment: Annotated[tuple[Line | Sine, ...], msgspec.Meta(min_length=1)]
+    windows: Windows
+
+    @property
+    def duration(self) -> float:
+        """Length, s."""
+        return self.segment[-1].end
+
+    @property
+    def ticks(self) -> int:
+        """Number of control ticks."""
+        return round(self.duration * self.rate)
+
+    @property
+    def closed_loop(self) -> bool:
+        """Whether the command is a position."""
+        return self.mode == "position"
+
+    def time(self) -> NDArray[np.float64]:
+        """Start of each tick, s, shape (ticks,)."""
+        return np.arange(self.ticks) / self.rate
+
+    def command(self) -> NDArray[np.float64]:
+        """Command of each tick, SI (A or m), shape (ticks,).
+
+        Where segments meet, and at a step, the tick that starts there still has the earlier value:
+        so the reference recordings show it.
+        """
+        time = self.time()
+        out = np.zeros(self.ticks)
+        for part in reversed(self.segment):
+            inside = time <= part.end + SLACK_S
+            out[inside] = part.values(time[inside])
+        return out * UNITS[self.mode][self.unit]
+
+
+def load_test(path: Path | str) -> StoredTest:
+    """Read a test file.
+
+    Raises
+    ------
+    InputOutputError: the file cannot be read.
+    ConfigurationError: not TOML, a key unknown or missing, times out of order, windows outside.
+    """
+    return _checked(read_toml(Path(path), StoredTest, "test file"), f"test file {path}")
+
+
+def bundled_tests() -> dict[str, StoredTest]:
+    """Return the stored tests of the contract by name."""
+    folder = resources.files("ehadiag").joinpath("data/tests")
+    tests = {}
+    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
+        if entry.name.endswith(".toml"):
+            where = f"bundled test {entry.name}"
+            test = _checked(decode_toml(entry.read_bytes(), StoredTest, where), where)
+            tests[test.name] = test
+    return tests
+
+
+def resolve_test(name: str) -> StoredTest:
+    """Return the bundled test of that name, or read it as a file."""
+    tests = bundled_tests()
+    if name in tests:
+        return tests[name]
+    if not Path(name).exists() and "/" not in name and not name.endswith(".toml"):
+        raise ConfigurationError(
+            f"test {name!r}: neither a stored test ({', '.join(tests)}) nor a test file"
+        )
+    return load_test(name)
+
+
+def _checked(test: StoredTest, where: str) -> StoredTest:
+    if test.unit not in UNITS[test.mode]:
+        choice = " or ".join(UNITS[test.mode])
+        raise ConfigurationError(
+            f"{where}: unit {test.unit!r} for a {test.mode} test, need {choice}"
+        )
+    at = 0.0
+    for index, part in enumerate(test.segment):
+        if isinstance(part, Line):
+            times = [point[0] for point in part.points]
+            if any(b < a for a, b in itertools.pairwise(times)):
+                raise ConfigurationError(f"{where}: times out of order in segment[{index}].points")
+        if part.end <= part.start:
+            raise ConfigurationError(f"{where}: segment[{index}] ends before it begins")
+        if abs(part.start - at) > 1e-9:
+            raise ConfigurationError(
+                f"{where}: segment[{index}] begins at {part.start:g} s, must at {at:g} s"
+            )
+        at = part.end
+    if test.duration > MAX_DURATION_S:
+        raise ConfigurationError(f"{where}: longer than {MAX_DURATION_S:g} s")
+    if test.ticks < 100:
+        raise ConfigurationError(f"{where}: shorter than 100 ticks")
+    _check_windows(test, where)
+    return test
+
+
+def _check_windows(test: StoredTest, where: str) -> None:
+    for field in ("FDJ", "Kintas", "FSS", "refinement"):
+        windows: tuple[Window, ...] = getattr(test.windows, field)
+        if not windows:
+            raise ConfigurationError(f"{where}: windows.{field} is empty")
+        for start, end in windows:
+            if not start < end <= test.duration + 1e-9:
+                raise ConfigurationError(
+                    f"{where}: windows.{field} [{start:g}, {end:g}] not inside the test"
+                )
+            if (end - start) * test.rate < LEAST_WINDOW:
+                raise ConfigurationError(
+                    f"{where}: windows.{field} [{start:g}, {end:g}] shorter than "
+                    f"{LEAST_WINDOW} ticks"
+                )

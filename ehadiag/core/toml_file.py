@@ -1,0 +1,65 @@
+"""Configuration files: TOML into validated, frozen structures."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+
+__all__ = ["MAX_BYTES", "decode_toml", "read_toml"]
+
+MAX_BYTES = 1 << 20
+"""Largest configuration file that is read; configuration is untrusted input."""
+
+T = TypeVar("T")
+
+
+def read_toml(path: Path, kind: type[T], what: str) -> T:
+    """Read `path` into `kind` (a msgspec structure); `what` names the file in errors.
+
+    Raises
+    ------
+    InputOutputError: the file cannot be read.
+    ConfigurationError: too large, not TOML, or not what `kind` demands.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputOutputError(f"{what} {path}: {error.strerror or error}") from None
+    return decode_toml(text, kind, f"{what} {path}")
+
+
+def decode_toml(text: bytes, kind: type[T], where: str) -> T:
+    """Decode TOML bytes into `kind`; `where` begins each error text."""
+    if len(text) > MAX_BYTES:
+        raise ConfigurationError(f"{where}: larger than {MAX_BYTES} bytes, not a configuration")
+    try:
+        tree = tomllib.loads(text.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigurationError(f"{where}: not valid TOML: {_one_line(error)}") from None
+    _refuse_non_finite(tree, where, "$")
+    try:
+        return msgspec.convert(tree, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"{where}: {_one_line(error)}") from None
+
+
+def _refuse_non_finite(node: Any, where: str, at: str) -> None:
+    if isinstance(node, dict):
+        for key, value in node.items():
+            _refuse_non_finite(value, where, f"{at}.{key}")
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            _refuse_non_finite(value, where, f"{at}[{index}]")
+    elif isinstance(node, float) and not math.isfinite(node):
+        raise ConfigurationError(f"{where}: a finite number is needed at {at}, not {node}")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,171 @@
+"""The servovalve current that was commanded, exactly where that is possible.
+
+Measured current carries the converter's noise; the commanded one is known better. In open loop it
+is the command. In closed loop the control law is repeated on the *digitised* jack position, as the
+flight-control computer saw it (bus.md: the position of the tick before feeds the control law).
+Where that sample is lost, its code follows from the measured current: one code of position is
+many codes of current.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.actuator import Controller
+from ehadiag.core.channels import CURRENT, POSITION
+from ehadiag.core.recording import CommandMode, Samples
+from ehadiag.core.stored_test import StoredTest
+
+__all__ = ["CurrentTrace", "commanded_current"]
+
+FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
+"""A command frame that far (A, m) from the stored test says that another command was played."""
+LEAST_LEVELS = 100
+"""Values sent that it takes to know their resolution."""
+LONG_HOLE = 50
+"""Ticks of a hole that count as guessed: amidst a longer one there is no sample either that a wrong
+current could be held against. An integral in the control law remembers all of them."""
+CONTROL_LAW_LSB = 4.0
+"""Gap (LSB rms) beyond which the control law does not explain the measured current."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurrentTrace:
+    """Commanded current of each tick.
+
+    Attributes
+    ----------
+    current: A, shape (n,).
+    gap_lsb: rms of measured less commanded current, converter steps; NaN without measurement.
+    offset: constant error of the measured current, A.
+    rebuilt: whether the measured current bears it out.
+    command_gap: largest distance of a command frame from the stored test, A or m.
+    guessed: share of ticks whose current follows from a position that was lost, and that the
+        measured current does not tell either; of a hole at most `LONG_HOLE` ticks count.
+    """
+
+    current: NDArray[np.float64]
+    gap_lsb: float
+    offset: float
+    rebuilt: bool
+    command_gap: float
+    guessed: float = 0.0
+
+
+def commanded_current(samples: Samples, test: StoredTest, controller: Controller) -> CurrentTrace:
+    """Rebuild the commanded current of a test from its samples."""
+    n = samples.ticks
+    stored = _fit_length(test.command(), n)
+    known = np.isfinite(samples.command)
+    gap = np.abs(samples.command - stored)[known]
+    command_gap = float(gap.max()) if gap.size else 0.0
+    command = np.where(known, samples.command, _as_sent(stored, samples.command[known]))
+    guessed = 0.0
+    if samples.mode is CommandMode.CURRENT:
+        current = np.clip(command, -controller.IM, controller.IM)
+    else:
+        seen, unknown = _positions_seen(command, samples, controller)
+        current = _control_law(command, seen, samples.period_ns * 1e-9, controller)
+        # What the control law did after the last sample explains none.
+        last = np.flatnonzero(np.isfinite(samples.spool) | np.isfinite(samples.pressure))
+        until = int(last[-1]) + 1 if last.size else n
+        guessed = _guessed_share(unknown[:until], n if controller.GAI else LONG_HOLE)
+    # A code at the converter's end says no more than that the current is at least so large.
+    finite = np.isfinite(samples.current) & ~samples.saturated[0]
+    difference = samples.current[finite] - current[finite]
+    if difference.size == 0:
+        return CurrentTrace(current, float("nan"), 0.0, True, command_gap, guessed)
+    offset = float(np.median(difference))
+    # A handful of ticks may be far off where samples were lost: compare most of them.
+    spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
+    gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
+    rebuilt = gap_lsb < CONTROL_LAW_LSB
+    return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap, guessed)
+
+
+def _guessed_share(unknown: NDArray[np.bool_], longest: int) -> float:
+    """Share of ticks that are unknown; of a hole no more than its first `longest` ones."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], unknown.astype(np.int8), [0]])))
+    lengths = edges[1::2] - edges[::2]
+    return float(np.minimum(lengths, longest).sum()) / max(len(unknown), 1)
+
+
+def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Cut the stored command to n ticks, or hold its last value."""
+    if len(command) >= n:
+        return command[:n]
+    return np.concatenate([command, np.full(n - len(command), command[-1])])
+
+
+def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round the stored command to the resolution of the command frames.
+
+    The flight-control computer acts on what the frame says; the resolution is the smallest
+    distance between two values sent.
+    """
+    levels = np.unique(sent)
+    if levels.size < LEAST_LEVELS:
+        return stored
+    resolution = float(np.diff(levels).min())
+    return np.asarray(np.round(stored / resolution) * resolution)
+
+
+def _control_law(
+    command: NDArray[np.float64], seen: NDArray[np.float64], period: float, controller: Controller
+) -> NDArray[np.float64]:
+    """Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt), Err = Com − XJm (model.md section 1)."""
+    error = command - seen
+    demand = controller.GAP * error
+    if controller.GAD:
+        demand += controller.GAD * np.diff(error, prepend=error[0]) / period
+    if not controller.GAI:
+        return np.clip(demand, -controller.IM, controller.IM)
+    out = np.empty_like(demand)
+    integral = 0.0
+    for k in range(len(demand)):
+        trial = integral + error[k] * period
+        wanted = demand[k] + controller.GAI * trial
+        out[k] = min(max(wanted, -controller.IM), controller.IM)
+        # Conditional integration: the integral rests while it would push further into saturation.
+        if wanted == out[k] or (wanted - out[k]) * error[k] < 0.0:
+            integral = trial
+    return out
+
+
+def _positions_seen(
+    command: NDArray[np.float64], samples: Samples, controller: Controller
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Digitised jack position that each tick's control law worked on, m, shape (n,).
+
+    Also the ticks whose position was lost and is bridged over: the sensor's noise in that sample,
+    which the control law turned into current, cannot be told. A current at its limit is none of
+    them: there the position did not matter.
+    """
+    seen = np.concatenate([[np.nan], samples.position[:-1]])
+    lost = np.flatnonzero(np.isnan(seen))
+    unknown = np.zeros(len(seen), dtype=np.bool_)
+    if lost.size == 0:
+        return seen, unknown
+    ticks = np.arange(len(seen))
+    present = np.isfinite(seen)
+    bridged = np.interp(ticks, ticks[present], seen[present]) if present.any() else 0.0 * command
+    seen = np.where(present, seen, np.round(bridged / POSITION.lsb) * POSITION.lsb)
+    clear = controller.GAP * POSITION.lsb > 6.0 * CURRENT.lsb
+    unknown[lost] = True
+    if not clear or controller.GAI or controller.GAD:
+        return seen, unknown
+    linear = np.abs(samples.current) < controller.IM - 3.0 * CURRENT.lsb
+    linear &= ~samples.saturated[0]
+    exact = present & linear
+    offset = 0.0
+    if exact.any():
+        law = controller.GAP * (command - seen)
+        offset = float(np.median(samples.current[exact] - law[exact]))
+    for k in lost:
+        if linear[k]:
+            position = command[k] - (samples.current[k] - offset) / controller.GAP
+            seen[k] = np.round(position / POSITION.lsb) * POSITION.lsb
+    return seen, unknown & np.isnan(samples.current)

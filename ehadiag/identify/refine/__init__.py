@@ -1,0 +1,1 @@
+"""Local refinement: robust least squares from the optimum of the search."""

@@ -1,0 +1,1 @@
+"""Global search: the three one-dimensional searches and the genetic algorithm."""

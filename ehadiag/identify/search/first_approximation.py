@@ -1,0 +1,237 @@
+"""First approximation: three deterministic one-dimensional searches, FDJ, Kintas, FSS.
+
+Each works on the windows of the test and the signal that its fault shows most:
+
+- FDJ on the differential pressure while the jack creeps. The jack is driven by the *measured*
+  spool, so neither of the other faults enters.
+- Kintas on the path of the spool while it slews as fast as the first stage can feed it (maximum
+  velocity, overshoot).
+- FSS on the path of the spool on slow ramps (break-away, hysteresis, limit cycle), the model put
+  back on the measured spool where it left it: so each break-away counts once, and one that comes at
+  another tick does not spoil the rest of the ramp.
+
+Friction slows the slewing spool a little, so the last two searches are repeated in ever smaller
+ranges, each with the other's value.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.kernels import kernel
+from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
+from ehadiag.identify.search.objective import Objective
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.jack import jack_response
+from ehadiag.model.scalar.residuals import Batch
+
+__all__ = ["FirstApproximation", "FirstInputs", "first_approximation", "first_inputs"]
+
+GRID = 32
+"""Points of the coarse search over 0 … 1."""
+RANGES = ((0.2, 0.06), (0.05, 0.02))
+"""Half-widths of the repeated searches, Kintas and FSS."""
+FINER_GRID = 16
+TOLERANCE = 6e-4
+"""Spacing of the last grid."""
+LEAD_S = 0.05
+CREEP_PRESSURE_CAP = 25.0
+CREEP_CAP = 100.0
+"""A stick-slip jump at another tick counts no more than ten times the noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class FirstApproximation:
+    """Result of the three searches."""
+
+    values: tuple[float, float, float]
+    """Kintas, FSS, FDJ."""
+    evaluations: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstInputs:
+    """All that the three searches look at."""
+
+    creeps: tuple[_Creep, ...]
+    slewing: Batch
+    creeping: Batch
+
+    def arrays(self) -> Iterator[NDArray[np.float64] | NDArray[np.int64]]:
+        """Return every number in it."""
+        for creep in self.creeps:
+            yield np.array([*creep.constants, creep.before, creep.noise])
+            yield creep.nodes
+            yield creep.pressure
+        yield from self.slewing
+        yield from self.creeping
+
+
+def first_inputs(experiments: Sequence[Experiment]) -> FirstInputs:
+    """Lay out the windows of the three searches."""
+    return FirstInputs(
+        creeps=tuple(piece for experiment in experiments for piece in _creeps(experiment)),
+        slewing=make_batch(
+            experiments,
+            [experiment.test.windows.Kintas for experiment in experiments],
+            lead=LEAD_S,
+            channels=(True, False),
+        ),
+        creeping=make_batch(
+            experiments,
+            [experiment.test.windows.FSS for experiment in experiments],
+            lead=LEAD_S,
+            channels=(True, False),
+            anchor_lsb=ANCHOR_LSB,
+        ),
+    )
+
+
+def first_approximation(inputs: FirstInputs) -> FirstApproximation:
+    """Search FDJ, then Kintas, then FSS; then Kintas and FSS twice more."""
+    counter = _Counter()
+    slewing = Objective(inputs.slewing, cap=np.inf)
+    creeping = Objective(inputs.creeping, cap=CREEP_CAP)
+
+    def fdj_cost(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sum(
+            [_pressure_costs(*creep, grid, CREEP_PRESSURE_CAP) for creep in inputs.creeps], axis=0
+        )
+
+    def kintas_cost(grid: NDArray[np.float64], fss: float) -> NDArray[np.float64]:
+        return slewing(np.column_stack([grid, np.full_like(grid, fss), np.zeros_like(grid)]))
+
+    def fss_cost(grid: NDArray[np.float64], kintas: float) -> NDArray[np.float64]:
+        return creeping(np.column_stack([np.full_like(grid, kintas), grid, np.zeros_like(grid)]))
+
+    fdj = _search(counter, fdj_cost, 0.0, 1.0, GRID)
+    kintas = _search(counter, lambda grid: kintas_cost(grid, 0.0), 0.0, 1.0, GRID)
+    fss = _search(counter, lambda grid: fss_cost(grid, kintas), 0.0, 1.0, GRID)
+    for kintas_range, fss_range in RANGES:
+        kintas = _search(
+            counter,
+            functools.partial(kintas_cost, fss=fss),
+            kintas - kintas_range,
+            kintas + kintas_range,
+            FINER_GRID,
+        )
+        fss = _search(
+            counter,
+            functools.partial(fss_cost, kintas=kintas),
+            fss - fss_range,
+            fss + fss_range,
+            FINER_GRID,
+        )
+    return FirstApproximation((kintas, fss, fdj), counter.count)
+
+
+class _Counter:
+    def __init__(self) -> None:
+        self.count = 0
+
+
+def _search(
+    counter: _Counter,
+    cost: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    low: float,
+    high: float,
+    points: int,
+) -> float:
+    """Minimum of a scalar function on [low, high] within 0 … 1.
+
+    Ever finer grids about the lowest point, all points of one at once; at last the vertex of the
+    parabola through the three lowest neighbours.
+    """
+    while True:
+        grid = np.linspace(max(low, 0.0), min(high, 1.0), points)
+        values = cost(grid)
+        counter.count += points
+        best = int(np.argmin(values))
+        spacing = float(grid[1] - grid[0])
+        if spacing <= TOLERANCE:
+            return _vertex(grid, values, best)
+        low, high = float(grid[best]) - spacing, float(grid[best]) + spacing
+        points = FINER_GRID
+
+
+def _vertex(grid: NDArray[np.float64], values: NDArray[np.float64], best: int) -> float:
+    """Vertex of the parabola through the lowest point and its neighbours, if it has some."""
+    if not 0 < best < len(grid) - 1:
+        return float(grid[best])
+    left, middle, right = values[best - 1 : best + 2]
+    bent = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / bent if bent > 0.0 else 0.0
+    return float(grid[best] + shift * (grid[1] - grid[0]))
+
+
+class _Creep(NamedTuple):
+    """Span in which the jack creeps, driven by the spool as it was measured.
+
+    constants: of the plant.
+    before: spool position before the span, m.
+    nodes: the spool's path in the form that the jack's kernel takes.
+    pressure: measured, Pa, shape (n,).
+    noise: of the pressure, Pa.
+    """
+
+    constants: PlantConstants
+    before: float
+    nodes: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    noise: float
+
+
+def _creeps(experiment: Experiment) -> Iterator[_Creep]:
+    ticks = np.arange(experiment.ticks)
+    seen = np.isfinite(experiment.spool)
+    spool = np.interp(ticks, ticks[seen], experiment.spool[seen])
+    for start, end in experiment.test.windows.FDJ:
+        a = round(start / experiment.tick)
+        b = min(round(end / experiment.tick), experiment.ticks)
+        if b - a > 1:
+            before = float(spool[a - 1]) if a else 0.0
+            yield _Creep(
+                experiment.constants,
+                before,
+                _straight_path(spool[a:b], before, experiment.tick),
+                experiment.pressure[a:b],
+                experiment.pressure_noise,
+            )
+
+
+def _straight_path(spool: NDArray[np.float64], before: float, tick: float) -> NDArray[np.float64]:
+    """Straight pieces from sample to sample, in the form that the jack's kernel takes."""
+    rate = np.diff(spool, prepend=before) / tick
+    length = np.full(len(spool), tick)
+    return np.ascontiguousarray(np.column_stack([length, spool, rate, rate, 0.0 * length]))
+
+
+@kernel
+def _pressure_costs(
+    constants: PlantConstants,
+    before: float,
+    nodes: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    noise: float,
+    grid: NDArray[np.float64],
+    cap: float,
+) -> NDArray[np.float64]:
+    """Capped squared pressure gap for each FDJ of the grid, shape (len(grid),)."""
+    n = measured.shape[0]
+    node_end = np.arange(1, n + 1)
+    pressure, position = np.empty(n), np.empty(n)
+    out = np.zeros(grid.shape[0])
+    for i in range(grid.shape[0]):
+        jack_response(constants, grid[i], before, nodes, node_end, pressure, position)
+        for k in range(n):
+            gap = (measured[k] - pressure[k]) / noise
+            if math.isfinite(gap):
+                out[i] += min(gap * gap, cap)
+    return out

@@ -1,0 +1,75 @@
+"""The monitoring model: current in, spool position, differential pressure, jack position out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.model.anchor import FREE_RUN, Anchor
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.jack import jack_response
+from ehadiag.model.scalar.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
+from ehadiag.model.scalar.transition import spool_tables
+
+__all__ = ["FREE_RUN", "Anchor", "Response", "respond"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """Modelled response at the end of each tick, arrays of shape (n,)."""
+
+    spool: NDArray[np.float64]
+    """m, before any re-anchoring of the tick."""
+    pressure: NDArray[np.float64]
+    """Pa."""
+    position: NDArray[np.float64]
+    """m, from 0 at the start."""
+    anchored: int
+    """How many times the model was re-anchored."""
+
+
+def respond(
+    constants: PlantConstants,
+    faults: NDArray[np.float64],
+    current: NDArray[np.float64],
+    tick: float,
+    *,
+    origin: float = 0.0,
+    current_before: float = 0.0,
+    measured: NDArray[np.float64] | None = None,
+    anchor: Anchor = FREE_RUN,
+) -> Response:
+    """Run the monitoring model from rest.
+
+    Parameters
+    ----------
+    faults: (Kintas, FSS, FDJ), each 0 … 1.
+    current: servovalve current of each tick, A, shape (n,).
+    tick: length of a tick, s.
+    origin: spool position before the first tick, m.
+    current_before: current before the first tick, A.
+    measured: spool position to re-anchor on, m, shape (n,), NaN where missing.
+    """
+    n = len(current)
+    spool, pressure, position = np.empty(n), np.empty(n), np.empty(n)
+    nodes = np.empty((n * NODES_PER_TICK, NODE_COLUMNS))
+    node_end = np.empty(n, dtype=np.int64)
+    tables = spool_tables(constants, float(faults[0]), float(faults[1]), tick)
+    reference = np.full(n, np.nan) if measured is None else measured
+    anchored = spool_response(
+        constants,
+        tables,
+        current,
+        tick,
+        origin,
+        current_before,
+        reference,
+        anchor.as_array(),
+        spool,
+        nodes,
+        node_end,
+    )
+    jack_response(constants, float(faults[2]), origin, nodes, node_end, pressure, position)
+    return Response(spool, pressure, position, anchored)

@@ -1,0 +1,81 @@
+"""First stage and spool over a whole record: kernel of the monitoring model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.kernels import kernel
+from ehadiag.model.anchor import re_anchored
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, spool_rest, spool_tick
+from ehadiag.model.scalar.transition import SpoolTables
+
+__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "spool_response"]
+
+
+@kernel
+def spool_response(
+    constants: PlantConstants,
+    tables: SpoolTables,
+    current: NDArray[np.float64],
+    tick: float,
+    origin: float,
+    current_before: float,
+    measured: NDArray[np.float64],
+    anchor: NDArray[np.float64],
+    spool: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    node_end: NDArray[np.int64],
+) -> int:
+    """Spool position at the end of every tick, from rest.
+
+    Parameters
+    ----------
+    current: servovalve current of each tick, A, shape (n,).
+    tick: s.
+    origin: spool position before the first tick, m.
+    current_before: current before the first tick, A; the flapper is in equilibrium with both.
+    measured: measured spool position, m, shape (n,), NaN where missing; used only to re-anchor.
+    anchor: (gain, small, large), see `ehadiag.model.anchor.Anchor`.
+    spool: out, m, shape (n,), the prediction before any re-anchoring.
+    nodes: out, shape (n * NODES_PER_TICK, NODE_COLUMNS), the path as `spool_tick` writes it, with
+        the jump that a re-anchoring adds after a tick's last piece.
+    node_end: out, shape (n,), index one past the last node of each tick.
+
+    Returns
+    -------
+    How many times the model was re-anchored.
+    """
+    c, t = constants, tables.scalars
+    moving, stuck, decay = tables.moving, tables.stuck, tables.decay
+    xf, xs = spool_rest(c, t, current_before, origin)
+    wf, vs, direction, clamped = 0.0, 0.0, 0, False
+    count, anchored, filtered = 0, 0, 0.0
+    for k in range(current.shape[0]):
+        xf, wf, xs, vs, direction, clamped, count = spool_tick(
+            c,
+            t,
+            moving,
+            stuck,
+            decay,
+            c.GM * current[k],
+            tick,
+            xf,
+            wf,
+            xs,
+            vs,
+            direction,
+            clamped,
+            nodes,
+            count,
+        )
+        node_end[k] = count
+        spool[k] = xs
+        xs, filtered, moved = re_anchored(
+            measured[k] - xs, anchor[0], anchor[1], anchor[2], xs, filtered, c.XSM
+        )
+        if moved:
+            nodes[count - 1, 4] = xs - spool[k]
+            anchored += 1
+    return anchored

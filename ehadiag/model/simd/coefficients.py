@@ -1,0 +1,179 @@
+"""Coefficients of many candidates at once."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.kernels import bare_kernel, kernel
+from ehadiag.compile.vector import WIDTH, load, packed, store
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.transition import FINEST, TAYLOR_HALVINGS
+from ehadiag.model.simd.layout import (
+    BREAK,
+    DAMPING,
+    DRY,
+    DYNAMIC,
+    JACK_FRICTION,
+    LANES,
+    MOVE,
+    PRESSURE_OFFSET,
+    REST,
+    ROOM,
+    SPOOL_OFFSET,
+)
+
+__all__ = ["MOVING_SIZE", "SHIFTS", "STUCK_SIZE", "tabulate"]
+
+SHIFTS = (FINEST - 3, FINEST - 6, 0)
+"""Lengths of the steps of a tick with events, as powers of two of the finest: an eighth of the
+tick, an eighth of that, and the finest; WIDTH of each, one behind the other."""
+PLACES = 3
+"""WIDTH as a power of two."""
+MOVING_ROWS, STUCK_ROWS = 18, 4
+"""Vectors for steps of one length: 4 x 4 transitions, time in s, decay of the spool's velocity with
+the flapper on its stop; 2 x 2 transitions."""
+MOVING_SIZE = LANES * len(SHIFTS) * MOVING_ROWS * WIDTH
+STUCK_SIZE = len(SHIFTS) * STUCK_ROWS * WIDTH
+TAYLOR_ORDER = 8
+
+
+@packed
+def _copy(source: NDArray[np.float64], target: NDArray[np.float64], start: int) -> None:
+    """Write all of `source` into `target` from `start`."""
+    for o in range(0, source.shape[0], WIDTH):
+        store(target, start + o, load(source, o))
+
+
+@packed
+def _add(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    """Add `source` to `target`."""
+    for o in range(0, source.shape[0], WIDTH):
+        store(target, o, load(target, o) + load(source, o))
+
+
+@bare_kernel
+def _product(
+    a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.float64], n: int, scale: float
+) -> None:
+    """Product of the n x n matrices of all lanes, times `scale`; flat, element by element."""
+    for r in range(n):
+        for q in range(n):
+            for o in range(0, LANES, WIDTH):
+                total = load(a, r * n * LANES + o) * load(b, q * LANES + o)
+                for k in range(1, n):
+                    x, y = load(a, (r * n + k) * LANES + o), load(b, (k * n + q) * LANES + o)
+                    total = total + x * y
+                store(out, (r * n + q) * LANES + o, total * scale)
+
+
+@kernel
+def _smallest(rates: NDArray[np.float64], n: int, tick: float) -> NDArray[np.float64]:
+    """exp(rates h) for the finest step: Taylor at a still smaller one, then squaring."""
+    scaled = rates * (tick / 2.0 ** (FINEST + TAYLOR_HALVINGS))
+    term, power, spare = np.zeros_like(rates), np.zeros_like(rates), np.zeros_like(rates)
+    for r in range(n):
+        start = (r * n + r) * LANES
+        term[start : start + LANES] = 1.0
+        power[start : start + LANES] = 1.0
+    for order in range(1, TAYLOR_ORDER + 1):
+        _product(term, scaled, spare, n, 1.0 / order)
+        term, spare = spare, term
+        _add(term, power)
+    for _ in range(TAYLOR_HALVINGS):
+        _product(power, power, spare, n, 1.0)
+        power, spare = spare, power
+    return power
+
+
+@kernel
+def _powers(
+    rates: NDArray[np.float64], n: int, tick: float, lanes: int, rows: int,
+    table: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Transitions over the steps of `SHIFTS`, of the first lanes.
+
+    table: out, shape (lanes, 3, rows, WIDTH), flat; the first n² rows are written.
+    Returns transitions of all lanes over a quarter of a tick and over a whole one.
+    """
+    size = n * n
+    one, power = _smallest(rates, n, tick), np.empty_like(rates)
+    spare, quarter = np.empty_like(rates), np.empty_like(rates)
+    for level in range(len(SHIFTS) - 1, -1, -1):
+        _copy(one, power, 0)
+        for step in range(WIDTH):
+            for i in range(lanes):
+                for e in range(size):
+                    place = ((i * len(SHIFTS) + level) * rows + e) * WIDTH + step
+                    table[place] = power[e * LANES + i]
+            if level == 0 and step == 1:
+                _copy(power, quarter, 0)
+            if step < WIDTH - 1:
+                _product(power, one, spare, n, 1.0)
+                power, spare = spare, power
+        if level > 0:
+            for _ in range(SHIFTS[level - 1] - SHIFTS[level] - PLACES):
+                _product(power, power, spare, n, 1.0)
+                power, spare = spare, power
+            one, power = power, one
+    return quarter, power
+
+
+@kernel
+def tabulate(
+    c: PlantConstants,
+    tick: float,
+    candidates: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+    moving: NDArray[np.float64],
+    stuck: NDArray[np.float64],
+) -> None:
+    """Coefficients of all lanes.
+
+    Parameters
+    ----------
+    candidates: (Kintas, FSS, FDJ, spool offset in m, pressure offset in Pa), shape (LANES, 5).
+    coefficients: out, shape (COEFFICIENT_ROWS * LANES,).
+    moving: out, what goes on over 1 … WIDTH steps of each length of `SHIFTS` with the spool moving,
+        shape (LANES, 3, MOVING_ROWS, WIDTH), flat.
+    stuck: out, the same with the spool at rest, of all lanes, shape (3, STUCK_ROWS, WIDTH), flat.
+    """
+    rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
+    force = c.AS * c.GPF
+    for i in range(LANES):
+        flow_gain = c.GQF * (1.0 - 0.8 * candidates[i, 0])
+        damping = c.GPF / flow_gain * c.AS * c.AS + c.CS
+        static = c.FSS0 + candidates[i, 1] * (c.FSS1 - c.FSS0)
+        coefficients[DRY * LANES + i] = 0.5 * static / force
+        coefficients[BREAK * LANES + i] = static / force
+        coefficients[ROOM * LANES + i] = min(static / force, c.XFM)
+        coefficients[DAMPING * LANES + i] = damping
+        coefficients[DYNAMIC * LANES + i] = 0.5 * static
+        coefficients[JACK_FRICTION * LANES + i] = c.FDJ0 + candidates[i, 2] * (c.FDJ1 - c.FDJ0)
+        coefficients[SPOOL_OFFSET * LANES + i] = candidates[i, 3]
+        coefficients[PRESSURE_OFFSET * LANES + i] = candidates[i, 4]
+        rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
+        rates[4 * LANES + i], rates[5 * LANES + i], rates[6 * LANES + i] = (
+            -c.KF / c.JF,
+            -c.CF / c.JF,
+            -c.KSF / c.JF,
+        )
+        rates[12 * LANES + i], rates[15 * LANES + i] = force / c.MS, -damping / c.MS
+        ring[1 * LANES + i], ring[2 * LANES + i], ring[3 * LANES + i] = (
+            1.0,
+            -c.KF / c.JF,
+            -c.CF / c.JF,
+        )
+    quarter, _ = _powers(rates, 4, tick, LANES, MOVING_ROWS, moving)
+    _copy(quarter, coefficients, MOVE * LANES)
+    for i in range(LANES):
+        for level, shift in enumerate(SHIFTS):
+            for step in range(WIDTH):
+                time = tick / (1 << FINEST) * ((step + 1) << shift)
+                place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH + step
+                moving[place] = time
+                moving[place + WIDTH] = math.exp(-time * coefficients[DAMPING * LANES + i] / c.MS)
+    _, whole = _powers(ring, 2, tick, 1, STUCK_ROWS, stuck)
+    _copy(whole, coefficients, REST * LANES)

@@ -1,0 +1,134 @@
+"""The machine-readable result: one JSON object a line, schema `ehadiag.diagnosis/1`."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+from ehadiag.model.parameters import FAULT_NAMES
+
+if TYPE_CHECKING:
+    from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.report.spent import Spent
+
+__all__ = ["SCHEMA", "json_line", "source_name", "test_name"]
+
+SCHEMA = "ehadiag.diagnosis/1"
+
+
+def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str:
+    """One line without its end.
+
+    Parameters
+    ----------
+    spent: around the diagnosis.
+    solver, seed: what was asked for; stated also where nothing was identified.
+    """
+    found = diagnosis.identification
+    timing = found.timing if found else None
+    serials = [item.serial for item in diagnosis.recordings if item.serial is not None]
+    tree: dict[str, Any] = {
+        "schema": SCHEMA,
+        "source": source_name(diagnosis),
+        "test": test_name(diagnosis),
+        "actuator": diagnosis.actuator.name,
+        "serial": serials[0] if serials else None,
+        "verdict": diagnosis.verdict.name,
+        "reasons": list(diagnosis.reasons),
+        "faults": _faults(diagnosis),
+        "fit": _fit(diagnosis),
+        "quality": _quality(diagnosis),
+        "solver": {
+            "name": found.solver if found else solver,
+            "seed": found.seed if found else seed,
+            "evaluations": found.evaluations if found else 0,
+            "generations": found.generations if found else 0,
+            "converged": found.converged if found else None,
+        },
+        "timing_s": {
+            "read": _rounded(spent.read),
+            "first": _rounded(timing.first) if timing else None,
+            "search": _rounded(timing.search) if timing else None,
+            "refine": _rounded(timing.refine) if timing else None,
+            "total": _rounded(spent.read + diagnosis.elapsed),
+            "after_test": None if spent.after_test is None else _rounded(spent.after_test),
+        },
+    }
+    return json.dumps(tree, allow_nan=False, ensure_ascii=False)
+
+
+def source_name(diagnosis: Diagnosis) -> str:
+    """File or bus; several joined by ' + '."""
+    return " + ".join(recording.source for recording in diagnosis.recordings)
+
+
+def test_name(diagnosis: Diagnosis) -> str | None:
+    """Name of the test; several joined by '+'; None if unknown."""
+    names = [test.name for test in diagnosis.tests if test is not None]
+    return "+".join(names) or None
+
+
+def _faults(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
+    if diagnosis.identification is None:
+        empty = {"first": None, "search": None, "estimate": None, "std": None, "interval95": None}
+        return {name: dict(empty, flags=[]) for name in FAULT_NAMES}
+    out = {}
+    for item in diagnosis.identification.estimates:
+        flags = ["at_bound"] * item.at_bound + ["not_shown"] * (not item.shown)
+        out[item.name] = {
+            "first": item.first,
+            "search": item.search,
+            "estimate": item.value,
+            "std": item.std,
+            "interval95": list(item.interval95),
+            "flags": flags,
+        }
+    return out
+
+
+def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    if diagnosis.identification is None:
+        return None
+    fit = diagnosis.identification.fit
+    return {
+        "spool_rms": _finite(fit.spool_rms),
+        "pressure_rms": _finite(fit.pressure_rms),
+        "outliers": fit.outliers,
+        "spool_noise_mm": fit.spool_noise * 1e3,
+        "pressure_noise_MPa": fit.pressure_noise * 1e-6,
+        "spool_offset_mm": fit.spool_offset * 1e3,
+        "pressure_offset_MPa": fit.pressure_offset * 1e-6,
+        "anchored": fit.anchored,
+    }
+
+
+def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
+    def total(count: str) -> int:
+        return sum(recording.quality.total(count) for recording in diagnosis.recordings)
+
+    saturated: dict[str, int] = {}
+    for recording in diagnosis.recordings:
+        for channel, count in recording.quality.saturated.items():
+            saturated[channel] = saturated.get(channel, 0) + count
+    return {
+        "frames": total("received"),
+        "lost": total("lost"),
+        "repeated": total("repeated"),
+        "crc_errors": total("crc_errors"),
+        "out_of_order": total("out_of_order"),
+        "length_errors": total("length_errors"),
+        "range_errors": total("range_errors"),
+        "foreign": sum(recording.quality.foreign for recording in diagnosis.recordings),
+        "error_frames": sum(recording.quality.error_frames for recording in diagnosis.recordings),
+        "saturated": saturated,
+        "notes": list(diagnosis.notes),
+    }
+
+
+def _rounded(seconds: float) -> float:
+    return round(seconds, 4)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

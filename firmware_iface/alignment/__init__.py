@@ -1,0 +1,1 @@
+"""Decoded frames onto the tick grid of a test, with counts of what was wrong."""

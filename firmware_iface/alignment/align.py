@@ -1,0 +1,313 @@
+"""Decoded frames onto the tick grid of each test, with the counts of what was wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.recording import (
+    CommandMode,
+    Environment,
+    Quality,
+    Recording,
+    Samples,
+)
+from firmware_iface.alignment.counts import count_frames, within
+from firmware_iface.alignment.episodes import Episode, find_episodes
+from firmware_iface.alignment.policy import judge_frames
+from firmware_iface.alignment.ticks import TickAxis, place
+from firmware_iface.codec.decode import DecodedTable, decode
+from firmware_iface.codec.status import read_status, resolve_turns
+from firmware_iface.mapping.bus_map import BusMap
+from firmware_iface.transport.frames import FrameTable
+
+__all__ = ["assemble"]
+
+STUCK_FRAMES = 20
+MARGIN = 1000
+"""Rows around a test in which late frames of messages without a counter are looked for."""
+
+CHANNEL_KEYS = ("current", "spool", "pressure", "position")
+FROZEN_TICKS = 100
+FROZEN_LIVELY = 0.2
+"""Share of ticks, outside a frozen stretch, in which a live channel changes its code."""
+
+
+def assemble(
+    table: FrameTable, bus_map: BusMap, source: str, notes: tuple[str, ...] = ()
+) -> tuple[Recording, ...]:
+    """All tests in a frame table, at least one recording (without samples if none ran).
+
+    Parameters
+    ----------
+    table: frames in order of arrival.
+    bus_map: what they mean.
+    source: file or bus, for reports.
+    notes: facts known before decoding.
+    """
+    decoded = decode(table, bus_map)
+    axis = place(decoded, bus_map.tick_ns)
+    status = read_status(decoded, axis, bus_map)
+    if axis is not None and (mended := resolve_turns(axis, status)) is not axis:
+        axis, status = mended, read_status(decoded, mended, bus_map)
+    notes += _protection_notes(bus_map)
+    if axis is None:
+        notes += ("no telemetry in the recording",)
+    else:
+        notes += axis.notes
+    episodes = find_episodes(decoded, axis, status, bus_map)
+    bounds = _Bounds.of(axis) if axis is not None else None
+    return tuple(
+        _recording(item, decoded, bounds, bus_map, source, notes, len(table)) for item in episodes
+    )
+
+
+def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
+    notes = []
+    for message in bus_map.messages.values():
+        if message.crc is None and any(r.name.startswith("channels.") for r in message.roles):
+            notes.append(f"{message.name}: no check sum; a corrupt frame cannot be told")
+    return tuple(notes)
+
+
+def _recording(
+    episode: Episode,
+    decoded: DecodedTable,
+    bounds: _Bounds | None,
+    bus_map: BusMap,
+    source: str,
+    notes: tuple[str, ...],
+    rows: int,
+) -> Recording:
+    begin, end = bounds.rows(episode, rows) if bounds is not None else (0, rows)
+    axis = bounds.axis if bounds is not None else None
+    extra: list[str] = []
+    samples = None
+    if axis is not None and episode.ticks > 0:
+        grid = _Grid(episode, decoded, axis, bus_map, max(begin - MARGIN, 0), end + MARGIN)
+        samples, extra = _samples(grid)
+    elif axis is not None:
+        extra = ["no test in the recording"]
+    extra += _stuck_counters(decoded, bus_map, begin, end)
+    counts = {
+        name: count_frames(item, axis, episode, begin, end)
+        for name, item in decoded.messages.items()
+    }
+    refused, used = judge_frames(bus_map.policy, counts)
+    quality = Quality(
+        messages=counts,
+        saturated=_saturated(samples),
+        foreign=within(decoded.foreign, begin, end),
+        error_frames=within(decoded.errors, begin, end),
+        notes=(*notes, *episode.notes, *extra, *used),
+        refused=refused,
+    )
+    return Recording(
+        source=source,
+        samples=samples,
+        test_id=episode.test_id,
+        serial=episode.serial,
+        outcome=episode.outcome,
+        environment=_environment(decoded, begin, end),
+        quality=quality,
+    )
+
+
+def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int) -> list[str]:
+    """Notes on counters that often stay while time goes on: repeats of a frame take no time."""
+    notes = []
+    for name, item in decoded.messages.items():
+        inside = slice(*np.searchsorted(item.row, [begin, end]))
+        if item.counter is None:
+            continue
+        still = np.diff(item.counter[inside]) == 0
+        still &= np.diff(item.time_ns[inside]) > bus_map.tick_ns // 2
+        if still.sum() >= STUCK_FRAMES:
+            notes.append(f"{name}: the counter stands still in {int(still.sum())} frames")
+    return notes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bounds:
+    """Finds the frames of a span of ticks without going through all of them.
+
+    Attributes
+    ----------
+    highest: highest tick up to each axis frame; ascending.
+    lowest: lowest tick from each axis frame on; ascending.
+    """
+
+    axis: TickAxis
+    highest: NDArray[np.int64]
+    lowest: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, axis: TickAxis) -> _Bounds:
+        """Bounds of an axis."""
+        lowest = np.minimum.accumulate(axis.tick[::-1])[::-1]
+        return cls(axis, np.maximum.accumulate(axis.tick), lowest)
+
+    def rows(self, episode: Episode, rows: int) -> tuple[int, int]:
+        """Rows of the table that belong to a test: from neighbour to neighbour.
+
+        They end with the word that the test has ended, if it has all its frames then: a live test
+        is judged on that word, and its recording goes on for a while.
+        """
+        stop = episode.first + episode.ticks
+        low = int(np.searchsorted(self.highest, episode.first))
+        high = int(np.searchsorted(self.lowest, stop))
+        tick = self.axis.tick[low:high]
+        hits = np.flatnonzero((tick >= episode.first) & (tick < stop))
+        if len(hits) == 0:
+            return 0, rows
+        first, last = low + int(hits[0]), low + int(hits[-1])
+        begin = int(self.axis.row[first - 1]) + 1 if first > 0 else 0
+        end = int(self.axis.row[last + 1]) if last + 1 < len(self.axis.row) else rows
+        if episode.ended is not None:
+            end = min(end, max(episode.ended, int(self.axis.row[last])) + 1)
+        return begin, end
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grid:
+    """One test's tick grid, and the rows of the table that can hold its frames."""
+
+    episode: Episode
+    decoded: DecodedTable
+    axis: TickAxis
+    bus_map: BusMap
+    begin: int
+    end: int
+
+    def fill(self, role: str) -> _Filled | None:
+        """Put the values of a role on the grid; of two frames for one tick the first counts.
+
+        None without a frame of the role's message.
+        """
+        found = self.bus_map.find(role)
+        tick = self.axis.ticks.get(found[0].name) if found is not None else None
+        if found is None or tick is None or len(tick) == 0:
+            return None
+        item = self.decoded.messages[found[0].name]
+        near = slice(*np.searchsorted(item.row, [self.begin, self.end]))
+        at = tick[near] - self.episode.first
+        value = item.values[role][near]
+        usable = np.flatnonzero((at >= 0) & (at < self.episode.ticks) & np.isfinite(value))[::-1]
+        at = at[usable]
+        out = np.full(self.episode.ticks, np.nan)
+        out[at] = value[usable]
+        host = np.full(self.episode.ticks, -1, dtype=np.int64)
+        host[at] = item.time_ns[near][usable]
+        saturated = np.zeros(self.episode.ticks, dtype=np.bool_)
+        if role in item.saturated:
+            saturated[at] = item.saturated[role][near][usable]
+        return _Filled(out, saturated, host)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Filled:
+    """A role on the grid; NaN, False and -1 where no frame brought it."""
+
+    value: NDArray[np.float64]
+    saturated: NDArray[np.bool_]
+    host_ns: NDArray[np.int64]
+
+
+def _samples(grid: _Grid) -> tuple[Samples, list[str]]:
+    ticks, period = grid.episode.ticks, grid.bus_map.tick_ns
+    nothing = _Filled(
+        np.full(ticks, np.nan), np.zeros(ticks, dtype=np.bool_), np.full(ticks, -1, dtype=np.int64)
+    )
+    notes: list[str] = []
+    filled: dict[str, _Filled] = {}
+    for key in CHANNEL_KEYS:
+        found = grid.fill(f"channels.{key}")
+        filled[key] = found or nothing
+        if found is None:
+            notes.append(f"no frame brings the {key}")
+            continue
+        frozen = _frozen(found.value, found.saturated)
+        if frozen:
+            seconds = frozen * period * 1e-9
+            notes.append(f"{key} stood at one code for {seconds:.3g} s though it moves elsewhere")
+    mode, command, said = _command(grid)
+    samples = Samples(
+        period_ns=period,
+        mode=mode,
+        current=filled["current"].value,
+        spool=filled["spool"].value,
+        pressure=filled["pressure"].value,
+        position=filled["position"].value,
+        command=command,
+        saturated=np.stack([filled[key].saturated for key in CHANNEL_KEYS]),
+        host_ns=filled["spool"].host_ns,
+    )
+    return samples, notes + said
+
+
+def _frozen(value: NDArray[np.float64], saturated: NDArray[np.bool_]) -> int:
+    """Length of a frozen stretch in ticks, 0 if the channel never stood still suspiciously."""
+    known = np.flatnonzero(np.isfinite(value) & ~saturated)
+    if len(known) == 0:
+        return 0
+    edges = np.flatnonzero(np.diff(value[known]) != 0.0)
+    bounds = np.concatenate(([-1], edges, [len(known) - 1]))
+    lengths = np.diff(bounds)
+    longest = int(lengths.argmax())
+    run = int(lengths[longest])
+    elsewhere = len(known) - run
+    span = int(known[bounds[longest + 1]] - known[bounds[longest] + 1]) + 1
+    lively = elsewhere > FROZEN_TICKS and len(edges) >= FROZEN_LIVELY * elsewhere
+    return span if run >= FROZEN_TICKS and lively else 0
+
+
+def _command(grid: _Grid) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
+    """Mode and command of a test; NaN where no frame said, or where it said another mode."""
+    notes: list[str] = []
+    bus_map = grid.bus_map
+    mode = bus_map.fixed_mode
+    modes = grid.fill("command.mode")
+    if modes is not None:
+        known = modes.value[np.isin(modes.value, list(bus_map.modes))]
+        if len(known):
+            values, count = np.unique(known, return_counts=True)
+            mode = bus_map.modes[int(values[np.argmax(count)])]
+    if mode is None:
+        mode = CommandMode.CURRENT
+        notes.append("no command says its mode; taken as a current")
+    command = grid.fill(f"command.{mode.name.lower()}")
+    if command is None:
+        return mode, np.full(grid.episode.ticks, np.nan), [*notes, "no command frames"]
+    value = command.value
+    if modes is not None:
+        wanted = [number for number, meaning in bus_map.modes.items() if meaning is mode]
+        other = np.isfinite(modes.value) & ~np.isin(modes.value, wanted)
+        if other.any():
+            notes.append(f"{int(other.sum())} commands of another mode left out")
+            value[other] = np.nan
+    return mode, value, notes
+
+
+def _saturated(samples: Samples | None) -> dict[str, int]:
+    if samples is None:
+        return {}
+    return {key: int(samples.saturated[index].sum()) for index, key in enumerate(CHANNEL_KEYS)}
+
+
+def _environment(decoded: DecodedTable, begin: int, end: int) -> Environment:
+    def median(key: str) -> float | None:
+        role = f"environment.{key}"
+        for item in decoded.messages.values():
+            if role in item.values:
+                value = item.values[role][slice(*np.searchsorted(item.row, [begin, end]))]
+                value = value[np.isfinite(value)]
+                return float(np.median(value)) if len(value) else None
+        return None
+
+    return Environment(
+        supply_pressure=median("supply_pressure"),
+        return_pressure=median("return_pressure"),
+        oil_temperature=median("oil_temperature"),
+    )

@@ -1,0 +1,283 @@
+"""Where the tests lie in a recording: first tick, length and outcome of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.recording import BitReason, BitState, Outcome
+from firmware_iface.alignment.ticks import TickAxis
+from firmware_iface.codec.decode import DecodedTable
+from firmware_iface.codec.protection import OUTSIDE
+from firmware_iface.codec.status import Status
+from firmware_iface.mapping.bus_map import BusMap
+
+__all__ = ["Episode", "find_episodes"]
+
+SAME_START = 20
+"""Status frames whose implied first ticks lie nearer than this belong to one test."""
+BLIP = 2
+"""A run of other test ids this short inside a test is corruption, not another test."""
+MAX_TICKS = 1_000_000
+"""Longest test that is unfolded onto a tick grid."""
+
+ENDS = (BitState.COMPLETE, BitState.ABORTED)
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One test.
+
+    Attributes
+    ----------
+    first: tick of row 0.
+    ticks: length; 0 if the test never ran.
+    test_id, serial: None if the bus does not say.
+    outcome: how it ended.
+    ended: row of the status frame that told of the end; None without one.
+    notes: what a reader should know.
+    """
+
+    first: int
+    ticks: int
+    test_id: int | None
+    serial: int | None
+    outcome: Outcome
+    ended: int | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """Ticks of a test as one source tells them; `after` and `before` are the idle neighbours."""
+
+    start: int
+    stop: int
+    test_id: int | None
+    after: int | None = None
+    before: int | None = None
+
+
+def find_episodes(
+    decoded: DecodedTable, axis: TickAxis | None, status: Status, bus_map: BusMap
+) -> tuple[Episode, ...]:
+    """Find all tests, in order of time.
+
+    Command test ids bound a test exactly where its neighbours arrived; status frames tell the
+    first tick where they did not. A recording with neither is one test. Refusals that stand alone
+    are episodes without ticks.
+    """
+    spans: list[_Span] = []
+    if axis is not None:
+        spans = _spans_by_id(decoded, axis, bus_map)
+        spans = _merge(spans, _spans_by_status(status, axis))
+        if not spans and _tells_nothing(decoded, status, bus_map):
+            spans = [_Span(int(axis.tick.min()), int(axis.tick.max()) + 1, None)]
+    found = []
+    for index, span in enumerate(spans):
+        limit = spans[index + 1].start if index + 1 < len(spans) else None
+        found.append(_episode(span, limit, status, axis))
+    return tuple(found) if found else _never_ran(status)
+
+
+def _tells_nothing(decoded: DecodedTable, status: Status, bus_map: BusMap) -> bool:
+    """Whether neither commands nor status could have told of a test."""
+    command = bus_map.find("command.test_id")
+    commands = command is not None and len(decoded.messages[command[0].name].row) > 0
+    return not commands and len(status.row) == 0
+
+
+def _spans_by_id(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> list[_Span]:
+    found = bus_map.find("command.test_id")
+    if found is None or found[0].name not in axis.ticks:
+        return []
+    item = decoded.messages[found[0].name]
+    tick, value = axis.ticks[found[0].name], item.values["command.test_id"]
+    known = np.isfinite(value) & (tick > OUTSIDE // 2)
+    order = np.argsort(tick[known], kind="stable")
+    tick, ids = tick[known][order], value[known][order].astype(np.int64)
+    runs = _runs(ids)
+    spans = []
+    for index, (begin, end) in enumerate(runs):
+        test_id = int(ids[begin])
+        if test_id == 0:
+            continue
+        after = int(tick[begin - 1]) if index > 0 else None
+        before = int(tick[end]) if index + 1 < len(runs) else None
+        spans.append(_Span(int(tick[begin]), int(tick[end - 1]) + 1, test_id, after, before))
+    return spans
+
+
+def _runs(ids: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Begin and end of stretches of one id; blips inside a stretch belong to it."""
+    if len(ids) == 0:
+        return []
+    edges = np.flatnonzero(np.diff(ids)) + 1
+    bounds = [0, *edges.tolist(), len(ids)]
+    runs: list[tuple[int, int]] = []
+    index = 0
+    while index + 1 < len(bounds):
+        begin, end = bounds[index], bounds[index + 1]
+        while (
+            index + 3 < len(bounds)
+            and bounds[index + 2] - bounds[index + 1] <= BLIP
+            and ids[bounds[index + 2]] == ids[begin]
+        ):
+            index += 2
+            end = bounds[index + 1]
+        runs.append((begin, end))
+        index += 1
+    return runs
+
+
+def _spans_by_status(status: Status, axis: TickAxis) -> list[_Span]:
+    running = np.flatnonzero((status.state == BitState.RUNNING) & np.isfinite(status.elapsed))
+    if len(running) == 0:
+        return []
+    start = status.start[running].astype(np.int64)
+    cuts = np.flatnonzero(np.abs(np.diff(start)) > SAME_START) + 1
+    spans = []
+    for group in np.split(np.arange(len(running)), cuts):
+        first = _most_common(start[group])
+        rows = running[group]
+        stop = _stop(status, int(rows[-1]), first, axis)
+        ids = status.test_id[rows]
+        test_id = _most_common(ids) if np.any(ids >= 0) else None
+        spans.append(_Span(first, stop, test_id))
+    return spans
+
+
+def _stop(status: Status, last_running: int, first: int, axis: TickAxis) -> int:
+    """One past the last tick of a test whose last running frame is given."""
+    after = last_running + 1
+    if after < len(status.row):
+        if status.state[after] == BitState.COMPLETE and np.isfinite(status.elapsed[after]):
+            return first + int(status.elapsed[after])
+        return int(status.following[after])
+    return int(axis.tick.max()) + 1
+
+
+def _most_common(values: NDArray[np.int64]) -> int:
+    unique, count = np.unique(values, return_counts=True)
+    return int(unique[np.argmax(count)])
+
+
+def _merge(by_id: list[_Span], by_status: list[_Span]) -> list[_Span]:
+    """Ids lead; a run of one id with several starts is split; status alone stands in for ids."""
+    merged: list[_Span] = []
+    for span in by_id:
+        inside = [
+            item
+            for item in by_status
+            if item.stop - item.start > SAME_START
+            and span.start + SAME_START < item.start < span.stop - SAME_START
+            and item.test_id in (None, span.test_id)
+        ]
+        edges = [span.start, *(item.start for item in inside), span.stop]
+        for index in range(len(edges) - 1):
+            first, last = index == 0, index == len(edges) - 2
+            merged.append(
+                replace(
+                    span,
+                    start=edges[index],
+                    stop=edges[index + 1],
+                    after=span.after if first else None,
+                    before=span.before if last else None,
+                )
+            )
+    for item in by_status:
+        if not any(item.start < other.stop and other.start < item.stop for other in merged):
+            merged.append(item)
+    return sorted(merged, key=lambda item: item.start)
+
+
+def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | None) -> Episode:
+    notes: list[str] = []
+    mine = _status_rows(span, limit, status)
+    running = mine[(status.state[mine] == BitState.RUNNING) & np.isfinite(status.elapsed[mine])]
+    first = span.start
+    low = span.after + 1 if span.after is not None else None
+    if len(running):
+        told = _most_common(status.start[running].astype(np.int64))
+        first = min(told, span.start) if low is None else min(max(told, low), span.start)
+        if abs(told - first) > 2:
+            notes.append(f"status and command ids differ by {abs(told - first)} ticks on the start")
+    elif low is not None and low < span.start:
+        notes.append(f"start of the test uncertain by {span.start - low} ticks")
+    stop = span.stop
+    outcome, final = _outcome(mine, status)
+    if outcome.state is BitState.COMPLETE and final is not None and status.elapsed[final] > 0:
+        stop = first + int(status.elapsed[final])
+        if span.before is not None:
+            stop = min(stop, span.before)
+        if span.test_id is not None and abs(stop - span.stop) > 2 and span.before == span.stop:
+            notes.append(f"status and command ids differ by {span.stop - stop} ticks on the end")
+    elif span.before is None and axis is not None and limit is None and len(mine) == 0:
+        stop = max(stop, int(axis.tick.max()) + 1) if axis.tick.max() - stop < SAME_START else stop
+    ticks = stop - first
+    if ticks > MAX_TICKS:
+        notes.append(f"test cut off at {MAX_TICKS} ticks")
+        ticks = MAX_TICKS
+    serials = status.serial[mine]
+    return Episode(
+        first=first,
+        ticks=max(ticks, 0),
+        test_id=span.test_id,
+        serial=_most_common(serials[serials >= 0]) if np.any(serials >= 0) else None,
+        outcome=outcome,
+        ended=int(status.row[final]) if final is not None and outcome.state in ENDS else None,
+        notes=tuple(notes),
+    )
+
+
+def _status_rows(span: _Span, limit: int | None, status: Status) -> NDArray[np.int64]:
+    """Status frames of a test; its end may be told right before the first tick of the next."""
+    mine = status.following >= span.start - SAME_START
+    if limit is not None:
+        ended = (status.following == limit) & (status.state != BitState.RUNNING)
+        mine &= (status.following < limit) | ended
+    return np.flatnonzero(mine)
+
+
+def _outcome(mine: NDArray[np.int64], status: Status) -> tuple[Outcome, int | None]:
+    """How a test ended: the first end after it ran."""
+    state = status.state[mine]
+    begun = np.flatnonzero(state == BitState.RUNNING)
+    begin = int(begun[0]) if len(begun) else 0
+    ends = np.flatnonzero(np.isin(state, ENDS) & (np.arange(len(state)) >= begin))
+    if len(ends):
+        final = int(mine[ends[0]])
+        return Outcome(BitState(int(status.state[final])), _reason(status, final)), final
+    if len(begun):
+        return Outcome(BitState.RUNNING), None
+    known = mine[state >= 0]
+    if len(known):
+        final = int(known[-1])
+        return Outcome(BitState(int(status.state[final])), _reason(status, final)), final
+    return Outcome(None), None
+
+
+def _reason(status: Status, index: int) -> BitReason:
+    number = int(status.reason[index])
+    return BitReason(number) if number in BitReason.__members__.values() else BitReason.NONE
+
+
+def _never_ran(status: Status) -> tuple[Episode, ...]:
+    """One episode without ticks: the last refusal, or the last state known."""
+    known = np.flatnonzero(status.state >= 0)
+    if len(known) == 0:
+        return (Episode(0, 0, None, None, Outcome(None)),)
+    refused = np.flatnonzero(status.state == BitState.REFUSED)
+    index = int(refused[-1]) if len(refused) else int(known[-1])
+    test_id, serial = int(status.test_id[index]), int(status.serial[index])
+    return (
+        Episode(
+            first=0,
+            ticks=0,
+            test_id=test_id if test_id > 0 else None,
+            serial=serial if serial >= 0 else None,
+            outcome=Outcome(BitState(int(status.state[index])), _reason(status, index)),
+        ),
+    )

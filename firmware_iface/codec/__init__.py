@@ -1,0 +1,1 @@
+"""Frames to physical values and back, with end-to-end protection checked."""

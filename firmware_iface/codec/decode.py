@@ -1,0 +1,184 @@
+"""Frames in bulk to checked signal columns in SI, one set per message."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.codec.protection import crc8_rows
+from firmware_iface.mapping.bus_map import BusMap, MessageMap, Role
+from firmware_iface.mapping.signal_layout import SignalLayout
+from firmware_iface.transport.frames import FrameTable
+
+__all__ = ["Decoded", "DecodedTable", "decode", "value_ends"]
+
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoded:
+    """The frames of one message; n of them passed the checks.
+
+    Attributes
+    ----------
+    message: what it is.
+    received: rows of the table with its identifier, good or bad.
+    crc_bad, length_bad, range_bad: rows that failed a check.
+    row: rows that passed length and check sum, shape (n,), ascending.
+    time_ns: host time, shape (n,).
+    counter: counter values, shape (n,); None without a counter.
+    values: SI value per role, shape (n,); NaN where a multiplexed signal is absent or its value
+        lies outside the range of the DBC.
+    saturated: per channel role, value at an end of its range, shape (n,).
+    stream: which set of multiplexed signals the frame carries, shape (n,); 0 without multiplexers.
+    """
+
+    message: MessageMap
+    received: Rows
+    crc_bad: Rows
+    length_bad: Rows
+    range_bad: Rows
+    row: Rows
+    time_ns: NDArray[np.int64]
+    counter: NDArray[np.int64] | None
+    values: Mapping[str, NDArray[np.float64]]
+    saturated: Mapping[str, NDArray[np.bool_]]
+    stream: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DecodedTable:
+    """All messages of a frame table; rows of frames that belong to none, and of error frames."""
+
+    messages: Mapping[str, Decoded]
+    foreign: Rows
+    errors: Rows
+
+
+def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
+    """Check and decode all frames of the mapped messages."""
+    unusable = table.error | table.remote
+    foreign = ~unusable
+    messages = {}
+    for message in bus_map.messages.values():
+        mine = table.can_id == message.can_id
+        mine &= table.extended == message.extended
+        mine &= ~unusable
+        foreign &= ~mine
+        keep_bad = bus_map.policy.crc == "flag"
+        messages[message.name] = _decode_message(
+            table, np.flatnonzero(mine), message, keep_bad, bus_map.policy.range == "flag"
+        )
+    return DecodedTable(messages, np.flatnonzero(foreign), np.flatnonzero(table.error))
+
+
+def _decode_message(
+    table: FrameTable, received: Rows, message: MessageMap, keep_bad_crc: bool, keep_range: bool
+) -> Decoded:
+    fits = table.length[received] == message.length
+    length_bad, row = received[~fits], received[fits]
+    data = _gather(table.data, row)
+    crc_bad = row[:0]
+    if message.crc is not None and len(row):
+        at = message.crc.lead // 8
+        good = crc8_rows(message.can_id, data, at, message.length) == data[:, at]
+        if not good.all():
+            crc_bad = row[~good]
+            if not keep_bad_crc:
+                row, data = row[good], np.ascontiguousarray(data[good])
+    values, saturated = {}, {}
+    outside = np.zeros(len(row), dtype=np.bool_)
+    stream = np.zeros(len(row), dtype=np.int64)
+    streams: dict[tuple[tuple[str, frozenset[int]], ...], int] = {}
+    for role in message.roles:
+        physical = role.signal.physical(data)
+        present = role.signal.present(data)
+        wrong = _outside(physical, role.signal)
+        if wrong is not None:
+            outside |= wrong if present is None else wrong & present
+        if role.name.startswith("channels."):
+            saturated[role.name] = _at_end(physical, role.signal)
+        value = _to_si(physical, role)
+        if wrong is not None and not keep_range:
+            value[wrong] = np.nan
+        if present is not None:
+            value[~present] = np.nan
+            key = tuple((item.name, chosen) for item, chosen in role.signal.selectors)
+            stream[present] |= 1 << streams.setdefault(key, len(streams))
+        values[role.name] = value
+    return Decoded(
+        message=message,
+        received=received,
+        crc_bad=crc_bad,
+        length_bad=length_bad,
+        range_bad=row[outside],
+        row=row,
+        time_ns=table.time_ns[row],
+        counter=_integers(message.counter, data),
+        values=values,
+        saturated=saturated,
+        stream=stream,
+    )
+
+
+def _gather(data: NDArray[np.uint8], row: Rows) -> NDArray[np.uint8]:
+    if data.shape[1] == 8 and data.flags.c_contiguous:
+        return data.view(np.uint64).reshape(-1)[row].view(np.uint8).reshape(-1, 8)
+    return np.ascontiguousarray(data[row])
+
+
+def _integers(signal: SignalLayout | None, data: NDArray[np.uint8]) -> NDArray[np.int64] | None:
+    return None if signal is None else signal.bits(data).astype(np.int64)
+
+
+def _to_si(physical: NDArray[np.float64], role: Role) -> NDArray[np.float64]:
+    value = physical * role.gain
+    if role.bias != 0.0:
+        value += role.bias
+    return value
+
+
+def _raw_ends(signal: SignalLayout) -> tuple[float, float]:
+    """Physical values of the smallest and the largest raw number, in ascending order."""
+    low = -(1 << (signal.length - 1)) if signal.signed else 0
+    high = low + (1 << signal.length) - 1
+    ends = sorted((low * signal.scale + signal.offset, high * signal.scale + signal.offset))
+    return ends[0], ends[1]
+
+
+def _outside(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.bool_] | None:
+    """Values outside the DBC's range, or not finite; None where that cannot be."""
+    slack = 0.5 * abs(signal.scale)
+    if signal.is_float:
+        wrong = ~np.isfinite(physical)
+        slack = 0.0
+    else:
+        ends = _raw_ends(signal)
+        if signal.minimum is None or signal.maximum is None:
+            return None
+        if signal.minimum - slack < ends[0] and ends[1] < signal.maximum + slack:
+            return None
+        wrong = np.zeros(len(physical), dtype=np.bool_)
+    if signal.minimum is not None and signal.maximum is not None:
+        wrong |= (physical < signal.minimum - slack) | (physical > signal.maximum + slack)
+    return wrong
+
+
+def value_ends(signal: SignalLayout) -> tuple[float, float]:
+    """Physical values at and beyond which a converter stands at its end: those of the DBC's range,
+    or of the raw number where it gives none."""
+    slack = 0.0 if signal.is_float else 0.5 * abs(signal.scale)
+    low, high = -np.inf, np.inf
+    if not signal.is_float:
+        low, high = _raw_ends(signal)
+    if signal.minimum is not None and signal.maximum is not None:
+        low, high = max(low, signal.minimum), min(high, signal.maximum)
+    return low + slack, high - slack
+
+
+def _at_end(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.bool_]:
+    low, high = value_ends(signal)
+    return (physical <= low) | (physical >= high)

@@ -1,0 +1,125 @@
+"""Frames one at a time, as they come: what the handshake, its limits and the emulator act on.
+
+Diagnosis does not read through here: it works on columns of the whole test (`decode`).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+
+from ehadiag.core.recording import BitReason, BitState
+from firmware_iface.codec.live_messages import BitStatus, Request, Sample
+from firmware_iface.codec.protection import crc8
+from firmware_iface.mapping.bus_map import BusMap, MessageMap, Role, default_map
+from firmware_iface.mapping.signal_layout import SignalLayout
+from firmware_iface.transport.frames import Frame
+
+__all__ = ["LiveDecoder", "bit_pattern", "checked_values"]
+
+FLOAT_FORMATS = {2: "<e", 4: "<f", 8: "<d"}
+REASONS = frozenset(BitReason)
+CHANNELS = {f"channels.{key}": key for key in ("current", "spool", "pressure", "position")}
+"""Roles in the order of `Sample`'s fields."""
+
+
+class LiveDecoder:
+    """Decodes single frames of the mapped messages, good ones only.
+
+    Keeps the last value of each channel, for buses that spread a sample over several messages.
+    """
+
+    def __init__(self, bus_map: BusMap | None = None) -> None:
+        self._map = bus_map or default_map()
+        sections = ("channels", "status", "request")
+        self._messages = {
+            (item.can_id, item.extended): item
+            for item in self._map.messages.values()
+            if any(role.name.split(".")[0] in sections for role in item.roles)
+        }
+        self._codes = {number: name for name, number in self._map.requests.items()}
+        self._last = dict.fromkeys(CHANNELS, math.nan)
+
+    def decode(self, frame: Frame) -> BitStatus | Sample | Request | None:
+        """Content of a frame; None for foreign, damaged and all other frames."""
+        message = self._messages.get((frame.can_id, frame.extended))
+        if message is None or frame.error or frame.remote or not _intact(message, frame.data):
+            return None
+        values = _values(message, frame.data)
+        if any(name in self._last for name in values):
+            self._last |= {name: values[name] for name in CHANNELS if name in values}
+            brought = frozenset(key for name, key in CHANNELS.items() if name in values)
+            current, spool, pressure, position = (self._last[name] for name in CHANNELS)
+            return Sample(current, spool, pressure, position, brought)
+        if "status.state" in values:
+            return self._status(values)
+        if "request.code" in values:
+            code = self._codes.get(round(values["request.code"]), "")
+            return Request(code, round(values.get("request.test_id", 0.0)))
+        return None
+
+    def _status(self, values: Mapping[str, float]) -> BitStatus | None:
+        state = self._map.states.get(round(values["status.state"]))
+        if state is None:
+            return None
+        reason = round(values.get("status.reason", 0.0))
+        serial = values.get("status.serial")
+        test_id = values.get("status.test_id")
+        return BitStatus(
+            state=BitState(state),
+            reason=BitReason(reason) if reason in REASONS else BitReason.NONE,
+            test_id=None if test_id is None else round(test_id),
+            elapsed=values.get("status.elapsed", 0.0),
+            serial=None if serial is None else round(serial),
+        )
+
+
+def checked_values(message: MessageMap, data: bytes) -> dict[str, float] | None:
+    """SI value of each role in a payload; None where its length or its check sum is wrong."""
+    return _values(message, data) if _intact(message, data) else None
+
+
+def bit_pattern(signal: SignalLayout, data: bytes) -> int:
+    """Bits of a signal in a payload, as an unsigned number."""
+    words = {True: int.from_bytes(data, "big"), False: int.from_bytes(data, "little")}
+    return _pattern(signal, words, 8 * len(data))
+
+
+def _intact(message: MessageMap, data: bytes) -> bool:
+    if len(data) != message.length:
+        return False
+    if message.crc is None:
+        return True
+    at = message.crc.lead // 8
+    header = struct.pack("<H", message.can_id & 0xFFFF)
+    return crc8(header + data[:at] + data[at + 1 :]) == data[at]
+
+
+def _values(message: MessageMap, data: bytes) -> dict[str, float]:
+    """SI value of each role that is present."""
+    words = {True: int.from_bytes(data, "big"), False: int.from_bytes(data, "little")}
+    bits = 8 * len(data)
+    return {
+        role.name: _si(role, words, bits)
+        for role in message.roles
+        if all(_pattern(item, words, bits) in chosen for item, chosen in role.signal.selectors)
+    }
+
+
+def _pattern(signal: SignalLayout, words: Mapping[bool, int], bits: int) -> int:
+    big = signal.big_endian
+    shift = bits - signal.lead - signal.length if big else signal.start
+    return words[big] >> shift & ((1 << signal.length) - 1)
+
+
+def _si(role: Role, words: Mapping[bool, int], bits: int) -> float:
+    signal = role.signal
+    pattern = _pattern(signal, words, bits)
+    raw: float = pattern
+    if signal.is_float:
+        size = signal.length // 8
+        raw = struct.unpack(FLOAT_FORMATS[size], pattern.to_bytes(size, "little"))[0]
+    elif signal.signed and pattern >> (signal.length - 1):
+        raw = pattern - (1 << signal.length)
+    return (raw * signal.scale + signal.offset) * role.gain + role.bias

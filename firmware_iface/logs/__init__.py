@@ -1,0 +1,1 @@
+"""Recordings on disk: reading, writing and replaying frames."""

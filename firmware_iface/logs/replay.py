@@ -1,0 +1,139 @@
+"""Logs as a source of frames, and back onto a bus."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from ehadiag.core.errors import ConfigurationError
+from firmware_iface.transport.frames import Frame, FrameTable
+from firmware_iface.transport.interface import Transport
+
+__all__ = ["ReplayTransport", "play"]
+
+BLOCK = 4096
+"""Rows turned into frames at a time."""
+STEP = 0.05
+"""s; how fast playing notices that it shall stop."""
+
+
+def _frames(table: FrameTable) -> Iterator[Frame]:
+    for start in range(0, len(table), BLOCK):
+        rows = slice(start, start + BLOCK)
+        for time_ns, can_id, length, data, extended, fd, error, remote, sent in zip(
+            table.time_ns[rows].tolist(),
+            table.can_id[rows].tolist(),
+            table.length[rows].tolist(),
+            table.data[rows],
+            table.extended[rows].tolist(),
+            table.fd[rows].tolist(),
+            table.error[rows].tolist(),
+            table.remote[rows].tolist(),
+            table.sent[rows].tolist(),
+            strict=True,
+        ):
+            payload = data[:length].tobytes()
+            yield Frame(time_ns, can_id, payload, extended, fd, error, remote, sent)
+
+
+class ReplayTransport(Transport):
+    """A recorded log as a transport: as fast as it is read, or in the log's own time.
+
+    `now_ns` is the time in the log: of the frame read last, or, in real time, of the moment.
+    Nothing can be sent.
+
+    Raises
+    ------
+    ConfigurationError: speed not positive.
+    """
+
+    def __init__(self, table: FrameTable, name: str, *, speed: float | None = None) -> None:
+        """`speed` 1 replays in real time, 10 ten times as fast, None as fast as possible."""
+        super().__init__(f"replay of {name}", transmit=False)
+        if speed is not None and not speed > 0:
+            raise ConfigurationError(f"{self.name}: speed {speed:g}, need more than 0")
+        self._rows = _frames(table)
+        self._next: Frame | None = next(self._rows, None)
+        self._speed = speed
+        self._first_ns = 0 if self._next is None else self._next.time_ns
+        self._now = self._first_ns
+        self._started = time.monotonic_ns()
+
+    @property
+    def at_end(self) -> bool:
+        """Whether the last frame was read."""
+        return self._next is None
+
+    @property
+    def real_time(self) -> bool:
+        """Whether the log's own rhythm is kept."""
+        return self._speed is not None
+
+    def now_ns(self) -> int:
+        """Time in the log, ns."""
+        if self._speed is None:
+            return self._now
+        return self._first_ns + int((time.monotonic_ns() - self._started) * self._speed)
+
+    def _receive(self, timeout: float) -> Frame | None:
+        frame = self._next
+        if frame is None:
+            self._now += round(timeout * 1e9)  # a silent bus, as fast as it is read
+            return None
+        if self._speed is not None:
+            wait = (frame.time_ns - self.now_ns()) / 1e9 / self._speed
+            time.sleep(max(0.0, min(wait, timeout)))
+            if wait > timeout:
+                return None
+        self._now = max(self._now, frame.time_ns)
+        self._next = next(self._rows, None)
+        return frame
+
+    def _send(self, frame: Frame) -> None:
+        raise AssertionError(f"not opened to send {frame}")
+
+    def _close(self) -> None:
+        self._next = None
+
+
+def play(
+    table: FrameTable,
+    transport: Transport,
+    *,
+    speed: float | None = 1.0,
+    stop: threading.Event | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Send a log's frames onto a bus in their own rhythm; return how many were sent.
+
+    Absolute deadlines: lateness is made up, not added up. Error frames are left out, no bus can
+    be told to send them. `speed` None sends as fast as the bus takes them. `progress` gets the
+    number sent, after every block.
+
+    Raises
+    ------
+    ConfigurationError: the transport was opened to listen only; speed not positive.
+    BusLostError: the bus failed.
+    """
+    if speed is not None and not speed > 0:
+        raise ConfigurationError(f"speed {speed:g}, need more than 0")
+    halt = stop or threading.Event()
+    started = time.monotonic()
+    first_ns: int | None = None
+    sent = 0
+    for frame in _frames(table):
+        if frame.error:
+            continue
+        first_ns = frame.time_ns if first_ns is None else first_ns
+        if speed is not None:
+            due = started + (frame.time_ns - first_ns) / 1e9 / speed
+            while (wait := due - time.monotonic()) > 0 and not halt.is_set():
+                time.sleep(min(wait, STEP))
+        if halt.is_set():
+            break
+        transport.send(frame)
+        sent += 1
+        if progress is not None and sent % BLOCK == 0:
+            progress(sent)
+    return sent

@@ -1,0 +1,61 @@
+"""python-can's log writers, opened so that a killed process leaves a readable file.
+
+Imported only where a recording is written: python-can takes half a second to import.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import can
+
+from ehadiag.core.errors import ConfigurationError
+
+__all__ = ["FlushingBlfWriter", "open_writer"]
+
+FILE_BUFFER = 1 << 20
+"""Bytes. Larger than what comes between two flushes, so that each flush is one write and a killed
+process leaves no half line or half container."""
+
+
+class FlushingBlfWriter(can.BLFWriter):
+    """A BLF file that is readable up to its last flush.
+
+    python-can's own keeps up to 128 KiB in memory and writes the true header at its end; without
+    the header's start time a reader takes frame times as relative ones.
+    """
+
+    def flush(self) -> None:
+        """Write all frames so far and a header that fits them."""
+        while self._buffer_size:
+            self._flush()
+        end = self.file.tell()
+        self.file.seek(0)
+        self._write_header(end)
+        self.file.seek(end)
+        self.file.flush()
+
+
+def open_writer(path: Path) -> Any:
+    """Create `path`, which must not exist, and return the writer for its suffix.
+
+    Raises
+    ------
+    ConfigurationError: MF4 without its library.
+    OSError: the file exists or cannot be created.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".mf4":
+        path.open("xb").close()
+        try:
+            return can.MF4Writer(path)
+        except (ImportError, NotImplementedError):
+            path.unlink()
+            raise ConfigurationError(
+                f"recording {path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"
+            ) from None
+    if suffix == ".blf":
+        return FlushingBlfWriter(path.open("xb", buffering=FILE_BUFFER))
+    kinds: dict[str, Any] = {".asc": can.ASCWriter, ".csv": can.CSVWriter, ".trc": can.TRCWriter}
+    return kinds[suffix](path.open("x", buffering=FILE_BUFFER, encoding="utf-8", newline=""))

@@ -1,0 +1,1 @@
+"""Which messages and signals of a DBC play which role: mapping file, DBC, units."""

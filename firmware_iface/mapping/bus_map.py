@@ -1,0 +1,284 @@
+"""A mapping resolved against its DBC: what decoder and encoder work from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path, PurePosixPath
+
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.recording import BitState, CommandMode
+from ehadiag.core.toml_file import decode_toml, read_toml
+from firmware_iface.mapping.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, recall_dbc
+from firmware_iface.mapping.file import MappingFile, Policy, Protection, SignalRef
+from firmware_iface.mapping.signal_layout import SignalLayout
+from firmware_iface.mapping.units import si_factor
+from firmware_iface.transport.frames import MAX_PAYLOAD
+
+__all__ = ["BusMap", "MessageMap", "Role", "default_map", "load_map"]
+
+MAX_MULTIPLEXERS = 8
+"""Multiplexers of multiplexers."""
+
+DIMENSIONS: dict[str, dict[str, str | None]] = {
+    "channels": {
+        "current": "current",
+        "spool": "length",
+        "pressure": "pressure",
+        "position": "length",
+    },
+    "command": {"current": "current", "position": "length", "mode": None, "test_id": None},
+    "environment": {
+        "supply_pressure": "pressure",
+        "return_pressure": "pressure",
+        "oil_temperature": "temperature",
+    },
+    "status": {
+        "state": None,
+        "reason": None,
+        "test_id": None,
+        "elapsed": "time",
+        "serial": None,
+    },
+    "request": {"code": None, "test_id": None},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """A signal in its role: SI value = physical * gain + bias."""
+
+    name: str
+    """Section and key of the mapping, as `channels.spool`."""
+    signal: SignalLayout
+    gain: float = 1.0
+    bias: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class MessageMap:
+    """One message that carries roles, and how it is guarded."""
+
+    name: str
+    can_id: int
+    extended: bool
+    fd: bool
+    length: int
+    roles: tuple[Role, ...]
+    counter: SignalLayout | None = None
+    counts_ticks: bool = False
+    crc: SignalLayout | None = None
+    crc_kind: str = "none"
+    cycle_ns: int = 0
+    """Nominal time between frames; 0: on event or not said."""
+
+    @property
+    def modulus(self) -> int:
+        """Counts per turn of the counter."""
+        return 1 << self.counter.length if self.counter else 0
+
+
+@dataclass(frozen=True, slots=True)
+class BusMap:
+    """All messages in use, by name, and the numbers that stand for states."""
+
+    name: str
+    tick_ns: int
+    messages: Mapping[str, MessageMap]
+    modes: Mapping[int, CommandMode]
+    fixed_mode: CommandMode | None
+    states: Mapping[int, BitState]
+    requests: Mapping[str, int]
+    policy: Policy
+
+    def find(self, role: str) -> tuple[MessageMap, Role] | None:
+        """Message and signal of a role (`command.mode`); None if the mapping leaves it out."""
+        for message in self.messages.values():
+            for item in message.roles:
+                if item.name == role:
+                    return message, item
+        return None
+
+
+def default_map() -> BusMap:
+    """Return the contract's own bus (`data/eha_fcc.dbc`)."""
+    folder = resources.files("firmware_iface").joinpath("data")
+    where = "bundled mapping eha_fcc.toml"
+    tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)
+    text = folder.joinpath(tree.dbc).read_bytes()
+    return resolve(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
+
+
+def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
+    """Read a mapping file and its DBC (`dbc` overrides the one that the mapping names).
+
+    Raises
+    ------
+    InputOutputError: a file cannot be read.
+    ConfigurationError: not a mapping, not a DBC, a signal that does not exist or has a wrong unit.
+    """
+    path = Path(path)
+    tree = read_toml(path, MappingFile, "mapping file")
+    if dbc is None:
+        inside = PurePosixPath(tree.dbc)
+        if inside.is_absolute() or ".." in inside.parts or "\\" in tree.dbc or "\0" in tree.dbc:
+            raise ConfigurationError(
+                f"mapping file {path}: dbc must be a path in the mapping's folder, not {tree.dbc!r}"
+            )
+        dbc = path.parent / inside
+    try:
+        with Path(dbc).open("rb") as file:
+            text = file.read(MAX_DBC_BYTES + 1)
+    except OSError as error:
+        raise InputOutputError(f"DBC file {dbc}: {error.strerror or error}") from None
+    return resolve(tree, recall_dbc(text, str(dbc)), f"mapping file {path}", str(dbc))
+
+
+def resolve(
+    tree: MappingFile, database: Mapping[str, DbcMessage], where: str, dbc_name: str
+) -> BusMap:
+    """Resolve a mapping against the messages of a DBC; `where` begins the error texts."""
+    roles: dict[str, list[Role]] = {}
+    for section, dimensions in DIMENSIONS.items():
+        signals = getattr(tree, section)
+        for key, dimension in dimensions.items():
+            ref = getattr(signals, key)
+            if ref is not None:
+                role = _role(ref, f"{section}.{key}", dimension, database, where)
+                roles.setdefault(ref.message, []).append(role)
+    for name in tree.protection:
+        if name not in roles:
+            raise ConfigurationError(f"{where}: protection of {name!r}, which no role uses")
+    messages = {
+        name: _message(database[name], tuple(items), tree.protection.get(name), where)
+        for name, items in roles.items()
+    }
+    seen: dict[tuple[int, bool], str] = {}
+    for item in messages.values():
+        other = seen.setdefault((item.can_id, item.extended), item.name)
+        if other != item.name:
+            raise ConfigurationError(f"{where}: {other} and {item.name} share an identifier")
+    moduli = {item.modulus for item in messages.values() if item.counts_ticks}
+    if len(moduli) > 1:
+        raise ConfigurationError(f"{where}: counters that count ticks must be equally wide")
+    modes = {tree.command.modes[key]: CommandMode[key.upper()] for key in tree.command.modes}
+    states = {tree.status.states[key]: BitState[key.upper()] for key in tree.status.states}
+    return BusMap(
+        name=dbc_name,
+        tick_ns=round(tree.tick_ms * 1e6),
+        messages=messages,
+        modes=modes,
+        fixed_mode=_fixed_mode(tree, where),
+        states=states,
+        requests={str(key): value for key, value in tree.request.codes.items()},
+        policy=tree.policy,
+    )
+
+
+def _fixed_mode(tree: MappingFile, where: str) -> CommandMode | None:
+    command = tree.command
+    if command.mode is not None:
+        return None
+    if command.current is not None and command.position is not None:
+        raise ConfigurationError(
+            f"{where}: command.mode is needed where both a current and a position are commanded"
+        )
+    if command.current is not None:
+        return CommandMode.CURRENT
+    return CommandMode.POSITION if command.position is not None else None
+
+
+def _role(
+    ref: SignalRef,
+    name: str,
+    dimension: str | None,
+    database: Mapping[str, DbcMessage],
+    where: str,
+) -> Role:
+    at = f"{where}: {name}"
+    message = database.get(ref.message)
+    if message is None:
+        raise ConfigurationError(f"{at}: the DBC has no message {ref.message!r}")
+    signal = _layout(message, ref.signal, at)
+    gain, bias = (1.0, 0.0)
+    if dimension is not None:
+        text = ref.unit if ref.unit is not None else signal.unit
+        gain, bias = si_factor(text, dimension, f"{at} ({ref.message}.{ref.signal})")
+    if ref.scale == 0.0:
+        raise ConfigurationError(f"{at}: scale must not be zero")
+    return Role(name, signal, gain * ref.scale, gain * ref.offset + bias)
+
+
+def _layout(message: DbcMessage, name: str, at: str, depth: int = 0) -> SignalLayout:
+    found = next((item for item in message.signals if item.name == name), None)
+    if found is None:
+        raise ConfigurationError(f"{at}: message {message.name!r} has no signal {name!r}")
+    return signal_layout(found, message, at, depth)
+
+
+def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 0) -> SignalLayout:
+    """Layout of a signal, with its chain of multiplexers."""
+    scale, offset = signal.scale, signal.offset
+    if scale is None or offset is None or not 1 <= signal.length <= 64:
+        raise ConfigurationError(f"{at}: signal {signal.name!r} is not a plain number")
+    if scale == 0 or not math.isfinite(scale) or not math.isfinite(offset):
+        raise ConfigurationError(
+            f"{at}: the DBC gives signal {signal.name!r} a scale of zero or a number without end"
+        )
+    if depth > MAX_MULTIPLEXERS:
+        raise ConfigurationError(f"{at}: the multiplexers of {message.name!r} go in a circle")
+    selectors: tuple[tuple[SignalLayout, frozenset[int]], ...] = ()
+    if signal.multiplexer is not None and signal.multiplexer_ids:
+        parent = _layout(message, signal.multiplexer, at, depth + 1)
+        selectors = (*parent.selectors, (parent, frozenset(signal.multiplexer_ids)))
+    low, high = signal.minimum, signal.maximum
+    ranged = low is not None and high is not None and low < high
+    layout = SignalLayout(
+        name=signal.name,
+        start=signal.start,
+        length=signal.length,
+        big_endian=signal.byte_order == "big_endian",
+        signed=signal.is_signed,
+        is_float=signal.is_float,
+        scale=scale,
+        offset=offset,
+        minimum=low if ranged else None,
+        maximum=high if ranged else None,
+        unit=signal.unit,
+        selectors=selectors,
+    )
+    if layout.last_byte >= message.length:
+        raise ConfigurationError(f"{at}: signal {signal.name!r} does not fit its message")
+    return layout
+
+
+def _message(
+    message: DbcMessage, roles: tuple[Role, ...], guard: Protection | None, where: str
+) -> MessageMap:
+    guard = guard or Protection()
+    at = f"{where}: protection.{message.name}"
+    counter = _layout(message, guard.counter, at) if guard.counter else None
+    crc = _layout(message, guard.crc, at) if guard.crc else None
+    if counter is not None and (counter.is_float or not 2 <= counter.length <= 32):
+        raise ConfigurationError(
+            f"{at}: counter {counter.name!r} must be an integer of 2 … 32 bits"
+        )
+    if crc is not None and (crc.length != 8 or crc.lead % 8):
+        raise ConfigurationError(f"{at}: check sum {crc.name!r} must fill one byte")
+    if message.length > MAX_PAYLOAD:
+        raise ConfigurationError(f"{where}: message {message.name!r} is longer than a CAN FD frame")
+    return MessageMap(
+        name=message.name,
+        can_id=message.frame_id,
+        extended=message.extended,
+        fd=message.fd,
+        length=message.length,
+        roles=roles,
+        counter=counter,
+        counts_ticks=counter is not None and guard.counts == "ticks",
+        crc=crc,
+        crc_kind=guard.crc_kind if crc is not None else "none",
+        cycle_ns=message.cycle_ms * 1_000_000,
+    )

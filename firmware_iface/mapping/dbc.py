@@ -1,0 +1,166 @@
+"""A DBC file as plain data: read by cantools, remembered in the user's cache.
+
+cantools takes a quarter of a second to load (it loads python-can, and that whatever reads MF4), so
+what it found in a file is kept, as JSON under a hash of the file's bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from ehadiag.core.cache_folder import private_folder
+from ehadiag.core.errors import ConfigurationError
+
+__all__ = ["MAX_DBC_BYTES", "DbcMessage", "DbcSignal", "parse_dbc", "recall_dbc"]
+
+MAX_DBC_BYTES = 8 << 20
+MAX_KEPT_BYTES = 32 << 20
+MAX_KEPT = 16
+"""Files in the cache; the oldest goes."""
+FORM = 1
+"""Raised with each change of what is kept."""
+
+
+class DbcSignal(msgspec.Struct, frozen=True):
+    """One signal; `scale` and `offset` are None where the raw value is no plain number."""
+
+    name: str
+    start: int
+    length: int
+    byte_order: Literal["big_endian", "little_endian"]
+    is_signed: bool
+    is_float: bool
+    scale: float | None
+    offset: float | None
+    minimum: float | None
+    maximum: float | None
+    unit: str
+    multiplexer: str | None
+    multiplexer_ids: tuple[int, ...]
+
+
+class DbcMessage(msgspec.Struct, frozen=True):
+    """One message; `cycle_ms` is 0 where the file gives none."""
+
+    name: str
+    frame_id: int
+    extended: bool
+    fd: bool
+    length: int
+    cycle_ms: int
+    signals: tuple[DbcSignal, ...]
+
+
+Dbc = dict[str, DbcMessage]
+DECODER = msgspec.json.Decoder(Dbc)
+
+
+def recall_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
+    """`parse_dbc`, from the cache if the same bytes were read before."""
+    folder = private_folder("dbc") if len(text) <= MAX_DBC_BYTES else None
+    if folder is None:
+        return parse_dbc(text, name)
+    key = hashlib.sha256(f"{FORM} {version('cantools')} ".encode() + text).hexdigest()
+    path = folder / f"{key}.json"
+    kept = _read(path)
+    if kept is None:
+        kept = parse_dbc(text, name)
+        _keep(kept, path)
+    return kept
+
+
+def parse_dbc(text: bytes, name: str) -> Dbc:
+    """Messages of a DBC by their name; `name` is the file's, for errors.
+
+    Raises
+    ------
+    ConfigurationError: not a DBC, or too large.
+    """
+    if len(text) > MAX_DBC_BYTES:
+        raise ConfigurationError(f"DBC file {name}: larger than {MAX_DBC_BYTES} bytes")
+    import cantools.database  # noqa: PLC0415 - slow to import
+    from cantools.database.can.database import Database  # noqa: PLC0415
+
+    try:
+        content = text.decode("utf-8")
+    except UnicodeDecodeError:
+        content = text.decode("cp1252", "replace")  # what older tools write
+    try:
+        database = cantools.database.load_string(content, "dbc")
+        if not isinstance(database, Database):
+            raise ConfigurationError(f"DBC file {name}: no CAN messages in it")
+        return {message.name: plain_message(message) for message in database.messages}
+    except ConfigurationError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ConfigurationError(f"DBC file {name}: not a valid DBC: {reason}") from None
+
+
+def plain_message(message: Any) -> DbcMessage:
+    """What this project needs of a cantools message."""
+    return DbcMessage(
+        name=message.name,
+        frame_id=message.frame_id,
+        extended=message.is_extended_frame,
+        fd=message.is_fd,
+        length=message.length,
+        cycle_ms=int(message.cycle_time or 0),
+        signals=tuple(_plain_signal(item) for item in message.signals),
+    )
+
+
+def _plain_signal(signal: Any) -> DbcSignal:
+    conversion = signal.conversion
+    return DbcSignal(
+        name=signal.name,
+        start=signal.start,
+        length=signal.length,
+        byte_order=signal.byte_order,
+        is_signed=signal.is_signed,
+        is_float=conversion.is_float,
+        scale=_number(getattr(conversion, "scale", None)),
+        offset=_number(getattr(conversion, "offset", None)),
+        minimum=_number(signal.minimum),
+        maximum=_number(signal.maximum),
+        unit=signal.unit or "",
+        multiplexer=signal.multiplexer_signal,
+        multiplexer_ids=tuple(signal.multiplexer_ids or ()),
+    )
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _read(path: Path) -> Dbc | None:
+    """Return what is kept; None if there is nothing, or nothing that can be read."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_KEPT_BYTES)
+        return DECODER.decode(content)
+    except (OSError, msgspec.DecodeError, RecursionError):
+        return None
+
+
+def _keep(found: Dbc, path: Path) -> None:
+    """Write to the cache if that is possible, and gives the same when it is read."""
+    content = msgspec.json.encode(found)
+    draft = path.with_suffix(f".{os.getpid()}")
+    with suppress(OSError, msgspec.DecodeError):
+        if len(content) >= MAX_KEPT_BYTES or DECODER.decode(content) != found:
+            return
+        draft.write_bytes(content)
+        draft.replace(path)
+        by_age = sorted(path.parent.iterdir(), key=lambda item: item.stat().st_mtime, reverse=True)
+        for old in islice(by_age, MAX_KEPT, None):
+            old.unlink()

@@ -1,0 +1,1 @@
+"""Running a built-in test on a bus: handshake, limits, recording, bus report."""

@@ -1,0 +1,291 @@
+"""What a bus or a log carries for us: what maps, what is missing, rates, gaps, range use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.alignment.ticks import TickAxis, place
+from firmware_iface.codec.decode import Decoded, decode
+from firmware_iface.mapping.bus_map import DIMENSIONS, BusMap, MessageMap
+from firmware_iface.transport.frames import FrameTable
+
+__all__ = ["BusReport", "MessageReport", "RangeUse", "render", "report_bus"]
+
+MAX_FOREIGN = 20
+"""Foreign identifiers that are listed, the most frequent ones."""
+LONGEST_GAP_S = 0.25
+"""Span without a sample that a diagnosis bears within a test."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageReport:
+    """One mapped message.
+
+    Attributes
+    ----------
+    name, can_id, extended: which.
+    roles: what it carries for us.
+    received, crc_errors, length_errors, range_errors: frames.
+    lost: frames that the counter says are missing; None without a counter.
+    rate: frames per second, 0 with fewer than two.
+    longest_gap: between two frames, s.
+    jitter: standard deviation of the time between frames, s.
+    counter, crc: whether the mapping has them.
+    """
+
+    name: str
+    can_id: int
+    extended: bool
+    roles: tuple[str, ...]
+    received: int
+    crc_errors: int
+    length_errors: int
+    range_errors: int
+    lost: int | None
+    rate: float
+    longest_gap: float
+    jitter: float
+    counter: bool
+    crc: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RangeUse:
+    """Use of one converter channel: raw codes seen, codes possible (None for floats), SI values."""
+
+    channel: str
+    lowest_code: int | None
+    highest_code: int | None
+    codes: int | None
+    lowest: float
+    highest: float
+    saturated: int
+
+
+@dataclass(frozen=True, slots=True)
+class BusReport:
+    """What was heard.
+
+    Attributes
+    ----------
+    duration: s.
+    frames, errors: all frames, error frames.
+    messages: mapped messages, heard or not.
+    ranges: channels of which a sample was heard.
+    foreign: identifier, whether extended, frames; the most frequent first.
+    delay: median time from a command to the telemetry of its tick, s; None if unknown.
+    problems: what stands in the way of a diagnosis, one sentence each; empty if nothing.
+    remarks: what a diagnosis has to assume, or may stumble over, one sentence each.
+    """
+
+    duration: float
+    frames: int
+    errors: int
+    messages: tuple[MessageReport, ...]
+    ranges: tuple[RangeUse, ...]
+    foreign: tuple[tuple[int, bool, int], ...]
+    delay: float | None
+    problems: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
+    """Report on some seconds of a bus."""
+    decoded = decode(table, bus_map)
+    axis = place(decoded, bus_map.tick_ns)
+    messages = tuple(_message(item, table) for item in decoded.messages.values())
+    ranges = tuple(use for item in decoded.messages.values() for use in _ranges(item, table))
+    span = int(table.time_ns.max() - table.time_ns.min()) if len(table) else 0
+    return BusReport(
+        duration=span * 1e-9,
+        frames=len(table),
+        errors=len(decoded.errors),
+        messages=messages,
+        ranges=ranges,
+        foreign=_foreign(table, decoded.foreign),
+        delay=_delay(decoded.messages, axis),
+        problems=_problems(messages, len(table)),
+        remarks=(*_pauses(messages), *_unsaid(decoded.messages, len(table))),
+    )
+
+
+def _message(item: Decoded, table: FrameTable) -> MessageReport:
+    message = item.message
+    stamps = np.sort(table.time_ns[item.received])
+    steps = np.diff(stamps) * 1e-9
+    span = float(steps.sum())
+    return MessageReport(
+        name=message.name,
+        can_id=message.can_id,
+        extended=message.extended,
+        roles=tuple(role.name for role in message.roles),
+        received=len(item.received),
+        crc_errors=len(item.crc_bad),
+        length_errors=len(item.length_bad),
+        range_errors=len(item.range_bad),
+        lost=_lost(item),
+        rate=len(steps) / span if span > 0 else 0.0,
+        longest_gap=float(steps.max()) if len(steps) else 0.0,
+        jitter=float(steps.std()) if len(steps) else 0.0,
+        counter=message.counter is not None,
+        crc=message.crc is not None,
+    )
+
+
+def _lost(item: Decoded) -> int | None:
+    if item.counter is None:
+        return None
+    modulus = item.message.modulus
+    step = np.diff(item.counter) % modulus
+    missing = int((step[(step > 1) & (step <= modulus // 2)] - 1).sum())
+    return max(missing - len(item.crc_bad) - len(item.length_bad), 0)
+
+
+def _ranges(item: Decoded, table: FrameTable) -> list[RangeUse]:
+    data = table.data[item.row]
+    uses = []
+    for role in item.message.roles:
+        if role.name not in item.saturated:
+            continue
+        known = np.isfinite(item.values[role.name])
+        if not known.any():
+            continue
+        value = item.values[role.name][known]
+        low = high = codes = None
+        if not role.signal.is_float:
+            raw = role.signal.raw(data[known])
+            low, high, codes = int(raw.min()), int(raw.max()), 1 << role.signal.length
+        uses.append(
+            RangeUse(
+                channel=role.name.removeprefix("channels."),
+                lowest_code=low,
+                highest_code=high,
+                codes=codes,
+                lowest=float(value.min()),
+                highest=float(value.max()),
+                saturated=int(item.saturated[role.name][known].sum()),
+            )
+        )
+    return uses
+
+
+def _foreign(table: FrameTable, rows: NDArray[np.int64]) -> tuple[tuple[int, bool, int], ...]:
+    marked = table.can_id[rows].astype(np.int64) << 1 | table.extended[rows]
+    ids, counts = np.unique(marked, return_counts=True)
+    order = np.argsort(-counts, kind="stable")[:MAX_FOREIGN]
+    return tuple((int(ids[i]) >> 1, bool(ids[i] & 1), int(counts[i])) for i in order)
+
+
+def _delay(messages: Mapping[str, Decoded], axis: TickAxis | None) -> float | None:
+    """Median time from command to telemetry, where both tell their tick."""
+    if axis is None:
+        return None
+    telemetry = [item for item in messages.values() if item.saturated]
+    command = [item for item in messages.values() if _commands(item.message)]
+    for later in telemetry:
+        for earlier in command:
+            names = later.message.name, earlier.message.name
+            if names[0] == names[1] or any(name not in axis.ticks for name in names):
+                continue
+            _, left, right = np.intersect1d(
+                axis.ticks[names[0]], axis.ticks[names[1]], return_indices=True
+            )
+            if len(left):
+                return float(np.median(later.time_ns[left] - earlier.time_ns[right])) * 1e-9
+    return None
+
+
+def _commands(message: MessageMap) -> bool:
+    return any(role.name.startswith("command.") for role in message.roles)
+
+
+def _problems(messages: tuple[MessageReport, ...], frames: int) -> tuple[str, ...]:
+    if not frames:
+        return ("the bus is silent",)
+    problems = []
+    for item in messages:
+        needed = any(role.split(".")[0] in ("channels", "command") for role in item.roles)
+        good = item.received - item.crc_errors - item.length_errors
+        if not item.received and needed:
+            problems.append(
+                f"{item.name} ({item.can_id:#x}) does not come: {', '.join(item.roles)}"
+            )
+        elif item.received and not good:
+            why = "length" if item.length_errors else "check sum"
+            problems.append(
+                f"{item.name}: every frame has a wrong {why}; is the DBC the right one?"
+            )
+        if item.range_errors:
+            problems.append(f"{item.name}: {item.range_errors} frames with values out of range")
+        if item.lost:
+            problems.append(f"{item.name}: {item.lost} frames lost")
+    return tuple(problems)
+
+
+def _pauses(messages: tuple[MessageReport, ...]) -> tuple[str, ...]:
+    """Silences too long for a test; a counter that turns meanwhile does not tell of them."""
+    return tuple(
+        f"{item.name}: nothing for {item.longest_gap:.3g} s; within a test a diagnosis bears"
+        f" {LONGEST_GAP_S:g} s"
+        for item in messages
+        if item.longest_gap > LONGEST_GAP_S
+        and any(role.startswith("channels.") for role in item.roles)
+    )
+
+
+def _unsaid(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:
+    """What the mapping does not name of the command, and the bus does not say of oil and supply."""
+    if not frames:
+        return ()
+    commands = "no command is mapped: a test in closed loop cannot be judged without"
+    unmapped = () if any(_commands(item.message) for item in messages.values()) else (commands,)
+    said = {
+        name
+        for item in messages.values()
+        for name, value in item.values.items()
+        if np.isfinite(value).any()
+    }
+    return unmapped + tuple(
+        f"{name} is not on the bus: a diagnosis assumes the actuator file's"
+        for name in DIMENSIONS["environment"]
+        if f"environment.{name}" not in said
+    )
+
+
+def render(report: BusReport) -> str:
+    """Text of a report, lines of at most some 100 characters."""
+    lines = [
+        f"{report.frames} frames in {report.duration:.2f} s, {report.errors} error frames",
+        "",
+        f"{'message':<24}{'id':>11}{'frames':>8}{'1/s':>9}{'gap ms':>9}{'lost':>6}{'crc':>5}"
+        f"{'len':>5}{'range':>6}",
+    ]
+    for item in report.messages:
+        lost = "-" if item.lost is None else str(item.lost)
+        check = str(item.crc_errors) if item.crc else "-"
+        lines.append(
+            f"{item.name:<24}{item.can_id:>#11x}{item.received:>8}{item.rate:>9.1f}"
+            f"{1e3 * item.longest_gap:>9.2f}{lost:>6}{check:>5}{item.length_errors:>5}"
+            f"{item.range_errors:>6}"
+        )
+    if report.ranges:
+        lines += ["", f"{'channel':<12}{'codes seen':>16}{'of':>8}{'use':>7}{'at end':>8}"]
+    for use in report.ranges:
+        seen, of, share = "-", "-", "-"
+        if use.lowest_code is not None and use.highest_code is not None and use.codes:
+            seen, of = f"{use.lowest_code} … {use.highest_code}", str(use.codes)
+            share = f"{100 * (use.highest_code - use.lowest_code + 1) / use.codes:.0f} %"
+        lines.append(f"{use.channel:<12}{seen:>16}{of:>8}{share:>7}{use.saturated:>8}")
+    if report.delay is not None:
+        lines += ["", f"telemetry follows its command by {1e3 * report.delay:.3f} ms"]
+    if report.foreign:
+        listed = ", ".join(f"{number:#x} ({count})" for number, _, count in report.foreign)
+        lines += ["", f"not mapped: {listed}"]
+    if report.remarks:
+        lines += ["", *report.remarks]
+    lines += ["", *(report.problems or ("everything that a diagnosis needs is there",))]
+    return "\n".join(lines)

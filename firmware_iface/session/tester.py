@@ -1,0 +1,266 @@
+"""Runs one built-in test on a bus: requests it, records it, watches it, and says how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ehadiag.core.errors import BusLostError, ConfigurationError, EhadiagError
+from ehadiag.core.recording import Outcome
+from firmware_iface.codec.encode import Encoder
+from firmware_iface.codec.live_decode import LiveDecoder
+from firmware_iface.codec.live_messages import BitStatus, Request, Sample
+from firmware_iface.logs.recorder import Recorder
+from firmware_iface.mapping.bus_map import BusMap, default_map
+from firmware_iface.session.handshake import Action, Handshake, Phase, TimeLimits
+from firmware_iface.session.limits import Limits
+from firmware_iface.transport.frames import Frame
+from firmware_iface.transport.interface import FrameSource, Transport
+from firmware_iface.transport.receiver import open_source
+
+__all__ = ["Progress", "TesterOutcome", "run_test"]
+
+POLL = 0.02
+"""s; longest wait for a frame before the time limits are looked at."""
+STALL_NS = 100_000_000
+"""A wait so much longer than POLL: this process did not run, which is no silence of the bus."""
+PROGRESS_NS = 20_000_000
+"""Between two progress reports of one phase."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What a display shows while a test runs."""
+
+    phase: Phase
+    elapsed: float
+    """s since the test began to run; 0 before."""
+    duration: float
+    frames: int
+    sample: Sample | None
+
+
+@dataclass(frozen=True, slots=True)
+class TesterOutcome:
+    """How the request ended.
+
+    Attributes
+    ----------
+    complete: the computer completed our test while telemetry flowed: worth diagnosing.
+    why: one clause for NOT TESTED; empty when complete.
+    outcome: last state and reason that the computer gave for the test.
+    test_id, serial: number of the test and of the actuator; None where the bus did not say.
+    abort_confirmed: whether an abort was obeyed; None when none was requested.
+    frames: frames received.
+    dropped: frames that the reader was too slow for; the recording has them.
+    degraded: what the transport said of itself, empty if nothing.
+    recorded: files that hold the raw frames.
+    """
+
+    complete: bool
+    why: str
+    outcome: Outcome
+    test_id: int | None
+    serial: int | None
+    abort_confirmed: bool | None
+    frames: int
+    dropped: int
+    degraded: str
+    recorded: tuple[Path, ...]
+
+
+def run_test(
+    transport: Transport,
+    *,
+    test_id: int | None,
+    duration: float,
+    transmit: bool = False,
+    recorder: Recorder | None = None,
+    bus_map: BusMap | None = None,
+    limits: Limits | None = None,
+    times: TimeLimits | None = None,
+    on_frame: Callable[[Frame], None] | None = None,
+    stop: threading.Event | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    all_there: Callable[[], bool] | None = None,
+) -> TesterOutcome:
+    """Run one test, or with `transmit` false wait for one that someone else starts.
+
+    Parameters
+    ----------
+    transport: open; to be closed by the caller.
+    test_id: number of the test; None (listening only): any.
+    duration: of the test, s.
+    recorder: gets every frame before anything else does, own requests included; it is closed at
+        the end, whatever happens.
+    on_frame: gets every frame in order, in the caller's thread.
+    stop: when set, the test is aborted.
+    all_there: asked once, when the computer has said that the test is complete: whether no frame of
+        it may still come, so that there is nothing left to listen for.
+
+    The end of a bus, the stop, an exceeded limit and a computer that does not answer are outcomes,
+    not exceptions.
+
+    Raises
+    ------
+    ConfigurationError: `transmit` without a test number or on a transport that listens only.
+    InputOutputError: the recording cannot be written (an abort was requested).
+    """
+    if transmit and not transport.transmits:
+        raise ConfigurationError(f"{transport.name}: opened to listen only, nothing is sent")
+    if transmit and test_id is None:
+        raise ConfigurationError("a test can be requested only by its number")
+    machine = Handshake(
+        test_id=test_id,
+        duration=duration,
+        transmit=transmit,
+        now=transport.now_ns(),
+        times=times or TimeLimits(),
+        limits=limits or Limits(),
+    )
+    session = _Session(transport, recorder, bus_map or default_map(), machine)
+    session.on_frame, session.progress, session.all_there = on_frame, progress, all_there
+    try:
+        return session.run(stop or threading.Event())
+    finally:
+        if recorder is not None:
+            recorder.close()
+
+
+class _Session:
+    """Carries frames to the machine and its requests to the bus."""
+
+    def __init__(
+        self, transport: Transport, recorder: Recorder | None, bus_map: BusMap, machine: Handshake
+    ) -> None:
+        self._transport = transport
+        self._recorder = recorder
+        self._machine = machine
+        self._decoder = LiveDecoder(bus_map)
+        self._encoder = Encoder(bus_map)
+        self._frames = 0
+        self._sample: Sample | None = None
+        self._serial: int | None = None
+        self._shown = 0
+        self._shown_phase: Phase | None = None
+        self.on_frame: Callable[[Frame], None] | None = None
+        self.progress: Callable[[Progress], None] | None = None
+        self.all_there: Callable[[], bool] | None = None
+
+    def run(self, stop: threading.Event) -> TesterOutcome:
+        """Run to the end of the handshake."""
+        recorder = self._recorder
+        with open_source(
+            self._transport,
+            sink=recorder.write if recorder else None,
+            idle=recorder.idle if recorder else None,
+        ) as source:
+            try:
+                self._loop(source, stop)
+            except BusLostError as error:
+                self._machine.lost(f"bus lost: {error}")
+            except BaseException:
+                self._last_abort()
+                raise
+        return self._outcome(source)
+
+    def _loop(self, source: FrameSource, stop: threading.Event) -> None:
+        machine = self._machine
+        now = source.now_ns()
+        while machine.phase is not Phase.DONE:
+            frame = source.receive(POLL)
+            before, now = now, source.now_ns()
+            if self._transport.real_time and now - before > STALL_NS:
+                machine.excuse(now - before)
+            if stop.is_set():
+                self._act(machine.stop(now, "stopped by the user"))
+            if frame is not None:
+                self._take(frame, now)
+            elif source.at_end:
+                machine.lost("the recording ends before the test does")
+            self._act(machine.on_time(now))
+            self._report(now)
+
+    def _take(self, frame: Frame, now: int) -> None:
+        self._frames += 1
+        if self.on_frame is not None:
+            self.on_frame(frame)
+        if frame.sent:
+            return
+        content = self._decoder.decode(frame)
+        match content:
+            case BitStatus():
+                if content.serial is not None:
+                    self._serial = content.serial
+                self._act(self._machine.on_status(now, content))
+                self._look_whether_all_is_there()
+            case Sample():
+                self._sample = content
+                self._act(self._machine.on_sample(now, content))
+            case Request():
+                self._act(self._machine.on_foreign_request(now))
+
+    def _look_whether_all_is_there(self) -> None:
+        if self._machine.phase is Phase.TRAILING and self.all_there is not None:
+            ask, self.all_there = self.all_there, None
+            if ask():
+                self._machine.all_there()
+
+    def _act(self, actions: list[Action]) -> None:
+        for action in actions:
+            try:
+                self._request(action)
+            except BusLostError as error:
+                self._machine.lost(f"bus lost: {error}")
+                return
+
+    def _request(self, action: Action) -> None:
+        test_id = self._machine.test_id
+        if test_id is None:
+            raise AssertionError("a listener requests nothing")
+        for frame in self._encoder.request(action.value, test_id, self._transport.stamp_ns()):
+            if self._recorder is not None:
+                self._recorder.write(replace(frame, sent=True))
+            self._transport.send(frame)
+
+    def _last_abort(self) -> None:
+        """Ask for zero current on the way out; nothing may hide the error that leads out."""
+        active = (Phase.REQUESTED, Phase.ARMING, Phase.RUNNING, Phase.ABORTING)
+        if self._machine.transmit and self._machine.phase in active:
+            recorder, self._recorder = self._recorder, None
+            with contextlib.suppress(EhadiagError):
+                self._request(Action.ABORT)
+            self._recorder = recorder
+
+    def _report(self, now: int) -> None:
+        machine = self._machine
+        same = machine.phase is self._shown_phase
+        if self.progress is None or (same and now - self._shown < PROGRESS_NS):
+            return
+        self._shown, self._shown_phase = now, machine.phase
+        since = machine.running_since
+        elapsed = 0.0 if since is None else (now - since) / 1e9
+        self.progress(
+            Progress(machine.phase, elapsed, machine.duration, self._frames, self._sample)
+        )
+
+    def _outcome(self, source: FrameSource) -> TesterOutcome:
+        verdict = self._machine.verdict
+        if verdict is None:
+            raise AssertionError("the handshake has not ended")
+        status = verdict.status
+        return TesterOutcome(
+            complete=verdict.complete,
+            why=verdict.why,
+            outcome=Outcome(status.state, status.reason) if status else Outcome(),
+            test_id=self._machine.test_id,
+            serial=self._serial,
+            abort_confirmed=verdict.abort_confirmed,
+            frames=self._frames,
+            dropped=source.overflow,
+            degraded=source.detail,
+            recorded=self._recorder.paths if self._recorder else (),
+        )

@@ -1,0 +1,1 @@
+"""Buses as frame sources and sinks: CAN adapters, serial link, receive thread."""

@@ -1,0 +1,1 @@
+"""Harness faults: what a damaged bus does to frames."""

@@ -1,0 +1,1 @@
+"""Emulated flight-control computer: control law, handshake, telemetry."""

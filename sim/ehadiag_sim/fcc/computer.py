@@ -1,0 +1,261 @@
+"""The flight-control computer's side of bus.md, one control tick at a time, without a clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import POSITION
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.recording import BitReason, BitState, CommandMode
+from ehadiag.core.stored_test import StoredTest
+from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.simulator import Plant
+from firmware_iface.codec.encode import Encoder
+from firmware_iface.codec.live_decode import LiveDecoder
+from firmware_iface.codec.live_messages import Request
+from firmware_iface.mapping.bus_map import BusMap, default_map
+from firmware_iface.transport.frames import Frame
+
+__all__ = ["FccCore", "Preconditions"]
+
+FRAME_NS = 130_000
+"""Length of an 8-byte frame at 1 Mbit/s, stuff bits included: frames of a tick follow so."""
+STATUS_HZ = 50.0
+ENVIRONMENT_HZ = 10.0
+ARMING_S = 0.1
+HOLD_S = 0.5
+"""How long an end of a test, or a refusal, stays on the bus before the state is idle again."""
+MAX_SERIAL = 0xFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Preconditions:
+    """What the computer demands before it starts a test."""
+
+    supply: float = 15e6
+    """Least supply pressure above return, Pa."""
+    oil_temperature: float = -20.0
+    """Least, degC."""
+    off_centre: float = 1e-3
+    """Largest jack position, m."""
+
+
+class FccCore:
+    """State of the emulated computer and its actuator; `step` advances both by one tick.
+
+    Between tests the computer holds the surface in the middle. Each test begins with the actuator
+    at rest there and with noise drawn from (seed, number of the test), so a run does not depend on
+    how long the computer idled before. An abort commands zero current in the very next tick.
+
+    Raises
+    ------
+    ConfigurationError: two tests with one number, a test at another rate than the controller, a
+        serial number that the bus cannot carry.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        tests: Iterable[StoredTest],
+        *,
+        faults: Faults | None = None,
+        effects: Effects | None = None,
+        sensors: Sensors | None = None,
+        seed: int = 0,
+        serial: int = 1,
+        preconditions: Preconditions | None = None,
+        idle_telemetry: bool = True,
+        start_ns: int = 0,
+        bus_map: BusMap | None = None,
+    ) -> None:
+        if not 0 <= serial <= MAX_SERIAL:
+            raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL}")
+        self._actuator = actuator
+        self._tests = _by_number(tests, actuator)
+        self._faults, self._sensors = faults, sensors
+        self._effects = effects or Effects()
+        self._seed, self._serial = seed, serial
+        self._demands = preconditions or Preconditions()
+        self._idle_telemetry = idle_telemetry
+        bus_map = bus_map or default_map()
+        self._encoder = Encoder(bus_map)
+        self._decoder = LiveDecoder(bus_map)
+        self._rate = actuator.controller.rate
+        self.period_ns = round(1e9 / self._rate)
+        self._start_ns = start_ns
+        self._tick = 0
+        self._count = 0
+        self._plant = self._fresh_plant()
+        self._state, self._test_id = BitState.IDLE, 0
+        self._refused: tuple[BitReason, int] | None = None
+        self._since = 0
+        self._commands: list[float] = []
+        self._elapsed = 0
+        self._mode = CommandMode.POSITION
+        self._told: tuple[BitState, int] | None = None
+        self._pending: deque[Request] = deque()
+        self.interlock_open = False
+
+    @property
+    def state(self) -> BitState:
+        """State of the built-in test."""
+        return self._state
+
+    @property
+    def now_ns(self) -> int:
+        """Start of the next tick, ns."""
+        return self._start_ns + self._tick * self.period_ns
+
+    @property
+    def tests_started(self) -> int:
+        """Number of tests begun so far."""
+        return self._count
+
+    @property
+    def plant(self) -> Plant:
+        """The actuator as it is now."""
+        return self._plant
+
+    def take(self, frame: Frame) -> None:
+        """Take a frame off the bus; anything but a valid request is ignored."""
+        request = self._decoder.decode(frame)
+        if isinstance(request, Request):
+            self._pending.append(request)
+
+    def step(self) -> list[Frame]:
+        """Run one control tick; return the frames that the computer sends at its end."""
+        while self._pending:
+            request = self._pending.popleft()
+            if request.code == "start":
+                self._start(request.test_id)
+            elif request.code == "abort":
+                self._abort()
+        self._advance()
+        running = self._state is BitState.RUNNING
+        if running:
+            self._elapsed = self._tick - self._since
+            command, mode, test_id = self._commands[self._elapsed], self._mode, self._test_id
+        elif self._state is BitState.ABORTED:
+            command, mode, test_id = 0.0, CommandMode.CURRENT, 0
+        else:
+            command, mode, test_id = 0.0, CommandMode.POSITION, 0
+        codes = self._plant.tick(command, mode)
+        self._tick += 1
+        frames: list[Frame] = []
+        frames += self._status()
+        if running or self._idle_telemetry:
+            frames += self._encoder.command(mode, command, test_id, 0)
+            frames += self._encoder.telemetry(codes.tolist(), 0)
+        if (self._tick - 1) % round(self._rate / ENVIRONMENT_HZ) == 0:
+            effects = self._effects
+            frames += self._encoder.environment(
+                effects.supply_pressure, effects.return_pressure, effects.oil_temperature, 0
+            )
+        return [_stamped(frame, self.now_ns + i * FRAME_NS) for i, frame in enumerate(frames)]
+
+    def _start(self, test_id: int) -> None:
+        reason = self._objection(test_id)
+        if reason is BitReason.NONE:
+            test = self._tests[test_id]
+            self._commands = test.command().tolist()
+            self._elapsed = 0
+            self._mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+            self._refused = None  # an earlier refusal may still stand on the bus
+            self._enter(BitState.ARMING, test_id)
+        elif self._state in (BitState.ARMING, BitState.RUNNING):
+            self._refused = (reason, test_id)  # said once; the running test goes on
+        else:
+            self._refused = (reason, test_id)
+            self._enter(BitState.REFUSED, test_id)
+
+    def _objection(self, test_id: int) -> BitReason:
+        effects, demands = self._effects, self._demands
+        position = float(POSITION.decode(np.asarray(self._plant.codes[3:]))[0])
+        checks = (
+            (self._state in (BitState.ARMING, BitState.RUNNING), BitReason.ALREADY_RUNNING),
+            (test_id not in self._tests, BitReason.UNKNOWN_TEST),
+            (self.interlock_open, BitReason.INTERLOCK_OPEN),
+            (
+                effects.supply_pressure - effects.return_pressure < demands.supply,
+                BitReason.SUPPLY_PRESSURE_LOW,
+            ),
+            (effects.oil_temperature < demands.oil_temperature, BitReason.OIL_TOO_COLD),
+            (abs(position) > demands.off_centre, BitReason.NOT_CENTRED),
+        )
+        return next((reason for failed, reason in checks if failed), BitReason.NONE)
+
+    def _abort(self) -> None:
+        if self._state in (BitState.ARMING, BitState.RUNNING):
+            self._enter(BitState.ABORTED, self._test_id)
+
+    def _advance(self) -> None:
+        """Change state when its time is up, before the tick is computed."""
+        elapsed = self._tick - self._since
+        if self._state is BitState.ARMING and elapsed >= ARMING_S * self._rate:
+            self._count += 1
+            self._plant = self._fresh_plant()
+            self._enter(BitState.RUNNING, self._test_id)
+        elif self._state is BitState.RUNNING and elapsed >= len(self._commands):
+            self._elapsed = elapsed
+            self._enter(BitState.COMPLETE, self._test_id)
+        elif (
+            self._state in (BitState.COMPLETE, BitState.ABORTED, BitState.REFUSED)
+            and elapsed >= HOLD_S * self._rate
+        ):
+            self._elapsed = 0
+            self._enter(BitState.IDLE, 0)
+
+    def _enter(self, state: BitState, test_id: int) -> None:
+        self._state, self._test_id = state, test_id
+        self._since = self._tick
+
+    def _status(self) -> tuple[Frame, ...]:
+        """Status on change and at its rate; the answer to a second request in between."""
+        frames: tuple[Frame, ...] = ()
+        running = self._state in (BitState.ARMING, BitState.RUNNING)
+        reason = BitReason.NONE
+        if self._refused is not None:
+            reason, wanted = self._refused
+            if running:
+                frames += self._encoder.status(
+                    BitState.REFUSED, reason, wanted, 0.0, self._serial, 0
+                )
+            if running or self._state is BitState.IDLE:
+                self._refused, reason = None, BitReason.NONE
+        present = (self._state, self._since)
+        due = (self._tick - 1) % round(self._rate / STATUS_HZ) == 0
+        if due or present != self._told or frames:
+            self._told = present
+            frames += self._encoder.status(
+                self._state, reason, self._test_id, self._elapsed / self._rate, self._serial, 0
+            )
+        return frames
+
+    def _fresh_plant(self) -> Plant:
+        seed = int(np.random.SeedSequence((self._seed, self._count)).generate_state(1)[0])
+        return Plant(self._actuator, self._faults, self._effects, self._sensors, seed)
+
+
+def _by_number(tests: Iterable[StoredTest], actuator: Actuator) -> dict[int, StoredTest]:
+    numbered: dict[int, StoredTest] = {}
+    for test in tests:
+        if test.id in numbered:
+            raise ConfigurationError(
+                f"tests {numbered[test.id].name!r} and {test.name!r} have the same id {test.id}"
+            )
+        if test.rate != actuator.controller.rate:
+            raise ConfigurationError(
+                f"test {test.name!r} runs at {test.rate:g} Hz, the controller of actuator "
+                f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
+            )
+        numbered[test.id] = test
+    return numbered
+
+
+def _stamped(frame: Frame, time_ns: int) -> Frame:
+    return Frame(time_ns, frame.can_id, frame.data, frame.extended, frame.fd)

@@ -1,0 +1,1 @@
+"""Detailed simulator of servovalve, jack and sensors."""

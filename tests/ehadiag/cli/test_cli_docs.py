@@ -1,0 +1,97 @@
+"""The documentation says what the program does: options, keys, limits, links."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from cli_result import REPOSITORY, Run
+from places import LOGS
+
+from ehadiag.assess import acceptance as fitness
+from ehadiag.cli.main import _parser
+
+DOCS = REPOSITORY / "docs"
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+
+
+def options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from options(command)
+        else:
+            yield from (name for name in action.option_strings if name.startswith("--"))
+
+
+def test_every_option_is_documented() -> None:
+    page = (DOCS / "reference" / "command-line.md").read_text()
+    documented = set(re.findall(r"--[A-Za-z][A-Za-z-]*", page))
+    aliases = {"--kintas", "--fss", "--fdj", "--data_bitrate", "--version"}
+    assert set(options(_parser())) - aliases - documented == set()
+    assert documented - set(options(_parser())) == set()
+
+
+def test_every_key_of_the_json_result_is_documented(run: Run) -> None:
+    page = (DOCS / "reference" / "json.md").read_text()
+    (found,) = run("diagnose", "--json", LOGS / "healthy-open.blf").objects
+    paths = set()
+    for key, value in found.items():
+        if key == "faults":
+            paths |= {f"faults.*.{name}" for name in value["FSS"]}
+        elif isinstance(value, dict):
+            paths |= {f"{key}.{name}" for name in value}
+        else:
+            paths.add(key)
+    assert {path for path in paths if f"`{path}`" not in page} == set()
+
+
+@pytest.mark.parametrize(
+    ("page", "data"), [("actuator-file", "actuator.toml"), ("test-file", "tests/open.toml")]
+)
+def test_every_key_of_the_data_files_is_documented(page: str, data: str) -> None:
+    text = (DOCS / "reference" / f"{page}.md").read_text()
+    tree = tomllib.loads(resources.files("ehadiag").joinpath("data", data).read_text())
+    keys = {key for key in tree if not isinstance(tree[key], dict)}
+    keys |= {key for part in tree.values() if isinstance(part, dict) for key in part}
+    assert {key for key in keys if not re.search(rf"[`.]{key}`", text)} == set()
+
+
+def test_limits_are_the_documented_ones() -> None:
+    page = (DOCS / "reference" / "verdicts.md").read_text()
+    low, high = fitness.TEMPERATURES
+    for limit in (
+        f"missing | {100 * fitness.MOST_LOST:g} % |",
+        f"for x s | {fitness.LONGEST_GAP_S:g} s |",
+        f"are lost (closed loop) | {100 * fitness.MOST_GUESSED:g} %, see",
+        f"the command too | {fitness.LEAST_COMMANDS} frames |",
+        f"at least {1000 * fitness.LEAST_MISSED_S:g} ms missing",
+        f"converter's end | {100 * fitness.MOST_SATURATED:g} % |",
+        f"outside −{-low:g} … {high:g} °C",
+        f"more than {100 * fitness.MOST_OUTLIERS:g} % of the gaps",
+        f"rms gap above {fitness.MOST_RMS:g} times",
+    ):
+        assert limit in page
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_links_and_named_files_exist(page: Path) -> None:
+    text = page.read_text()
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        assert (page.parent / target).exists(), target
+    for name in re.findall(r"`((?:tests|tools|docs|firmware_iface|ehadiag)/[\w./-]+)`", text):
+        assert (REPOSITORY / name).exists(), name
+
+
+def test_examples_in_the_docs_are_sound(run: Run, tmp_path: Path) -> None:
+    page = (DOCS / "how-to" / "own-test.md").read_text()
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "short.toml").write_text(example)
+    result = run("bit", "--simulate", "--fast", "--json", "--test", "short.toml", "--Kintas", 0.3)
+    assert json.loads(result.out)["faults"]["Kintas"]["estimate"] == pytest.approx(0.3, abs=2e-3)

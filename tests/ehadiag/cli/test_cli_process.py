@@ -1,0 +1,234 @@
+"""The command line as processes: signals, two of them on a bus, an installation without rights."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from cli_result import COMMAND, REPOSITORY
+from places import LOGS
+
+from ehadiag.compile.kernels import cache_folder
+from ehadiag.core.recording import BitState
+from firmware_iface.logs.reader import read_recording
+
+LOOPNET = REPOSITORY / "tools" / "loopnet.sh"
+NO_NAMESPACE = 125
+PAPER = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))
+CASES = [(test, faults) for test in ("open", "closed") for faults in PAPER]
+DEFAULT_CASE = ("closed", (0.3, 0.6, 0.3))
+BOTH_ENDS = """
+"$PYTHON" -m ehadiag.cli.main sim --interface udp_multicast "$@" 2> sim.err &
+sim=$!
+until grep -q 'Ctrl-C stops it' sim.err; do
+    kill -0 $sim || { cat sim.err >&2; exit 99; }
+    sleep 0.05
+done
+"$PYTHON" -m ehadiag.cli.main bit --test "$TEST" --interface udp_multicast --json --out out
+code=$?
+kill -TERM $sim
+wait $sim
+echo "sim ended with $?" >&2
+cat sim.err >&2
+exit $code
+"""
+
+
+@pytest.mark.parametrize(
+    ("test", "faults"),
+    [pytest.param(*case, marks=() if case == DEFAULT_CASE else pytest.mark.slow) for case in CASES],
+)
+def test_two_processes_on_multicast(
+    test: str,
+    faults: tuple[float, float, float],
+    tmp_path: Path,
+    environment: dict[str, str],
+) -> None:
+    names = ("Kintas", "FSS", "FDJ")
+    options = [f"--{name}={value}" for name, value in zip(names, faults, strict=True)]
+    done = subprocess.run(
+        [LOOPNET, "sh", "-c", BOTH_ENDS, "ends", *options, "--serial-number=4711"],
+        cwd=tmp_path,
+        env=environment | {"PYTHON": sys.executable, "TEST": test},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    if done.returncode == NO_NAMESPACE:
+        pytest.skip(f"no network namespace: {done.stderr.strip()}")
+    assert done.returncode == 10, done.stdout + done.stderr
+    assert "sim ended with 0" in done.stderr
+    assert ", 1 tests started" in done.stderr
+    found = json.loads(done.stdout)
+    assert (found["verdict"], found["test"], found["serial"]) == ("DEGRADED", test, 4711)
+    estimates = [found["faults"][name]["estimate"] for name in names]
+    assert estimates == pytest.approx(faults, abs=1.5e-3)
+    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [
+        ".blf", ".json", ".png",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_aborts_the_test_and_leaves_a_readable_recording(
+    number: signal.Signals, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "bit", "--test", "open", "--simulate", "--json", "--record", "cut.blf"],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stderr is not None
+        while "recording to" not in process.stderr.readline():
+            assert process.poll() is None
+        recording = tmp_path / "cut.blf"
+        # Some hundred frames on disk: the test has been requested and is on its way.
+        while recording.stat().st_size < 4000:
+            assert process.poll() is None
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 30, errors
+    assert "Traceback" not in errors
+    found = json.loads(output)
+    assert found["verdict"] == "NOT_TESTED"
+    assert found["reasons"] == ["stopped by the user"]
+    assert read_recording(recording).outcome.state is BitState.ABORTED
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_sim_ends_on_a_signal(number: signal.Signals, environment: dict[str, str]) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "sim", "-i", "virtual"], env=environment, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stderr is not None
+        assert "Ctrl-C stops it" in process.stderr.readline()
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    (line,) = errors.splitlines()
+    assert line.startswith("ehadiag: stopped after ")
+
+
+def test_reader_that_goes_away_ends_it_without_a_traceback(environment: dict[str, str]) -> None:
+    done = subprocess.run(
+        ["sh", "-c", '"$@" | head -1', "pipe", *COMMAND, "tests", "--csv", "open"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.stdout == "time_s,command_mA\n"
+    assert done.stderr == ""
+
+
+def installed_copy(folder: Path) -> Path:
+    """Copy the packages and take away the right to write to them."""
+    for source in ("ehadiag", "firmware_iface", "sim/ehadiag_sim"):
+        package = REPOSITORY / source
+        ignored = shutil.ignore_patterns("__pycache__", "c")
+        shutil.copytree(package, folder / package.name, ignore=ignored)
+    for path in [*folder.rglob("*"), folder]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    return folder
+
+
+def without_home(
+    site: Path, temporary: Path, arguments: list[str], environment: dict[str, str]
+) -> subprocess.CompletedProcess[str]:
+    gone = ("HOME", "XDG_CACHE_HOME", "EHADIAG_CACHE_DIR", "NUMBA_CACHE_DIR", "MPLCONFIGDIR")
+    kept = {key: value for key, value in environment.items() if key not in gone}
+    kept |= {"PYTHONPATH": str(site), "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
+    # As root the lack of rights hinders nobody, so what was written is looked at afterwards.
+    code = textwrap.dedent(f"""
+        import sys, ehadiag
+        assert ehadiag.__file__.startswith({str(site)!r})
+        from ehadiag.cli.main import main
+        sys.exit(main(sys.argv[1:]))
+    """)
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=temporary,
+        env=kept,
+        capture_output=True,
+        text=True,
+        timeout=180,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("warm", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_read_only_installation_without_home(
+    warm: bool, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    site, temporary = tmp_path / "site", tmp_path / "tmp"
+    temporary.mkdir()
+    installed_copy(site)
+    before = sorted(site.rglob("*"))
+    if warm:
+        ours = cache_folder()
+        shutil.copytree(ours, temporary / f"ehadiag-{os.getuid()}" / ours.name)
+    log = str(LOGS / "healthy-open.blf")
+    arguments = ["diagnose", "--json", "--out", "reports", log]
+    done = without_home(site, temporary, arguments, environment)
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stderr.splitlines() if "font cache" not in line]
+    assert [line.partition(":")[0] for line in said] == ["ehadiag"] * (1 if warm else 2)
+    assert json.loads(done.stdout)["verdict"] == "HEALTHY"
+    assert sorted(site.rglob("*")) == before
+    told = "compiling the model's kernels, once for this installation" in done.stderr
+    assert told is not warm
+    assert any((temporary / f"ehadiag-{os.getuid()}").glob("kernels-*/*.nbi"))
+
+
+def in_shell(
+    command: str, folder: Path, environment: dict[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run ehadiag with arguments and redirections as a shell reads them."""
+    return subprocess.run(
+        ["sh", "-c", f'"$0" -m ehadiag.cli.main {command}', sys.executable],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.skipif(os.name != "posix", reason="streams are closed by a POSIX shell")
+@pytest.mark.parametrize(
+    ("closed", "code"),
+    [("<&-", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0), (">&- --csv nothing", 2)],
+)
+def test_closed_streams_are_no_failure(
+    closed: str, code: int, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    done = in_shell(f"tests {closed}", tmp_path, environment)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (done.stdout == "") == (">&-" in closed.replace("2>&-", ""))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="streams are closed by a POSIX shell")
+def test_what_is_said_does_not_go_to_another_stream(
+    tmp_path: Path, environment: dict[str, str]
+) -> None:
+    done = in_shell("diagnose gone.blf 2>&-", tmp_path, environment)
+    assert (done.returncode, done.stdout) == (3, "")

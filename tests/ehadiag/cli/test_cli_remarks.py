@@ -1,0 +1,173 @@
+"""What a recording lacks: said beside the verdict, or as the reason why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_result import Run
+from places import LOGS
+
+from ehadiag.assess.diagnosis import Diagnosis, diagnose
+from ehadiag.assess.verdict import Verdict
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.recording import BitState, Environment, Outcome, Recording
+from ehadiag.core.stored_test import bundled_tests
+from firmware_iface.logs.reader import read_frames, read_recording
+from firmware_iface.logs.recorder import Recorder
+from firmware_iface.transport.frames import Frame, FrameTable
+
+TELEMETRY, COMMAND, ENVIRONMENT = 0x110, 0x111, 0x120
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return read_recording(LOGS / "paper-open-1.blf")
+
+
+def diagnosis_of(recording: Recording) -> Diagnosis:
+    return diagnose([recording], default_actuator(), bundled_tests().values())
+
+
+def frames_of(table: FrameTable) -> list[Frame]:
+    columns = table.time_ns.tolist(), table.can_id.tolist(), table.data, table.length.tolist()
+    return [
+        Frame(time_ns, can_id, bytes(data[:length]))
+        for time_ns, can_id, data, length in zip(*columns, strict=True)
+    ]
+
+
+def rewritten(log: str, folder: Path, without: int) -> Path:
+    """A log without one message."""
+    path = folder / f"without-{without:x}.blf"
+    with Recorder(path) as recorder:
+        for frame in frames_of(read_frames(LOGS / log)):
+            if frame.can_id != without:
+                recorder.write(frame)
+    return path
+
+
+def cut(recording: Recording, first: int, last: int) -> Recording:
+    """Without the samples before tick `first` and from tick `last` on."""
+    samples = recording.samples
+    assert samples is not None
+    gone = (np.arange(samples.ticks) < first) | (np.arange(samples.ticks) >= last)
+    names = ("current", "spool", "pressure", "position", "command")
+    lost = {name: np.where(gone, np.nan, getattr(samples, name)) for name in names}
+    return replace(recording, samples=replace(samples, **lost))
+
+
+def test_a_whole_recording_needs_no_remark(recording: Recording) -> None:
+    assert diagnosis_of(recording).notes == ()
+
+
+def test_what_is_assumed_without_environment_is_said(recording: Recording) -> None:
+    sound = diagnosis_of(recording)
+    bare = diagnosis_of(replace(recording, environment=Environment()))
+    assert bare.notes == (
+        "no oil temperature on the bus: 40 degC assumed",
+        "no supply pressure on the bus: the actuator file's 20 MPa assumed",
+    )
+    assert (bare.verdict, bare.reasons) == (sound.verdict, sound.reasons)
+    half = replace(recording.environment, return_pressure=None)
+    assert len(diagnosis_of(replace(recording, environment=half)).notes) == 1
+
+
+def test_a_log_without_environment_says_so_in_text_and_json(run: Run, tmp_path: Path) -> None:
+    path = rewritten("paper-open-1.blf", tmp_path, ENVIRONMENT)
+    text = run("diagnose", path)
+    assert text.code == 10
+    assert "note: no oil temperature on the bus: 40 degC assumed" in text.out
+    (found,) = run("diagnose", "--json", path).objects
+    assert len(found["quality"]["notes"]) == 2
+    checked = run("check-bus", "--log", path)
+    assert "oil_temperature is not on the bus: a diagnosis assumes the actuator file's" in (
+        checked.out
+    )
+    assert checked.code == run("check-bus", "--log", LOGS / "paper-open-1.blf").code
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "words"),
+    [
+        (0, 5300, "the last 0.200 s of the test are missing: the recording ends early"),
+        (0, 5490, "the last 0.010 s of the test are missing: the recording ends early"),
+        (120, 5500, "the first 0.120 s of the test are missing"),
+    ],
+)
+def test_a_recording_cut_at_an_end_says_how_much_is_missing(
+    first: int, last: int, words: str, recording: Recording
+) -> None:
+    came = diagnosis_of(cut(recording, first, last))
+    assert came.notes == (words,)
+    assert came.verdict is Verdict.DEGRADED
+
+
+def test_the_end_that_is_missing_in_closed_loop_needs_no_current() -> None:
+    came = diagnosis_of(cut(read_recording(LOGS / "paper-closed-1.blf"), 0, 5300))
+    assert came.notes == ("the last 0.200 s of the test are missing: the recording ends early",)
+    assert came.verdict is Verdict.DEGRADED
+
+
+def test_a_single_lost_frame_at_the_end_is_no_cut(recording: Recording) -> None:
+    assert diagnosis_of(cut(recording, 0, 5497)).notes == ()
+
+
+def test_a_recording_without_the_word_of_completion_says_so(recording: Recording) -> None:
+    running = replace(recording, outcome=Outcome(BitState.RUNNING))
+    (note,) = diagnosis_of(running).notes
+    assert note == "the recording ends before the computer's word that the test is complete"
+
+
+def test_what_the_users_own_policy_refuses_is_the_reason(recording: Recording) -> None:
+    why = "ServoTelemetry: 9 of 5500 frames lost (the mapping's policy allows 0.001)"
+    strict = replace(recording, quality=replace(recording.quality, refused=(why,)))
+    came = diagnosis_of(strict)
+    assert (came.verdict, came.reasons) == (Verdict.NOT_TESTED, (why,))
+
+
+def test_notes_of_joint_recordings_are_said_once(recording: Recording) -> None:
+    bare = replace(recording, environment=Environment())
+    joint = diagnose([bare, bare], default_actuator(), bundled_tests().values())
+    assert len(joint.notes) == 2
+
+
+def test_closed_loop_without_command_frames_says_what_to_record(run: Run, tmp_path: Path) -> None:
+    path = rewritten("paper-closed-1.blf", tmp_path, COMMAND)
+    (found,) = run("diagnose", "--json", path).objects
+    assert found["verdict"] == "NOT_TESTED"
+    (reason,) = found["reasons"]
+    assert reason == (
+        "no command frames in the recording, and closed loop cannot be judged without them: "
+        "record the message with the command too, and name it in the mapping"
+    )
+
+
+def test_open_loop_needs_no_command_frames(run: Run, tmp_path: Path) -> None:
+    assert run("diagnose", rewritten("paper-open-1.blf", tmp_path, COMMAND)).code == 10
+
+
+@pytest.mark.parametrize(("every", "tested"), [(100, True), (20, False)])
+def test_closed_loop_with_lost_positions_is_judged_up_to_a_stated_share(
+    every: int, tested: bool
+) -> None:
+    """Two ticks in a row lost: neither position nor current tells what the control law did."""
+    whole = read_recording(LOGS / "paper-closed-1.blf")
+    samples = whole.samples
+    assert samples is not None
+    gone = np.isin(np.arange(samples.ticks) % every, (7, 8))
+    lost = {
+        name: np.where(gone, np.nan, getattr(samples, name))
+        for name in ("current", "spool", "pressure", "position")
+    }
+    came = diagnosis_of(replace(whole, samples=replace(samples, **lost)))
+    if tested:
+        assert came.verdict is Verdict.DEGRADED
+    else:
+        assert came.verdict is Verdict.NOT_TESTED
+        assert came.reasons == (
+            "5.0% of the jack positions that the control law worked on are lost (limit 1.5%): "
+            "the servovalve current cannot be rebuilt",
+        )

@@ -1,0 +1,66 @@
+"""What a command loads: each of these libraries costs every start a tenth of a second or more."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from places import LOGS
+
+SHOW = """
+import sys
+from ehadiag.cli.main import main
+try:
+    code = main(sys.argv[1:])
+except SystemExit as stop:
+    code = stop.code or 0
+print(*sys.modules, sep="\\n", file=sys.stderr)
+sys.exit(code)
+"""
+BUSES = {"can", "cantools", "serial", "asammdf", "pandas"}
+REPORTS = {"matplotlib"}
+NUMERICS = {"scipy.linalg", "scipy.optimize", "scipy.special", "scipy.stats", "pygad"}
+COMPILER_TABLES = {"numba.np.arraymath", "numba.np.npyimpl", "numba.np.linalg"}
+"""What numba loads once it compiles: a kernel that needs them was not cached, or inlines them."""
+
+
+def loaded(arguments: list[str], environment: dict[str, str]) -> set[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW, *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode in (0, 10), done.stderr
+    return set(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["diagnose", "--help"], ["tests"], ["tests", "--csv", "open"]]
+)
+def test_what_needs_no_model_loads_no_compiler(
+    arguments: list[str], environment: dict[str, str]
+) -> None:
+    found = loaded(arguments, environment)
+    assert "ehadiag.cli.main" in found
+    assert not found & (BUSES | REPORTS | NUMERICS | {"numba", "llvmlite", "scipy"})
+
+
+@pytest.mark.parametrize("name", ["paper-open-1.blf", "paper-closed-1.blf"])
+def test_diagnosis_of_a_recording_loads_neither_bus_nor_compiler(
+    name: str, environment: dict[str, str]
+) -> None:
+    command = ["diagnose", "--json", str(LOGS / name)]
+    loaded(command, environment)  # the first one may have to read the DBC
+    found = loaded(command, environment)
+    assert {"numba", "ehadiag.identify.pipeline"} <= found
+    assert not found & (BUSES | REPORTS | NUMERICS | COMPILER_TABLES | {"rich"})
+
+
+def test_a_picture_does_load_what_draws_it(environment: dict[str, str], tmp_path: Path) -> None:
+    log = str(LOGS / "healthy-open.blf")
+    assert loaded(["diagnose", "--out", str(tmp_path), log], environment) > REPORTS

@@ -1,0 +1,156 @@
+"""The commanded current, rebuilt exactly, also where samples are lost."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.channels import CURRENT, POSITION
+from ehadiag.core.recording import CommandMode, Samples
+from ehadiag.core.stored_test import resolve_test
+from ehadiag.identify.commanded_current import commanded_current
+from ehadiag_sim.fcc.controller import PositionController
+
+TEST = resolve_test("closed")
+EXACT = 5e-12
+"""A."""
+
+
+def controller(**gains):
+    return msgspec.structs.replace(default_actuator().controller, **gains)
+
+
+def closed_loop(data, *, seed=0, lag=40.0, offset_lsb=0.0, noise_lsb=0.5):
+    """A jack that follows its command late, the simulator's control law on its noisy codes."""
+    rng = np.random.default_rng(seed)
+    command = np.rint(TEST.command() / 2e-6) * 2e-6
+    law = PositionController(data)
+    place, seen = 0.0, POSITION.lsb * rng.integers(-1, 2)
+    current, position = np.empty(TEST.ticks), np.empty(TEST.ticks)
+    for k, wanted in enumerate(command.tolist()):
+        current[k] = law.current(wanted, CommandMode.POSITION, float(seen))
+        place += lag * current[k] * 1e-3
+        volts = np.array([place + noise_lsb * POSITION.lsb * rng.standard_normal()])
+        seen = POSITION.decode(POSITION.encode(volts))[0]
+        position[k] = seen
+    measured = current + CURRENT.lsb * (offset_lsb + noise_lsb * rng.standard_normal(TEST.ticks))
+    nothing = np.zeros(TEST.ticks)
+    samples = Samples(
+        period_ns=1_000_000,
+        mode=CommandMode.POSITION,
+        current=CURRENT.decode(CURRENT.encode(measured)),
+        spool=nothing,
+        pressure=nothing,
+        position=position,
+        command=command,
+        saturated=np.zeros((4, TEST.ticks), dtype=np.bool_),
+        host_ns=np.zeros(TEST.ticks, dtype=np.int64),
+    )
+    return samples, current
+
+
+def without(samples, rows, *, commands_too=False):
+    """Telemetry rows lost: all four channels."""
+    lost = {}
+    for name in ("current", "spool", "pressure", "position"):
+        values = getattr(samples, name).copy()
+        values[rows] = np.nan
+        lost[name] = values
+    command = samples.command.copy()
+    if commands_too:
+        command[rows] = np.nan
+    return Samples(
+        period_ns=samples.period_ns,
+        mode=samples.mode,
+        command=command,
+        saturated=samples.saturated,
+        host_ns=samples.host_ns,
+        **lost,
+    )
+
+
+def test_open_loop_current_is_the_command():
+    test = resolve_test("open")
+    data = default_actuator().controller
+    command = 1.3 * test.command()
+    shape = np.zeros(test.ticks)
+    played = np.clip(command, -data.IM, data.IM)
+    samples = Samples(
+        1_000_000, CommandMode.CURRENT, played, shape, shape, shape, command,
+        np.zeros((4, test.ticks), dtype=np.bool_), np.zeros(test.ticks, dtype=np.int64),
+    )  # fmt: skip
+    trace = commanded_current(samples, test, data)
+    assert trace.rebuilt
+    np.testing.assert_array_equal(trace.current, played)
+    assert trace.command_gap == pytest.approx(0.3 * 10e-3, rel=1e-9)
+
+
+def test_proportional_law_is_rebuilt_exactly():
+    samples, truth = closed_loop(controller())
+    trace = commanded_current(samples, TEST, controller())
+    assert trace.rebuilt
+    np.testing.assert_allclose(trace.current, truth, atol=EXACT)
+    assert 0.5 < trace.gap_lsb < 0.65
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.001, 0.2))
+@settings(max_examples=25)
+def test_lost_samples_have_their_exact_codes(seed, share):
+    """One code of position is many codes of current, so the current tells the lost code.
+
+    Where the current of the same tick is lost too or saturates, nothing tells it.
+    """
+    samples, truth = closed_loop(controller(), seed=seed % 50)
+    rows = np.flatnonzero(np.random.default_rng(seed).random(TEST.ticks) < share)
+    trace = commanded_current(without(samples, rows), TEST, controller())
+    assert trace.rebuilt
+    told = np.ones(TEST.ticks, dtype=np.bool_)
+    told[rows] = False
+    np.testing.assert_allclose(trace.current[told], truth[told], atol=EXACT)
+    # Elsewhere the position is bridged: it moves few codes a tick.
+    code = controller().GAP * POSITION.lsb
+    assert np.abs(trace.current - truth).max() < 200.0 * code
+
+
+def test_a_current_sensor_with_an_offset_does_not_spoil_lost_codes():
+    samples, truth = closed_loop(controller(), offset_lsb=5.0)
+    rows = np.arange(100, TEST.ticks, 50)
+    trace = commanded_current(without(samples, rows), TEST, controller())
+    # Within the offset of saturation nothing tells whether the law was linear.
+    linear = np.abs(truth) < controller().IM - 10.0 * CURRENT.lsb
+    told = np.setdiff1d(np.flatnonzero(linear), rows)
+    np.testing.assert_allclose(trace.current[told], truth[told], atol=EXACT)
+    assert trace.offset == pytest.approx(5.0 * CURRENT.lsb, abs=0.3 * CURRENT.lsb)
+
+
+@pytest.mark.parametrize("gains", [{"GAI": 10.0}, {"GAD": 0.01}, {"GAI": 10.0, "GAD": 0.01}])
+def test_integral_and_derivative_are_rebuilt(gains):
+    data = controller(**gains)
+    samples, truth = closed_loop(data)
+    plain = commanded_current(samples, TEST, controller())
+    trace = commanded_current(samples, TEST, data)
+    assert trace.rebuilt
+    assert not plain.rebuilt
+    # The unlogged sample before the test enters the first two ticks, and the integral for good.
+    np.testing.assert_allclose(trace.current[2:], truth[2:], atol=0.2 * CURRENT.lsb)
+
+
+def test_another_control_law_is_noticed():
+    """Half the gain does not explain the current."""
+    samples, _ = closed_loop(controller())
+    trace = commanded_current(samples, TEST, controller(GAP=0.5 * controller().GAP))
+    assert not trace.rebuilt
+    assert trace.gap_lsb > 20.0
+
+
+def test_without_command_frames_the_stored_command_serves():
+    samples, truth = closed_loop(controller())
+    blind = without(samples, np.array([], dtype=int))
+    blind.command[:] = np.nan
+    trace = commanded_current(blind, TEST, controller())
+    assert trace.rebuilt
+    # The stored command is exact, the played one rounded to 2 µm.
+    assert np.abs(trace.current - truth)[1:].max() < controller().GAP * 1.01e-6
+    assert trace.command_gap == 0.0

@@ -1,0 +1,145 @@
+"""The monitoring model against independent solutions of the contract's equations."""
+
+import numpy as np
+import pytest
+from other_actuator import with_data
+from scipy.linalg import expm
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
+from ehadiag.model.plant import plant_constants
+from ehadiag.model.scalar.jack import jack_response
+from ehadiag.model.scalar.response import respond
+from ehadiag_tools.simulator.stiff_reference import StiffReference
+
+TICK = 1e-3
+LSB = np.array([[SPOOL.lsb], [PRESSURE.lsb], [POSITION.lsb]])
+CORNERS = [(0, 0, 0), (1, 1, 1), (0, 1, 0), (1, 0, 1), (0.3, 0.6, 0.3), (0.9, 0.1, 0.5)]
+
+
+def model(actuator, faults, current):
+    constants = plant_constants(actuator)
+    answer = respond(constants, np.array(faults, dtype=float), current, TICK)
+    return np.vstack([answer.spool, answer.pressure, answer.position])
+
+
+def gaps(actuator, faults, current):
+    reference = StiffReference(actuator, *faults)
+    gap = (model(actuator, faults, current) - reference.respond(current)) / LSB
+    return np.sqrt((gap**2).mean(axis=1)), np.abs(gap).max(axis=1), reference
+
+
+@pytest.mark.parametrize("faults", CORNERS)
+def test_stick_slip_follows_the_stiff_solver(faults):
+    """Two tones; the spool and the jack stick and break away again and again."""
+    time = np.arange(100) * TICK
+    current = 1.5e-3 * (np.sin(2 * np.pi * 7 * time) + np.sin(2 * np.pi * 43 * time))
+    rms, _, reference = gaps(default_actuator(), faults, current)
+    assert reference.slides[1] >= 5
+    assert rms[0] < 0.02
+    assert rms[1] < 0.4
+    assert rms[2] < 0.02
+
+
+@pytest.mark.parametrize("faults", CORNERS)
+def test_full_steps_follow_the_stiff_solver(faults):
+    """Rated current back and forth: flapper on its stops, second stage saturated."""
+    current = np.zeros(90)
+    current[1:] = 10e-3 * np.sign(np.sin(2 * np.pi * 20 * np.arange(89) * TICK + 0.1))
+    rms, largest, reference = gaps(default_actuator(), faults, current)
+    assert reference.slides[0] >= 3  # the flapper left its stops
+    assert rms[0] < 0.05
+    assert largest[0] < 0.5
+    # A spool that rushes through the middle as a tick ends leaves 3 LSB of pressure in that tick.
+    assert rms[1] < 0.8
+    assert rms[2] < 0.05
+
+
+@pytest.mark.parametrize("faults", [(0, 0, 0), (0.5, 1, 0.2)])
+def test_stops_of_the_spool_follow_the_stiff_solver(faults):
+    """Twenty per cent more torque drives the spool into its stops."""
+    actuator = with_data(servovalve={"GM": 1.2 * 2.82})
+    current = np.zeros(60)
+    current[1:] = 10e-3 * np.sign(np.sin(2 * np.pi * 20 * np.arange(59) * TICK + 0.1))
+    answer = model(actuator, faults, current)
+    assert np.abs(answer[0]).max() == actuator.servovalve.XSM
+    rms, _, _ = gaps(actuator, faults, current)
+    assert rms[0] < 0.05
+
+
+def test_a_load_moves_the_jack_to_its_stop():
+    actuator = with_data(jack={"XJM": 0.2e-3, "FR": 300.0})
+    current = np.zeros(80)
+    current[1:] = 2e-3 * np.sign(np.sin(2 * np.pi * 15 * np.arange(79) * TICK + 0.1))
+    answer = model(actuator, (0.2, 0.2, 0.2), current)
+    assert np.abs(answer[2]).max() == 0.2e-3
+    rms, _, reference = gaps(actuator, (0.2, 0.2, 0.2), current)
+    assert reference.slides[2] >= 2
+    assert rms[2] < 0.05
+
+
+def test_without_friction_the_spool_is_the_linear_system():
+    """No dry friction, no stop: the matrix exponential is the exact answer."""
+    actuator = with_data(servovalve={"FSS0": 0.0})
+    valve, kintas = actuator.servovalve, 0.4
+    time = np.arange(300) * TICK
+    current = 1e-3 * (np.sin(2 * np.pi * 3 * time) + 0.5 * np.sin(2 * np.pi * 37 * time))
+    drag = valve.GPF / (valve.GQF * (1 - 0.8 * kintas)) * valve.AS**2 + valve.CS
+    rates = np.zeros((5, 5))  # XF, DXF, XS, DXS, current
+    rates[0, 1] = rates[2, 3] = 1.0
+    rates[1] = np.array([-valve.KF, -valve.CF, -valve.KSF, 0.0, valve.GM]) / valve.JF
+    rates[3, 0], rates[3, 3] = valve.AS * valve.GPF / valve.MS, -drag / valve.MS
+    step = expm(rates * TICK)
+    state, exact = np.zeros(5), []
+    for value in current:
+        state[4] = value
+        state = step @ state
+        exact.append(state[2])
+    assert np.abs(exact).max() > 20 * SPOOL.lsb
+    answer = model(actuator, (kintas, 0.0, 0.0), current)
+    np.testing.assert_allclose(answer[0], exact, atol=1e-3 * SPOOL.lsb)
+
+
+def jack_by_small_steps(constants, fdj, spool, step=0.5e-6):
+    """Second stage and jack, the contract's section 1 as it stands; the spool moves straight."""
+    c = constants
+    dynamic = c.FDJ0 + fdj * (c.FDJ1 - c.FDJ0)
+    substeps = round(TICK / step)
+    velocity = place = before = 0.0
+    out = []
+    for after in spool:
+        for i in range(1, substeps + 1):
+            xs = before + (after - before) * i / substeps
+            source = min(max(c.GP * xs, -c.PSR), c.PSR)
+            saturated = abs(c.GP * xs) > c.PSR
+            resistance = c.PSR / (c.GQ * abs(xs)) if saturated else c.GP / c.GQ
+            share = 1.0 / (1.0 + resistance * c.CLK)
+            drag = c.AJ**2 * share * resistance + c.CJ
+            push = c.AJ * share * source - c.FR
+            if velocity == 0.0:
+                if abs(push) > 2.0 * dynamic:
+                    velocity = np.copysign(1e-15, push)
+                else:
+                    continue
+            way = np.copysign(1.0, velocity)
+            new = (velocity + step / c.MJ * (push - way * dynamic)) / (1.0 + step / c.MJ * drag)
+            velocity = 0.0 if new * way < 0.0 else new
+            place += velocity * step
+        before = after
+        out.append((share * (source - resistance * c.AJ * velocity), place))
+    return np.array(out).T
+
+
+@pytest.mark.parametrize("fdj", [0.0, 0.4, 1.0])
+def test_jack_alone_follows_small_steps(fdj):
+    """A given straight-lined spool path through the middle, saturated at both ends."""
+    constants = plant_constants(default_actuator())
+    spool = 60e-6 * np.sin(2 * np.pi * 20 * np.arange(1, 61) * TICK)
+    before = np.concatenate([[0.0], spool[:-1]])
+    rate = (spool - before) / TICK
+    nodes = np.column_stack([np.full(60, TICK), spool, rate, rate, np.zeros(60)])
+    pressure, position = np.empty(60), np.empty(60)
+    jack_response(constants, fdj, 0.0, nodes, np.arange(1, 61), pressure, position)
+    truth = jack_by_small_steps(constants, fdj, spool)
+    assert np.sqrt(np.mean((pressure - truth[0]) ** 2)) < 0.3 * PRESSURE.lsb
+    np.testing.assert_allclose(position, truth[1], atol=0.03 * POSITION.lsb)

@@ -1,0 +1,245 @@
+"""Which message the tick axis comes from, and how the other messages find their place on it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_iface.alignment import ticks
+from firmware_iface.alignment.ticks import PHASE_BLOCK, TickAxis, place
+from firmware_iface.codec.protection import OUTSIDE
+
+MS = 1_000_000
+
+
+def item(
+    name: str,
+    time_ms: Any,
+    counter: Any = None,
+    *,
+    role: str = "channels.spool",
+    telemetry: bool = True,
+    counts: bool = False,
+    first_row: int = 0,
+    modulus: int = 256,
+) -> Any:
+    """What placing reads of a decoded message; its rows are tenths of a millisecond."""
+    time_ms = np.asarray(time_ms, dtype=np.float64)
+    return SimpleNamespace(
+        row=first_row + np.rint(time_ms * 10).astype(np.int64),
+        time_ns=np.rint(time_ms * MS).astype(np.int64),
+        counter=None if counter is None else np.asarray(counter, dtype=np.int64),
+        message=SimpleNamespace(
+            name=name,
+            modulus=0 if counter is None else modulus,
+            counts_ticks=counts,
+            roles=(SimpleNamespace(name=role),),
+        ),
+        saturated={"channels.spool": None} if telemetry else {},
+        stream=np.zeros(len(time_ms), dtype=np.int64),
+    )
+
+
+def command(time_ms: Any, counter: Any = None, **other: Any) -> Any:
+    return item("command", time_ms, counter, role="command.current", telemetry=False, **other)
+
+
+def placed(*items: Any) -> TickAxis:
+    axis = place(SimpleNamespace(messages={one.message.name: one for one in items}), MS)
+    assert axis is not None
+    return axis
+
+
+def test_without_telemetry_there_is_no_axis() -> None:
+    frames = command(np.arange(5), np.arange(5), counts=True)
+    assert place(SimpleNamespace(messages={"command": frames}), MS) is None
+    silent = item("telemetry", [], [], counts=True)
+    assert place(SimpleNamespace(messages={"t": silent, "command": frames}), MS) is None
+
+
+def test_counted_messages_share_the_axis_in_order_of_arrival() -> None:
+    count = np.arange(6)
+    telemetry = item("telemetry", count + 0.5, count + 250, counts=True)
+    telemetry.counter %= 256
+    sent = command(count, (count + 250) % 256, counts=True)
+    axis = placed(telemetry, sent)
+    assert axis.row.tolist() == [0, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55]
+    assert axis.tick.tolist() == np.repeat(count + 250, 2).tolist()
+    assert axis.time_ns.tolist() == (np.arange(12) * MS // 2).tolist()
+    assert {name: list(tick) for name, tick in axis.ticks.items()} == {
+        "telemetry": (count + 250).tolist(),
+        "command": (count + 250).tolist(),
+    }
+    assert axis.rows["command"].tolist() == sent.row.tolist()
+    assert (dict(axis.every), axis.turn) == ({"telemetry": 1, "command": 1}, 256)
+    assert axis.notes == ()
+
+
+def test_a_counted_frame_out_of_line_is_not_on_the_axis() -> None:
+    counter = np.arange(30)
+    counter[12] = 200
+    axis = placed(item("telemetry", np.arange(30), counter, counts=True))
+    assert axis.ticks["telemetry"][12] == OUTSIDE
+    assert axis.tick.tolist() == [k for k in range(30) if k != 12]
+    assert axis.row.tolist() == [10 * k for k in range(30) if k != 12]
+    assert axis.time_ns.tolist() == [k * MS for k in range(30) if k != 12]
+
+
+def test_counted_commands_beside_uncounted_telemetry_do_not_make_the_axis() -> None:
+    sent = command(np.arange(50) + 0.2, np.arange(50) + 7, counts=True)
+    axis = placed(item("telemetry", np.arange(50) + 0.7), sent)
+    assert axis.tick.tolist() == list(range(50))
+    assert axis.turn == 0
+    assert axis.ticks["command"].tolist() == list(range(50))
+
+
+def test_of_two_messages_the_one_with_more_frames_is_the_anchor() -> None:
+    slow = item("slow", np.arange(0, 100, 2) + 0.3)
+    fast = item("fast", np.arange(100) + 0.6)
+    axis = placed(slow, fast)
+    assert axis.row.tolist() == fast.row.tolist()
+    assert axis.ticks["slow"].tolist() == list(range(0, 100, 2))
+    assert dict(axis.every) == {"fast": 1, "slow": 2}
+    assert axis.notes == tuple(
+        f"{name}: no counter to place samples by; host time stamps do" for name in ("fast", "slow")
+    )
+
+
+def test_an_anchor_with_a_counter_of_its_own_turns_after_its_counts() -> None:
+    anchor = item("telemetry", np.arange(0, 400, 4), np.arange(100) % 16, modulus=16)
+    axis = placed(anchor)
+    assert axis.tick.tolist() == list(range(0, 400, 4))
+    assert axis.rows["telemetry"].tolist() == anchor.row.tolist()
+    assert (dict(axis.every), axis.turn, axis.notes) == ({"telemetry": 4}, 64, ())
+
+
+def test_an_anchor_out_of_line_leaves_the_axis_and_the_others_find_their_place() -> None:
+    counter = np.arange(60) % 256
+    counter[20] = 180
+    sent = command(np.arange(60) - 0.3)
+    axis = placed(item("telemetry", np.arange(60), counter, first_row=5), sent)
+    kept = [k for k in range(60) if k != 20]
+    assert axis.tick.tolist() == kept
+    assert axis.row.tolist() == [5 + 10 * k for k in kept]
+    assert axis.time_ns.tolist() == [k * MS for k in kept]
+    assert axis.ticks["telemetry"][20] == OUTSIDE
+    assert axis.ticks["command"].tolist() == list(range(60))
+
+
+@pytest.mark.parametrize(
+    ("ahead_ms", "first"),
+    [(0.0, 0), (0.3, 0), (0.85, 0), (-0.05, 0), (-0.3, 1)],
+)
+def test_a_command_belongs_to_the_telemetry_that_follows(ahead_ms: float, first: int) -> None:
+    """At the same time (less than a tenth of a tick after) it still is the same tick's."""
+    sent = command(np.arange(5, 80) - ahead_ms)
+    axis = placed(item("telemetry", np.arange(100)), sent)
+    assert (axis.ticks["command"] - np.arange(5, 80)).tolist() == [first] * 75
+
+
+@pytest.mark.parametrize(("late_ms", "first"), [(-0.4, 0), (0.0, 0), (0.4, 0), (0.6, 1)])
+def test_other_telemetry_belongs_to_the_nearest_tick(late_ms: float, first: int) -> None:
+    other = item("other", np.arange(5, 80) + late_ms)
+    axis = placed(item("telemetry", np.arange(100)), other)
+    assert (axis.ticks["other"] - np.arange(5, 80)).tolist() == [first] * 75
+
+
+def test_other_telemetry_that_drifts_keeps_the_ticks_that_fit_half_of_its_frames() -> None:
+    count = np.arange(2000)
+    axis = placed(item("telemetry", np.arange(2010)), item("other", count * (1 + 1.5 / 2000)))
+    assert (axis.ticks["other"] - count).tolist() == [1] * 2000
+
+
+def test_a_message_with_a_counter_of_its_own_keeps_its_gaps() -> None:
+    """Its time only says where it begins; one frame that is late by ticks moves nothing."""
+    numbers = np.array([*range(20), *range(25, 60)])
+    time = 2.0 * numbers + 0.2
+    time[30] += 5.0
+    sent = command(time, numbers % 256)
+    axis = placed(item("telemetry", np.arange(140)), sent)
+    assert axis.every["command"] == 2
+    assert axis.ticks["command"].tolist() == (2 * numbers + 1).tolist()
+    assert axis.notes == ("telemetry: no counter to place samples by; host time stamps do",)
+
+
+def test_a_counter_out_of_line_does_not_count_for_where_a_message_begins() -> None:
+    numbers = np.arange(9)
+    counter = numbers.copy()
+    counter[[2, 4, 6]] = [90, 140, 200]
+    axis = placed(item("telemetry", np.arange(20)), command(numbers - 0.5 + 4, counter))
+    expected = numbers + 4
+    assert (
+        axis.ticks["command"][[0, 1, 3, 5, 7, 8]].tolist() == expected[[0, 1, 3, 5, 7, 8]].tolist()
+    )
+    assert axis.ticks["command"][[2, 4, 6]].tolist() == [OUTSIDE] * 3
+    assert set(axis.rows) == {"telemetry", "command"}
+
+
+def test_others_are_placed_by_the_telemetry_even_if_commands_share_the_axis() -> None:
+    """A second command between the first one and the telemetry is of the telemetry's tick."""
+    count = np.arange(30)
+    telemetry = item("telemetry", count + 0.5, count, counts=True)
+    sent = command(count, count, counts=True)
+    second = item("second", count + 0.2, role="command.position", telemetry=False, first_row=3)
+    axis = placed(telemetry, sent, second)
+    assert axis.ticks["second"].tolist() == count.tolist()
+    assert axis.ticks["second"].dtype == np.int64
+    assert axis.rows["second"].tolist() == second.row.tolist()
+    assert axis.every["second"] == 1
+    assert axis.row.tolist() == sorted([*telemetry.row, *sent.row])
+    assert axis.notes == ("second: no counter to place samples by; host time stamps do",)
+
+
+def test_counted_telemetry_leads_even_if_other_telemetry_has_more_frames() -> None:
+    counted = item("counted", np.arange(0, 60, 2) + 0.1, np.arange(5, 65, 2), counts=True)
+    plain = item("plain", np.arange(60) + 0.4)
+    axis = placed(counted, plain)
+    assert axis.row.tolist() == counted.row.tolist()
+    assert axis.ticks["plain"].tolist() == list(range(5, 65))
+
+
+def test_messages_without_frames_or_without_samples_have_no_ticks() -> None:
+    status = item("status", np.arange(3), role="status.state", telemetry=False)
+    axis = placed(item("telemetry", np.arange(9)), command([]), status)
+    assert set(axis.ticks) == set(axis.rows) == {"telemetry"}
+
+
+def test_late_frames_go_back_but_no_further_than_they_must() -> None:
+    tick = np.array([0, 3, 3, 3, 4, 9])
+    assert ticks._settle(tick, 1).tolist() == [0, 1, 2, 3, 4, 9]
+    assert ticks._settle(np.array([0, 2, 7, 8, 8, 10]), 2).tolist() == [0, 2, 4, 6, 8, 10]
+    assert ticks._settle(tick, 0).tolist() == tick.tolist()
+
+
+def test_time_places_frames_from_the_first_on() -> None:
+    """Whatever the epoch of the host's clock."""
+    times = 1.7e12 + np.arange(200)
+    alone, every, _ = ticks._own_ticks(item("telemetry", times), MS)
+    assert alone.tolist() == list(range(200))
+    assert alone.dtype == np.int64
+    assert every == 1
+
+
+def test_the_phase_is_that_of_blocks_and_between_their_middles() -> None:
+    count = 2 * PHASE_BLOCK + 100
+    offset = np.repeat([0.1, 0.3, 0.2], [PHASE_BLOCK, PHASE_BLOCK, 100])
+    phase = ticks._phase(np.arange(count) + offset)
+    middles = [0.5 * PHASE_BLOCK, 1.5 * PHASE_BLOCK, 2 * PHASE_BLOCK + 50]
+    assert phase == pytest.approx(np.interp(np.arange(count), middles, [0.1, 0.3, 0.2]), abs=1e-9)
+
+
+def test_the_phase_of_a_block_is_the_mean_of_its_frames() -> None:
+    fraction = np.arange(4) + np.array([0.2, 0.3, 0.2, 0.3])
+    assert ticks._phase(fraction) == pytest.approx([0.25] * 4, abs=1e-9)
+
+
+def test_of_moving_and_standing_frames_only_the_moving_have_a_position() -> None:
+    counter, time = np.array([3, 4, 4, 5]), np.array([0, 1, 2, 3]) * MS
+    moving = np.array([True, True, False, True])
+    position, notes = ticks._unwrap(counter, time, moving, MS, 256)
+    assert (position.tolist(), notes) == ([3, 4, OUTSIDE, 5], ())
+    turned, _ = ticks._unwrap(np.array([15, 15, 1]), time[:3], moving[[0, 2, 1]], MS, 16)
+    assert turned.tolist() == [15, OUTSIDE, 17]

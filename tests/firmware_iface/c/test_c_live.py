@@ -1,0 +1,227 @@
+"""The C programs as live peers of the tester: over the serial link, and over SocketCAN."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ehadiag.core.recording import BitReason, BitState, Recording
+from ehadiag.core.stored_test import bundled_tests
+from firmware_iface.alignment.align import assemble
+from firmware_iface.mapping.bus_map import default_map
+from firmware_iface.session import tester
+from firmware_iface.session.tester import Progress, run_test
+from firmware_iface.transport.frames import Frame, FrameTable
+from firmware_iface.transport.interface import Transport
+from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from firmware_iface.transport.serial_link import SerialTransport
+
+BUS = default_map()
+REFUSALS = [
+    ((), 3, BitReason.UNKNOWN_TEST, "refused: unknown test"),
+    (("--supply-MPa", "9"), 1, BitReason.SUPPLY_PRESSURE_LOW, "refused: supply pressure low"),
+    (("--oil-degC", "-30"), 1, BitReason.OIL_TOO_COLD, "refused: oil too cold"),
+    (("--interlock-open",), 1, BitReason.INTERLOCK_OPEN, "refused: interlock open"),
+]
+
+
+@contextmanager
+def running(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """A node that must end well when it is told to."""
+    process = subprocess.Popen([str(item) for item in command], stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        _, error = process.communicate(timeout=10)
+    assert (process.returncode, error) == (0, "")
+
+
+def wait_for_frames(transport: Transport) -> None:
+    deadline = time.monotonic() + 10
+    while transport.receive(0.1) is None:
+        assert time.monotonic() < deadline, "the node sends nothing"
+
+
+def run(
+    transport: Transport,
+    test_id: int,
+    stop: threading.Event | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[tester.TesterOutcome, Recording]:
+    frames: list[Frame] = []
+    outcome = run_test(
+        transport,
+        test_id=test_id,
+        duration=5.5,
+        transmit=True,
+        bus_map=BUS,
+        on_frame=frames.append,
+        stop=stop,
+        progress=progress,
+    )
+    return outcome, assemble(FrameTable.from_frames(frames), BUS, "here")[0]
+
+
+def assert_whole(outcome: tester.TesterOutcome, recording: Recording) -> None:
+    assert outcome.why == ""
+    assert outcome.outcome.state is BitState.COMPLETE
+    assert (outcome.test_id, outcome.serial) == (1, 4711)
+    quality = recording.quality
+    assert [quality.total(kind) for kind in ("lost", "crc_errors", "repeated")] == [0, 0, 0]
+    samples = recording.samples
+    assert samples is not None
+    wanted = bundled_tests()["open"].command()
+    assert np.abs(samples.command - wanted).max() <= 0.25e-6 + 1e-12
+    # The stand-in's current is the command at once: half a code, half a step of the command.
+    assert np.abs(samples.current - wanted).max() <= 3.2e-6
+
+
+def assert_aborted(outcome: tester.TesterOutcome, recording: Recording) -> None:
+    assert outcome.why == "stopped by the user"
+    assert outcome.abort_confirmed is True
+    assert recording.outcome.state is BitState.ABORTED
+    samples = recording.samples
+    assert samples is not None
+    # The test has 5500 ticks, and what came after the abort does not belong to it.
+    played = np.flatnonzero(~np.isnan(samples.command))
+    assert 300 <= len(played) < 3000
+
+
+def abort(transport: Transport) -> tuple[tester.TesterOutcome, Recording]:
+    stop = threading.Event()
+
+    def watch(progress: Progress) -> None:
+        if progress.elapsed > 0.5:
+            stop.set()
+
+    return run(transport, 1, stop, watch)
+
+
+class TestSerialLink:
+    def test_a_whole_test(self, c_build: Path, wire: tuple[str, str]) -> None:
+        with (
+            SerialTransport(wire[0], transmit=True) as transport,
+            running(c_build / "fcc-serial", wire[1], "--serial", "4711"),
+        ):
+            wait_for_frames(transport)
+            assert_whole(*run(transport, 1))
+            assert transport.bad_packets == 0
+
+    def test_an_abort_is_obeyed(self, c_build: Path, wire: tuple[str, str]) -> None:
+        with (
+            SerialTransport(wire[0], transmit=True) as transport,
+            running(c_build / "fcc-serial", wire[1]),
+        ):
+            wait_for_frames(transport)
+            assert_aborted(*abort(transport))
+
+    @pytest.mark.parametrize(("options", "test_id", "reason", "why"), REFUSALS)
+    def test_refusals(
+        self,
+        c_build: Path,
+        wire: tuple[str, str],
+        options: tuple[str, ...],
+        test_id: int,
+        reason: BitReason,
+        why: str,
+    ) -> None:
+        with (
+            SerialTransport(wire[0], transmit=True) as transport,
+            running(c_build / "fcc-serial", wire[1], *options),
+        ):
+            wait_for_frames(transport)
+            outcome, _ = run(transport, test_id)
+        assert (outcome.why, outcome.outcome.reason) == (why, reason)
+
+    def test_requests_behind_noise_get_through(self, c_build: Path, wire: tuple[str, str]) -> None:
+        with (
+            SerialTransport(wire[0], transmit=True) as transport,
+            running(c_build / "fcc-serial", wire[1], "--interlock-open"),
+        ):
+            wait_for_frames(transport)
+            with open(wire[0], "wb", buffering=0) as line:
+                line.write(bytes(range(1, 256)) * 3 + b"\0\0\x05\0")
+            outcome, _ = run(transport, 1)
+        assert outcome.why == "refused: interlock open"
+
+
+@pytest.mark.socketcan
+class TestSocketCan:
+    @pytest.fixture
+    def transport(self) -> Iterator[Transport]:
+        options = BusOptions("socketcan", channel="vcan0")
+        with PythonCanTransport(options, transmit=True) as transport:
+            yield transport
+
+    def test_a_whole_test(self, c_build: Path, transport: Transport) -> None:
+        with running(c_build / "fcc-can", "vcan0", "--serial", "4711"):
+            wait_for_frames(transport)
+            assert_whole(*run(transport, 1))
+
+    def test_an_abort_is_obeyed(self, c_build: Path, transport: Transport) -> None:
+        with running(c_build / "fcc-can", "vcan0"):
+            wait_for_frames(transport)
+            assert_aborted(*abort(transport))
+
+    @pytest.mark.parametrize(("options", "test_id", "reason", "why"), REFUSALS)
+    def test_refusals(
+        self,
+        c_build: Path,
+        transport: Transport,
+        options: tuple[str, ...],
+        test_id: int,
+        reason: BitReason,
+        why: str,
+    ) -> None:
+        with running(c_build / "fcc-can", "vcan0", *options):
+            wait_for_frames(transport)
+            outcome, _ = run(transport, test_id)
+        assert (outcome.why, outcome.outcome.reason) == (why, reason)
+
+
+@pytest.mark.parametrize("program", ["fcc-serial", "fcc-can"])
+@pytest.mark.parametrize(
+    ("arguments", "status", "text"),
+    [
+        ((), 2, "usage:"),
+        (("--serial", "1"), 2, "usage:"),
+        (("nowhere", "--serial", "65536"), 2, "usage:"),
+        (("nowhere", "--oil-degC", "warm"), 2, "usage:"),
+        (("nowhere", "--oil-degC"), 2, "usage:"),
+        (("nowhere", "--jack", "1"), 2, "usage:"),
+        (("nowhere",), 1, "nowhere: No such "),
+    ],
+)
+def test_wrong_options(
+    c_build: Path, program: str, arguments: tuple[str, ...], status: int, text: str
+) -> None:
+    done = subprocess.run(
+        [c_build / program, *arguments], capture_output=True, text=True, check=False, timeout=10
+    )
+    assert done.returncode == status
+    assert text in done.stderr
+
+
+def test_a_line_that_goes_away_ends_the_node(c_build: Path, wire: tuple[str, str]) -> None:
+    import os
+    import tty
+
+    far, near = os.openpty()
+    tty.setraw(near)
+    process = subprocess.Popen(
+        [c_build / "fcc-serial", os.ttyname(near)], stderr=subprocess.PIPE, text=True
+    )
+    assert os.read(far, 1)
+    os.close(near)
+    os.close(far)
+    _, error = process.communicate(timeout=10)
+    assert process.returncode == 1
+    assert "bus lost" in error

@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+import pytest
+from bus_synth import play
+from places import LOGS
+
+from firmware_iface.codec.encode import Encoder
+from firmware_iface.mapping.bus_map import default_map
+
+
+@pytest.fixture(scope="session")
+def bus_map():
+    return default_map()
+
+
+@pytest.fixture
+def encoder(bus_map):
+    return Encoder(bus_map)
+
+
+@pytest.fixture
+def frames(encoder, truth):
+    """What brings the `truth` of a module."""
+    return play(encoder, truth)
+
+
+@pytest.fixture(scope="session")
+def logs():
+    return LOGS

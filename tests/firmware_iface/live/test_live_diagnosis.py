@@ -1,0 +1,131 @@
+"""From a damaged harness, or a damaged log, to the verdict: the stated outcome, never a wrong one.
+
+All faults are `slow`; a handful of each kind runs by default.
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fault_cases import CASES, Case
+from fault_diagnosis import Diagnoser, Judged, deviations, objection
+from fault_logs import KEPT, LOG_CASES, NOISE, LogCase, collected, noise
+
+from ehadiag.assess.verdict import Verdict
+from ehadiag.core.recording import BitState
+
+LONGEST_S = 9.0
+"""Simulated time: request, 5.5 s of test, 1 s to its end, 1 s for an abort; not 2 s beyond."""
+QUICK = ("loss of 20 %", "telemetry counter stuck", "bit flips with a valid CRC, 1 %")
+CLOSED = (
+    "loss of 1 %",
+    "loss of 5 %",
+    "loss of 10 %",
+    "frames 40 places late, 5 %",
+    "pause of 0.1 s, frames lost",
+    "bit flips with a valid CRC, 1 %",
+)
+QUICK_LOGS = ("last 0.2 s missing, word of completion too", "last 0.3 s missing")
+
+
+@pytest.fixture(scope="module")
+def diagnoser() -> Diagnoser:
+    return Diagnoser()
+
+
+@pytest.fixture(scope="module")
+def sound(diagnoser: Diagnoser) -> Judged:
+    judged = diagnoser.judge(CASES[0])
+    assert judged.diagnosis.verdict is Verdict.DEGRADED  # all constants are 0.3
+    assert judged.diagnosis.identification is not None
+    for item in judged.diagnosis.identification.estimates:
+        assert abs(item.value - 0.3) <= 2.0 * 1.96 * item.std, item.name
+    return judged
+
+
+def marked(cases: tuple[Case, ...] | tuple[LogCase, ...], quick: tuple[str, ...]) -> list[object]:
+    return [
+        pytest.param(item, id=item.name, marks=() if item.name in quick else pytest.mark.slow)
+        for item in cases
+    ]
+
+
+@pytest.mark.parametrize("case", marked(CASES, QUICK))
+def test_a_fault_gives_the_stated_verdict(case: Case, diagnoser: Diagnoser, sound: Judged) -> None:
+    came = diagnoser.judge(case)
+    assert objection(case, sound.diagnosis, came.diagnosis) == ""
+    assert came.run.simulated_s < LONGEST_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CLOSED)
+def test_the_closed_loop_test_bears_it_too(name: str) -> None:
+    diagnoser = Diagnoser("closed")
+    sound = diagnoser.judge(CASES[0]).diagnosis
+    case = next(item for item in CASES if item.name == name)
+    assert objection(case, sound, diagnoser.judge(case).diagnosis) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["loss of 20 %", "loss in bursts of 20 frames"])
+def test_the_closed_loop_test_is_refused_where_positions_are_guessed(name: str) -> None:
+    diagnoser = Diagnoser("closed")
+    sound = diagnoser.judge(CASES[0]).diagnosis
+    case = next(item for item in CASES if item.name == name)
+    unfit = replace(case, unfit="jack positions that the control law worked on are lost")
+    assert objection(unfit, sound, diagnoser.judge(case).diagnosis) == ""
+
+
+@pytest.mark.parametrize("case", marked(LOG_CASES, QUICK_LOGS))
+def test_a_damaged_log_gives_the_stated_verdict(
+    case: LogCase, diagnoser: Diagnoser, sound: Judged, tmp_path: Path
+) -> None:
+    frames = sound.run.frames
+    begun = next(item.time_ns for item in frames if item.can_id == 0x111 and item.data[5] == 1)
+    came = diagnoser.diagnose(case.damage(frames, begun / 1e9, tmp_path))
+    assert objection(Case(case.name, unfit=case.why), sound.diagnosis, came) == ""
+
+
+def test_a_log_that_ends_early_has_fewer_samples_and_no_word_of_its_end(sound: Judged) -> None:
+    frames = sound.run.frames
+    begun = next(item.time_ns for item in frames if item.can_id == 0x111 and item.data[5] == 1)
+    recording = collected(item for item in frames if item.time_ns - begun < 5_300_000_000)
+    assert recording.samples is not None
+    assert recording.samples.ticks == 5300
+    assert recording.outcome.state is BitState.RUNNING
+
+
+def test_the_memory_of_a_flood_is_that_of_what_is_kept() -> None:
+    tracemalloc.start()
+    try:
+        recording = collected(noise(NOISE, 0), KEPT)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert recording.samples is None
+    # 64 bytes of payload and 14 of the rest a frame; at the end the columns are copied twice, and
+    # the checks mark each frame. All of the flood would be four times as much.
+    assert peak < 4 * KEPT * 90
+
+
+def test_the_comparison_of_verdicts_sees_what_is_wrong(sound: Judged) -> None:
+    clean = sound.diagnosis
+    case = Case("x")
+    assert objection(case, clean, clean) == ""
+    assert "instead of" in objection(case, clean, replace(clean, verdict=Verdict.HEALTHY))
+    assert "instead of" in objection(case, clean, replace(clean, verdict=Verdict.NOT_TESTED))
+    assert "was stated" in objection(replace(case, unfit="x"), clean, clean)
+    untested = replace(clean, verdict=Verdict.NOT_TESTED, reasons=("because",))
+    assert objection(replace(case, unfit="because"), clean, untested) == ""
+    assert "other reasons" in objection(replace(case, why="lost"), clean, untested)
+    assert clean.identification is not None
+    moved = tuple(
+        replace(item, value=item.value + 4.0 * item.std) for item in clean.identification.estimates
+    )
+    shifted = replace(clean, identification=replace(clean.identification, estimates=moved))
+    assert np.allclose(list(deviations(clean, shifted).values()), 4.0)
+    assert "4.0" in objection(case, clean, shifted)

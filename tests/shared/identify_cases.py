@@ -1,0 +1,59 @@
+"""Experiments with known truth for the tests of the identification."""
+
+from functools import lru_cache
+
+import numpy as np
+from places import LOGS
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.channels import CHANNELS, PRESSURE, SPOOL
+from ehadiag.core.recording import CommandMode, Environment, Samples
+from ehadiag.core.stored_test import resolve_test
+from ehadiag.identify.experiment import build_experiment
+from ehadiag.model.plant import plant_constants
+from ehadiag.model.scalar.response import respond
+from firmware_iface.logs.reader import read_recording
+
+PAPER_FAULTS = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))
+
+
+@lru_cache(maxsize=16)
+def recorded(file, test):
+    """Experiment of a recording of the contract (not from the project's simulator)."""
+    recording = read_recording(LOGS / file)
+    return build_experiment(
+        recording.samples, recording.environment, resolve_test(test), default_actuator()
+    )
+
+
+def own_samples(faults, *, seed=0, noise_lsb=0.5, offsets_lsb=(0.0, 0.0)):
+    """Open-loop test with the monitoring model as the plant: nothing is mismatched."""
+    test = resolve_test("open")
+    current = test.command()
+    truth = respond(plant_constants(default_actuator()), np.array(faults), current, 1e-3)
+    rng = np.random.default_rng(seed)
+    clean = (current, truth.spool, truth.pressure, truth.position)
+    offsets = (0.0, *offsets_lsb, 0.0)
+    seen = []
+    for channel, values, offset in zip(CHANNELS, clean, offsets, strict=True):
+        volts = values + channel.lsb * (offset + noise_lsb * rng.standard_normal(len(values)))
+        seen.append(channel.decode(channel.encode(volts)))
+    return Samples(
+        period_ns=1_000_000,
+        mode=CommandMode.CURRENT,
+        current=seen[0],
+        spool=seen[1],
+        pressure=seen[2],
+        position=seen[3],
+        command=current,
+        saturated=np.zeros((4, test.ticks), dtype=np.bool_),
+        host_ns=np.arange(test.ticks, dtype=np.int64) * 1_000_000,
+    )
+
+
+def own_experiment(faults, **options):
+    samples = own_samples(faults, **options)
+    return build_experiment(samples, Environment(), resolve_test("open"), default_actuator())
+
+
+NOISE = (SPOOL.lsb * np.sqrt(0.5**2 + 1 / 12), PRESSURE.lsb * np.sqrt(0.5**2 + 1 / 12))

@@ -1,0 +1,9 @@
+"""Where this repository and its reference recordings are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LOGS = ROOT / "tests" / "data" / "logs"
+CORPUS = ROOT / "tests" / "data" / "fuzz"

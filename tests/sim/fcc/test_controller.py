@@ -1,0 +1,61 @@
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.recording import CommandMode
+from ehadiag_sim.fcc.controller import PositionController
+
+LIMIT = default_actuator().controller.IM
+metres = st.floats(-0.06, 0.06)
+
+
+def law(**changes):
+    return PositionController(msgspec.structs.replace(default_actuator().controller, **changes))
+
+
+@given(st.lists(st.tuples(metres, metres), min_size=1, max_size=30))
+def test_current_never_exceeds_the_rated_one(ticks):
+    controller = law(GAI=30.0, GAD=0.05)
+    for command, measured in ticks:
+        assert abs(controller.current(command, CommandMode.POSITION, measured)) <= LIMIT
+
+
+@given(metres, metres)
+def test_default_is_proportional(command, measured):
+    expected = max(-LIMIT, min(LIMIT, 1.7 * (command - measured)))
+    assert law().current(command, CommandMode.POSITION, measured) == pytest.approx(expected)
+
+
+@given(st.floats(-0.1, 0.1))
+def test_current_mode_passes_the_command_saturated(command):
+    current = law().current(command, CommandMode.CURRENT, 0.02)
+    assert current == max(-LIMIT, min(LIMIT, command))
+
+
+def test_integral_and_derivative_follow_their_definitions():
+    controller = law(GAP=0.0, GAI=2.0, GAD=0.1)
+    first = controller.current(1e-3, CommandMode.POSITION, 0.0)
+    second = controller.current(1.01e-3, CommandMode.POSITION, 0.0)
+    assert first == pytest.approx(2.0 * 1e-6)
+    assert second == pytest.approx(2.0 * (1e-6 + 1.01e-6) + 0.1 * 0.01e-3 / 1e-3)
+
+
+def test_integral_does_not_wind_up():
+    winding = law(GAI=20.0)
+    for _ in range(1000):
+        assert winding.current(0.05, CommandMode.POSITION, 0.0) == LIMIT
+    # One second at full error would hold 0.05 m s of it and keep the output at its end.
+    assert winding.current(0.0, CommandMode.POSITION, 0.001) < 0.0
+
+
+def test_current_mode_clears_the_memory():
+    controller = law(GAI=20.0, GAD=0.01)
+    for _ in range(10):
+        controller.current(1e-3, CommandMode.POSITION, 0.0)
+    controller.current(0.0, CommandMode.CURRENT, 0.0)
+    fresh = law(GAI=20.0, GAD=0.01)
+    assert controller.current(1e-3, CommandMode.POSITION, 0.0) == fresh.current(
+        1e-3, CommandMode.POSITION, 0.0
+    )

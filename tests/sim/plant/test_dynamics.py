@@ -1,0 +1,236 @@
+"""Properties that the plant must have whatever drives it."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.errors import ConfigurationError
+from ehadiag_sim.plant.coefficients import coefficients
+from ehadiag_sim.plant.conditions import Effects, Faults
+from ehadiag_sim.plant.dynamics import Dynamics, respond
+from ehadiag_sim.plant.kernels import (
+    BALL,
+    DXF,
+    DXJ,
+    DXS,
+    MOTOR,
+    P12,
+    STATES,
+    XF,
+    XJ,
+    XS,
+    play,
+    step_tick,
+    velocity_after,
+)
+
+ACTUATOR = default_actuator()
+COARSE = 2e-6
+unit = st.floats(0.0, 1.0)
+faults = st.builds(Faults, Kintas=unit, FSS=unit, FDJ=unit)
+effects = st.builds(
+    Effects,
+    hysteresis=st.floats(0.0, 0.2),
+    gain_change=st.floats(-0.3, 0.3),
+    backlash=st.floats(0.0, 50e-6),
+    oil_temperature=st.floats(-40.0, 120.0),
+    supply_pressure=st.floats(5e6, 28e6),
+)
+currents = st.lists(st.floats(-10e-3, 10e-3), min_size=1, max_size=25).map(np.array)
+
+
+@settings(max_examples=60)
+@given(faults, effects, currents)
+def test_nothing_leaves_its_limits(fault, effect, drive):
+    plant = Dynamics(ACTUATOR, fault, effect, COARSE)
+    for current in drive:
+        plant.advance(float(current))
+        state = plant.state
+        assert np.isfinite(state).all()
+        assert abs(state[XF]) <= ACTUATOR.servovalve.XFM
+        assert abs(plant.spool) <= ACTUATOR.servovalve.XSM
+        assert abs(plant.pressure) <= effect.supply_pressure - effect.return_pressure
+        assert abs(plant.position) <= ACTUATOR.jack.XJM
+        assert abs(state[BALL] - state[XS]) <= effect.backlash + 1e-18
+
+
+@settings(max_examples=40)
+@given(faults, effects, currents)
+def test_mirrored_current_gives_mirrored_response(fault, effect, drive):
+    there = respond(ACTUATOR, drive, fault, effect, COARSE)
+    back = respond(ACTUATOR, -drive, fault, effect, COARSE)
+    np.testing.assert_array_equal(there, -back)
+
+
+@settings(max_examples=40)
+@given(faults, st.floats(-0.99, 0.99))
+def test_friction_holds_a_spool_at_rest(fault, share):
+    """Flapper at a still place whose spool force is just below static friction."""
+    p = coefficients(ACTUATOR, fault, Effects())
+    flapper = share * min(p.FSS / p.FORCE, p.XFM)
+    state = np.zeros(STATES)
+    state[XF] = flapper
+    step_tick(state, p, p.KF * flapper / p.GM, COARSE, 500)
+    assert (state[XS], state[DXS], state[DXJ]) == (0.0, 0.0, 0.0)
+
+
+def test_spool_breaks_away_just_above_static_friction():
+    p = coefficients(ACTUATOR, Faults(FSS=0.5), Effects())
+    state = np.zeros(STATES)
+    state[XF] = 1.01 * p.FSS / p.FORCE
+    step_tick(state, p, p.KF * state[XF] / p.GM, COARSE, 500)
+    assert state[XS] > 0.0
+
+
+speeds = st.just(0.0) | st.floats(1e-6, 1.0) | st.floats(-1.0, -1e-6)
+forces = st.floats(-1e4, 1e4)
+
+
+@given(speeds, forces, st.floats(0.0, 100.0), st.floats(0.0, 1e3), st.floats(1e-8, 1e-3))
+def test_dry_friction_never_drives(velocity, force, damping, static, step):
+    """Friction takes energy: the step ends no faster, and no further, than without friction."""
+    mass = 0.5
+    per_mass = 1.0 / (mass + step * damping)
+    slick = velocity_after(mass * velocity, force, step, per_mass, 0.0, 0.0)
+    rough = velocity_after(mass * velocity, force, step, per_mass, static, 0.5 * static)
+    if velocity != 0.0:
+        assert rough * velocity >= 0.0
+        assert abs(rough) <= abs(slick)
+    elif abs(force) <= static:
+        assert rough == 0.0
+    else:
+        assert abs(rough) <= abs(slick)
+
+
+@settings(max_examples=40)
+@given(faults, st.floats(0.01, 2.0), st.floats(0.001, 0.3))
+def test_undriven_masses_only_lose_energy(fault, spool_speed, jack_speed):
+    """Flapper and feedback are cut off, so that nothing feeds the spool and the jack."""
+    p = coefficients(ACTUATOR, fault, Effects())._replace(FORCE=0.0, GP=1e-6, KSF=0.0)
+    state = np.zeros(STATES)
+    state[DXS], state[DXJ] = spool_speed, jack_speed
+    energy = np.inf
+    for _ in range(50):
+        step_tick(state, p, 0.0, COARSE, 10)
+        now = 0.5 * p.MS * state[DXS] ** 2 + 0.5 * p.MJ * state[DXJ] ** 2
+        assert now <= energy
+        energy = now
+    assert state[DXS] >= 0.0
+    assert state[DXJ] >= 0.0
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=50), st.floats(0.0, 0.5))
+def test_play_holds_inside_its_width_and_is_dragged_outside(inputs, width):
+    held = 0.0
+    for value in inputs:
+        before, held = held, play(held, value, width)
+        assert abs(held - value) <= width + 1e-12
+        if abs(before - value) <= width:
+            assert held == pytest.approx(before, abs=1e-12)
+
+
+def test_gain_change_scales_the_steady_spool():
+    drive = np.full(200, 4e-3)
+    slick = msgspec.structs.replace(
+        ACTUATOR, servovalve=msgspec.structs.replace(ACTUATOR.servovalve, FSS0=0.0)
+    )
+    for change in (-0.2, 0.0, 0.2):
+        spool = respond(slick, drive, Faults(), Effects(gain_change=change), COARSE)[0, -1]
+        steady = 2.82 * (1.0 + change) * 4e-3 / 74.3
+        assert spool == pytest.approx(steady, rel=1e-6)
+
+
+def test_hysteresis_is_as_wide_as_it_says():
+    """A slow triangle of 5 mA up and back: current behind the play differs by hyst·IM."""
+    drive = np.concatenate([np.linspace(0, 5e-3, 100), np.linspace(5e-3, -5e-3, 200)])
+    plant = Dynamics(ACTUATOR, effects=Effects(hysteresis=0.05), step=COARSE)
+    seen = []
+    for current in drive:
+        plant.advance(float(current))
+        seen.append(plant.state[MOTOR])
+    rising, falling = np.array(seen[50:99]) - drive[50:99], np.array(seen[150:]) - drive[150:]
+    np.testing.assert_allclose(rising, -0.5 * 0.05 * 10e-3, atol=1e-15)
+    np.testing.assert_allclose(falling, 0.5 * 0.05 * 10e-3, atol=1e-15)
+
+
+def test_hysteresis_costs_the_spool_half_its_width():
+    slick = msgspec.structs.replace(
+        ACTUATOR, servovalve=msgspec.structs.replace(ACTUATOR.servovalve, FSS0=0.0)
+    )
+    drive = np.full(200, 4e-3)
+    spool = respond(slick, drive, effects=Effects(hysteresis=0.05), step=COARSE)[0, -1]
+    assert spool == pytest.approx(2.82 * (4e-3 - 0.25e-3) / 74.3, rel=1e-6)
+
+
+def test_backlash_moves_the_steady_spool_by_its_half_width():
+    slick = msgspec.structs.replace(
+        ACTUATOR, servovalve=msgspec.structs.replace(ACTUATOR.servovalve, FSS0=0.0)
+    )
+    drive = np.concatenate([np.linspace(0.0, 4e-3, 150), np.full(200, 4e-3)])
+    tight = respond(slick, drive, step=COARSE)[0, -1]
+    loose = respond(slick, drive, effects=Effects(backlash=5e-6), step=COARSE)[0, -1]
+    assert loose - tight == pytest.approx(5e-6, rel=0.02)
+
+
+def test_jack_at_its_stop_sees_the_blocked_pressure():
+    drive = np.full(400, 10e-3)
+    effect = Effects(supply_pressure=15.7e6, return_pressure=0.7e6)
+    spool, pressure, position = respond(ACTUATOR, drive, effects=effect, step=COARSE)[:, -1]
+    valve = ACTUATOR.servovalve
+    leak = 15e6 / (valve.GQ * spool) * valve.CLK
+    assert position == ACTUATOR.jack.XJM
+    assert pressure == pytest.approx(15e6 / (1.0 + leak), rel=1e-9)
+
+
+def test_external_load_below_friction_moves_nothing_above_it_does():
+    for load, moves in ((250.0, False), (400.0, True)):  # static friction as new: 300 N
+        jack = msgspec.structs.replace(ACTUATOR.jack, FR=load)
+        loaded = msgspec.structs.replace(ACTUATOR, jack=jack)
+        position = respond(loaded, np.zeros(20), step=COARSE)[2, -1]
+        assert (position < 0.0) == moves
+
+
+@pytest.mark.parametrize("speed", [-0.006, -10.0])
+def test_jack_driven_back_cannot_exceed_the_supply(speed):
+    p = coefficients(ACTUATOR, Faults(), Effects())
+    state = np.zeros(STATES)
+    state[DXJ] = speed
+    step_tick(state, p, 0.0, 1e-7, 1)
+    assert state[P12] == p.PSR
+    slowed = (p.MJ * speed + 1e-7 * (p.AJ * p.PSR + p.FDJ)) / (p.MJ + 1e-7 * p.CJ)
+    assert state[DXJ] == pytest.approx(slowed, rel=1e-12)
+
+
+def test_spool_stands_at_its_stop():
+    plant = Dynamics(ACTUATOR, effects=Effects(gain_change=0.2), step=COARSE)
+    for _ in range(30):
+        plant.advance(10e-3)
+    state = plant.state
+    assert (state[XS], state[DXS]) == (ACTUATOR.servovalve.XSM, 0.0)
+
+
+def test_flapper_strikes_its_stop_without_bounce():
+    plant = Dynamics(ACTUATOR, Faults(Kintas=1.0, FSS=1.0), step=COARSE)
+    plant.advance(10e-3)
+    state = plant.state
+    assert (state[XF], state[DXF]) == (ACTUATOR.servovalve.XFM, 0.0)
+
+
+@pytest.mark.parametrize("step", [0.0, -1e-6, 2e-3, float("nan"), float("inf")])
+def test_impossible_step_is_refused(step):
+    with pytest.raises(ConfigurationError, match="integration step"):
+        Dynamics(ACTUATOR, step=step)
+
+
+def test_position_integrates_velocity_over_a_tick():
+    plant = Dynamics(ACTUATOR, step=COARSE)
+    for _ in range(60):
+        plant.advance(5e-3)
+    before = plant.state
+    plant.advance(5e-3)
+    after = plant.state
+    mean = 0.5 * (before[DXJ] + after[DXJ])
+    assert (after[XJ] - before[XJ]) / 1e-3 == pytest.approx(mean, rel=1e-3)

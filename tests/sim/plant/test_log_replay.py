@@ -1,0 +1,104 @@
+"""The tool that drives the simulator with a recording's own currents, and its two launchers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.recording import Environment
+from ehadiag.core.stored_test import bundled_tests
+from ehadiag_sim.plant.conditions import Effects, Faults
+from ehadiag_sim.plant.simulator import simulate
+from ehadiag_tools.simulator import compare_logs, convergence
+from ehadiag_tools.simulator.replay import replay
+
+ACTUATOR = default_actuator()
+TESTS = bundled_tests()
+FAULTS = Faults(0.6, 0.3, 0.3)
+STEP = 5e-6
+FLOOR = np.sqrt(0.5**2 + 1 / 12)
+
+
+@pytest.fixture(scope="module", params=["open", "closed"])
+def run(request):
+    return simulate(ACTUATOR, TESTS[request.param], FAULTS, seed=4, step=STEP)
+
+
+def truth(result):
+    return np.vstack([result.current, result.spool, result.pressure, result.position])
+
+
+def test_replay_rebuilds_the_run_exactly(run):
+    again = replay(ACTUATOR, run.samples, run.command, FAULTS, Effects(), STEP)
+    np.testing.assert_array_equal(again, truth(run))
+
+
+def test_replay_bridges_lost_rows(run):
+    """Two per cent lost, some in a row: the next current tells what the position was."""
+    samples = run.samples
+    lost = np.random.default_rng(1).random(samples.ticks) < 0.02
+    lost[[300, 301, 302]] = True
+    channels = ("current", "spool", "pressure", "position")
+    holes = {name: np.where(lost, np.nan, getattr(samples, name)) for name in channels}
+    holed = dataclasses.replace(samples, **holes)
+    again = replay(ACTUATOR, holed, run.command, FAULTS, Effects(), STEP)
+    single = lost & ~np.roll(lost, -1)
+    assert single.sum() > 50
+    gap = (again - truth(run)) / np.array([[24e-3], [1e-3], [50e6], [0.12]]) * 4096
+    # Only where two rows in turn are lost may a code be guessed wrong.
+    assert np.abs(gap[0]).max() < 30.0
+    assert (np.abs(gap[0]) < 0.1).mean() > 0.998
+    assert np.sqrt((gap[3] ** 2).mean()) < 0.5
+
+
+def test_residual_is_the_noise_floor(run):
+    gap = compare_logs.residuals(ACTUATOR, run.samples, run.command, FAULTS, Effects(), STEP)
+    np.testing.assert_allclose(np.sqrt((gap**2).mean(axis=1)), FLOOR, rtol=0.03)
+
+
+def test_residual_shows_other_faults(run):
+    gap = compare_logs.residuals(
+        ACTUATOR, run.samples, run.command, Faults(0.5, 0.3, 0.4), Effects(), STEP
+    )
+    assert np.sqrt((gap[1:3] ** 2).mean(axis=1)).min() > 1.1 * FLOOR
+
+
+def test_environment_becomes_effects():
+    assert compare_logs.effects_of(Environment()) == Effects()
+    known = compare_logs.effects_of(Environment(20.1e6, 0.6e6, 85.0))
+    assert (known.supply_pressure, known.return_pressure) == (20.1e6, 0.6e6)
+    assert known.oil_temperature == 85.0
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "words"),
+    [
+        (None, 3, "truth.csv"),
+        ("file,test,Kintas,FSS,FDJ\na.blf,open,x,0,0\n", 2, "line 2"),
+        ("file,test,Kintas,FSS\na.blf,open,0,0\n", 2, "FDJ"),
+        ("file,test,Kintas,FSS,FDJ\na.blf,open,1.5,0,0\n", 2, "Kintas"),
+        ("file,test,Kintas,FSS,FDJ\na.blf,open,0,0,0\n", 3, "a.blf"),
+    ],
+)
+def test_bad_folder_is_one_line_on_stderr(tmp_path, capsys, text, code, words):
+    if text is not None:
+        (tmp_path / "truth.csv").write_text(text)
+    assert compare_logs.main([str(tmp_path)]) == code
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert words in error
+
+
+def test_convergence_prints_a_table(capsys):
+    assert convergence.main(["--test", "open", "--ticks", "450", "--steps", "8", "4"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert [row.split("|")[1].strip() for row in rows] == ["step, µs", "---", "8", "4"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"), [(["--faults", "2", "0", "0"], "Kintas"), (["--ticks", "0"], "--ticks")]
+)
+def test_convergence_refuses_impossible_options(capsys, options, words):
+    assert convergence.main(options) == 2
+    assert words in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""Accuracy of the identification on tests with known truth."""

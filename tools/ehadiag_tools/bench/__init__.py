@@ -1,0 +1,1 @@
+"""Benchmarks: speed of the project against others, in one table."""

@@ -1,0 +1,84 @@
+"""The recordings that the benchmark works on."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.recording import Recording, Samples
+from ehadiag.core.stored_test import resolve_test
+from ehadiag.identify.experiment import Experiment, build_experiment, make_batch
+from ehadiag.identify.search.stages import LEAD_S
+from ehadiag.model.scalar.residuals import Batch
+from firmware_iface.logs.reader import read_recording
+
+__all__ = [
+    "LOG",
+    "TRUTH",
+    "all_tests",
+    "experiment",
+    "population",
+    "recording",
+    "samples",
+    "search_window",
+    "whole_test",
+]
+
+LOG = "paper-open-2.blf"
+TRUTH = (0.3, 0.6, 0.3)
+"""Of that recording."""
+
+
+@lru_cache(maxsize=1)
+def recording(logs: Path) -> Recording:
+    """Return the recording, an open-loop test of 5.5 s."""
+    return read_recording(logs / LOG)
+
+
+def samples(logs: Path) -> Samples:
+    """Return its samples."""
+    found = recording(logs).samples
+    assert found is not None
+    return found
+
+
+def experiment(logs: Path) -> Experiment:
+    """Prepare it for the identification."""
+    return build_experiment(
+        samples(logs), recording(logs).environment, resolve_test("open"), default_actuator()
+    )
+
+
+def whole_test(logs: Path, tests: int) -> Batch:
+    """Lay it out so many times, all of the test."""
+    return make_batch([experiment(logs)] * tests)
+
+
+def all_tests(logs: Path) -> list[Batch]:
+    """Lay out each recording of the paper's cases, all of the test."""
+    out = []
+    for kind in ("open", "closed"):
+        for log in sorted(logs.glob(f"paper-{kind}-*.blf")):
+            found = read_recording(log)
+            assert found.samples is not None
+            item = build_experiment(
+                found.samples, found.environment, resolve_test(kind), default_actuator()
+            )
+            out.append(make_batch([item]))
+    return out
+
+
+def population(size: int) -> np.ndarray:
+    """Candidates all over the cube, no offsets, shape (size, 5)."""
+    rows = np.zeros((size, 5))
+    rows[:, :3] = np.random.default_rng(0).uniform(0.0, 1.0, (size, 3))
+    return rows
+
+
+def search_window(logs: Path) -> Batch:
+    """Lay out the window on which the genetic search works."""
+    item = experiment(logs)
+    return make_batch([item], [item.test.windows.refinement], lead=LEAD_S)

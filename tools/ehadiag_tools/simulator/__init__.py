@@ -1,0 +1,1 @@
+"""Checks of the simulator: against recordings and a stiff reference solver."""

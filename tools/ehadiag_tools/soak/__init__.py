@@ -1,0 +1,1 @@
+"""Long runs on a loaded bus: losses, memory, latency."""
