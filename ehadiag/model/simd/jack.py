@@ -5,8 +5,8 @@ Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5), which
 stiff. Unknown are the pressures of the stages, not the velocities: with D = GQ max(abs(x),
 PSR/GP) + PSR CLK the second stage of model.md section 1 reads P12 = PSR (GQ x - AJ v) / D at any x,
 so the stages' equations are linear with coefficients that need no division, no branch and no
-exponential, and a step takes one division, for the last stage's pressure. A lane whose jack sticks, breaks away
-or meets its stop takes that step alone (`ehadiag.model.simd.jack_events`).
+exponential, and a step takes one division, for the last stage's pressure. A lane whose jack sticks,
+breaks away or meets its stop takes that step alone (`ehadiag.model.simd.jack_events`).
 """
 
 from __future__ import annotations
