@@ -25,7 +25,7 @@ class Verdict(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Levels of a fault constant, 0 … 1.
+    """Levels of a severity, 0 … 1.
 
     Raises
     ------

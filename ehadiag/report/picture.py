@@ -14,6 +14,7 @@ from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.core.errors import InputOutputError
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
+from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.scalar.response import respond
 
 __all__ = ["draw_diagnosis"]
@@ -55,8 +56,9 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
 
 def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:
     time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    faults = np.array([item.value for item in found.estimates])
-    model = respond(experiment.constants, faults, experiment.trace.current, experiment.tick)
+    severities = np.array([item.value for item in found.estimates])
+    constants = Unknowns(FAULTS, (experiment.constants,), {}).constants(severities)
+    model = respond(constants, experiment.trace.current, experiment.tick)
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
     axes[0].set_title(f"test {experiment.test.name!r}", fontsize=10)

@@ -29,7 +29,7 @@ from ehadiag.core.stored_test import StoredTest, resolve_test
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
-    from ehadiag.assess.online import OnlineIdentification
+    from ehadiag.assess.diagnosis import DiagnosisSession
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.session.tester import Progress
@@ -108,8 +108,10 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_beforehand(arguments, test, actuator, bus_map)
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
-    from ehadiag.assess.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
-    from ehadiag.assess.online import OnlineIdentification  # noqa: PLC0415
+    from ehadiag.assess.diagnosis import (  # noqa: PLC0415 - loads numba
+        DiagnosisSession,
+        not_tested,
+    )
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
 
@@ -117,25 +119,21 @@ def run(arguments: argparse.Namespace) -> int:
     warm_up(actuator, test)
     load_report(arguments)
     begin = time.perf_counter()
-    solver = make_solver(arguments.solver)
-    online = OnlineIdentification(test, actuator, solver=solver, seed=arguments.seed)
-    recording, why, stem, ended_at = _acquire(arguments, actuator, test, bus_map, folder, online)
+    session = DiagnosisSession(
+        actuator,
+        [test],
+        default=test,
+        levels=levels,
+        solver=make_solver(arguments.solver),
+        seed=arguments.seed,
+    )
+    recording, why, stem, ended_at = _acquire(arguments, actuator, test, bus_map, folder, session)
     read_s = time.perf_counter() - begin
     if why:
         result = not_tested(recording, test, actuator, [why])
     else:
         with progress_bar() as progress:
-            result = diagnose(
-                [recording],
-                actuator,
-                [test],
-                default=test,
-                levels=levels,
-                solver=solver,
-                seed=arguments.seed,
-                progress=progress,
-                memory=online.memory,
-            )
+            result = session.finish([recording], progress)
     timing = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
     show(result, arguments, timing)
     write_report(result, stem, arguments, timing)
@@ -148,7 +146,7 @@ def _acquire(
     test: StoredTest,
     bus_map: BusMap,
     folder: Path,
-    online: OnlineIdentification,
+    session: DiagnosisSession,
 ) -> tuple[Recording, str, Path, float | None]:
     """Run the test on the bus.
 
@@ -161,7 +159,7 @@ def _acquire(
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
     assembler = Assembler(str(path), bus_map)
-    with working_ahead(online, assembler, test) as ahead:
+    with working_ahead(session, assembler, test) as ahead:
         with ExitStack() as stack:
             ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
             stop = stack.enter_context(stop_on_signals())

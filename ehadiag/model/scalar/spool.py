@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
 from ehadiag.model.anchor import re_anchored
+from ehadiag.model.laws import drive
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, spool_rest, spool_tick
+from ehadiag.model.scalar.spool_tick import sampled, spool_rest, spool_tick
 from ehadiag.model.scalar.transition import SpoolTables
+from ehadiag.model.spool_events import SpoolState
 
-__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "spool_response"]
+__all__ = ["spool_response"]
 
 
 @kernel
@@ -38,7 +40,7 @@ def spool_response(
     current_before: current before the first tick, A; the flapper is in equilibrium with both.
     measured: measured spool position, m, shape (n,), NaN where missing; used only to re-anchor.
     anchor: (gain, small, large), see `ehadiag.model.anchor.Anchor`.
-    spool: out, m, shape (n,), the prediction before any re-anchoring.
+    spool: out, m, shape (n,), as it is sampled, the prediction before any re-anchoring.
     nodes: out, shape (n * NODES_PER_TICK, NODE_COLUMNS), the path as `spool_tick` writes it, with
         the jump that a re-anchoring adds after a tick's last piece.
     node_end: out, shape (n,), index one past the last node of each tick.
@@ -47,35 +49,20 @@ def spool_response(
     -------
     How many times the model was re-anchored.
     """
-    c, t = constants, tables.scalars
-    moving, stuck, decay = tables.moving, tables.stuck, tables.decay
-    xf, xs = spool_rest(c, t, current_before, origin)
-    wf, vs, direction, clamped = 0.0, 0.0, 0, False
+    gain, law = constants.GM / constants.KF, tables.law
+    s = spool_rest(law, drive(gain, current_before), origin)
     count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
-        xf, wf, xs, vs, direction, clamped, count = spool_tick(
-            c,
-            t,
-            moving,
-            stuck,
-            decay,
-            c.GM * current[k],
-            tick,
-            xf,
-            wf,
-            xs,
-            vs,
-            direction,
-            clamped,
-            nodes,
-            count,
-        )
+        before = s.xs
+        s, count = spool_tick(tables, drive(gain, current[k]), tick, s, nodes, count)
         node_end[k] = count
-        spool[k] = xs
+        spool[k] = sampled(nodes, count, before, constants.DLY)
         xs, filtered, moved = re_anchored(
-            measured[k] - xs, anchor[0], anchor[1], anchor[2], xs, filtered, c.XSM
-        )
+            measured[k] - constants.OXS - spool[k], anchor[0], anchor[1], anchor[2],
+            s.xs, filtered, law.stroke,
+        )  # fmt: skip
         if moved:
-            nodes[count - 1, 4] = xs - spool[k]
+            nodes[count - 1, 4] = xs - s.xs
+            s = SpoolState(s.xf, s.wf, xs, s.vs, s.direction, s.clamped)
             anchored += 1
     return anchored

@@ -11,16 +11,74 @@ LANES = 2 * WIDTH
 NODES = 4
 """Pieces of the spool's path in a tick."""
 
-# Rows of the state.
-FLAPPER, FLAPPER_RATE, SPOOL, SPOOL_RATE, DIRECTION, CLAMPED, BUSY = 0, 1, 2, 3, 4, 5, 6
-JACK, JACK_VELOCITY, JACK_DIRECTION, PRESSURE, FILTERED = 7, 8, 9, 10, 11
-FRESH, DONE, ANCHORED = 12, 13, 14
-"""FRESH: the jack has just started or stopped; DONE: it has taken this tick beside the spool."""
-STATE_ROWS = 15
-# Rows of the path: position and velocity of the spool at the nodes 0 … NODES.
+(
+    FLAPPER,
+    FLAPPER_RATE,
+    SPOOL,
+    SPOOL_RATE,
+    DIRECTION,
+    CLAMPED,
+    BUSY,
+    JACK,
+    JACK_VELOCITY,
+    JACK_DIRECTION,
+    PRESSURE,
+    FILTERED,
+    FRESH,
+    DONE,
+    DEFLECTION,
+    SEEN,
+    ANCHORED,
+    STATE_ROWS,
+) = range(18)
+"""Rows of the state. DEFLECTION: of the flapper by the current alone; SEEN:
+spool as it is sampled; FRESH: the jack has just
+started or stopped; DONE: it has taken this tick beside the spool; ANCHORED: how often the lane was
+re-anchored, which goes on from span to span."""
+
 PLACE, SLOPE = 0, NODES + 1
 PATH_ROWS = 2 * (NODES + 1)
-# Rows of the coefficients: the step of a whole tick at rest (2 x 2), of a quarter tick (4 x 4).
-DRY, BREAK, ROOM, DAMPING, DYNAMIC, JACK_FRICTION = 0, 1, 2, 3, 4, 5
-SPOOL_OFFSET, PRESSURE_OFFSET, REST, MOVE = 6, 7, 8, 12
-COEFFICIENT_ROWS = 28
+"""Rows of the path: position and velocity of the spool at the nodes 0 … NODES."""
+
+(
+    DRIVE_GAIN,
+    RATIO,
+    REACH,
+    DRY,
+    BREAKAWAY,
+    ROOM,
+    FLAPPER_STOP,
+    STROKE,
+    FORCE,
+    SPOOL_MASS,
+    DAMPING,
+    DYNAMIC,
+    RING_DAMPING,
+    RING_TIME,
+    JACK_FLOW,
+    JACK_SLOPE,
+    JACK_LEAK,
+    JACK_CORNER,
+    JACK_AREA,
+    JACK_VISCOSITY,
+    JACK_BY_MASS,
+    JACK_SUPPLY,
+    JACK_STROKE,
+    JACK_LOAD,
+    JACK_FRICTION,
+    JACK_STATIC,
+    SPOOL_OFFSET,
+    PRESSURE_OFFSET,
+    SEEN_PLACE_BEFORE,
+    SEEN_PLACE,
+    SEEN_SLOPE_BEFORE,
+    SEEN_SLOPE,
+    SCALAR_ROWS,
+) = range(33)
+"""Rows of the coefficients that are one number a lane, see `ehadiag.model.laws`. ROOM: flapper
+deflection within which a resting spool stays; RING_TIME: reciprocal of the ringing's rate;
+SEEN_…: weights of the last piece's ends at the instant of sampling."""
+REST = SCALAR_ROWS
+MOVE = REST + 4
+COEFFICIENT_ROWS = MOVE + 16
+"""Then the transitions over a whole tick at rest (2 x 2) and a quarter of a tick moving (4 x 4)."""

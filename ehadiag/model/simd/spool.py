@@ -22,30 +22,44 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.plant import PlantConstants
+from ehadiag.model.laws import drive, slide_base, still_flapper
 from ehadiag.model.simd.layout import (
     ANCHORED,
-    BREAK,
+    BREAKAWAY,
     BUSY,
     CLAMPED,
+    DEFLECTION,
     DIRECTION,
     DONE,
+    DRIVE_GAIN,
     DRY,
     FILTERED,
     FLAPPER,
     FLAPPER_RATE,
+    FLAPPER_STOP,
     LANES,
     MOVE,
+    NODES,
     PLACE,
+    RATIO,
+    REACH,
     REST,
+    RING_DAMPING,
+    RING_TIME,
     ROOM,
+    SEEN,
+    SEEN_PLACE,
+    SEEN_PLACE_BEFORE,
+    SEEN_SLOPE,
+    SEEN_SLOPE_BEFORE,
     SLOPE,
     SPOOL,
     SPOOL_OFFSET,
     SPOOL_RATE,
+    STROKE,
 )
 
-__all__ = ["anchor_lanes", "rest", "spool_lanes"]
+__all__ = ["anchor_lanes", "drive_lanes", "rest_lanes", "see_lanes", "spool_lanes"]
 
 BIG = 1e30
 LEAST_DEPTH = -1e-14
@@ -56,26 +70,32 @@ denormal numbers, which cost a hundred times as much."""
 
 
 @packed
-def rest(
-    c: PlantConstants,
-    current_before: float,
-    origin: float,
-    coefficients: NDArray[np.float64],
-    state: NDArray[np.float64],
+def drive_lanes(
+    current: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
-    """State of all lanes before the first tick: at rest, the flapper in equilibrium if it can.
-
-    The count of re-anchorings goes on from span to span.
-    """
-    xs = min(max(origin, -c.XSM), c.XSM)
-    state[: ANCHORED * LANES] = 0.0
+    """Flapper deflection that the current (A) of a tick alone makes, all lanes, into the state."""
     for o in range(0, LANES, WIDTH):
-        held = load(coefficients, BREAK * LANES + o)
-        store(
-            state,
-            FLAPPER * LANES + o,
-            most(least((c.GM * current_before - c.KSF * xs) / c.KF, held), -held),
+        gain = load(coefficients, DRIVE_GAIN * LANES + o)
+        store(state, DEFLECTION * LANES + o, drive(gain, current))
+
+
+@packed
+def rest_lanes(
+    origin: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> None:
+    """All lanes at rest, the spool at `origin` (m), the flapper in equilibrium if it can be.
+
+    The deflection by the current is in the state; the count of re-anchorings goes on.
+    """
+    state[: DEFLECTION * LANES] = 0.0
+    for o in range(0, LANES, WIDTH):
+        stroke = load(coefficients, STROKE * LANES + o)
+        xs = most(least(stroke * 0.0 + origin, stroke), -stroke)
+        limit = load(coefficients, BREAKAWAY * LANES + o)
+        still = still_flapper(
+            load(coefficients, RATIO * LANES + o), load(state, DEFLECTION * LANES + o), xs
         )
+        store(state, FLAPPER * LANES + o, most(least(still, limit), -limit))
         store(state, SPOOL * LANES + o, xs)
 
 
@@ -98,31 +118,30 @@ def _quarter(
 
 @packed
 def spool_lanes(
-    c: PlantConstants,
-    torque: float,
     tick: float,
-    ring_damping: float,
-    ring_time: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> bool:
     """Flapper and spool of all lanes over a tick without events.
 
-    `ring_time`: reciprocal of the flapper's angular frequency, s. Lanes in which an event may hide
-    are marked BUSY and left as they were; returns whether there are any.
+    Lanes in which an event may hide are marked BUSY and left as they were; returns whether there
+    are any.
     """
     any_busy = False
-    bow, by_KSF, by_KF = tick / 16.0, 1.0 / c.KSF, 1.0 / c.KF
+    bow = tick / 16.0
     for o in range(0, LANES, WIDTH):
         xf, wf = load(state, FLAPPER * LANES + o), load(state, FLAPPER_RATE * LANES + o)
         xs, vs = load(state, SPOOL * LANES + o), load(state, SPOOL_RATE * LANES + o)
         d, clamped = load(state, DIRECTION * LANES + o), load(state, CLAMPED * LANES + o)
+        deflection = load(state, DEFLECTION * LANES + o)
         dry = load(coefficients, DRY * LANES + o)
         # At rest, if the flapper rings too little to end that.
-        still = (torque - c.KSF * xs) * by_KF
+        still = still_flapper(load(coefficients, RATIO * LANES + o), deflection, xs)
         ra = xf - still
-        rb = (wf + ring_damping * ra) * ring_time
+        rb = (wf + load(coefficients, RING_DAMPING * LANES + o) * ra) * load(
+            coefficients, RING_TIME * LANES + o
+        )
         room = load(coefficients, ROOM * LANES + o) - magnitude(still)
         free = clamped == 0.0
         rests = (d == 0.0) & free & (room > 0.0) & (ra * ra + rb * rb < room * room)
@@ -147,7 +166,7 @@ def spool_lanes(
                 load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
                 load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
             )  # fmt: skip
-            base = (torque - c.KF * dry * d) * by_KSF
+            base = slide_base(load(coefficients, REACH * LANES + o), deflection, dry, d)
             a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
             s, n, x = zero + BIG, zero + BIG, zero
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
@@ -159,7 +178,8 @@ def spool_lanes(
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
             b4, u4 = base + d * b, d * most(v, CREEP)
             moves = (d != 0.0) & free & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
-            moves = moves & (x < c.XFM) & (d * b4 < c.XSM)
+            moves = moves & (x < load(coefficients, FLAPPER_STOP * LANES + o))
+            moves = moves & (d * b4 < load(coefficients, STROKE * LANES + o))
             w = where(magnitude(w) > CREEP, w, 0.0)
             x1, x2 = where(moves, b1, xs), where(moves, b2, xs)
             x3, x4 = where(moves, b3, xs), where(moves, b4, xs)
@@ -189,8 +209,27 @@ def spool_lanes(
 
 
 @packed
+def see_lanes(
+    state: NDArray[np.float64], path: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> None:
+    """Spool of all lanes as it is sampled in a tick, into the state."""
+    before, now = NODES - 1, NODES
+    for o in range(0, LANES, WIDTH):
+        seen = load(coefficients, SEEN_PLACE * LANES + o) * load(path, (PLACE + now) * LANES + o)
+        seen = seen + load(coefficients, SEEN_PLACE_BEFORE * LANES + o) * load(
+            path, (PLACE + before) * LANES + o
+        )
+        seen = seen + load(coefficients, SEEN_SLOPE_BEFORE * LANES + o) * load(
+            path, (SLOPE + before) * LANES + o
+        )
+        seen = seen + load(coefficients, SEEN_SLOPE * LANES + o) * load(
+            path, (SLOPE + now) * LANES + o
+        )
+        store(state, SEEN * LANES + o, seen)
+
+
+@packed
 def anchor_lanes(
-    c: PlantConstants,
     measured: float,
     gain: float,
     small: float,
@@ -201,7 +240,8 @@ def anchor_lanes(
     """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`)."""
     for o in range(0, LANES, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
-        error = measured - load(coefficients, SPOOL_OFFSET * LANES + o) - xs
+        seen = load(state, SEEN * LANES + o)
+        error = measured - load(coefficients, SPOOL_OFFSET * LANES + o) - seen
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)
@@ -210,4 +250,5 @@ def anchor_lanes(
         store(
             state, ANCHORED * LANES + o, load(state, ANCHORED * LANES + o) + where(jumps, 1.0, 0.0)
         )
-        store(state, SPOOL * LANES + o, most(least(xs + move, c.XSM), -c.XSM))
+        stroke = load(coefficients, STROKE * LANES + o)
+        store(state, SPOOL * LANES + o, most(least(xs + move, stroke), -stroke))

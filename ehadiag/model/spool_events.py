@@ -1,12 +1,12 @@
-"""What ends a step of flapper and spool."""
+"""Events of flapper and spool: which one ends a step, and the state after it."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from ehadiag.compile.kernels import inlined
-from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.transition import SpoolScalars
+from ehadiag.model.laws import SpoolLaw, still_flapper
 
 __all__ = [
     "BREAKAWAY",
@@ -16,6 +16,7 @@ __all__ = [
     "REVERSAL",
     "SPOOL_STOP",
     "UNSURE",
+    "SpoolState",
     "clamped_event",
     "held",
     "moving_event",
@@ -33,36 +34,53 @@ FLAPPER_STOP = 4
 RELEASE = 5
 
 
+class SpoolState(NamedTuple):
+    """Flapper and spool at an instant.
+
+    Attributes
+    ----------
+    xf, wf: flapper deflection and its rate, m and m/s.
+    xs, vs: spool position and velocity, m and m/s.
+    direction: of the spool's motion, +1 or -1; 0 at rest.
+    clamped: whether the flapper is on its stop.
+    """
+
+    xf: float
+    wf: float
+    xs: float
+    vs: float
+    direction: int
+    clamped: bool
+
+
 @inlined
-def held(c: PlantConstants, t: SpoolScalars, xf: float, xs: float) -> bool:
+def held(t: SpoolLaw, xf: float, xs: float) -> bool:
     """Whether a spool at rest stays: friction holds it, or its stop does."""
-    return abs(xf) <= t.breakaway or (abs(xs) >= c.XSM and xs * xf > 0.0)
+    return abs(xf) <= t.breakaway or (abs(xs) >= t.stroke and xs * xf > 0.0)
 
 
 @inlined
 def clamped_event(
-    c: PlantConstants,
-    t: SpoolScalars,
-    torque: float,
+    t: SpoolLaw,
+    deflection: float,
     xf: float,
     xs: float,
     vs: float,
     direction: int,
 ) -> int:
     """What ends a step with the flapper on its stop, which it leaves when the torque turns."""
-    if (torque - c.KSF * xs - c.KF * xf) * xf < 0.0:
+    if (still_flapper(t.ratio, deflection, xs) - xf) * xf < 0.0:
         return RELEASE
     if direction == 0:
-        return NOTHING if held(c, t, xf, xs) else BREAKAWAY
+        return NOTHING if held(t, xf, xs) else BREAKAWAY
     if vs * direction <= 0.0:
         return REVERSAL
-    return SPOOL_STOP if abs(xs) >= c.XSM and xs * direction > 0.0 else NOTHING
+    return SPOOL_STOP if abs(xs) >= t.stroke and xs * direction > 0.0 else NOTHING
 
 
 @inlined
 def moving_event(
-    c: PlantConstants,
-    t: SpoolScalars,
+    t: SpoolLaw,
     h: float,
     before_xf: float,
     before_wf: float,
@@ -75,23 +93,22 @@ def moving_event(
     """What ends a step with flapper free and spool moving."""
     if vs * direction <= 0.0:
         return REVERSAL
-    if abs(xs) >= c.XSM and xs * direction > 0.0:
+    if abs(xs) >= t.stroke and xs * direction > 0.0:
         return SPOOL_STOP
-    if abs(xf) >= c.XFM:
+    if abs(xf) >= t.flapper_stop:
         return FLAPPER_STOP
     if before_wf * wf < 0.0:
         # An extreme of the flapper lies inside: the spool may stop there, or the flapper touch.
         swing = 0.25 * h * max(abs(before_wf), abs(wf))
-        lowest = min(before_xf * direction, xf * direction) - t.dynamic / t.force - swing
-        if lowest <= 0.0 or max(abs(before_xf), abs(xf)) + swing >= c.XFM:
+        lowest = min(before_xf * direction, xf * direction) - t.dry - swing
+        if lowest <= 0.0 or max(abs(before_xf), abs(xf)) + swing >= t.flapper_stop:
             return UNSURE
     return NOTHING
 
 
 @inlined
 def stuck_event(
-    c: PlantConstants,
-    t: SpoolScalars,
+    t: SpoolLaw,
     h: float,
     before_xf: float,
     before_wf: float,
@@ -100,40 +117,31 @@ def stuck_event(
     xs: float,
 ) -> int:
     """What ends a step with flapper free and spool at rest."""
-    if not held(c, t, xf, xs):
+    if not held(t, xf, xs):
         return BREAKAWAY
-    if abs(xf) >= c.XFM:
+    if abs(xf) >= t.flapper_stop:
         return FLAPPER_STOP
     if before_wf * wf < 0.0:
         swing = 0.25 * h * max(abs(before_wf), abs(wf))
-        if max(abs(before_xf), abs(xf)) + swing > min(t.breakaway, c.XFM):
+        if max(abs(before_xf), abs(xf)) + swing > min(t.breakaway, t.flapper_stop):
             return UNSURE
     return NOTHING
 
 
 @inlined
-def switch(
-    c: PlantConstants,
-    t: SpoolScalars,
-    event: int,
-    xf: float,
-    wf: float,
-    xs: float,
-    vs: float,
-    direction: int,
-    clamped: bool,
-) -> tuple[float, float, float, float, int, bool]:
+def switch(t: SpoolLaw, event: int, s: SpoolState) -> SpoolState:
     """State after an event."""
+    xf, wf, xs, vs, direction, clamped = s
     if event == REVERSAL:
         vs, direction = 0.0, 0
         if abs(xf) > t.breakaway:
             direction = 1 if xf > 0.0 else -1
     elif event == SPOOL_STOP:
-        xs, vs, direction = math.copysign(c.XSM, xs), 0.0, 0
+        xs, vs, direction = math.copysign(t.stroke, xs), 0.0, 0
     elif event == BREAKAWAY:
         direction = 1 if xf > 0.0 else -1
     elif event == FLAPPER_STOP:
-        xf, wf, clamped = math.copysign(c.XFM, xf), 0.0, True
+        xf, wf, clamped = math.copysign(t.flapper_stop, xf), 0.0, True
     elif event == RELEASE:
         clamped = False
-    return xf, wf, xs, vs, direction, clamped
+    return SpoolState(xf, wf, xs, vs, direction, clamped)

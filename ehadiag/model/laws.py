@@ -1,0 +1,217 @@
+"""The laws of the actuator, each written once: inlined by the scalar and the vector kernels alike.
+
+Named tuples hold what a law needs of a candidate, precombined; the functions take plain numbers or
+vectors of lanes. Symbols and requirement numbers are those of docs/reference/physics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from ehadiag.compile.kernels import inlined
+from ehadiag.compile.vector import magnitude, most, packed
+from ehadiag.model.plant import PlantConstants
+
+__all__ = [
+    "JackLaw",
+    "SpoolLaw",
+    "drive",
+    "excess",
+    "flapper_held",
+    "jack_law",
+    "opening",
+    "pressure",
+    "resistance",
+    "seen_weights",
+    "slide_base",
+    "spool_law",
+    "steady_rate",
+    "still_flapper",
+]
+
+STATIC_SHARE_SPOOL = 0.5
+"""Dynamic over static dry friction of the spool (PHY-11)."""
+STATIC_RATIO_JACK = 2.0
+"""Static over dynamic dry friction of the jack (PHY-12)."""
+
+
+class SpoolLaw(NamedTuple):
+    """Torque motor, flapper and spool of one candidate.
+
+    Attributes
+    ----------
+    ratio: flapper deflection that the feedback wire takes back per spool travel, KSF / KF.
+    reach: its inverse, spool travel per flapper deflection.
+    force: on the spool per flapper deflection, AS GPF, N/m.
+    mass: of the spool, kg.
+    damping: viscous coefficient of the moving spool, (GPF/GQF) AS² + CS, N s/m.
+    dynamic: dry friction of the moving spool, N.
+    dry: flapper deflection that balances it, m.
+    breakaway: flapper deflection that overcomes the static friction, m.
+    flapper_stop, stroke: of flapper and spool, m.
+    ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper beside a resting
+        spool; rate 0 where it does not ring.
+    """
+
+    ratio: float
+    reach: float
+    force: float
+    mass: float
+    damping: float
+    dynamic: float
+    dry: float
+    breakaway: float
+    flapper_stop: float
+    stroke: float
+    ring_damping: float
+    ring_rate: float
+
+
+@inlined
+def spool_law(c: PlantConstants) -> SpoolLaw:
+    """Precombine what the flapper and spool laws need (PHY-2, PHY-3, PHY-11)."""
+    force = c.AS * c.GPF
+    ring_damping = 0.5 * c.CF / c.JF
+    square = c.KF / c.JF - ring_damping * ring_damping
+    return SpoolLaw(
+        c.KSF / c.KF,
+        c.KF / c.KSF,
+        force,
+        c.MS,
+        c.GPF / c.GQF * c.AS * c.AS + c.CS,
+        STATIC_SHARE_SPOOL * c.FSS,
+        STATIC_SHARE_SPOOL * c.FSS / force,
+        c.FSS / force,
+        c.XFM,
+        c.XSM,
+        ring_damping,
+        math.sqrt(square) if square > 0.0 else 0.0,
+    )
+
+
+@packed
+def drive(gain: Any, current: Any) -> Any:
+    """Flapper deflection (m) that the torque of a current (A) alone makes; `gain`: GM / KF."""
+    return gain * current
+
+
+@packed
+def still_flapper(ratio: Any, deflection: Any, xs: Any) -> Any:
+    """Deflection at which the flapper rests while the spool stands at `xs`, m."""
+    return deflection - ratio * xs
+
+
+@packed
+def slide_base(reach: Any, deflection: Any, dry: Any, direction: Any) -> Any:
+    """Spool position towards which it slides while the current lasts, m."""
+    return (deflection - dry * direction) * reach
+
+
+@inlined
+def steady_rate(t: SpoolLaw, xf: float, direction: float) -> float:
+    """Velocity that the spool approaches with the flapper held at `xf`, m/s."""
+    return (t.force * xf - t.dynamic * direction) / t.damping
+
+
+@inlined
+def flapper_held(t: SpoolLaw, deflection: float, xs: float) -> float:
+    """Deflection of a flapper in equilibrium beside a spool that friction holds, m."""
+    xf = still_flapper(t.ratio, deflection, xs)
+    return min(max(xf, -t.breakaway), t.breakaway)
+
+
+@inlined
+def seen_weights(lead: float, span: float) -> tuple[float, float, float, float]:
+    """Weights by which the ends of a path's last piece give the spool as it is sampled.
+
+    Parameters
+    ----------
+    lead: sampling instant before the end of the tick, s, within the piece.
+    span: of the piece, s.
+
+    Returns
+    -------
+    Of the place before and after, and of the slope before and after (Hermite's cubic).
+    """
+    u = 1.0 - min(max(lead / span, 0.0), 1.0)
+    v = 1.0 - u
+    return (1.0 + 2.0 * u) * v * v, u * u * (3.0 - 2.0 * u), u * v * v * span, -u * u * v * span
+
+
+class JackLaw(NamedTuple):
+    """Second stage and jack of one candidate.
+
+    The second stage's equation, solved for the pressure, reads P12 = (flow x - v) / e with
+    e = slope max(abs(x), corner) + leak, whether its pressure gain saturates or not (PHY-4).
+
+    Attributes
+    ----------
+    flow: no-load velocity of the jack per spool travel, GQ / AJ, 1/s.
+    slope: velocity that a pressure takes, per opening, GQ / (PSR AJ), 1/(s Pa).
+    leak: the same by leakage, CLK / AJ, m/(s Pa).
+    corner: opening at which the pressure gain saturates, PSR / GP, m.
+    area, viscosity: of the jack, m² and N s/m.
+    by_mass: reciprocal of its mass, 1/kg.
+    supply: supply minus return pressure, Pa.
+    stroke: m.
+    load: external, N.
+    friction: dry friction of the moving jack, N.
+    static: of the resting one, N.
+    """
+
+    flow: Any
+    slope: Any
+    leak: Any
+    corner: Any
+    area: Any
+    viscosity: Any
+    by_mass: Any
+    supply: Any
+    stroke: Any
+    load: Any
+    friction: Any
+    static: Any
+
+
+@inlined
+def jack_law(c: PlantConstants) -> JackLaw:
+    """Precombine what the laws of second stage and jack need (PHY-4, PHY-5, PHY-12)."""
+    return JackLaw(
+        c.GQ / c.AJ,
+        c.GQ / (c.PSR * c.AJ),
+        c.CLK / c.AJ,
+        c.PSR / c.GP,
+        c.AJ,
+        c.CJ,
+        1.0 / c.MJ,
+        c.PSR,
+        c.XJM,
+        c.FR,
+        c.FDJ,
+        STATIC_RATIO_JACK * c.FDJ,
+    )
+
+
+@packed
+def opening(j: JackLaw, x: Any) -> Any:
+    """Opening of the second stage with the spool at `x`, no less than its corner, m."""
+    return most(magnitude(x), j.corner)
+
+
+@packed
+def resistance(j: JackLaw, x: Any) -> Any:
+    """Velocity that a pressure takes from the jack with the spool at `x`, e, m/(s Pa)."""
+    return j.slope * opening(j, x) + j.leak
+
+
+@packed
+def pressure(j: JackLaw, x: Any, velocity: Any) -> Any:
+    """Differential pressure with the spool at `x` and the jack at a velocity, unlimited, Pa."""
+    return (j.flow * x - velocity) / resistance(j, x)
+
+
+@packed
+def excess(j: JackLaw, x: Any, hold: Any) -> Any:
+    """Force on the resting jack beyond `hold` (N, signed), times e, which is positive."""
+    return j.area * j.flow * x - (j.load + hold) * resistance(j, x)
