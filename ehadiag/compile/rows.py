@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from ehadiag.compile.kernels import inlined
+from ehadiag.compile.vector import load, packed
 
-__all__ = ["packer", "unpacker"]
+__all__ = ["lane_of", "lane_packer", "lanes_of", "packer", "unpacker"]
 
 
 def unpacker(kind: Any, start: int = 0) -> Any:
@@ -32,6 +33,36 @@ def packer(kind: Any, start: int = 0) -> Any:
         f"\n    row[{start + index}] = value.{name}" for index, name in enumerate(kind._fields)
     )
     return _compiled(f"def pack(row, value):{lines}", "pack", kind)
+
+
+def lane_of(kind: Any, first: int, lanes: int) -> Any:
+    """Compiled function of an array and a lane that makes a named tuple of that lane's numbers.
+
+    The array holds rows of `lanes` numbers; the fields stand in the rows from `first`.
+    """
+    numbers = ", ".join(
+        f"row[{(first + index) * lanes} + lane]" for index in range(len(kind._fields))
+    )
+    return _compiled(f"def unpack(row, lane):\n    return kind({numbers})", "unpack", kind)
+
+
+def lane_packer(kind: Any, first: int, lanes: int) -> Any:
+    """Compiled function of an array, a lane and a named tuple that writes the lane's numbers."""
+    lines = "".join(
+        f"\n    row[{(first + index) * lanes} + lane] = value.{name}"
+        for index, name in enumerate(kind._fields)
+    )
+    return _compiled(f"def pack(row, lane, value):{lines}", "pack", kind)
+
+
+def lanes_of(kind: Any, first: int, lanes: int) -> Any:
+    """Compiled function of an array and a lane: a named tuple of vectors from that lane on."""
+    numbers = ", ".join(
+        f"load(row, {(first + index) * lanes} + lane)" for index in range(len(kind._fields))
+    )
+    scope: dict[str, Any] = {"kind": kind, "load": load}
+    exec(f"def unpack(row, lane):\n    return kind({numbers})", scope)
+    return packed(scope["unpack"])
 
 
 def _compiled(source: str, name: str, kind: Any) -> Any:

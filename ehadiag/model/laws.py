@@ -14,16 +14,20 @@ from ehadiag.compile.vector import magnitude, most, packed
 from ehadiag.model.plant import PlantConstants
 
 __all__ = [
+    "DriveLaw",
     "JackLaw",
+    "SensorLaw",
     "SpoolLaw",
     "drive",
+    "drive_law",
     "excess",
     "flapper_held",
     "jack_law",
     "opening",
     "pressure",
     "resistance",
-    "seen_weights",
+    "sampled",
+    "sensor_law",
     "slide_base",
     "spool_law",
     "steady_rate",
@@ -34,6 +38,29 @@ STATIC_SHARE_SPOOL = 0.5
 """Dynamic over static dry friction of the spool (PHY-11)."""
 STATIC_RATIO_JACK = 2.0
 """Static over dynamic dry friction of the jack (PHY-12)."""
+
+
+class DriveLaw(NamedTuple):
+    """What the torque motor of one candidate makes of the current.
+
+    Attributes
+    ----------
+    gain: flapper deflection per current, GM / KF, m/A.
+    """
+
+    gain: Any
+
+
+@inlined
+def drive_law(c: PlantConstants) -> DriveLaw:
+    """Precombine what the torque motor's law needs (PHY-2)."""
+    return DriveLaw(c.GM / c.KF)
+
+
+@packed
+def drive(law: DriveLaw, current: Any) -> Any:
+    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-2)."""
+    return law.gain * current
 
 
 class SpoolLaw(NamedTuple):
@@ -91,12 +118,6 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
 
 
 @packed
-def drive(gain: Any, current: Any) -> Any:
-    """Flapper deflection (m) that the torque of a current (A) alone makes; `gain`: GM / KF."""
-    return gain * current
-
-
-@packed
 def still_flapper(ratio: Any, deflection: Any, xs: Any) -> Any:
     """Deflection at which the flapper rests while the spool stands at `xs`, m."""
     return deflection - ratio * xs
@@ -119,24 +140,6 @@ def flapper_held(t: SpoolLaw, deflection: float, xs: float) -> float:
     """Deflection of a flapper in equilibrium beside a spool that friction holds, m."""
     xf = still_flapper(t.ratio, deflection, xs)
     return min(max(xf, -t.breakaway), t.breakaway)
-
-
-@inlined
-def seen_weights(lead: float, span: float) -> tuple[float, float, float, float]:
-    """Weights by which the ends of a path's last piece give the spool as it is sampled.
-
-    Parameters
-    ----------
-    lead: sampling instant before the end of the tick, s, within the piece.
-    span: of the piece, s.
-
-    Returns
-    -------
-    Of the place before and after, and of the slope before and after (Hermite's cubic).
-    """
-    u = 1.0 - min(max(lead / span, 0.0), 1.0)
-    v = 1.0 - u
-    return (1.0 + 2.0 * u) * v * v, u * u * (3.0 - 2.0 * u), u * v * v * span, -u * u * v * span
 
 
 class JackLaw(NamedTuple):
@@ -215,3 +218,43 @@ def pressure(j: JackLaw, x: Any, velocity: Any) -> Any:
 def excess(j: JackLaw, x: Any, hold: Any) -> Any:
     """Force on the resting jack beyond `hold` (N, signed), times e, which is positive."""
     return j.area * j.flow * x - (j.load + hold) * resistance(j, x)
+
+
+class SensorLaw(NamedTuple):
+    """How the sensors of one candidate show spool and pressure.
+
+    Attributes
+    ----------
+    spool_offset, pressure_offset: constant errors, m and Pa.
+    place_before, place, slope_before, slope: weights by which the ends of the last piece of the
+        spool's path give the spool at the instant of sampling (Hermite's cubic).
+    """
+
+    spool_offset: Any
+    pressure_offset: Any
+    place_before: Any
+    place: Any
+    slope_before: Any
+    slope: Any
+
+
+@inlined
+def sensor_law(c: PlantConstants, span: float) -> SensorLaw:
+    """Precombine what the sensors' laws need; `span`: of the path's last piece, s."""
+    u = 1.0 - min(max(c.DLY / span, 0.0), 1.0)
+    v = 1.0 - u
+    return SensorLaw(
+        c.OXS,
+        c.OPD,
+        (1.0 + 2.0 * u) * v * v,
+        u * u * (3.0 - 2.0 * u),
+        u * v * v * span,
+        -u * u * v * span,
+    )
+
+
+@packed
+def sampled(law: SensorLaw, before: Any, now: Any, slope_before: Any, slope: Any) -> Any:
+    """Spool as its sensor samples it, m, from the ends of the path's last piece (m and m/s)."""
+    place = law.place_before * before + law.place * now
+    return place + law.slope_before * slope_before + law.slope * slope

@@ -35,6 +35,7 @@ from ehadiag.monitor.layout import (
     Settings,
     control_law_of,
     control_of,
+    drive_law_of,
     followed_of,
     jack_law_of,
     jack_of,
@@ -157,7 +158,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
         _part(address, DECAY, (FINEST + 1,)),
         law,
     )
-    deflection = drive(s.drive_gain, _commanded(p, s, command, current, position))
+    deflection = drive(drive_law_of(p), _commanded(p, s, command, current, position))
     before = SpoolState(m.xf, m.wf, m.xs, m.vs, int(m.direction), m.clamped != 0.0)
     after, count = spool_tick(tables, deflection, control_law_of(p).tick, before, nodes, 0)
     innovation = spool - s.spool_offset - after.xs

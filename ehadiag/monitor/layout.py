@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 from ehadiag.compile.rows import packer, unpacker
 from ehadiag.model.control import ControlLaw, ControlState
 from ehadiag.model.jack import JackState
-from ehadiag.model.laws import JackLaw, SpoolLaw
+from ehadiag.model.laws import DriveLaw, JackLaw, SpoolLaw
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import FINEST
 
@@ -20,7 +20,6 @@ class Settings(NamedTuple):
 
     Attributes
     ----------
-    drive_gain: GM / KF, m/A.
     closed: not 0: the command is a position.
     invertible: not 0: a lost position's code follows from the current.
     linear: below this current it does, A.
@@ -32,7 +31,6 @@ class Settings(NamedTuple):
     deviation: a lost command did not go on where the current is off by more, A.
     """
 
-    drive_gain: float
     closed: float
     invertible: float
     linear: float
@@ -91,7 +89,8 @@ def _place(start: int, kind: Any) -> int:
     return start + len(kind._fields)
 
 
-SPOOL_LAW: Final = 0
+DRIVE_LAW: Final = 0
+SPOOL_LAW: Final = _place(DRIVE_LAW, DriveLaw)
 JACK_LAW: Final = _place(SPOOL_LAW, SpoolLaw)
 CONTROL_LAW: Final = _place(JACK_LAW, JackLaw)
 SETTINGS: Final = _place(CONTROL_LAW, ControlLaw)
@@ -115,6 +114,7 @@ NODES: Final = DECAY + FINEST + 1
 """The path of a tick, behind all tables."""
 SIZE: Final = NODES + NODES_PER_TICK * NODE_COLUMNS
 
+drive_law_of = unpacker(DriveLaw, DRIVE_LAW)
 spool_law_of, jack_law_of = unpacker(SpoolLaw, SPOOL_LAW), unpacker(JackLaw, JACK_LAW)
 control_law_of = unpacker(ControlLaw, CONTROL_LAW)
 settings_of = unpacker(Settings, SETTINGS)

@@ -18,7 +18,7 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import CommandMode, Environment
 from ehadiag.model.anchor import Anchor
 from ehadiag.model.control import ControlLaw
-from ehadiag.model.laws import SpoolLaw, jack_law
+from ehadiag.model.laws import SpoolLaw, drive_law, jack_law
 from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.scalar.transition import spool_tables
@@ -132,7 +132,6 @@ class Monitor:
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
         settings = layout.Settings(
-            drive_gain=constants.GM / constants.KF,
             closed=float(mode is CommandMode.POSITION),
             invertible=float(
                 law.GAP * POSITION.lsb > 6.0 * CURRENT.lsb and not law.GAI and not law.GAD
@@ -153,7 +152,13 @@ class Monitor:
         )
         control = ControlLaw(law.IM, law.GAP, law.GAI, law.GAD, tick)
         p = np.zeros(layout.SIZE)
-        p[: layout.STATE] = [*tables.law, *jack_law(constants), *control, *settings]
+        p[: layout.STATE] = [
+            *drive_law(constants),
+            *tables.law,
+            *jack_law(constants),
+            *control,
+            *settings,
+        ]
         p[layout.SLIDE : layout.RING] = tables.moving.ravel()
         p[layout.RING : layout.DECAY] = tables.stuck.ravel()
         p[layout.DECAY : layout.NODES] = tables.decay

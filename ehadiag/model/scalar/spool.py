@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
 from ehadiag.model.anchor import re_anchored
-from ehadiag.model.laws import drive
+from ehadiag.model.laws import drive, drive_law
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.spool_tick import sampled, spool_rest, spool_tick
+from ehadiag.model.scalar.spool_tick import sampled_path, spool_rest, spool_tick
 from ehadiag.model.scalar.transition import SpoolTables
 from ehadiag.model.spool_events import SpoolState
 
@@ -49,14 +49,14 @@ def spool_response(
     -------
     How many times the model was re-anchored.
     """
-    gain, law = constants.GM / constants.KF, tables.law
-    s = spool_rest(law, drive(gain, current_before), origin)
+    motor, law = drive_law(constants), tables.law
+    s = spool_rest(law, drive(motor, current_before), origin)
     count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
         before = s.xs
-        s, count = spool_tick(tables, drive(gain, current[k]), tick, s, nodes, count)
+        s, count = spool_tick(tables, drive(motor, current[k]), tick, s, nodes, count)
         node_end[k] = count
-        spool[k] = sampled(nodes, count, before, constants.DLY)
+        spool[k] = sampled_path(constants, nodes, count, before)
         xs, filtered, moved = re_anchored(
             measured[k] - constants.OXS - spool[k], anchor[0], anchor[1], anchor[2],
             s.xs, filtered, law.stroke,

@@ -18,11 +18,13 @@ from ehadiag.compile.kernels import inlined
 from ehadiag.model.laws import (
     SpoolLaw,
     flapper_held,
-    seen_weights,
+    sampled,
+    sensor_law,
     slide_base,
     steady_rate,
     still_flapper,
 )
+from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.spool_events import (
     NOTHING,
@@ -33,7 +35,7 @@ from ehadiag.model.spool_events import (
     switch,
 )
 
-__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "sampled", "spool_rest", "spool_tick"]
+__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "sampled_path", "spool_rest", "spool_tick"]
 
 Matrix = NDArray[np.float64]
 BASE = 3
@@ -194,13 +196,13 @@ def spool_tick(
 
 
 @inlined
-def sampled(nodes: Matrix, end: int, before: float, lead: float) -> float:
-    """Spool position `lead` seconds before the end of a tick, within its last piece, m.
+def sampled_path(c: PlantConstants, nodes: Matrix, end: int, before: float) -> float:
+    """Spool as its sensor samples it in a tick, m, from the path's last piece.
 
     nodes, end: the path up to the tick's end; before: position before the path's last piece where
     that is the first of all, m.
     """
-    node = end - 1
-    start = nodes[node - 1, 1] + nodes[node - 1, 4] if node > 0 else before
-    w = seen_weights(lead, nodes[node, 0])
-    return w[0] * start + w[1] * nodes[node, 1] + w[2] * nodes[node, 2] + w[3] * nodes[node, 3]
+    last = end - 1
+    start = nodes[last - 1, 1] + nodes[last - 1, 4] if last > 0 else before
+    law = sensor_law(c, nodes[last, 0])
+    return sampled(law, start, nodes[last, 1], nodes[last, 2], nodes[last, 3])

@@ -9,46 +9,21 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined, kernel
 from ehadiag.compile.vector import WIDTH, load, packed, store
-from ehadiag.model.laws import jack_law, seen_weights, spool_law
+from ehadiag.model.laws import SpoolLaw, drive_law, jack_law, sensor_law, spool_law
 from ehadiag.model.plant import PlantConstants, plant_of
 from ehadiag.model.scalar.transition import FINEST, TAYLOR_HALVINGS
 from ehadiag.model.simd.layout import (
-    BREAKAWAY,
-    DAMPING,
-    DRIVE_GAIN,
-    DRY,
-    DYNAMIC,
-    FLAPPER_STOP,
-    FORCE,
-    JACK_AREA,
-    JACK_BY_MASS,
-    JACK_CORNER,
-    JACK_FLOW,
-    JACK_FRICTION,
-    JACK_LEAK,
-    JACK_LOAD,
-    JACK_SLOPE,
-    JACK_STATIC,
-    JACK_STROKE,
-    JACK_SUPPLY,
-    JACK_VISCOSITY,
     LANES,
     MOVE,
     NODES,
-    PRESSURE_OFFSET,
-    RATIO,
-    REACH,
     REST,
-    RING_DAMPING,
     RING_TIME,
     ROOM,
-    SEEN_PLACE,
-    SEEN_PLACE_BEFORE,
-    SEEN_SLOPE,
-    SEEN_SLOPE_BEFORE,
-    SPOOL_MASS,
-    SPOOL_OFFSET,
-    STROKE,
+    keep_drive_law,
+    keep_jack_law,
+    keep_sensor_law,
+    keep_spool_law,
+    spool_law_of_lane,
 )
 
 __all__ = ["MOVING_SIZE", "SHIFTS", "STUCK_SIZE", "tabulate"]
@@ -148,41 +123,17 @@ def _powers(
 
 
 @inlined
-def _scalar_rows(c: PlantConstants, tick: float, i: int, out: NDArray[np.float64]) -> None:
-    """Coefficients of lane `i` that are one number."""
-    t, j = spool_law(c), jack_law(c)
-    out[DRIVE_GAIN * LANES + i] = c.GM / c.KF
-    out[RATIO * LANES + i] = t.ratio
-    out[REACH * LANES + i] = t.reach
-    out[DRY * LANES + i] = t.dry
-    out[BREAKAWAY * LANES + i] = t.breakaway
+def _laws(c: PlantConstants, tick: float, i: int, out: NDArray[np.float64]) -> SpoolLaw:
+    """Write the laws of lane `i`; returns that of the spool."""
+    t = spool_law(c)
+    keep_drive_law(out, i, drive_law(c))
+    keep_spool_law(out, i, t)
+    keep_jack_law(out, i, jack_law(c))
+    keep_sensor_law(out, i, sensor_law(c, tick / NODES))
     out[ROOM * LANES + i] = min(t.breakaway, t.flapper_stop)
-    out[FLAPPER_STOP * LANES + i] = t.flapper_stop
-    out[STROKE * LANES + i] = t.stroke
-    out[FORCE * LANES + i] = t.force
-    out[SPOOL_MASS * LANES + i] = t.mass
-    out[DAMPING * LANES + i] = t.damping
-    out[DYNAMIC * LANES + i] = t.dynamic
-    out[RING_DAMPING * LANES + i] = t.ring_damping
     # A flapper that does not ring is never taken to rest: slower, not wrong.
     out[RING_TIME * LANES + i] = 1.0 / t.ring_rate if t.ring_rate > 0.0 else NEVER
-    out[JACK_FLOW * LANES + i] = j.flow
-    out[JACK_SLOPE * LANES + i] = j.slope
-    out[JACK_LEAK * LANES + i] = j.leak
-    out[JACK_CORNER * LANES + i] = j.corner
-    out[JACK_AREA * LANES + i] = j.area
-    out[JACK_VISCOSITY * LANES + i] = j.viscosity
-    out[JACK_BY_MASS * LANES + i] = j.by_mass
-    out[JACK_SUPPLY * LANES + i] = j.supply
-    out[JACK_STROKE * LANES + i] = j.stroke
-    out[JACK_LOAD * LANES + i] = j.load
-    out[JACK_FRICTION * LANES + i] = j.friction
-    out[JACK_STATIC * LANES + i] = j.static
-    out[SPOOL_OFFSET * LANES + i] = c.OXS
-    out[PRESSURE_OFFSET * LANES + i] = c.OPD
-    w = seen_weights(c.DLY, tick / NODES)
-    out[SEEN_PLACE_BEFORE * LANES + i], out[SEEN_PLACE * LANES + i] = w[0], w[1]
-    out[SEEN_SLOPE_BEFORE * LANES + i], out[SEEN_SLOPE * LANES + i] = w[2], w[3]
+    return t
 
 
 @kernel
@@ -207,18 +158,19 @@ def tabulate(
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
     for i in range(LANES):
         c = plant_of(candidates[i])
-        _scalar_rows(c, tick, i, coefficients)
+        t = _laws(c, tick, i, coefficients)
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
         rates[4 * LANES + i], rates[5 * LANES + i] = stiffness, friction
         rates[6 * LANES + i] = -c.KSF / c.JF
-        rates[12 * LANES + i] = coefficients[FORCE * LANES + i] / c.MS
-        rates[15 * LANES + i] = -coefficients[DAMPING * LANES + i] / c.MS
+        rates[12 * LANES + i] = t.force / t.mass
+        rates[15 * LANES + i] = -t.damping / t.mass
         ring[1 * LANES + i], ring[2 * LANES + i], ring[3 * LANES + i] = 1.0, stiffness, friction
     quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, moving)
     _copy(quarter, coefficients, MOVE * LANES)
     for i in range(LANES):
-        rate = coefficients[DAMPING * LANES + i] / coefficients[SPOOL_MASS * LANES + i]
+        t = spool_law_of_lane(coefficients, i)
+        rate = t.damping / t.mass
         for level, shift in enumerate(SHIFTS):
             for step in range(WIDTH):
                 time = tick / (1 << FINEST) * ((step + 1) << shift)

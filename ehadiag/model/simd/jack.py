@@ -22,31 +22,20 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.jack import C1, C2, radau_velocity
-from ehadiag.model.laws import JackLaw, opening, pressure, resistance
+from ehadiag.model.laws import opening, pressure, resistance
 from ehadiag.model.simd.layout import (
     BUSY,
     DONE,
     FRESH,
     JACK,
-    JACK_AREA,
-    JACK_BY_MASS,
-    JACK_CORNER,
     JACK_DIRECTION,
-    JACK_FLOW,
-    JACK_FRICTION,
-    JACK_LEAK,
-    JACK_LOAD,
-    JACK_SLOPE,
-    JACK_STATIC,
-    JACK_STROKE,
-    JACK_SUPPLY,
     JACK_VELOCITY,
-    JACK_VISCOSITY,
     LANES,
     NODES,
     PLACE,
     PRESSURE,
     SLOPE,
+    jack_laws,
 )
 
 __all__ = ["jack_lanes", "pressures"]
@@ -86,25 +75,6 @@ STAGES = _stages()
 
 
 @packed
-def _law(coefficients: NDArray[np.float64], o: int) -> JackLaw:
-    """Laws of the lanes from `o`."""
-    return JackLaw(
-        load(coefficients, JACK_FLOW * LANES + o),
-        load(coefficients, JACK_SLOPE * LANES + o),
-        load(coefficients, JACK_LEAK * LANES + o),
-        load(coefficients, JACK_CORNER * LANES + o),
-        load(coefficients, JACK_AREA * LANES + o),
-        load(coefficients, JACK_VISCOSITY * LANES + o),
-        load(coefficients, JACK_BY_MASS * LANES + o),
-        load(coefficients, JACK_SUPPLY * LANES + o),
-        load(coefficients, JACK_STROKE * LANES + o),
-        load(coefficients, JACK_LOAD * LANES + o),
-        load(coefficients, JACK_FRICTION * LANES + o),
-        load(coefficients, JACK_STATIC * LANES + o),
-    )
-
-
-@packed
 def _place(path: NDArray[np.float64], o: int, k: int, tick: float) -> Vector:
     """Spool at the stage whose place in STAGES is `k`, lanes from `o`."""
     a = int(STAGES[k]) * LANES + o
@@ -131,7 +101,7 @@ def jack_lanes(
     h = tick / (1 << level)
     k = ((level << MOST_HALVINGS) + step) * 15
     for o in range(0, LANES, WIDTH):
-        j = _law(coefficients, o)
+        j = jack_laws(coefficients, o)
         place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
         d = load(state, JACK_DIRECTION * LANES + o)
         x3 = _place(path, o, k + 10, tick)
@@ -178,7 +148,7 @@ def pressures(
 ) -> None:
     """Differential pressure of all lanes at the end of a tick, into the state."""
     for o in range(0, LANES, WIDTH):
-        j = _law(coefficients, o)
+        j = jack_laws(coefficients, o)
         x = load(path, (PLACE + NODES) * LANES + o)
         p12 = pressure(j, x, load(state, JACK_VELOCITY * LANES + o))
         store(state, PRESSURE * LANES + o, most(least(p12, j.supply), -j.supply))

@@ -9,50 +9,19 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined
 from ehadiag.model.jack import JackState, Piece, jack_piece
-from ehadiag.model.laws import JackLaw
 from ehadiag.model.simd.layout import (
     BUSY,
     FRESH,
     JACK,
-    JACK_AREA,
-    JACK_BY_MASS,
-    JACK_CORNER,
     JACK_DIRECTION,
-    JACK_FLOW,
-    JACK_FRICTION,
-    JACK_LEAK,
-    JACK_LOAD,
-    JACK_SLOPE,
-    JACK_STATIC,
-    JACK_STROKE,
-    JACK_SUPPLY,
     JACK_VELOCITY,
-    JACK_VISCOSITY,
     LANES,
     NODES,
     SLOPE,
+    jack_law_of_lane,
 )
 
-__all__ = ["jack_events", "keep_lane_jack", "lane_jack", "lane_law"]
-
-
-@inlined
-def lane_law(coefficients: NDArray[np.float64], i: int) -> JackLaw:
-    """Law of lane `i`."""
-    return JackLaw(
-        coefficients[JACK_FLOW * LANES + i],
-        coefficients[JACK_SLOPE * LANES + i],
-        coefficients[JACK_LEAK * LANES + i],
-        coefficients[JACK_CORNER * LANES + i],
-        coefficients[JACK_AREA * LANES + i],
-        coefficients[JACK_VISCOSITY * LANES + i],
-        coefficients[JACK_BY_MASS * LANES + i],
-        coefficients[JACK_SUPPLY * LANES + i],
-        coefficients[JACK_STROKE * LANES + i],
-        coefficients[JACK_LOAD * LANES + i],
-        coefficients[JACK_FRICTION * LANES + i],
-        coefficients[JACK_STATIC * LANES + i],
-    )
+__all__ = ["jack_events", "keep_lane_jack", "lane_jack"]
 
 
 @inlined
@@ -91,7 +60,7 @@ def jack_events(
     for i in range(LANES):
         if state[BUSY * LANES + i] == 0.0:
             continue
-        j, jack = lane_law(coefficients, i), lane_jack(state, i)
+        j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
         for n in range(first, last):
             a, b = n * LANES + i, (n + 1) * LANES + i
             rise0, rise1 = span * path[SLOPE * LANES + a], span * path[SLOPE * LANES + b]

@@ -5,7 +5,9 @@ Arrays are flat, row r of lane i at r * LANES + i.
 
 from __future__ import annotations
 
+from ehadiag.compile.rows import lane_of, lane_packer, lanes_of
 from ehadiag.compile.vector import WIDTH
+from ehadiag.model.laws import DriveLaw, JackLaw, SensorLaw, SpoolLaw
 
 LANES = 2 * WIDTH
 NODES = 4
@@ -40,45 +42,29 @@ PLACE, SLOPE = 0, NODES + 1
 PATH_ROWS = 2 * (NODES + 1)
 """Rows of the path: position and velocity of the spool at the nodes 0 … NODES."""
 
-(
-    DRIVE_GAIN,
-    RATIO,
-    REACH,
-    DRY,
-    BREAKAWAY,
-    ROOM,
-    FLAPPER_STOP,
-    STROKE,
-    FORCE,
-    SPOOL_MASS,
-    DAMPING,
-    DYNAMIC,
-    RING_DAMPING,
-    RING_TIME,
-    JACK_FLOW,
-    JACK_SLOPE,
-    JACK_LEAK,
-    JACK_CORNER,
-    JACK_AREA,
-    JACK_VISCOSITY,
-    JACK_BY_MASS,
-    JACK_SUPPLY,
-    JACK_STROKE,
-    JACK_LOAD,
-    JACK_FRICTION,
-    JACK_STATIC,
-    SPOOL_OFFSET,
-    PRESSURE_OFFSET,
-    SEEN_PLACE_BEFORE,
-    SEEN_PLACE,
-    SEEN_SLOPE_BEFORE,
-    SEEN_SLOPE,
-    SCALAR_ROWS,
-) = range(33)
-"""Rows of the coefficients that are one number a lane, see `ehadiag.model.laws`. ROOM: flapper
-deflection within which a resting spool stays; RING_TIME: reciprocal of the ringing's rate;
-SEEN_…: weights of the last piece's ends at the instant of sampling."""
-REST = SCALAR_ROWS
+DRIVE_LAW = 0
+SPOOL_LAW = DRIVE_LAW + len(DriveLaw._fields)
+JACK_LAW = SPOOL_LAW + len(SpoolLaw._fields)
+SENSOR_LAW = JACK_LAW + len(JackLaw._fields)
+ROOM = SENSOR_LAW + len(SensorLaw._fields)
+RING_TIME = ROOM + 1
+REST = RING_TIME + 1
 MOVE = REST + 4
 COEFFICIENT_ROWS = MOVE + 16
-"""Then the transitions over a whole tick at rest (2 x 2) and a quarter of a tick moving (4 x 4)."""
+"""Rows of the coefficients: the laws' fields; flapper deflection within which a resting spool
+stays; reciprocal of the ringing's rate; transitions over a whole tick at rest (2 x 2) and a quarter
+of a tick moving (4 x 4)."""
+
+drive_laws = lanes_of(DriveLaw, DRIVE_LAW, LANES)
+spool_laws = lanes_of(SpoolLaw, SPOOL_LAW, LANES)
+jack_laws = lanes_of(JackLaw, JACK_LAW, LANES)
+sensor_laws = lanes_of(SensorLaw, SENSOR_LAW, LANES)
+"""Compiled, of an array and a lane: laws of the WIDTH lanes from there."""
+spool_law_of_lane = lane_of(SpoolLaw, SPOOL_LAW, LANES)
+jack_law_of_lane = lane_of(JackLaw, JACK_LAW, LANES)
+"""Compiled, of an array and a lane: laws of that lane."""
+keep_drive_law = lane_packer(DriveLaw, DRIVE_LAW, LANES)
+keep_spool_law = lane_packer(SpoolLaw, SPOOL_LAW, LANES)
+keep_jack_law = lane_packer(JackLaw, JACK_LAW, LANES)
+keep_sensor_law = lane_packer(SensorLaw, SENSOR_LAW, LANES)
+"""Compiled, of an array, a lane and a law: write that lane's."""

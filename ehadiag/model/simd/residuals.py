@@ -31,10 +31,9 @@ from ehadiag.model.simd.layout import (
     LANES,
     PATH_ROWS,
     PRESSURE,
-    PRESSURE_OFFSET,
     SEEN,
-    SPOOL_OFFSET,
     STATE_ROWS,
+    sensor_laws,
 )
 from ehadiag.model.simd.spool import anchor_lanes, drive_lanes, rest_lanes, see_lanes, spool_lanes
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
@@ -144,20 +143,18 @@ def _level(path: NDArray[np.float64]) -> int:
 
 @packed
 def _hold_against(
-    measured: float,
-    weight: float,
-    cap: float,
-    row: int,
-    offset: int,
-    state: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
-    sample: NDArray[np.float64],
-    sums: NDArray[np.float64],
-) -> None:
-    """Weighted residual of one sample in every lane, its capped square added to the sums."""
+    measured: float, weight: float, cap: float, row: int, signal: int,
+    state: NDArray[np.float64], coefficients: NDArray[np.float64],
+    sample: NDArray[np.float64], sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Weighted residual of one sample in every lane, its capped square added to the sums.
+
+    row: of the state; signal: row of the residuals.
+    """
     for o in range(0, LANES, WIDTH):
-        seen = measured - load(coefficients, offset * LANES + o)
-        residual = (seen - load(state, row * LANES + o)) * weight
+        law = sensor_laws(coefficients, o)
+        offset = law.spool_offset if signal == SPOOL_ROW else law.pressure_offset
+        residual = (measured - offset - load(state, row * LANES + o)) * weight
         store(sample, o, residual)
         store(sums, o, load(sums, o) + least(residual * residual, cap))
 
@@ -214,7 +211,7 @@ def _block(
                 see_lanes(state, path, coefficients)
             if weight[SPOOL_ROW, k] != 0.0 and seen:
                 _hold_against(
-                    spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_OFFSET,
+                    spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_ROW,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
@@ -226,7 +223,7 @@ def _block(
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
                 pressures(state, path, coefficients)
                 _hold_against(
-                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_OFFSET,
+                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_ROW,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):

@@ -22,41 +22,31 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.laws import drive, slide_base, still_flapper
+from ehadiag.model.laws import drive, sampled, slide_base, still_flapper
 from ehadiag.model.simd.layout import (
     ANCHORED,
-    BREAKAWAY,
     BUSY,
     CLAMPED,
     DEFLECTION,
     DIRECTION,
     DONE,
-    DRIVE_GAIN,
-    DRY,
     FILTERED,
     FLAPPER,
     FLAPPER_RATE,
-    FLAPPER_STOP,
     LANES,
     MOVE,
     NODES,
     PLACE,
-    RATIO,
-    REACH,
     REST,
-    RING_DAMPING,
     RING_TIME,
     ROOM,
     SEEN,
-    SEEN_PLACE,
-    SEEN_PLACE_BEFORE,
-    SEEN_SLOPE,
-    SEEN_SLOPE_BEFORE,
     SLOPE,
     SPOOL,
-    SPOOL_OFFSET,
     SPOOL_RATE,
-    STROKE,
+    drive_laws,
+    sensor_laws,
+    spool_laws,
 )
 
 __all__ = ["anchor_lanes", "drive_lanes", "rest_lanes", "see_lanes", "spool_lanes"]
@@ -75,8 +65,7 @@ def drive_lanes(
 ) -> None:
     """Flapper deflection that the current (A) of a tick alone makes, all lanes, into the state."""
     for o in range(0, LANES, WIDTH):
-        gain = load(coefficients, DRIVE_GAIN * LANES + o)
-        store(state, DEFLECTION * LANES + o, drive(gain, current))
+        store(state, DEFLECTION * LANES + o, drive(drive_laws(coefficients, o), current))
 
 
 @packed
@@ -89,13 +78,10 @@ def rest_lanes(
     """
     state[: DEFLECTION * LANES] = 0.0
     for o in range(0, LANES, WIDTH):
-        stroke = load(coefficients, STROKE * LANES + o)
-        xs = most(least(stroke * 0.0 + origin, stroke), -stroke)
-        limit = load(coefficients, BREAKAWAY * LANES + o)
-        still = still_flapper(
-            load(coefficients, RATIO * LANES + o), load(state, DEFLECTION * LANES + o), xs
-        )
-        store(state, FLAPPER * LANES + o, most(least(still, limit), -limit))
+        t = spool_laws(coefficients, o)
+        xs = most(least(t.stroke * 0.0 + origin, t.stroke), -t.stroke)
+        still = still_flapper(t.ratio, load(state, DEFLECTION * LANES + o), xs)
+        store(state, FLAPPER * LANES + o, most(least(still, t.breakaway), -t.breakaway))
         store(state, SPOOL * LANES + o, xs)
 
 
@@ -135,13 +121,12 @@ def spool_lanes(
         xs, vs = load(state, SPOOL * LANES + o), load(state, SPOOL_RATE * LANES + o)
         d, clamped = load(state, DIRECTION * LANES + o), load(state, CLAMPED * LANES + o)
         deflection = load(state, DEFLECTION * LANES + o)
-        dry = load(coefficients, DRY * LANES + o)
+        t = spool_laws(coefficients, o)
+        dry = t.dry
         # At rest, if the flapper rings too little to end that.
-        still = still_flapper(load(coefficients, RATIO * LANES + o), deflection, xs)
+        still = still_flapper(t.ratio, deflection, xs)
         ra = xf - still
-        rb = (wf + load(coefficients, RING_DAMPING * LANES + o) * ra) * load(
-            coefficients, RING_TIME * LANES + o
-        )
+        rb = (wf + t.ring_damping * ra) * load(coefficients, RING_TIME * LANES + o)
         room = load(coefficients, ROOM * LANES + o) - magnitude(still)
         free = clamped == 0.0
         rests = (d == 0.0) & free & (room > 0.0) & (ra * ra + rb * rb < room * room)
@@ -166,7 +151,7 @@ def spool_lanes(
                 load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
                 load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
             )  # fmt: skip
-            base = slide_base(load(coefficients, REACH * LANES + o), deflection, dry, d)
+            base = slide_base(t.reach, deflection, dry, d)
             a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
             s, n, x = zero + BIG, zero + BIG, zero
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
@@ -178,8 +163,7 @@ def spool_lanes(
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
             b4, u4 = base + d * b, d * most(v, CREEP)
             moves = (d != 0.0) & free & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
-            moves = moves & (x < load(coefficients, FLAPPER_STOP * LANES + o))
-            moves = moves & (d * b4 < load(coefficients, STROKE * LANES + o))
+            moves = moves & (x < t.flapper_stop) & (d * b4 < t.stroke)
             w = where(magnitude(w) > CREEP, w, 0.0)
             x1, x2 = where(moves, b1, xs), where(moves, b2, xs)
             x3, x4 = where(moves, b3, xs), where(moves, b4, xs)
@@ -213,17 +197,13 @@ def see_lanes(
     state: NDArray[np.float64], path: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
     """Spool of all lanes as it is sampled in a tick, into the state."""
-    before, now = NODES - 1, NODES
     for o in range(0, LANES, WIDTH):
-        seen = load(coefficients, SEEN_PLACE * LANES + o) * load(path, (PLACE + now) * LANES + o)
-        seen = seen + load(coefficients, SEEN_PLACE_BEFORE * LANES + o) * load(
-            path, (PLACE + before) * LANES + o
-        )
-        seen = seen + load(coefficients, SEEN_SLOPE_BEFORE * LANES + o) * load(
-            path, (SLOPE + before) * LANES + o
-        )
-        seen = seen + load(coefficients, SEEN_SLOPE * LANES + o) * load(
-            path, (SLOPE + now) * LANES + o
+        seen = sampled(
+            sensor_laws(coefficients, o),
+            load(path, (PLACE + NODES - 1) * LANES + o),
+            load(path, (PLACE + NODES) * LANES + o),
+            load(path, (SLOPE + NODES - 1) * LANES + o),
+            load(path, (SLOPE + NODES) * LANES + o),
         )
         store(state, SEEN * LANES + o, seen)
 
@@ -240,8 +220,8 @@ def anchor_lanes(
     """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`)."""
     for o in range(0, LANES, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
-        seen = load(state, SEEN * LANES + o)
-        error = measured - load(coefficients, SPOOL_OFFSET * LANES + o) - seen
+        offset = sensor_laws(coefficients, o).spool_offset
+        error = measured - offset - load(state, SEEN * LANES + o)
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)
@@ -250,5 +230,5 @@ def anchor_lanes(
         store(
             state, ANCHORED * LANES + o, load(state, ANCHORED * LANES + o) + where(jumps, 1.0, 0.0)
         )
-        stroke = load(coefficients, STROKE * LANES + o)
+        stroke = spool_laws(coefficients, o).stroke
         store(state, SPOOL * LANES + o, most(least(xs + move, stroke), -stroke))

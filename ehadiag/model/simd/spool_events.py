@@ -27,36 +27,28 @@ from ehadiag.model.jack import Piece, jack_piece
 from ehadiag.model.laws import SpoolLaw, slide_base, steady_rate, still_flapper
 from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.simd.coefficients import MOVING_ROWS, SHIFTS, STUCK_ROWS
-from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack, lane_law
+from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack
 from ehadiag.model.simd.layout import (
-    BREAKAWAY,
     BUSY,
     CLAMPED,
-    DAMPING,
     DEFLECTION,
     DIRECTION,
     DONE,
-    DRY,
-    DYNAMIC,
     FLAPPER,
     FLAPPER_RATE,
-    FLAPPER_STOP,
-    FORCE,
     LANES,
     NODES,
     PATH_ROWS,
     PLACE,
-    RATIO,
-    REACH,
     SLOPE,
     SPOOL,
-    SPOOL_MASS,
     SPOOL_RATE,
-    STROKE,
+    jack_law_of_lane,
+    spool_law_of_lane,
 )
-from ehadiag.model.spool_events import BREAKAWAY as BREAKS_AWAY
-from ehadiag.model.spool_events import FLAPPER_STOP as HITS_FLAPPER_STOP
 from ehadiag.model.spool_events import (
+    BREAKAWAY,
+    FLAPPER_STOP,
     NOTHING,
     REVERSAL,
     SPOOL_STOP,
@@ -183,25 +175,6 @@ def _clamped_instants(
     return leaves | (new_vs * d <= 0.0) | (new_xs * d >= t.stroke)
 
 
-@inlined
-def _law(coefficients: NDArray[np.float64], i: int) -> SpoolLaw:
-    """Of lane `i`; its ringing is not looked at here."""
-    return SpoolLaw(
-        coefficients[RATIO * LANES + i],
-        coefficients[REACH * LANES + i],
-        coefficients[FORCE * LANES + i],
-        coefficients[SPOOL_MASS * LANES + i],
-        coefficients[DAMPING * LANES + i],
-        coefficients[DYNAMIC * LANES + i],
-        coefficients[DRY * LANES + i],
-        coefficients[BREAKAWAY * LANES + i],
-        coefficients[FLAPPER_STOP * LANES + i],
-        coefficients[STROKE * LANES + i],
-        0.0,
-        0.0,
-    )
-
-
 @merged
 def _event_tick(
     i: int,
@@ -213,7 +186,11 @@ def _event_tick(
     stuck: NDArray[np.float64],
 ) -> None:
     """Lane `i`."""
-    t, unit, deflection = _law(coefficients, i), tick / WHOLE, state[DEFLECTION * LANES + i]
+    t, unit, deflection = (
+        spool_law_of_lane(coefficients, i),
+        tick / WHOLE,
+        state[DEFLECTION * LANES + i],
+    )
     s = SpoolState(
         state[FLAPPER * LANES + i],
         state[FLAPPER_RATE * LANES + i],
@@ -289,10 +266,10 @@ def _event_tick(
 def _event(t: SpoolLaw, xf: float, xs: float, vs: float, direction: int) -> int:
     """Which event has come at an instant that is past one."""
     if direction == 0:
-        return HITS_FLAPPER_STOP if held(t, xf, xs) else BREAKS_AWAY
+        return FLAPPER_STOP if held(t, xf, xs) else BREAKAWAY
     if vs * direction <= 0.0:
         return REVERSAL
-    return HITS_FLAPPER_STOP if abs(xf) >= t.flapper_stop else SPOOL_STOP
+    return FLAPPER_STOP if abs(xf) >= t.flapper_stop else SPOOL_STOP
 
 
 @merged
@@ -305,7 +282,7 @@ def _jack_beside(
     coefficients: NDArray[np.float64],
 ) -> None:
     """Jack of lane `i` over the tick, by `count` pieces of the spool's path."""
-    j, jack = lane_law(coefficients, i), lane_jack(state, i)
+    j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
     for n in range(count):
         o = PIECES + 4 * n
         span = path[o]
