@@ -123,6 +123,18 @@ REGISTRY: tuple[Parameter, ...] = (
         changes=lambda c, value: {"DLY": c.DLY + value},
     ),
     Parameter(
+        name="torque_motor_gain",
+        symbol="dGM",
+        unit="1",
+        lower=-0.1,
+        upper=0.1,
+        kind=Kind.NUISANCE,
+        scale=0.1,
+        short="torque-motor gain",
+        meaning="relative change of the torque motor's gain",
+        changes=lambda c, value: {"GM": c.GM * (1.0 + value)},
+    ),
+    Parameter(
         name="Kintas",
         symbol="Kintas",
         unit="1",
