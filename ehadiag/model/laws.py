@@ -46,21 +46,23 @@ class DriveLaw(NamedTuple):
     Attributes
     ----------
     gain: flapper deflection per current, GM / KF, m/A.
+    bias: current that the motor adds to the commanded one, A.
     """
 
     gain: Any
+    bias: Any
 
 
 @inlined
 def drive_law(c: PlantConstants) -> DriveLaw:
-    """Precombine what the torque motor's law needs (PHY-2)."""
-    return DriveLaw(c.GM / c.KF)
+    """Precombine what the torque motor's law needs (PHY-2, PHY-30)."""
+    return DriveLaw(c.GM / c.KF, c.IB)
 
 
 @packed
 def drive(law: DriveLaw, current: Any) -> Any:
-    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-2)."""
-    return law.gain * current
+    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-2, PHY-30)."""
+    return law.gain * (current + law.bias)
 
 
 class SpoolLaw(NamedTuple):

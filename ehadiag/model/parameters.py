@@ -123,6 +123,18 @@ REGISTRY: tuple[Parameter, ...] = (
         changes=lambda c, value: {"DLY": c.DLY + value},
     ),
     Parameter(
+        name="null_bias",
+        symbol="ib",
+        unit="A",
+        lower=-5e-4,
+        upper=5e-4,
+        kind=Kind.NUISANCE,
+        scale=2e-4,
+        short="null bias",
+        meaning="current that the torque motor adds to the commanded one",
+        changes=lambda c, value: {"IB": c.IB + value},
+    ),
+    Parameter(
         name="torque_motor_gain",
         symbol="dGM",
         unit="1",

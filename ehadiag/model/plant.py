@@ -44,6 +44,8 @@ class PlantConstants(NamedTuple):
     scales of severity use.
     """
 
+    IB: Value
+    """Null bias of the torque motor, A."""
     GM: Value
     """Torque-motor gain, N m/A."""
     JF: Value
@@ -142,6 +144,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         if environment.supply_pressure is not None and environment.return_pressure is not None:
             supply = environment.supply_pressure - environment.return_pressure
     return PlantConstants(
+        IB=0.0,
         GM=valve.GM,
         JF=valve.JF,
         CF=valve.CF,
