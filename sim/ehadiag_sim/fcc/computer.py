@@ -152,10 +152,8 @@ class FccCore:
             frames += self._encoder.command(mode, command, test_id, 0)
             frames += self._encoder.telemetry(codes.tolist(), 0)
         if (self._tick - 1) % round(self._rate / ENVIRONMENT_HZ) == 0:
-            effects = self._effects
-            frames += self._encoder.environment(
-                effects.supply_pressure, effects.return_pressure, effects.oil_temperature, 0
-            )
+            supply, drain, degc = self._plant.probed
+            frames += self._encoder.environment(supply, drain, degc, 0)
         return [_stamped(frame, self.now_ns + i * FRAME_NS) for i, frame in enumerate(frames)]
 
     def _start(self, test_id: int) -> None:
@@ -174,17 +172,18 @@ class FccCore:
             self._enter(BitState.REFUSED, test_id)
 
     def _objection(self, test_id: int) -> BitReason:
-        effects, demands = self._effects, self._demands
+        demands = self._demands
+        supply, drain, degc = self._plant.probed
         position = float(POSITION.decode(np.asarray(self._plant.codes[3:]))[0])
         checks = (
             (self._state in (BitState.ARMING, BitState.RUNNING), BitReason.ALREADY_RUNNING),
             (test_id not in self._tests, BitReason.UNKNOWN_TEST),
             (self.interlock_open, BitReason.INTERLOCK_OPEN),
             (
-                effects.supply_pressure - effects.return_pressure < demands.supply,
+                supply - drain < demands.supply,
                 BitReason.SUPPLY_PRESSURE_LOW,
             ),
-            (effects.oil_temperature < demands.oil_temperature, BitReason.OIL_TOO_COLD),
+            (degc < demands.oil_temperature, BitReason.OIL_TOO_COLD),
             (abs(position) > demands.off_centre, BitReason.NOT_CENTRED),
         )
         return next((reason for failed, reason in checks if failed), BitReason.NONE)

@@ -110,12 +110,16 @@ def read_truth(path: Path) -> list[Truth]:
 
 def effects_of(environment: Environment) -> Effects:
     """Oil and pressures of a recording; defaults where the bus did not say."""
-    known = {
-        "oil_temperature": environment.oil_temperature,
-        "supply_pressure": environment.supply_pressure,
-        "return_pressure": environment.return_pressure,
-    }
-    return Effects(**{name: value for name, value in known.items() if value is not None})
+    default = Effects()
+
+    def known(value: float | None, otherwise: float) -> float:
+        return otherwise if value is None else value
+
+    return Effects(
+        oil_temperature=known(environment.oil_temperature, default.oil_temperature),
+        supply_pressure=known(environment.supply_pressure, default.supply_pressure),
+        return_pressure=known(environment.return_pressure, default.return_pressure),
+    )
 
 
 def residuals(

@@ -1,0 +1,73 @@
+"""Sensors and converters: from what the electronics see to the codes on the bus."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import CHANNELS
+from ehadiag_sim.plant.conditions import Sensors, Strangers
+
+__all__ = ["Converters"]
+
+LSB = np.array([channel.lsb for channel in CHANNELS])
+
+
+class Converters:
+    """The four channels of one unit: bent curve, gain, offset, noise, rounding, in that order.
+
+    Parameters
+    ----------
+    actuator: its stops scale the bends.
+    sensors: gains, offsets, noise.
+    strangers: bends of the two displacement sensors.
+    seed: of the noise.
+    """
+
+    def __init__(
+        self, actuator: Actuator, sensors: Sensors, strangers: Strangers, seed: int
+    ) -> None:
+        self._noise_lsb = sensors.noise_lsb
+        self._offsets = np.array(sensors.offsets_lsb)
+        self._gains = 1.0 + np.array(sensors.gains)
+        stops = actuator.servovalve.XSM, actuator.jack.XJM
+        self._bent = any(
+            (
+                strangers.spool_bend_2,
+                strangers.spool_bend_3,
+                strangers.jack_bend_2,
+                strangers.jack_bend_3,
+            )
+        )
+        self._second = np.array(
+            [0.0, strangers.spool_bend_2 / stops[0], 0.0, strangers.jack_bend_2 / stops[1]]
+        )
+        self._third = np.array(
+            [
+                0.0,
+                strangers.spool_bend_3 / stops[0] ** 2,
+                0.0,
+                strangers.jack_bend_3 / stops[1] ** 2,
+            ]
+        )
+        self._noise = np.random.default_rng(seed)
+
+    def read(self, seen: tuple[float, float, float, float]) -> NDArray[np.float64]:
+        """Current (A), spool (m), pressure (Pa), jack (m) as read without noise, shape (4,)."""
+        return self._curved(seen) + self._offsets * LSB
+
+    def digitise(self, seen: tuple[float, float, float, float]) -> NDArray[np.int64]:
+        """ADC codes of the four channels, shape (4,); the noise goes on from call to call."""
+        noise = self._noise_lsb * self._noise.standard_normal(len(CHANNELS))
+        volts = self._curved(seen) + (self._offsets + noise) * LSB
+        # One value at a time costs the real-time emulator little; the code stays Channel's own.
+        return np.concatenate(
+            [channel.encode(volts[i : i + 1]) for i, channel in enumerate(CHANNELS)]
+        )
+
+    def _curved(self, seen: tuple[float, float, float, float]) -> NDArray[np.float64]:
+        values = np.array(seen)
+        if self._bent:
+            values = values * (1.0 + values * (self._second + self._third * values))
+        return values * self._gains
