@@ -12,6 +12,8 @@ from ehadiag_sim.plant.conditions import Sensors, Strangers
 __all__ = ["Converters"]
 
 LSB = np.array([channel.lsb for channel in CHANNELS])
+HALF = np.array([1 << (channel.bits - 1) for channel in CHANNELS])
+TOP = 2 * HALF - 1
 
 
 class Converters:
@@ -61,10 +63,9 @@ class Converters:
         """ADC codes of the four channels, shape (4,); the noise goes on from call to call."""
         noise = self._noise_lsb * self._noise.standard_normal(len(CHANNELS))
         volts = self._curved(seen) + (self._offsets + noise) * LSB
-        # One value at a time costs the real-time emulator little; the code stays Channel's own.
-        return np.concatenate(
-            [channel.encode(volts[i : i + 1]) for i, channel in enumerate(CHANNELS)]
-        )
+        # `Channel.encode` for the four at once: the emulator does this a thousand times a second.
+        codes = np.floor(volts / LSB + 0.5).astype(np.int64) + HALF
+        return np.minimum(np.maximum(codes, 0), TOP)
 
     def _curved(self, seen: tuple[float, float, float, float]) -> NDArray[np.float64]:
         values = np.array(seen)
