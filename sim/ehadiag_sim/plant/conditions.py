@@ -74,8 +74,8 @@ class Effects:
     """Number of plays whose mean the hysteresis is, 1 … 256."""
     null_bias: float = number(0.0, -5e-3, 5e-3, "effect null_bias (A)")
     """Added to the current before hysteresis and gain, A, ±5e-3."""
-    gain_change: float = number(0.0, -0.9, 1.0)
-    """Relative change of the torque-motor gain, -0.9 … 1."""
+    gain_change: float = number(0.0, -2.0, 1.0)
+    """Relative change of the torque-motor gain, -2 (wired the wrong way round) … 1."""
     backlash: float = number(0.0, 0.0, 1e-3, "effect backlash (m)")
     """Half-width of the play between spool and feedback-spring ball, m, 0 … 1e-3."""
     oil_temperature: float = number(40.0, -54.0, 205.0, "oil temperature (degC)")

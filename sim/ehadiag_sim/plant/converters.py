@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,15 +13,22 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import CHANNELS
 from ehadiag_sim.plant.conditions import Sensors, Strangers
 
-__all__ = ["Converters"]
+__all__ = ["ChannelFault", "Converters"]
 
 LSB = np.array([channel.lsb for channel in CHANNELS])
 HALF = np.array([1 << (channel.bits - 1) for channel in CHANNELS])
 TOP = 2 * HALF - 1
 
 
+class ChannelFault(Protocol):
+    """Damage to sensors or wires."""
+
+    def __call__(self, tick: int, values: list[float], /) -> None:
+        """Change the four readings of a tick in place: A, m, Pa, m."""
+
+
 class Converters:
-    """The four channels of one unit: bent curve, gain, offset, noise, rounding, in that order.
+    """The four channels of one unit: bend, gain, damage, offset, noise, rounding, in that order.
 
     Parameters
     ----------
@@ -25,10 +36,16 @@ class Converters:
     sensors: gains, offsets, noise.
     strangers: bends of the two displacement sensors.
     seed: of the noise.
+    faults: damage to sensors and wires, in turn; copied.
     """
 
     def __init__(
-        self, actuator: Actuator, sensors: Sensors, strangers: Strangers, seed: int
+        self,
+        actuator: Actuator,
+        sensors: Sensors,
+        strangers: Strangers,
+        seed: int,
+        faults: Sequence[ChannelFault] = (),
     ) -> None:
         self._noise_lsb = sensors.noise_lsb
         self._offsets = np.array(sensors.offsets_lsb)
@@ -53,6 +70,8 @@ class Converters:
                 strangers.jack_bend_3 / stops[1] ** 2,
             ]
         )
+        self._faults = copy.deepcopy(tuple(faults))
+        self._ticks = 0
         self._noise = np.random.default_rng(seed)
 
     def read(self, seen: tuple[float, float, float, float]) -> NDArray[np.float64]:
@@ -62,7 +81,10 @@ class Converters:
     def digitise(self, seen: tuple[float, float, float, float]) -> NDArray[np.int64]:
         """ADC codes of the four channels, shape (4,); the noise goes on from call to call."""
         noise = self._noise_lsb * self._noise.standard_normal(len(CHANNELS))
-        volts = self._curved(seen) + (self._offsets + noise) * LSB
+        readings = self._curved(seen)
+        if self._faults:
+            readings = self._damaged(readings)
+        volts = readings + (self._offsets + noise) * LSB
         # `Channel.encode` for the four at once: the emulator does this a thousand times a second.
         codes = np.floor(volts / LSB + 0.5).astype(np.int64) + HALF
         return np.minimum(np.maximum(codes, 0), TOP)
@@ -72,3 +94,10 @@ class Converters:
         if self._bent:
             values = values * (1.0 + values * (self._second + self._third * values))
         return values * self._gains
+
+    def _damaged(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        values: list[float] = readings.tolist()
+        for fault in self._faults:
+            fault(self._ticks, values)
+        self._ticks += 1
+        return np.array(values)

@@ -19,7 +19,7 @@ __all__ = ["DEFAULT_STEP", "Dynamics", "respond"]
 DEFAULT_STEP = 0.25e-6
 """Integration step, s: errors below a fiftieth of a converter's step (detailed-model.md)."""
 SHORTEST_STEP = 1e-9
-LAG_PIECE = 20e-6
+LAG_PIECE = 50e-6
 """Pieces of constant torque into which a current that lags divides a tick, s."""
 DRIFT_TICKS = 10
 """A drifting oil temperature is brought into the coefficients so often."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ from ehadiag.core.recording import (
 from ehadiag.core.stored_test import StoredTest
 from ehadiag_sim.fcc.controller import PositionController
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
-from ehadiag_sim.plant.converters import Converters
+from ehadiag_sim.plant.converters import ChannelFault, Converters
 from ehadiag_sim.plant.dynamics import DEFAULT_STEP, Dynamics
 
 __all__ = [
@@ -62,6 +63,7 @@ class Plant:
         seed: int = 0,
         *,
         step: float = DEFAULT_STEP,
+        channel_faults: Sequence[ChannelFault] = (),
     ) -> None:
         sensors, effects = sensors or Sensors(), effects or Effects()
         self._dynamics = Dynamics(
@@ -72,7 +74,7 @@ class Plant:
             filter_time=sensors.filter_time,
             early=sensors.early,
         )
-        self._converters = Converters(actuator, sensors, effects.strangers, seed)
+        self._converters = Converters(actuator, sensors, effects.strangers, seed, channel_faults)
         self._effects, self._sensors = effects, sensors
         self._controller = PositionController(actuator.controller)
         self._current = 0.0
@@ -188,10 +190,12 @@ def simulate(
     *,
     seed: int = 0,
     step: float = DEFAULT_STEP,
+    channel_faults: Sequence[ChannelFault] = (),
 ) -> SimulatedRun:
     """Run a stored test from rest; the same seed gives the same run.
 
-    `step` is the integration step in s, shortened so that a whole number makes a tick.
+    `step` is the integration step in s, shortened so that a whole number makes a tick;
+    `channel_faults` damage sensors and wires.
 
     Raises
     ------
@@ -203,7 +207,9 @@ def simulate(
             f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
         )
     effects = effects or Effects()
-    plant = Plant(actuator, faults, effects, sensors, seed, step=step)
+    plant = Plant(
+        actuator, faults, effects, sensors, seed, step=step, channel_faults=channel_faults
+    )
     command, mode = bus_command(test), _mode(test)
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
