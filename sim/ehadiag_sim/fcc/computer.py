@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitReason, BitState, CommandMode
 from ehadiag.core.stored_test import StoredTest
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.converters import ChannelFault
 from ehadiag_sim.plant.simulator import Plant
 from firmware_iface.codec.encode import Encoder
 from firmware_iface.codec.live_decode import LiveDecoder
@@ -72,12 +73,14 @@ class FccCore:
         idle_telemetry: bool = True,
         start_ns: int = 0,
         bus_map: BusMap | None = None,
+        channel_faults: Sequence[ChannelFault] = (),
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL}")
         self._actuator = actuator
         self._tests = _by_number(tests, actuator)
         self._faults, self._sensors = faults, sensors
+        self._channel_faults = tuple(channel_faults)
         self._effects = effects or Effects()
         self._seed, self._serial = seed, serial
         self._demands = preconditions or Preconditions()
@@ -237,7 +240,14 @@ class FccCore:
 
     def _fresh_plant(self) -> Plant:
         seed = int(np.random.SeedSequence((self._seed, self._count)).generate_state(1)[0])
-        return Plant(self._actuator, self._faults, self._effects, self._sensors, seed)
+        return Plant(
+            self._actuator,
+            self._faults,
+            self._effects,
+            self._sensors,
+            seed,
+            channel_faults=self._channel_faults,
+        )
 
 
 def _by_number(tests: Iterable[StoredTest], actuator: Actuator) -> dict[int, StoredTest]:
