@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.channels import CHANNELS
@@ -160,3 +161,19 @@ def test_damage_goes_with_any_wear_and_loop(kind):
     )
     assert np.isfinite(rows(recording)).all()
     assert kind in recording.source
+
+
+def test_every_kind_is_documented():
+    page = (ROOT / "docs/reference/broken-hardware.md").read_text()
+    rows = {
+        name.strip().strip("`"): line.rsplit("|", 2)[1].strip() == "yes"
+        for line in page.splitlines()
+        if line.startswith("| `")
+        for name in line.split("|")[1].split(",")
+    }
+    found = {}
+    for kind, item in KINDS.items():
+        pattern = kind if of_plant(kind) or "swapped" in kind else kind.split("-")[0] + "-CHANNEL"
+        assert rows[pattern] == item.hidden, kind
+        found[pattern] = True
+    assert set(found) == set(rows)
