@@ -7,6 +7,7 @@ import math
 import os
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.cli.effects import add_effect_options
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
@@ -191,6 +192,7 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of the simulated actuator (default 1)",
     )
+    add_effect_options(parser)
 
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:

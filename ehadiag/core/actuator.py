@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.toml_file import decode_toml, read_toml
 
-__all__ = ["Actuator", "Controller", "Jack", "Servovalve", "default_actuator", "load_actuator"]
+__all__ = [
+    "Actuator",
+    "Controller",
+    "Jack",
+    "SecondStage",
+    "Servovalve",
+    "default_actuator",
+    "load_actuator",
+]
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -92,13 +100,25 @@ class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """External load, N."""
 
 
+class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How spool position becomes pressure: model.md section 1, or orifices of section 8."""
+
+    kind: Literal["linear", "orifice"] = "linear"
+    """`linear`: saturating pressure gain, stiff oil; `orifice`: two lands, compressible oil."""
+    beta: Annotated[float, msgspec.Meta(ge=1e7, le=3e9)] = 7.5e8
+    """Effective bulk modulus of the oil, Pa; of orifices only."""
+    volume: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1.6e-4
+    """Volume of both chambers together, m³; of orifices only."""
+
+
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One actuator: its name, controller, servovalve and jack."""
+    """One actuator: its name, controller, servovalve, second stage and jack."""
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     controller: Controller
     servovalve: Servovalve
     jack: Jack
+    second_stage: SecondStage = SecondStage()
 
 
 def load_actuator(path: Path | str) -> Actuator:

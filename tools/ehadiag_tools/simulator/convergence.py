@@ -20,6 +20,7 @@ from ehadiag_sim.plant.conditions import Faults
 from ehadiag_sim.plant.dynamics import respond
 from ehadiag_sim.plant.simulator import simulate
 from ehadiag_tools.simulator.stiff_reference import StiffReference
+from ehadiag_tools.simulator.unit_convergence import unit_table
 
 __all__ = ["main"]
 
@@ -43,12 +44,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--steps", type=float, nargs="+", default=STEPS_US, help="steps, µs (%(default)s)"
     )
+    parser.add_argument(
+        "--units",
+        type=int,
+        default=0,
+        metavar="N",
+        help="instead of the stiff solver: N random units of either second stage",
+    )
     options = parser.parse_args(argv)
     try:
         if options.ticks is not None and options.ticks < 1:
             raise ConfigurationError(f"--ticks {options.ticks}: need at least 1")
         faults = Faults(*options.faults)
         for name in options.test or ("open", "closed"):
+            if options.units:
+                unit_table(resolve_test(name), options.units, options.steps)
+                continue
             table(name, faults, options.steps, options.ticks)
     except EhadiagError as error:
         print(f"convergence: {error}", file=sys.stderr)
