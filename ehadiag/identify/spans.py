@@ -68,15 +68,15 @@ def lay_out(
             anchor = Anchor(ANCHOR_GAIN, anchor_lsb[0] * unit, anchor_lsb[1] * unit)
         anchors.append(anchor.as_array())
         origins.append(_origin(experiment, first))
+    begins = np.cumsum([0, *(item.ticks for item in experiments)])
     return Batch(
         test=np.array([index for index, _, _, _ in parts]),
         tick=np.array([experiments[i].tick for i, _, _, _ in parts]),
         start=np.concatenate([[0], np.cumsum([b - first for _, first, _, b in parts])]),
         origin=np.array(origins),
-        current_before=np.array(
-            [experiments[i].trace.current[a - 1] if a else 0.0 for i, a, _, _ in parts]
-        ),
-        current=np.concatenate([experiments[i].trace.current[first:b] for i, first, _, b in parts]),
+        history=np.array([first for _, first, _, _ in parts]),
+        since=np.array([begins[i] + first for i, first, _, _ in parts]),
+        current=np.concatenate([item.trace.current for item in experiments]),
         spool=np.concatenate([experiments[i].spool[first:b] for i, first, _, b in parts]),
         pressure=np.concatenate([experiments[i].pressure[first:b] for i, first, _, b in parts]),
         weight=np.hstack(weight),

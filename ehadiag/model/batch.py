@@ -30,10 +30,12 @@ class Batch(NamedTuple):
         First tick of each span in the flat arrays, then N.
     origin : shape (m,)
         Spool position before the first tick of each span, m.
-    current_before : shape (m,)
-        Current before the first tick of each span, A.
-    current : shape (N,)
-        A.
+    history : shape (m,)
+        Ticks of its test before the first one of each span.
+    since : shape (m,)
+        Place of each span's first tick in `current`.
+    current : shape (M,)
+        Of whole tests, each once, A: what comes before a span has loaded the hysteresis.
     spool, pressure : shape (N,)
         Measured, m and Pa, NaN where missing.
     weight : shape (SIGNALS, N)
@@ -46,7 +48,8 @@ class Batch(NamedTuple):
     tick: NDArray[np.float64]
     start: NDArray[np.int64]
     origin: NDArray[np.float64]
-    current_before: NDArray[np.float64]
+    history: NDArray[np.int64]
+    since: NDArray[np.int64]
     current: NDArray[np.float64]
     spool: NDArray[np.float64]
     pressure: NDArray[np.float64]

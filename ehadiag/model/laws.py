@@ -10,7 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 from ehadiag.compile.kernels import inlined
-from ehadiag.compile.vector import magnitude, most, packed
+from ehadiag.compile.vector import least, magnitude, most, packed
 from ehadiag.model.plant import PlantConstants
 
 __all__ = [
@@ -18,12 +18,12 @@ __all__ = [
     "JackLaw",
     "SensorLaw",
     "SpoolLaw",
-    "drive",
     "drive_law",
     "excess",
     "flapper_held",
     "jack_law",
     "opening",
+    "play",
     "pressure",
     "resistance",
     "sampled",
@@ -47,22 +47,26 @@ class DriveLaw(NamedTuple):
     ----------
     gain: flapper deflection per current, GM / KF, m/A.
     bias: current that the motor adds to the commanded one, A.
+    spacing: of the half-widths of the plays, A: they are spacing (i + 1/2).
+    share: of each play in the current that acts, 1 / plays.
     """
 
     gain: Any
     bias: Any
+    spacing: Any
+    share: Any
 
 
 @inlined
 def drive_law(c: PlantConstants) -> DriveLaw:
-    """Precombine what the torque motor's law needs (PHY-2, PHY-30)."""
-    return DriveLaw(c.GM / c.KF, c.IB)
+    """Precombine what the torque motor's law needs (PHY-2, PHY-30, PHY-31)."""
+    return DriveLaw(c.GM / c.KF, c.IB, c.HYS * c.IM / c.NPL, 1.0 / c.NPL)
 
 
 @packed
-def drive(law: DriveLaw, current: Any) -> Any:
-    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-2, PHY-30)."""
-    return law.gain * (current + law.bias)
+def play(held: Any, value: Any, half_width: Any) -> Any:
+    """What a play of a half-width holds after its input has gone to a value (PHY-31)."""
+    return least(most(held, value - half_width), value + half_width)
 
 
 class SpoolLaw(NamedTuple):
@@ -79,6 +83,7 @@ class SpoolLaw(NamedTuple):
     dry: flapper deflection that balances it, m.
     breakaway: flapper deflection that overcomes the static friction, m.
     flapper_stop, stroke: of flapper and spool, m.
+    backlash: half-width of the play between spool and feedback wire, m.
     ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper beside a resting
         spool; rate 0 where it does not ring.
     """
@@ -93,6 +98,7 @@ class SpoolLaw(NamedTuple):
     breakaway: float
     flapper_stop: float
     stroke: float
+    backlash: float
     ring_damping: float
     ring_rate: float
 
@@ -114,21 +120,22 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.FSS / force,
         c.XFM,
         c.XSM,
+        c.BKL,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
 
 
 @packed
-def still_flapper(ratio: Any, deflection: Any, xs: Any) -> Any:
-    """Deflection at which the flapper rests while the spool stands at `xs`, m."""
-    return deflection - ratio * xs
+def still_flapper(ratio: Any, deflection: Any, wire: Any) -> Any:
+    """Deflection at which the flapper rests while the feedback wire is held at `wire`, m."""
+    return deflection - ratio * wire
 
 
 @packed
-def slide_base(reach: Any, deflection: Any, dry: Any, direction: Any) -> Any:
+def slide_base(t: SpoolLaw, deflection: Any, direction: Any) -> Any:
     """Spool position towards which it slides while the current lasts, m."""
-    return (deflection - dry * direction) * reach
+    return (deflection - t.dry * direction) * t.reach + t.backlash * direction
 
 
 @inlined
@@ -138,9 +145,9 @@ def steady_rate(t: SpoolLaw, xf: float, direction: float) -> float:
 
 
 @inlined
-def flapper_held(t: SpoolLaw, deflection: float, xs: float) -> float:
+def flapper_held(t: SpoolLaw, deflection: float, wire: float) -> float:
     """Deflection of a flapper in equilibrium beside a spool that friction holds, m."""
-    xf = still_flapper(t.ratio, deflection, xs)
+    xf = still_flapper(t.ratio, deflection, wire)
     return min(max(xf, -t.breakaway), t.breakaway)
 
 

@@ -44,8 +44,14 @@ class PlantConstants(NamedTuple):
     scales of severity use.
     """
 
+    IM: Value
+    """Rated current, A."""
     IB: Value
     """Null bias of the torque motor, A."""
+    HYS: Value
+    """Hysteresis of the torque motor: width of the loop over rated current."""
+    NPL: Value
+    """Number of plays whose mean the hysteresis is."""
     GM: Value
     """Torque-motor gain, N m/A."""
     JF: Value
@@ -70,6 +76,8 @@ class PlantConstants(NamedTuple):
     """Spool viscous coefficient, N s/m."""
     XSM: Value
     """Spool stop, m."""
+    BKL: Value
+    """Half-width of the backlash between spool and feedback spring, m."""
     FSS: Value
     """Static dry friction of the spool, N."""
     FSS1: Value
@@ -144,7 +152,10 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         if environment.supply_pressure is not None and environment.return_pressure is not None:
             supply = environment.supply_pressure - environment.return_pressure
     return PlantConstants(
+        IM=actuator.controller.IM,
         IB=0.0,
+        HYS=0.0,
+        NPL=1.0,
         GM=valve.GM,
         JF=valve.JF,
         CF=valve.CF,
@@ -157,6 +168,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         MS=valve.MS,
         CS=valve.CS * viscosity,
         XSM=valve.XSM,
+        BKL=0.0,
         FSS=valve.FSS0,
         FSS1=valve.FSS1,
         PSR=supply,

@@ -6,10 +6,11 @@ import math
 from typing import NamedTuple
 
 from ehadiag.compile.kernels import inlined
-from ehadiag.model.laws import SpoolLaw, still_flapper
+from ehadiag.model.laws import SpoolLaw, play, still_flapper
 
 __all__ = [
     "BREAKAWAY",
+    "ENGAGE",
     "FLAPPER_STOP",
     "NOTHING",
     "RELEASE",
@@ -17,6 +18,7 @@ __all__ = [
     "SPOOL_STOP",
     "UNSURE",
     "SpoolState",
+    "carried",
     "clamped_event",
     "held",
     "moving_event",
@@ -32,6 +34,10 @@ SPOOL_STOP = 2
 BREAKAWAY = 3
 FLAPPER_STOP = 4
 RELEASE = 5
+ENGAGE = 6
+"""The feedback wire meets the other side of its backlash."""
+TOUCH = 1e-12
+"""m; what rounding may make of a wire that the spool carries along."""
 
 
 class SpoolState(NamedTuple):
@@ -41,6 +47,7 @@ class SpoolState(NamedTuple):
     ----------
     xf, wf: flapper deflection and its rate, m and m/s.
     xs, vs: spool position and velocity, m and m/s.
+    wire: end of the feedback wire, which is the spool's but for the backlash, m.
     direction: of the spool's motion, +1 or -1; 0 at rest.
     clamped: whether the flapper is on its stop.
     """
@@ -49,6 +56,7 @@ class SpoolState(NamedTuple):
     wf: float
     xs: float
     vs: float
+    wire: float
     direction: int
     clamped: bool
 
@@ -60,16 +68,23 @@ def held(t: SpoolLaw, xf: float, xs: float) -> bool:
 
 
 @inlined
+def carried(t: SpoolLaw, direction: int, xs: float, wire: float) -> bool:
+    """Whether a spool that moves carries the feedback wire along."""
+    return direction * (xs - wire) >= t.backlash - TOUCH
+
+
+@inlined
 def clamped_event(
     t: SpoolLaw,
     deflection: float,
     xf: float,
     xs: float,
     vs: float,
+    wire: float,
     direction: int,
 ) -> int:
     """What ends a step with the flapper on its stop, which it leaves when the torque turns."""
-    if (still_flapper(t.ratio, deflection, xs) - xf) * xf < 0.0:
+    if (still_flapper(t.ratio, deflection, wire) - xf) * xf < 0.0:
         return RELEASE
     if direction == 0:
         return NOTHING if held(t, xf, xs) else BREAKAWAY
@@ -88,11 +103,15 @@ def moving_event(
     wf: float,
     xs: float,
     vs: float,
+    wire: float,
+    loose: bool,
     direction: int,
 ) -> int:
-    """What ends a step with flapper free and spool moving."""
+    """What ends a step with flapper free and spool moving; loose: without the feedback wire."""
     if vs * direction <= 0.0:
         return REVERSAL
+    if loose and carried(t, direction, xs, wire):
+        return ENGAGE
     if abs(xs) >= t.stroke and xs * direction > 0.0:
         return SPOOL_STOP
     if abs(xf) >= t.flapper_stop:
@@ -130,8 +149,8 @@ def stuck_event(
 
 @inlined
 def switch(t: SpoolLaw, event: int, s: SpoolState) -> SpoolState:
-    """State after an event."""
-    xf, wf, xs, vs, direction, clamped = s
+    """State after a step that an event ends, or none."""
+    xf, wf, xs, vs, wire, direction, clamped = s
     if event == REVERSAL:
         vs, direction = 0.0, 0
         if abs(xf) > t.breakaway:
@@ -144,4 +163,4 @@ def switch(t: SpoolLaw, event: int, s: SpoolState) -> SpoolState:
         xf, wf, clamped = math.copysign(t.flapper_stop, xf), 0.0, True
     elif event == RELEASE:
         clamped = False
-    return SpoolState(xf, wf, xs, vs, direction, clamped)
+    return SpoolState(xf, wf, xs, vs, play(wire, xs, t.backlash), direction, clamped)

@@ -16,15 +16,17 @@ from ehadiag.compile.kernels import brief_kernel, inlined, inlined_exact
 from ehadiag.model.anchor import re_anchored
 from ehadiag.model.control import ControlLaw, ControlState, control
 from ehadiag.model.jack import jack_tick
-from ehadiag.model.laws import drive
+from ehadiag.model.scalar.drive import drive
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, spool_tick
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.spool_events import SpoolState
 from ehadiag.monitor.layout import (
     CUSUM,
     DECAY,
+    LOOSE,
     NODES,
     NUMBER,
+    PLAYS,
     PREDICTED,
     RESIDUAL,
     RING,
@@ -154,12 +156,14 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
     s, law, m = settings_of(p), spool_law_of(p), moving_of(p)
     tables = SpoolTables(
         _part(address, SLIDE, (FINEST + 1, 4, 4)),
+        _part(address, LOOSE, (FINEST + 1, 4, 4)),
         _part(address, RING, (FINEST + 1, 2, 2)),
         _part(address, DECAY, (FINEST + 1,)),
         law,
     )
-    deflection = drive(drive_law_of(p), _commanded(p, s, command, current, position))
-    before = SpoolState(m.xf, m.wf, m.xs, m.vs, int(m.direction), m.clamped != 0.0)
+    held = _part(address, PLAYS, (int(s.plays),))
+    deflection = drive(drive_law_of(p), held, _commanded(p, s, command, current, position))
+    before = SpoolState(m.xf, m.wf, m.xs, m.vs, m.wire, int(m.direction), m.clamped != 0.0)
     after, count = spool_tick(tables, deflection, control_law_of(p).tick, before, nodes, 0)
     innovation = spool - s.spool_offset - after.xs
     p12, jack, jack_spool = jack_tick(jack_law_of(p), nodes, 0, count, jack_of(p), m.jack_spool)
@@ -178,6 +182,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
             after.wf,
             xs,
             after.vs,
+            after.wire + (xs - after.xs),
             float(after.direction),
             clamped,
             filtered,

@@ -20,6 +20,7 @@ class Settings(NamedTuple):
 
     Attributes
     ----------
+    plays: number of plays of the hysteresis.
     closed: not 0: the command is a position.
     invertible: not 0: a lost position's code follows from the current.
     linear: below this current it does, A.
@@ -31,6 +32,7 @@ class Settings(NamedTuple):
     deviation: a lost command did not go on where the current is off by more, A.
     """
 
+    plays: float
     closed: float
     invertible: float
     linear: float
@@ -61,6 +63,7 @@ class Moving(NamedTuple):
     wf: float
     xs: float
     vs: float
+    wire: float
     direction: float
     clamped: float
     filtered: float
@@ -105,10 +108,15 @@ RESIDUAL: Final = PREDICTED + 3
 """Spool, pressure."""
 CUSUM: Final = RESIDUAL + 2
 """Upper and lower sum of the spool, then of the pressure."""
-TABLES: Final = CUSUM + 4
+PLAYS: Final = CUSUM + 4
+"""What the plays of the hysteresis hold, A; how many is in the settings."""
+MOST_PLAYS: Final = 16
+TABLES: Final = PLAYS + MOST_PLAYS
 SLIDE: Final = TABLES
-"""See `ehadiag.model.scalar.transition.SpoolTables`: spool moving, at rest, flapper on its stop."""
-RING: Final = SLIDE + 16 * (FINEST + 1)
+"""See `ehadiag.model.scalar.transition.SpoolTables`: spool moving with
+and without the feedback wire, at rest, flapper on its stop."""
+LOOSE: Final = SLIDE + 16 * (FINEST + 1)
+RING: Final = LOOSE + 16 * (FINEST + 1)
 DECAY: Final = RING + 4 * (FINEST + 1)
 NODES: Final = DECAY + FINEST + 1
 """The path of a tick, behind all tables."""

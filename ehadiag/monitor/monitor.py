@@ -132,6 +132,7 @@ class Monitor:
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
         settings = layout.Settings(
+            plays=constants.NPL,
             closed=float(mode is CommandMode.POSITION),
             invertible=float(
                 law.GAP * POSITION.lsb > 6.0 * CURRENT.lsb and not law.GAI and not law.GAD
@@ -159,7 +160,8 @@ class Monitor:
             *control,
             *settings,
         ]
-        p[layout.SLIDE : layout.RING] = tables.moving.ravel()
+        p[layout.SLIDE : layout.LOOSE] = tables.moving.ravel()
+        p[layout.LOOSE : layout.RING] = tables.loose.ravel()
         p[layout.RING : layout.DECAY] = tables.stuck.ravel()
         p[layout.DECAY : layout.NODES] = tables.decay
         self._memory, self._address = p, p.ctypes.data
@@ -169,7 +171,7 @@ class Monitor:
         self.reading: Reading = Reading(
             _view(p[layout.PREDICTED : layout.RESIDUAL]),
             _view(p[layout.RESIDUAL : layout.CUSUM]),
-            _view(p[layout.CUSUM : layout.TABLES].reshape(2, 2)),
+            _view(p[layout.CUSUM : layout.PLAYS].reshape(2, 2)),
             _view(self._alarmed),
         )
         """What the last push left."""
@@ -208,7 +210,7 @@ class Monitor:
         self._alarms, self._alarmed[:] = 0, False
         xs = min(max(spool, -law.stroke), law.stroke)
         xf = min(max(-law.ratio * xs, -law.breakaway), law.breakaway)
-        rest = layout.Moving(xf, 0.0, xs, 0.0, 0.0, 0.0, 0.0, xs)
+        rest = layout.Moving(xf, 0.0, xs, 0.0, xs, 0.0, 0.0, 0.0, xs)
         p[layout.MOVING : layout.JACK] = rest
         p[layout.FOLLOWED : layout.PREDICTED] = layout.Followed(math.nan, 0.0, 0.0, 0.0)
 

@@ -57,10 +57,10 @@ def _residuals(
         anchored += spool_response(
             constants,
             spool_tables(constants, tick),
-            batch.current[a:b],
+            batch.current[batch.since[index] : batch.since[index] + n],
             tick,
             batch.origin[index],
-            batch.current_before[index],
+            batch.current[batch.since[index] - batch.history[index] : batch.since[index]],
             batch.spool[a:b],
             batch.anchor[index],
             work.spool[:n],
@@ -98,7 +98,7 @@ class ScalarModel:
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """See the protocol."""
-        out = np.empty((len(points), SIGNALS, len(self.batch.current)))
+        out = np.empty((len(points), SIGNALS, self.batch.weight.shape[1]))
         anchored = np.empty(len(points), dtype=np.int64)
         for i, candidate in enumerate(self.unknowns.candidates(points)):
             anchored[i] = _residuals(self.batch, candidate, self._work, out[i])

@@ -37,7 +37,7 @@ def respond(
     tick: float,
     *,
     origin: float = 0.0,
-    current_before: float = 0.0,
+    history: NDArray[np.float64] | None = None,
     measured: NDArray[np.float64] | None = None,
     anchor: Anchor = FREE_RUN,
 ) -> Response:
@@ -49,7 +49,7 @@ def respond(
     current: servovalve current of each tick, A, shape (n,).
     tick: length of a tick, s.
     origin: spool position before the first tick, m.
-    current_before: current before the first tick, A.
+    history: current before the first tick, A, shape (h,); None: the hysteresis is unloaded.
     measured: spool position to re-anchor on, m, shape (n,), NaN where missing.
     """
     n = len(current)
@@ -65,7 +65,7 @@ def respond(
         current,
         tick,
         origin,
-        current_before,
+        np.zeros(0) if history is None else history,
         reference,
         anchor.as_array(),
         spool,

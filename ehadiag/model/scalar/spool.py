@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
 from ehadiag.model.anchor import re_anchored
-from ehadiag.model.laws import drive, drive_law
+from ehadiag.model.laws import drive_law
 from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.drive import deflection_held, drive
 from ehadiag.model.scalar.spool_tick import sampled_path, spool_rest, spool_tick
 from ehadiag.model.scalar.transition import SpoolTables
 from ehadiag.model.spool_events import SpoolState
@@ -23,7 +24,7 @@ def spool_response(
     current: NDArray[np.float64],
     tick: float,
     origin: float,
-    current_before: float,
+    history: NDArray[np.float64],
     measured: NDArray[np.float64],
     anchor: NDArray[np.float64],
     spool: NDArray[np.float64],
@@ -37,7 +38,8 @@ def spool_response(
     current: servovalve current of each tick, A, shape (n,).
     tick: s.
     origin: spool position before the first tick, m.
-    current_before: current before the first tick, A; the flapper is in equilibrium with both.
+    history: current of all ticks before, A, shape (h,): it has loaded the hysteresis, and the
+        flapper is in equilibrium with its last.
     measured: measured spool position, m, shape (n,), NaN where missing; used only to re-anchor.
     anchor: (gain, small, large), see `ehadiag.model.anchor.Anchor`.
     spool: out, m, shape (n,), as it is sampled, the prediction before any re-anchoring.
@@ -50,11 +52,14 @@ def spool_response(
     How many times the model was re-anchored.
     """
     motor, law = drive_law(constants), tables.law
-    s = spool_rest(law, drive(motor, current_before), origin)
+    held = np.zeros(int(constants.NPL))
+    for k in range(history.shape[0]):
+        drive(motor, held, history[k])
+    s = spool_rest(law, deflection_held(motor, held), origin)
     count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
         before = s.xs
-        s, count = spool_tick(tables, drive(motor, current[k]), tick, s, nodes, count)
+        s, count = spool_tick(tables, drive(motor, held, current[k]), tick, s, nodes, count)
         node_end[k] = count
         spool[k] = sampled_path(constants, nodes, count, before)
         xs, filtered, moved = re_anchored(
@@ -63,6 +68,6 @@ def spool_response(
         )  # fmt: skip
         if moved:
             nodes[count - 1, 4] = xs - s.xs
-            s = SpoolState(s.xf, s.wf, xs, s.vs, s.direction, s.clamped)
+            s = SpoolState(s.xf, s.wf, xs, s.vs, s.wire + (xs - s.xs), s.direction, s.clamped)
             anchored += 1
     return anchored

@@ -18,6 +18,7 @@ from ehadiag.compile.kernels import inlined
 from ehadiag.model.laws import (
     SpoolLaw,
     flapper_held,
+    play,
     sampled,
     sensor_law,
     slide_base,
@@ -29,6 +30,7 @@ from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.spool_events import (
     NOTHING,
     SpoolState,
+    carried,
     clamped_event,
     moving_event,
     stuck_event,
@@ -59,7 +61,7 @@ def _rests(t: SpoolLaw, deflection: float, s: SpoolState) -> bool:
     """Whether a spool at rest stays so while this current lasts: the flapper rings too little."""
     if t.ring_rate <= 0.0:
         return False
-    still = still_flapper(t.ratio, deflection, s.xs)
+    still = still_flapper(t.ratio, deflection, s.wire)
     a = s.xf - still
     b = (s.wf + t.ring_damping * a) / t.ring_rate
     return abs(still) + math.sqrt(a * a + b * b) < min(t.breakaway, t.flapper_stop)
@@ -69,13 +71,31 @@ def _rests(t: SpoolLaw, deflection: float, s: SpoolState) -> bool:
 def _slide(t: SpoolLaw, m: Matrix, deflection: float, s: SpoolState) -> SpoolState:
     """Flapper free, spool moving: a step about the point where both would rest."""
     rest_xf = t.dry * s.direction
-    rest_xs = slide_base(t.reach, deflection, t.dry, float(s.direction))
+    rest_xs = slide_base(t, deflection, float(s.direction))
     a, w, b, v = s.xf - rest_xf, s.wf, s.xs - rest_xs, s.vs
     return SpoolState(
         rest_xf + m[0, 0] * a + m[0, 1] * w + m[0, 2] * b + m[0, 3] * v,
         m[1, 0] * a + m[1, 1] * w + m[1, 2] * b + m[1, 3] * v,
         rest_xs + m[2, 0] * a + m[2, 1] * w + m[2, 2] * b + m[2, 3] * v,
         m[3, 0] * a + m[3, 1] * w + m[3, 2] * b + m[3, 3] * v,
+        s.wire,
+        s.direction,
+        s.clamped,
+    )
+
+
+@inlined
+def _slide_loose(t: SpoolLaw, m: Matrix, h: float, deflection: float, s: SpoolState) -> SpoolState:
+    """Flapper free, spool moving within its backlash: the wire stays, the flapper rings."""
+    still = still_flapper(t.ratio, deflection, s.wire)
+    steady = steady_rate(t, still, float(s.direction))
+    a, w, v = s.xf - still, s.wf, s.vs - steady
+    return SpoolState(
+        still + m[0, 0] * a + m[0, 1] * w,
+        m[1, 0] * a + m[1, 1] * w,
+        s.xs + steady * h + m[2, 0] * a + m[2, 1] * w + m[2, 3] * v,
+        steady + m[3, 0] * a + m[3, 1] * w + m[3, 3] * v,
+        s.wire,
         s.direction,
         s.clamped,
     )
@@ -84,13 +104,14 @@ def _slide(t: SpoolLaw, m: Matrix, deflection: float, s: SpoolState) -> SpoolSta
 @inlined
 def _ring(t: SpoolLaw, n: Matrix, deflection: float, s: SpoolState) -> SpoolState:
     """Flapper free, spool at rest: a step of the flapper about its rest."""
-    still = still_flapper(t.ratio, deflection, s.xs)
+    still = still_flapper(t.ratio, deflection, s.wire)
     a = s.xf - still
     return SpoolState(
         still + n[0, 0] * a + n[0, 1] * s.wf,
         n[1, 0] * a + n[1, 1] * s.wf,
         s.xs,
         s.vs,
+        s.wire,
         s.direction,
         s.clamped,
     )
@@ -102,7 +123,7 @@ def _slide_clamped(t: SpoolLaw, h: float, fade: float, s: SpoolState) -> SpoolSt
     steady = steady_rate(t, s.xf, float(s.direction))
     xs = s.xs + steady * h + (s.vs - steady) * (1.0 - fade) * t.mass / t.damping
     vs = steady + (s.vs - steady) * fade
-    return SpoolState(s.xf, s.wf, xs, vs, s.direction, s.clamped)
+    return SpoolState(s.xf, s.wf, xs, vs, s.wire, s.direction, s.clamped)
 
 
 @inlined
@@ -119,7 +140,7 @@ def _node_wanted(event: int, done: int, bend: float) -> bool:
 def spool_rest(t: SpoolLaw, deflection: float, origin: float) -> SpoolState:
     """Flapper and spool at rest, the spool at `origin` (m) within its stroke."""
     xs = min(max(origin, -t.stroke), t.stroke)
-    return SpoolState(flapper_held(t, deflection, xs), 0.0, xs, 0.0, 0, False)
+    return SpoolState(flapper_held(t, deflection, xs), 0.0, xs, 0.0, xs, 0, False)
 
 
 @inlined
@@ -162,10 +183,17 @@ def spool_tick(
         if s.clamped:
             if s.direction != 0:
                 new = _slide_clamped(t, h, tables.decay[level], s)
-            event = clamped_event(t, deflection, s.xf, new.xs, new.vs, s.direction)
+            wire = play(s.wire, new.xs, t.backlash)
+            event = clamped_event(t, deflection, s.xf, new.xs, new.vs, wire, s.direction)
         elif s.direction != 0:
-            new = _slide(t, tables.moving[level], deflection, s)
-            event = moving_event(t, h, s.xf, s.wf, new.xf, new.wf, new.xs, new.vs, s.direction)
+            loose = not carried(t, s.direction, s.xs, s.wire)
+            if loose:
+                new = _slide_loose(t, tables.loose[level], h, deflection, s)
+            else:
+                new = _slide(t, tables.moving[level], deflection, s)
+            event = moving_event(
+                t, h, s.xf, s.wf, new.xf, new.wf, new.xs, new.vs, s.wire, loose, s.direction
+            )
         else:
             new = _ring(t, tables.stuck[level], deflection, s)
             event = stuck_event(t, h, s.xf, s.wf, new.xf, new.wf, s.xs)

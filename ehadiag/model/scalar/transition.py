@@ -24,11 +24,13 @@ class SpoolTables(NamedTuple):
     """Coefficients of one candidate; of the arrays one row a level.
 
     moving: shape (FINEST + 1, 4, 4), flapper free, spool moving; state (XF, DXF, XS, DXS).
+    loose: the same without the feedback wire, shape (FINEST + 1, 4, 4).
     stuck: shape (FINEST + 1, 2, 2), flapper free, spool at rest; state (XF, DXF).
     decay: shape (FINEST + 1,), exp(-h / tau) of the spool velocity with the flapper on a stop.
     """
 
     moving: NDArray[np.float64]
+    loose: NDArray[np.float64]
     stuck: NDArray[np.float64]
     decay: NDArray[np.float64]
     law: SpoolLaw
@@ -86,11 +88,14 @@ def spool_tables(constants: PlantConstants, tick: float) -> SpoolTables:
     rates[2, 3] = 1.0
     rates[3, 0] = law.force / c.MS
     rates[3, 3] = -law.damping / c.MS
+    without = rates.copy()
+    without[1, 2] = 0.0
     decay = np.empty(FINEST + 1)
     for level in range(FINEST + 1):
         decay[level] = math.exp(-(tick * law.damping / c.MS) / 2.0**level)
     return SpoolTables(
         moving=_transition(rates, tick),
+        loose=_transition(without, tick),
         stuck=_transition(rates[:2, :2].copy(), tick),
         decay=decay,
         law=law,

@@ -14,6 +14,7 @@ from ehadiag.model.plant import PlantConstants, plant_of
 from ehadiag.model.scalar.transition import FINEST, TAYLOR_HALVINGS
 from ehadiag.model.simd.layout import (
     LANES,
+    LOOSE,
     MOVE,
     NODES,
     REST,
@@ -142,9 +143,10 @@ def tabulate(
     tick: float,
     coefficients: NDArray[np.float64],
     moving: NDArray[np.float64],
+    loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
-) -> None:
-    """Coefficients of all lanes.
+) -> bool:
+    """Coefficients of all lanes; returns whether any has backlash.
 
     Parameters
     ----------
@@ -153,12 +155,15 @@ def tabulate(
     coefficients: out, shape (COEFFICIENT_ROWS * LANES,).
     moving: out, what goes on over 1 … WIDTH steps of each length of `SHIFTS` with the spool moving,
         shape (LANES, 3, MOVING_ROWS, WIDTH), flat.
+    loose: out, the same without the feedback wire, where a lane has backlash.
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
+    any_backlash = False
     for i in range(LANES):
         c = plant_of(candidates[i])
         t = _laws(c, tick, i, coefficients)
+        any_backlash = any_backlash or t.backlash > 0.0
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
         rates[4 * LANES + i], rates[5 * LANES + i] = stiffness, friction
@@ -179,3 +184,12 @@ def tabulate(
                 moving[place + WIDTH] = math.exp(-time * rate)
     _, whole = _powers(ring, 2, tick, STUCK_ROWS, stuck)
     _copy(whole, coefficients, REST * LANES)
+    if any_backlash:
+        rates[6 * LANES : 7 * LANES] = 0.0
+        quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, loose)
+        _copy(quarter, coefficients, LOOSE * LANES)
+        for i in range(LANES):
+            for level in range(len(SHIFTS)):
+                place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH
+                loose[place : place + WIDTH] = moving[place : place + WIDTH]
+    return any_backlash

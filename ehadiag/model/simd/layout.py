@@ -29,15 +29,19 @@ NODES = 4
     FRESH,
     DONE,
     DEFLECTION,
+    WIRE,
     SEEN,
     ANCHORED,
-    STATE_ROWS,
-) = range(18)
+    PLAYS,
+) = range(19)
 """Rows of the state. DEFLECTION: of the flapper by the current alone; SEEN:
-spool as it is sampled; FRESH: the jack has just
+spool as it is sampled; WIRE: end of the feedback wire; FRESH: the jack has just
 started or stopped; DONE: it has taken this tick beside the spool; ANCHORED: how often the lane was
 re-anchored, which goes on from span to span."""
 
+MOST_PLAYS = 16
+STATE_ROWS = PLAYS + MOST_PLAYS
+"""What the plays of the hysteresis hold stands in the last rows."""
 PLACE, SLOPE = 0, NODES + 1
 PATH_ROWS = 2 * (NODES + 1)
 """Rows of the path: position and velocity of the spool at the nodes 0 … NODES."""
@@ -50,10 +54,11 @@ ROOM = SENSOR_LAW + len(SensorLaw._fields)
 RING_TIME = ROOM + 1
 REST = RING_TIME + 1
 MOVE = REST + 4
-COEFFICIENT_ROWS = MOVE + 16
+LOOSE = MOVE + 16
+COEFFICIENT_ROWS = LOOSE + 16
 """Rows of the coefficients: the laws' fields; flapper deflection within which a resting spool
-stays; reciprocal of the ringing's rate; transitions over a whole tick at rest (2 x 2) and a quarter
-of a tick moving (4 x 4)."""
+stays; reciprocal of the ringing's rate; transitions over a whole tick at rest (2 x 2), over a
+quarter of a tick moving (4 x 4), and the same without the feedback wire."""
 
 drive_laws = lanes_of(DriveLaw, DRIVE_LAW, LANES)
 spool_laws = lanes_of(SpoolLaw, SPOOL_LAW, LANES)

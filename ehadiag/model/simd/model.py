@@ -50,7 +50,7 @@ class SimdModel:
         """See the protocol."""
         count = len(points)
         candidates = self.unknowns.candidates(points)
-        out = np.empty((count, SIGNALS, len(self.batch.current)))
+        out = np.empty((count, SIGNALS, self.batch.weight.shape[1]))
         anchored = np.empty(count, dtype=np.int64)
         blocks = -(-count // LANES)
         threads = max(1, min(self._threads, blocks))

@@ -21,7 +21,7 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch
-from ehadiag.model.plant import FIELDS
+from ehadiag.model.plant import FIELDS, plant_of
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
 from ehadiag.model.simd.jack import jack_lanes, pressures
 from ehadiag.model.simd.jack_events import jack_events
@@ -30,12 +30,20 @@ from ehadiag.model.simd.layout import (
     COEFFICIENT_ROWS,
     LANES,
     PATH_ROWS,
+    PLAYS,
     PRESSURE,
     SEEN,
     STATE_ROWS,
     sensor_laws,
 )
-from ehadiag.model.simd.spool import anchor_lanes, drive_lanes, rest_lanes, see_lanes, spool_lanes
+from ehadiag.model.simd.spool import (
+    anchor_lanes,
+    deflect_lanes,
+    drive_lanes,
+    rest_lanes,
+    see_lanes,
+    spool_lanes,
+)
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
 
 __all__ = ["Scratch", "block_costs", "block_residuals", "scratch_beside", "scratch_for"]
@@ -62,7 +70,7 @@ class Scratch(NamedTuple):
         How often the jack's ticks are halved, 0 … 4. The same for every candidate, so that no
         answer depends on the others in its block. Of no meaning where no pressure counts: there
         the jack is left out.
-    state, path, coefficients, moving, stuck
+    state, path, coefficients, moving, loose, stuck
         See `ehadiag.model.simd.layout`.
     rows : shape (LANES, FIELDS)
         Candidates of a block, in the test of the span at hand.
@@ -77,6 +85,7 @@ class Scratch(NamedTuple):
     path: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     moving: NDArray[np.float64]
+    loose: NDArray[np.float64]
     stuck: NDArray[np.float64]
     rows: NDArray[np.float64]
     sums: NDArray[np.float64]
@@ -92,11 +101,12 @@ def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
     `scattered`: their constants, shape (LANES, tests, FIELDS).
     """
     work = Scratch(
-        levels=np.full(len(batch.current), -1, dtype=np.int64),
+        levels=np.full(batch.weight.shape[1], -1, dtype=np.int64),
         state=np.zeros(STATE_ROWS * LANES),
         path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
         moving=np.zeros(MOVING_SIZE),
+        loose=np.zeros(MOVING_SIZE),
         stuck=np.zeros(STUCK_SIZE),
         rows=np.zeros((LANES, FIELDS)),
         sums=np.zeros(LANES),
@@ -183,7 +193,8 @@ def _block(
     out: shape (LANES or less, SIGNALS, N), or of no candidate.
     """
     state, path, coefficients = work.state, work.path, work.coefficients
-    moving, stuck, rows, sums, sample = work.moving, work.stuck, work.rows, work.sums, work.sample
+    moving, loose, stuck, rows = work.moving, work.loose, work.stuck, work.rows
+    sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
     weight, levels, start = batch.weight, work.levels, batch.start
     wanted, last_candidate = out.shape[0], candidates.shape[0] - 1
@@ -196,16 +207,20 @@ def _block(
         for i in range(LANES):
             for field in range(FIELDS):
                 rows[i, field] = candidates[min(i, last_candidate), test, field]
-        tabulate(rows, tick, coefficients, moving, stuck)
-        drive_lanes(batch.current_before[index], state, coefficients)
+        backlash = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
+        state[PLAYS * LANES :] = 0.0
+        for k in range(since - batch.history[index], since):
+            drive_lanes(current[k], plays, state, coefficients)
+        deflect_lanes(plays, state, coefficients)
         rest_lanes(batch.origin[index], state, coefficients)
         last = start[index + 1] - 1
         while last >= start[index] and weight[PRESSURE_ROW, last] == 0.0:
             last -= 1
         for k in range(start[index], start[index + 1]):
-            drive_lanes(current[k], state, coefficients)
-            if spool_lanes(tick, state, path, coefficients):
-                event_ticks(tick, state, path, coefficients, moving, stuck)
+            drive_lanes(current[since + k - start[index]], plays, state, coefficients)
+            if spool_lanes(tick, backlash, state, path, coefficients):
+                event_ticks(tick, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
             if seen:
                 see_lanes(state, path, coefficients)

@@ -24,7 +24,7 @@ from ehadiag.compile.vector import (
     store,
 )
 from ehadiag.model.jack import Piece, jack_piece
-from ehadiag.model.laws import SpoolLaw, slide_base, steady_rate, still_flapper
+from ehadiag.model.laws import SpoolLaw, play, slide_base, steady_rate, still_flapper
 from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.simd.coefficients import MOVING_ROWS, SHIFTS, STUCK_ROWS
 from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack
@@ -43,16 +43,20 @@ from ehadiag.model.simd.layout import (
     SLOPE,
     SPOOL,
     SPOOL_RATE,
+    WIRE,
     jack_law_of_lane,
     spool_law_of_lane,
 )
 from ehadiag.model.spool_events import (
     BREAKAWAY,
+    ENGAGE,
     FLAPPER_STOP,
     NOTHING,
     REVERSAL,
     SPOOL_STOP,
+    TOUCH,
     SpoolState,
+    carried,
     clamped_event,
     held,
     switch,
@@ -77,12 +81,13 @@ def event_ticks(
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
     moving: NDArray[np.float64],
+    loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> None:
     """Flapper and spool of BUSY lanes over a tick with events, located to tick / 2^FINEST."""
     for i in range(LANES):
         if state[BUSY * LANES + i] != 0.0:
-            _event_tick(i, tick, state, path, coefficients, moving, stuck)
+            _event_tick(i, tick, state, path, coefficients, moving, loose, stuck)
 
 
 @packed
@@ -118,6 +123,40 @@ def _moving_instants(
         swing = 0.25 * h * most(magnitude(before_w), magnitude(nw))
         low = least(before_a, na) - swing <= 0.0
         far = most(behind(abs(a + dry), size), size) + swing >= t.flapper_stop
+        found = found | ((before_w * nw < 0.0) & (low | far))
+    return found
+
+
+@packed
+def _loose_instants(
+    t: SpoolLaw, table: NDArray[np.float64], place: int, h: float, fine: bool, still: float,
+    s: SpoolState, path: NDArray[np.float64],
+) -> Mask:  # fmt: skip
+    """As `_moving_instants` within the backlash, without the feedback wire."""
+    d = float(s.direction)
+    lift = still * d
+    steady = (t.force * lift - t.dynamic) / t.damping
+    a, w, v = s.xf * d - lift, s.wf * d, s.vs * d - steady
+    k = place * MOVING_ROWS * WIDTH
+    na = load(table, k) * a + load(table, k + WIDTH) * w
+    nw = load(table, k + 4 * WIDTH) * a + load(table, k + 5 * WIDTH) * w
+    nb = load(table, k + 8 * WIDTH) * a + load(table, k + 9 * WIDTH) * w
+    nb = nb + load(table, k + 11 * WIDTH) * v + load(table, k + 16 * WIDTH) * steady
+    nv = load(table, k + 12 * WIDTH) * a + load(table, k + 13 * WIDTH) * w
+    nv = nv + load(table, k + 15 * WIDTH) * v + steady
+    store(path, INSTANTS, (na + lift) * d)
+    store(path, INSTANTS + WIDTH, nw * d)
+    store(path, INSTANTS + 2 * WIDTH, nb * d + s.xs)
+    store(path, INSTANTS + 3 * WIDTH, nv * d)
+    size = magnitude(na + lift)
+    travel = s.xs * d
+    found = (nv <= 0.0) | (nb >= t.stroke - travel) | (size >= t.flapper_stop)
+    found = found | (nb >= t.backlash - TOUCH - (s.xs - s.wire) * d)
+    if not fine:
+        before_a, before_w = behind(a, na), behind(w, nw)
+        swing = 0.25 * h * most(magnitude(before_w), magnitude(nw))
+        low = least(before_a, na) - swing <= t.dry - lift
+        far = most(behind(abs(a + lift), size), size) + swing >= t.flapper_stop
         found = found | ((before_w * nw < 0.0) & (low | far))
     return found
 
@@ -169,7 +208,8 @@ def _clamped_instants(
     store(path, INSTANTS + WIDTH, 0.0)
     store(path, INSTANTS + 2 * WIDTH, new_xs)
     store(path, INSTANTS + 3 * WIDTH, new_vs)
-    leaves = (still_flapper(t.ratio, deflection, new_xs) - xf) * xf < 0.0
+    wire = play(s.wire, new_xs, t.backlash)
+    leaves = (still_flapper(t.ratio, deflection, wire) - xf) * xf < 0.0
     if d == 0.0:
         return leaves if held(t, xf, s.xs) else new_vs <= 0.0  # all of them: it rests
     return leaves | (new_vs * d <= 0.0) | (new_xs * d >= t.stroke)
@@ -183,6 +223,7 @@ def _event_tick(
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
     moving: NDArray[np.float64],
+    loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> None:
     """Lane `i`."""
@@ -196,6 +237,7 @@ def _event_tick(
         state[FLAPPER_RATE * LANES + i],
         state[SPOOL * LANES + i],
         state[SPOOL_RATE * LANES + i],
+        state[WIRE * LANES + i],
         int(state[DIRECTION * LANES + i]),
         state[CLAMPED * LANES + i] != 0.0,
     )
@@ -212,10 +254,14 @@ def _event_tick(
         if s.clamped:
             found = _clamped_instants(t, moving, place, deflection, s, path)
         elif s.direction != 0:
-            base = slide_base(t.reach, deflection, t.dry, float(s.direction))
-            found = _moving_instants(t, moving, place, h, fine, base, s, path)
+            if carried(t, s.direction, s.xs, s.wire):
+                base = slide_base(t, deflection, float(s.direction))
+                found = _moving_instants(t, moving, place, h, fine, base, s, path)
+            else:
+                still = still_flapper(t.ratio, deflection, s.wire)
+                found = _loose_instants(t, loose, place, h, fine, still, s, path)
         else:
-            still = still_flapper(t.ratio, deflection, s.xs)
+            still = still_flapper(t.ratio, deflection, s.wire)
             found = _stuck_instants(t, stuck, place, h, fine, still, s, path)
         first = first_place(found)
         event = NOTHING
@@ -223,9 +269,10 @@ def _event_tick(
             o = INSTANTS + first
             new_xf, new_xs, new_vs = path[o], path[o + 2 * WIDTH], path[o + 3 * WIDTH]
             if s.clamped:
-                event = clamped_event(t, deflection, new_xf, new_xs, new_vs, s.direction)
+                wire = play(s.wire, new_xs, t.backlash)
+                event = clamped_event(t, deflection, new_xf, new_xs, new_vs, wire, s.direction)
             else:
-                event = _event(t, new_xf, new_xs, new_vs, s.direction)
+                event = _event(t, s, new_xf, new_xs, new_vs)
         steps = whole if first >= whole else first + 1 if fine else first
         for n in range(steps):
             o = INSTANTS + n
@@ -234,6 +281,7 @@ def _event_tick(
                 path[o + WIDTH],
                 path[o + 2 * WIDTH],
                 path[o + 3 * WIDTH],
+                play(s.wire, path[o + 2 * WIDTH], t.backlash),
                 s.direction,
                 s.clamped,
             )
@@ -258,18 +306,21 @@ def _event_tick(
         _jack_beside(i, from_xs, count, state, path, coefficients)
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = s.xf, s.wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = s.xs, s.vs
+    state[WIRE * LANES + i] = s.wire
     state[DIRECTION * LANES + i] = s.direction
     state[CLAMPED * LANES + i] = 1.0 if s.clamped else 0.0
 
 
 @inlined
-def _event(t: SpoolLaw, xf: float, xs: float, vs: float, direction: int) -> int:
-    """Which event has come at an instant that is past one."""
-    if direction == 0:
+def _event(t: SpoolLaw, s: SpoolState, xf: float, xs: float, vs: float) -> int:
+    """Which event has come at an instant that is past one; `s`: the state before."""
+    if s.direction == 0:
         return FLAPPER_STOP if held(t, xf, xs) else BREAKAWAY
-    if vs * direction <= 0.0:
+    if vs * s.direction <= 0.0:
         return REVERSAL
-    return FLAPPER_STOP if abs(xf) >= t.flapper_stop else SPOOL_STOP
+    if abs(xf) >= t.flapper_stop:
+        return FLAPPER_STOP
+    return SPOOL_STOP if abs(xs) >= t.stroke else ENGAGE
 
 
 @merged
