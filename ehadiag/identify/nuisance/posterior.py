@@ -9,8 +9,6 @@ the smooth outline first and the fine structure last, each sample in its own tim
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +16,7 @@ from ehadiag.identify.nuisance.linearisation import Belief, Linearised, linearis
 from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
 
-__all__ = ["Sharpened", "robust_weights", "sharpen"]
+__all__ = ["TAIL", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
@@ -35,39 +33,32 @@ HELD_BACK = 0.1
 FREE = 1e-9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sharpened:
-    """Where the search has led.
-
-    Attributes
-    ----------
-    belief : Belief
-    settled : bool
-        Whether rounds had come to change nothing.
-    """
-
-    belief: Belief
-    settled: bool
-
-
 def sharpen(
-    model: Derivatives, start: Belief, information: NDArray[np.float64], rng: np.random.Generator
-) -> Sharpened:
+    model: Derivatives,
+    known: Belief,
+    begin: Belief,
+    information: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> Belief:
     """Sharpen a belief until the noise stops it.
 
     Parameters
     ----------
     model : Derivatives
         That runs free: re-anchored on the spool it jumps more.
+    known : Belief
+        Its mean is what was known before the recording.
+    begin : Belief
+        Where the search begins.
     information : shape (k,)
-        Of the start, of each parameter: reciprocal variance, 0 where nothing is known.
+        What was known of each coordinate: reciprocal variance, 0 where nothing.
     """
-    belief = start
+    belief = begin
     for _ in range(MOST_ROUNDS):
-        belief, ratios, step = _round(model, start, belief, information, rng)
-        if ratios.min() > SETTLED_RATIO and step < SETTLED_STEP:
-            return Sharpened(belief, True)
-    return Sharpened(belief, False)
+        belief, ratio, step = _round(model, known, belief, information, rng)
+        if ratio > SETTLED_RATIO and step < SETTLED_STEP:
+            break
+    return belief
 
 
 def robust_weights(linear: Linearised) -> NDArray[np.float64]:
@@ -78,18 +69,18 @@ def robust_weights(linear: Linearised) -> NDArray[np.float64]:
 
 def _round(
     model: Derivatives,
-    start: Belief,
+    known: Belief,
     belief: Belief,
     information: NDArray[np.float64],
     rng: np.random.Generator,
-) -> tuple[Belief, NDArray[np.float64], float]:
-    """One linearisation; also by which ratios the belief narrows, and the step by its widths."""
+) -> tuple[Belief, float, float]:
+    """One linearisation; also the ratio by which the belief would narrow most, and the step."""
     linear = linearised(model, belief, rng)
     weights = robust_weights(linear).ravel()
     rows = linear.jacobian.reshape(len(belief.x), -1)
     weighed = rows * weights
     normal = weighed @ rows.T + np.diag(information)
-    gradient = weighed @ linear.residuals.ravel() + information * (linear.x - start.x)
+    gradient = weighed @ linear.residuals.ravel() + information * (linear.x - known.x)
     curved = model.curved
     inverse_root = np.linalg.inv(belief.root)
     held = FREE * np.eye(len(belief.x))
@@ -104,4 +95,4 @@ def _round(
     ratios = np.sqrt(np.maximum(squares, 0.0))
     kept = np.clip(ratios, LEAST_RATIO, 1.0)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
-    return Belief(x, belief.root @ (axes * kept)), ratios, step
+    return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step

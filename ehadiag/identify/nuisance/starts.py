@@ -1,0 +1,119 @@
+"""Search from several starts, until a recording is explained.
+
+A search may settle beside the optimum; its residuals show it. From such a place a fresh look over a
+tenth of the first spread mostly finds the way on, else a start of its own does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.nuisance.linearisation import BLOCK, Belief
+from ehadiag.identify.nuisance.posterior import TAIL, sharpen
+from ehadiag.identify.refine.derivatives import Derivatives
+
+__all__ = ["Found", "robust_cost", "search"]
+
+AGAIN = 0.1
+"""Spread of a further look about the best so far, in spreads of the first."""
+FRESH_EVERY = 3
+"""Every so many starts begin anew."""
+ALIAS_SPAN = 1.25
+"""Half-width over which a parameter is moved against what it passes for, in units of its scale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The best place that a search has come to.
+
+    Attributes
+    ----------
+    belief : Belief
+    residuals : shape (SIGNALS, N)
+        Weighted, at its mean.
+    cost : float
+        Robust, see `robust_cost`.
+    explained : bool
+    starts : int
+        How many it took.
+    """
+
+    belief: Belief
+    residuals: NDArray[np.float64]
+    cost: float
+    explained: bool
+    starts: int
+
+
+def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cauchy's cost of weighted residuals, shape (n, SIGNALS, N): shape (n,)."""
+    return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
+
+
+def search(
+    model: Derivatives,
+    first: Belief,
+    information: NDArray[np.float64],
+    explains: Callable[[NDArray[np.float64]], bool],
+    *,
+    alias: str = "",
+    budget: int = 1600,
+    seed: int = 0,
+) -> Found:
+    """Search until the residuals are explained, or the budget is spent.
+
+    Parameters
+    ----------
+    first : Belief
+        Of the first start and every fresh one.
+    information : shape (k,)
+        See `sharpen`.
+    explains : callable
+        Of residuals, shape (SIGNALS, N): whether there is nothing better to look for.
+    alias : str
+        Name of a parameter that passes for a sensor's constant error.
+    budget : int
+        Runs of the model after which no further start is made.
+    """
+    until = model.evaluations + budget
+    best: Found | None = None
+    starts = 0
+    while best is None or (not best.explained and model.evaluations < until):
+        begin = first
+        if best is not None and starts % FRESH_EVERY != 0:
+            x = _past_alias(model, best, alias)
+            begin = Belief(x, AGAIN * first.root)
+        rng = np.random.default_rng([seed, starts])
+        belief = sharpen(model, first, begin, information, rng)
+        residuals = model.many(belief.x[None, :])[0]
+        cost = float(robust_cost(residuals))
+        starts += 1
+        if best is None or cost < best.cost:
+            best = Found(belief, residuals, cost, explains(residuals), starts)
+    return Found(best.belief, best.residuals, best.cost, best.explained, starts)
+
+
+def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:
+    """Best point along the line on which a parameter and a sensor's constant error trade."""
+    names = [item.name for item in model.estimated]
+    x = best.belief.x
+    if alias not in names:
+        return x
+    j = names.index(alias)
+    shifts = ALIAS_SPAN * (np.arange(BLOCK) - 0.5 * BLOCK + 1.0) / (0.5 * BLOCK)
+    points = np.repeat(x[None, :], BLOCK, axis=0)
+    points[:, j] = np.clip(x[j] + shifts, model.lower[j], model.upper[j])
+    constants = [k for k, item in enumerate(model.estimated) if item.adds_to is not None]
+    # Medians do not see the samples that the wrong pair spoils.
+    slopes = model.additive_slopes()
+    moved = model.many(points)
+    for k in constants:
+        row = model.estimated[k].adds_to
+        used = slopes[k, row] != 0.0
+        shares = np.median(moved[:, row][:, used] / slopes[k, row][used], axis=1)
+        points[:, k] -= shares
+    return points[int(np.argmin(robust_cost(model.many(points))))]
