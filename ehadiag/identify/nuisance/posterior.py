@@ -20,8 +20,8 @@ __all__ = ["TAIL", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
-MOST_ROUNDS = 20
-LEAST_RATIO = 0.4
+MOST_ROUNDS = 30
+LEAST_RATIO = 0.5
 """By which the belief may become narrower in a round, in any direction."""
 WIDTH = 2.0
 """Of the belief, in deviations of what the linear problem leaves."""
@@ -39,8 +39,8 @@ def sharpen(
     begin: Belief,
     information: NDArray[np.float64],
     rng: np.random.Generator,
-) -> Belief:
-    """Sharpen a belief until the noise stops it.
+) -> tuple[Belief, bool]:
+    """Sharpen a belief until the noise stops it; also whether it came to rest.
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ def sharpen(
     for _ in range(MOST_ROUNDS):
         belief, ratio, step = _round(model, known, belief, information, rng)
         if ratio > SETTLED_RATIO and step < SETTLED_STEP:
-            break
-    return belief
+            return belief, True
+    return belief, False
 
 
 def robust_weights(linear: Linearised) -> NDArray[np.float64]:

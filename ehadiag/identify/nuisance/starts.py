@@ -7,7 +7,7 @@ tenth of the first spread mostly finds the way on, else a start of its own does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,28 @@ from ehadiag.identify.nuisance.linearisation import BLOCK, Belief
 from ehadiag.identify.nuisance.posterior import TAIL, sharpen
 from ehadiag.identify.refine.derivatives import Derivatives
 
-__all__ = ["Found", "robust_cost", "search"]
+__all__ = ["Found", "Place", "robust_cost", "search"]
 
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
-FRESH_EVERY = 3
+FRESH_EVERY = 2
 """Every so many starts begin anew."""
 ALIAS_SPAN = 1.25
 """Half-width over which a parameter is moved against what it passes for, in units of its scale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where one start ended.
+
+    Attributes
+    ----------
+    x : shape (k,)
+    cost : float
+    """
+
+    x: NDArray[np.float64]
+    cost: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,15 +52,20 @@ class Found:
     cost : float
         Robust, see `robust_cost`.
     explained : bool
-    starts : int
-        How many it took.
+    places : tuple of Place
+        Where all starts ended.
     """
 
     belief: Belief
     residuals: NDArray[np.float64]
     cost: float
     explained: bool
-    starts: int
+    places: tuple[Place, ...]
+
+    @property
+    def starts(self) -> int:
+        """How many it took."""
+        return len(self.places)
 
 
 def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,7 +92,8 @@ def search(
     information : shape (k,)
         See `sharpen`.
     explains : callable
-        Of residuals, shape (SIGNALS, N): whether there is nothing better to look for.
+        Of residuals, shape (SIGNALS, N): whether there is nothing better to look for
+        (a search that has not come to rest goes on all the same).
     alias : str
         Name of a parameter that passes for a sensor's constant error.
     budget : int
@@ -81,20 +101,20 @@ def search(
     """
     until = model.evaluations + budget
     best: Found | None = None
-    starts = 0
+    places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
         begin = first
-        if best is not None and starts % FRESH_EVERY != 0:
+        if best is not None and len(places) % FRESH_EVERY != 0:
             x = _past_alias(model, best, alias)
             begin = Belief(x, AGAIN * first.root)
-        rng = np.random.default_rng([seed, starts])
-        belief = sharpen(model, first, begin, information, rng)
+        rng = np.random.default_rng([seed, len(places)])
+        belief, settled = sharpen(model, first, begin, information, rng)
         residuals = model.many(belief.x[None, :])[0]
         cost = float(robust_cost(residuals))
-        starts += 1
+        places.append(Place(belief.x, cost))
         if best is None or cost < best.cost:
-            best = Found(belief, residuals, cost, explains(residuals), starts)
-    return Found(best.belief, best.residuals, best.cost, best.explained, starts)
+            best = Found(belief, residuals, cost, settled and explains(residuals), ())
+    return replace(best, places=tuple(places))
 
 
 def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:
@@ -107,13 +127,11 @@ def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float
     shifts = ALIAS_SPAN * (np.arange(BLOCK) - 0.5 * BLOCK + 1.0) / (0.5 * BLOCK)
     points = np.repeat(x[None, :], BLOCK, axis=0)
     points[:, j] = np.clip(x[j] + shifts, model.lower[j], model.upper[j])
-    constants = [k for k, item in enumerate(model.estimated) if item.adds_to is not None]
-    # Medians do not see the samples that the wrong pair spoils.
-    slopes = model.additive_slopes()
-    moved = model.many(points)
-    for k in constants:
-        row = model.estimated[k].adds_to
-        used = slopes[k, row] != 0.0
-        shares = np.median(moved[:, row][:, used] / slopes[k, row][used], axis=1)
-        points[:, k] -= shares
+    # Medians do not see the samples that a wrong pair spoils.
+    slopes, runs = model.additive_slopes(), model.many(points)
+    for k, item in enumerate(model.estimated):
+        if item.adds_to is not None:
+            slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
+            used = slope != 0.0
+            points[:, k] -= np.median(run[:, used] / slope[used], axis=1)
     return points[int(np.argmin(robust_cost(model.many(points))))]
