@@ -22,7 +22,7 @@ from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import Solver
 from ehadiag.identify.search.stages import Memory, Progress
 
-__all__ = ["Diagnosis", "diagnose", "not_tested"]
+__all__ = ["Diagnosis", "diagnose", "match_tests", "not_tested"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +66,7 @@ def diagnose(
         answer.
     """
     begin = time.perf_counter()
-    known = tuple(tests)
-    matched = tuple(_match(recording, known, default) for recording in recordings)
+    matched = match_tests(recordings, tests, default)
 
     def result(
         verdict: Verdict,
@@ -110,20 +109,35 @@ def diagnose(
 
 
 def not_tested(
-    recording: Recording, test: StoredTest, actuator: Actuator, reasons: Sequence[str]
+    recordings: Sequence[Recording],
+    tests: Sequence[StoredTest | None],
+    actuator: Actuator,
+    reasons: Sequence[str],
+    elapsed: float = 0.0,
 ) -> Diagnosis:
-    """Return the verdict NOT TESTED for a test that did not come about."""
+    """Return the verdict NOT TESTED for a test that did not come about, or was not judged.
+
+    tests: of each recording.
+    """
     return Diagnosis(
-        recordings=(recording,),
-        tests=(test,),
+        recordings=tuple(recordings),
+        tests=tuple(tests),
         actuator=actuator,
         verdict=Verdict.NOT_TESTED,
         reasons=tuple(reasons),
         identification=None,
         experiments=(),
-        notes=_notes((recording,), (test,), actuator),
-        elapsed=0.0,
+        notes=_notes(recordings, tests, actuator),
+        elapsed=elapsed,
     )
+
+
+def match_tests(
+    recordings: Sequence[Recording], tests: Iterable[StoredTest], default: StoredTest | None = None
+) -> tuple[StoredTest | None, ...]:
+    """Find the test that each recording is of; None where it is none of `tests`."""
+    known = tuple(tests)
+    return tuple(_match(recording, known, default) for recording in recordings)
 
 
 def _notes(

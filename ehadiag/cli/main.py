@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -12,14 +13,16 @@ from typing import NoReturn
 
 from ehadiag.cli.commands import bit, diagnose, replay, sim, tests, warmup
 from ehadiag.cli.commands import check_bus as checkbus
+from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
+from ehadiag.cli.output import abandon, say
 from ehadiag.core.errors import EhadiagError, InputOutputError
+from ehadiag.core.printable import printable
 
-__all__ = ["main"]
+__all__ = ["main", "process"]
 
 EPILOG = """\
 exit codes: 0 healthy, 10 degraded, 20 fault, 30 not tested (reason given),
 2 wrong usage or configuration, 3 input/output failure; several logs: the worst."""
-BROKEN_PIPE = 3
 INTERRUPTED = 130
 
 
@@ -29,7 +32,7 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         command = self.prog.partition(" ")[2]
         where = f"{command}: " if command else ""
-        self.exit(2, f"ehadiag: {where}{message}; see {self.prog} --help\n")
+        self.exit(2, f"ehadiag: {where}{printable(message)}; see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,26 +42,48 @@ def main(argv: Sequence[str] | None = None) -> int:
     ------
     SystemExit: wrong usage (code 2), `--help` and `--version`.
     """
+    with signals_restored():
+        interrupt_on_signals()
+        return _run(argv)
+
+
+def process() -> NoReturn:
+    """Run the command line as this process: a signal after the verdict does not hide its code."""
+    interrupt_on_signals()
+    code = _run(None)
+    ignore_signals()
+    sys.exit(code)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     _fill_closed_streams()
-    arguments = _parser().parse_args(argv)
+    _print_whatever_comes()
+    code = 0
     try:
-        code = arguments.run(arguments)
+        arguments = _parser().parse_args(argv)
+        code = int(arguments.run(arguments))
         sys.stdout.flush()
-        return int(code)
     except EhadiagError as error:
-        print(f"ehadiag: {error}", file=sys.stderr)
+        say(str(error))
         return error.exit_code
     except BrokenPipeError:
-        # Whoever read our output has gone; what is left of it must not raise again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return BROKEN_PIPE
+        # Whoever read our output has gone.
+        abandon(sys.stdout)
+        return max(code, InputOutputError.exit_code)
     except OSError as error:
-        print(f"ehadiag: standard output: {error.strerror or error}", file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return InputOutputError.exit_code
+        abandon(sys.stdout)
+        say(f"{error.filename or 'standard output'}: {error.strerror or error}")
+        return max(code, InputOutputError.exit_code)
     except KeyboardInterrupt:
-        print("ehadiag: interrupted", file=sys.stderr)
+        say("interrupted")
         return INTERRUPTED
+    return code
+
+
+def _print_whatever_comes() -> None:
+    """Let a name that the terminal's encoding lacks be printed as numbers, not end the program."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _fill_closed_streams() -> None:
@@ -85,4 +110,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    process()

@@ -32,6 +32,8 @@ __all__ = [
 ]
 
 DEFAULT_BAUD = 921600
+TIME_LIMIT_S = 600.0
+"""Some ten thousand times what a sound recording takes."""
 
 
 def add_actuator_options(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +54,7 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
-    """Add solver, seed, levels and output."""
+    """Add solver, seed, levels, time limit and output."""
     parser.add_argument(
         "--solver",
         choices=("cga", "pygad"),
@@ -79,6 +81,14 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         default=0.75,
         metavar="K",
         help="FAULT at or above this fault constant (default 0.75)",
+    )
+    parser.add_argument(
+        "--time-limit",
+        type=positive,
+        default=TIME_LIMIT_S,
+        metavar="S",
+        help="NOT TESTED where the identification takes longer, wall clock"
+        f" (default {TIME_LIMIT_S:g})",
     )
     parser.add_argument(
         "--json",

@@ -6,6 +6,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.core.printable import valid_text
 from ehadiag.model.parameters import FAULT_NAMES
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
         "actuator": diagnosis.actuator.name,
         "serial": serials[0] if serials else None,
         "verdict": diagnosis.verdict.name,
-        "reasons": list(diagnosis.reasons),
+        "reasons": [valid_text(reason) for reason in diagnosis.reasons],
         "faults": _faults(diagnosis),
         "fit": _fit(diagnosis),
         "quality": _quality(diagnosis),
@@ -55,12 +56,12 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
             "after_test": None if spent.after_test is None else _rounded(spent.after_test),
         },
     }
-    return json.dumps(tree, allow_nan=False, ensure_ascii=False)
+    return json.dumps(tree, allow_nan=False)
 
 
 def source_name(diagnosis: Diagnosis) -> str:
-    """File or bus; several joined by ' + '."""
-    return " + ".join(recording.source for recording in diagnosis.recordings)
+    r"""File or bus; several joined by ' + '; bytes that are not UTF-8 are written as `\xff`."""
+    return " + ".join(valid_text(recording.source) for recording in diagnosis.recordings)
 
 
 def test_name(diagnosis: Diagnosis) -> str | None:
@@ -122,7 +123,7 @@ def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
         "foreign": sum(recording.quality.foreign for recording in diagnosis.recordings),
         "error_frames": sum(recording.quality.error_frames for recording in diagnosis.recordings),
         "saturated": saturated,
-        "notes": list(diagnosis.notes),
+        "notes": [valid_text(note) for note in diagnosis.notes],
     }
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import warnings
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -11,23 +14,27 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
 from ehadiag.model.scalar.response import respond
 
-__all__ = ["draw_diagnosis"]
+__all__ = ["diagnosis_figure", "draw_diagnosis"]
 
 MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
 
 
-def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
-    """Write a PNG: one column for each recording; current, spool, pressure and their gaps.
+def draw_diagnosis(diagnosis: Diagnosis) -> bytes:
+    """Return a PNG: one column for each recording; current, spool, pressure and their gaps."""
+    out = io.BytesIO()
+    with matplotlib.rc_context(matplotlib.rcParamsDefault), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # in names of others
+        diagnosis_figure(diagnosis).savefig(out, format="png", dpi=110)
+    return out.getvalue()
 
-    Raises
-    ------
-    InputOutputError: the file cannot be written.
-    """
+
+def diagnosis_figure(diagnosis: Diagnosis) -> Figure:
+    """Return the figure of which `draw_diagnosis` makes a PNG."""
     found = diagnosis.identification
     if found is None:
         raise ValueError("nothing was identified, so there is no modelled response to draw")
@@ -43,14 +50,13 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
         f"{item.name} {item.value:.5f} ({item.interval95[0]:.5f} … {item.interval95[1]:.5f})"
         for item in found.estimates
     )
-    names = " + ".join(Path(recording.source).name for recording in diagnosis.recordings)
+    names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
     figure.suptitle(
-        f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}", fontsize=11
+        f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}",
+        fontsize=11,
+        parse_math=False,  # names of others are no formulae
     )
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+    return figure
 
 
 def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:
@@ -59,7 +65,7 @@ def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification
     model = respond(experiment.constants, faults, experiment.trace.current, experiment.tick)
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
-    axes[0].set_title(f"test {experiment.test.name!r}", fontsize=10)
+    axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
     _pair(axes[1], axes[2], time, experiment.spool * 1e3, model.spool * 1e3, "spool, mm", "µm", 1e3)
     _pair(
         axes[3],

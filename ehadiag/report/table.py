@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ehadiag.assess.verdict import Verdict
+from ehadiag.core.printable import printable
 from ehadiag.model.parameters import FAULTS
 from ehadiag.report.json_line import source_name, test_name
 
@@ -32,23 +33,25 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent) -> Non
     verdict = diagnosis.verdict
     head = Text()
     head.append(verdict.name.replace("_", " "), style=STYLES[verdict])
-    head.append(f"  {source_name(diagnosis)}")
+    head.append(f"  {printable(source_name(diagnosis))}")
     console.print(head, soft_wrap=True)
     serial = f", serial {serials[0]}" if serials else ""
-    console.print(
-        f"  test {test_name(diagnosis) or 'unknown'}, actuator {diagnosis.actuator.name}{serial}",
-        soft_wrap=True,
-        highlight=False,
-    )
+    test = test_name(diagnosis) or "unknown"
+    _line(console, f"test {test}, actuator {diagnosis.actuator.name}{serial}")
     for reason in diagnosis.reasons:
-        console.print(f"  - {reason}", soft_wrap=True, highlight=False)
+        _line(console, f"- {reason}")
     if diagnosis.identification is not None:
         console.print(_constants(diagnosis), crop=False)
-    console.print(f"  {_quality(diagnosis)}", soft_wrap=True, highlight=False)
+    _line(console, _quality(diagnosis))
     for note in diagnosis.notes:
-        console.print(f"  note: {note}", soft_wrap=True, highlight=False)
+        _line(console, f"note: {note}")
     if diagnosis.identification is not None:
-        console.print(f"  {_effort(diagnosis, spent)}", soft_wrap=True, highlight=False)
+        _line(console, _effort(diagnosis, spent))
+
+
+def _line(console: Console, text: str) -> None:
+    """Print a line as it is: what others named is neither markup nor a terminal's command."""
+    console.print(f"  {printable(text)}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _constants(diagnosis: Diagnosis) -> Table:

@@ -7,18 +7,17 @@ what it found in a file is kept, as JSON under a hash of the file's bytes.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import version
 from itertools import islice
-from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 
-from ehadiag.core.cache_folder import private_folder
+from ehadiag.core.cache_folder import private_folder, tell
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.folder import Folder
 
 __all__ = ["MAX_DBC_BYTES", "DbcMessage", "DbcSignal", "parse_dbc", "recall_dbc"]
 
@@ -66,16 +65,18 @@ DECODER = msgspec.json.Decoder(Dbc)
 
 def recall_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
     """`parse_dbc`, from the cache if the same bytes were read before."""
-    folder = private_folder("dbc") if len(text) <= MAX_DBC_BYTES else None
+    if len(text) > MAX_DBC_BYTES:
+        return parse_dbc(text, name)  # which refuses it
+    folder = private_folder("dbc")
     if folder is None:
         return parse_dbc(text, name)
-    key = hashlib.sha256(f"{FORM} {version('cantools')} ".encode() + text).hexdigest()
-    path = folder / f"{key}.json"
-    kept = _read(path)
-    if kept is None:
-        kept = parse_dbc(text, name)
-        _keep(kept, path)
-    return kept
+    with folder:
+        key = hashlib.sha256(f"{FORM} {version('cantools')} ".encode() + text).hexdigest()
+        kept = _read(folder, f"{key}.json")
+        if kept is None:
+            kept = parse_dbc(text, name)
+            _keep(kept, folder, f"{key}.json")
+        return kept
 
 
 def parse_dbc(text: bytes, name: str) -> Dbc:
@@ -142,25 +143,27 @@ def _number(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def _read(path: Path) -> Dbc | None:
+def _read(folder: Folder, name: str) -> Dbc | None:
     """Return what is kept; None if there is nothing, or nothing that can be read."""
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_KEPT_BYTES)
-        return DECODER.decode(content)
+        return DECODER.decode(folder.read(name, MAX_KEPT_BYTES))
+    except FileNotFoundError:
+        return None
     except (OSError, msgspec.DecodeError, RecursionError):
+        tell(f"cache folder {folder.path}: what was kept of a DBC is damaged; read again")
         return None
 
 
-def _keep(found: Dbc, path: Path) -> None:
+def _keep(found: Dbc, folder: Folder, name: str) -> None:
     """Write to the cache if that is possible, and gives the same when it is read."""
     content = msgspec.json.encode(found)
-    draft = path.with_suffix(f".{os.getpid()}")
-    with suppress(OSError, msgspec.DecodeError):
+    with suppress(msgspec.DecodeError):
         if len(content) >= MAX_KEPT_BYTES or DECODER.decode(content) != found:
             return
-        draft.write_bytes(content)
-        draft.replace(path)
-        by_age = sorted(path.parent.iterdir(), key=lambda item: item.stat().st_mtime, reverse=True)
-        for old in islice(by_age, MAX_KEPT, None):
-            old.unlink()
+        try:
+            folder.write(name, content, synced=False)
+            by_age = sorted(folder.names(), key=folder.changed_at, reverse=True)
+            for old in islice(by_age, MAX_KEPT, None):
+                folder.remove(old)
+        except OSError as error:
+            tell(f"cache folder {folder.path}: {error.strerror or error}; the DBC is not kept")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
+import threading
 import time
-from contextlib import ExitStack
-from dataclasses import replace
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,17 +15,13 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
 from ehadiag.cli.ahead import working_ahead
 from ehadiag.cli.beforehand import refuse_beforehand
-from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import (
-    load_report,
-    make_folder,
-    progress_bar,
-    say,
-    say_if_compiling,
-    show,
-    write_report,
-)
+from ehadiag.cli.deadline import Deadline
+from ehadiag.cli.interrupt import interrupt_on_signals, stop_on_signals
+from ehadiag.cli.output import progress_bar, say, say_if_compiling
+from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.errors import NotTestedError
+from ehadiag.core.printable import plain_name
 from ehadiag.core.recording import Environment, Outcome, Quality, Recording
 from ehadiag.core.stored_test import StoredTest, resolve_test
 from ehadiag.report.spent import Spent
@@ -32,10 +30,13 @@ if TYPE_CHECKING:
     from ehadiag.assess.online import OnlineIdentification
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.mapping.bus_map import BusMap
-    from firmware_iface.session.tester import Progress
+    from firmware_iface.session.tester import Progress, TesterOutcome
     from firmware_iface.transport.interface import Transport
 
 __all__ = ["add_parser", "run"]
+
+STOPPED = "stopped by the user"
+STOPPED_TWICE = "stopped by the user; the abort was requested, its answer not waited for"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -115,31 +116,56 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Before the test: a verdict must not wait for the compiler.
     warm_up(actuator, test)
-    load_report(arguments)
+    results = Results(arguments, folder)
+    results.load()
     begin = time.perf_counter()
     solver = make_solver(arguments.solver)
     online = OnlineIdentification(test, actuator, solver=solver, seed=arguments.seed)
-    recording, why, stem, ended_at = _acquire(arguments, actuator, test, bus_map, folder, online)
-    read_s = time.perf_counter() - begin
-    if why:
-        result = not_tested(recording, test, actuator, [why])
-    else:
-        with progress_bar() as progress:
-            result = diagnose(
-                [recording],
-                actuator,
-                [test],
-                default=test,
-                levels=levels,
-                solver=solver,
-                seed=arguments.seed,
-                progress=progress,
-                memory=online.memory,
-            )
-    timing = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
-    show(result, arguments, timing)
-    write_report(result, stem, arguments, timing)
-    return int(result.verdict)
+    with stop_on_signals() as stop:
+        heard = _acquire(arguments, actuator, test, bus_map, folder.path, online, stop)
+        read_s = time.perf_counter() - begin
+        recordings, why = [heard.recording], heard.why
+        try:
+            interrupt_on_signals()
+            if stop.is_set() and not why:
+                raise KeyboardInterrupt
+            if not why:
+                with progress_bar() as progress:
+                    result = diagnose(
+                        recordings,
+                        actuator,
+                        [test],
+                        default=test,
+                        levels=levels,
+                        solver=solver,
+                        seed=arguments.seed,
+                        progress=heard.deadline.watch(progress),
+                        memory=online.memory,
+                    )
+        except KeyboardInterrupt:
+            why = STOPPED
+        except NotTestedError as error:
+            why = str(error)
+        if why:
+            result = not_tested(recordings, [test], actuator, [why])
+        ended_at = heard.ended_at
+        spent = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
+        return results.deliver(result, spent, heard.name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Heard:
+    """What came of a test on the bus."""
+
+    recording: Recording
+    why: str
+    """Why it is none; empty where it is one."""
+    name: str
+    """Of the recording's file, without suffix."""
+    ended_at: float | None
+    """When the word came that the test is complete, on `time.perf_counter`."""
+    deadline: Deadline
+    """Of the identification."""
 
 
 def _acquire(
@@ -149,11 +175,9 @@ def _acquire(
     bus_map: BusMap,
     folder: Path,
     online: OnlineIdentification,
-) -> tuple[Recording, str, Path, float | None]:
-    """Run the test on the bus.
-
-    Returns the recording, why it is not one, the files' stem, and when the test was complete.
-    """
+    stop: threading.Event,
+) -> _Heard:
+    """Run the test on the bus."""
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.session.limits import Limits  # noqa: PLC0415
     from firmware_iface.session.tester import run_test  # noqa: PLC0415
@@ -161,10 +185,11 @@ def _acquire(
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
     assembler = Assembler(str(path), bus_map)
+    outcome = None
     with working_ahead(online, assembler, test) as ahead:
-        with ExitStack() as stack:
+        # The second signal: an abort has been requested, nobody waits for the answer.
+        with suppress(KeyboardInterrupt), ExitStack() as stack:
             ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
-            stop = stack.enter_context(stop_on_signals())
             say(f"test {test.name!r} on {ours.name}, recording to {path}")
             display = stack.enter_context(progress_bar())
 
@@ -191,22 +216,27 @@ def _acquire(
                 all_there=ahead.all_there,
             )
             listened = time.monotonic() - began
+        deadline = Deadline(arguments.time_limit)
         if ahead.whole is not None:
             recording = ahead.whole
         else:
-            recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
-        if recording.serial is None:
-            recording = replace(recording, serial=outcome.serial)
-        if outcome.degraded:
-            say(outcome.degraded)
-        why = outcome.why
-        if outcome.complete:
-            ahead.finish()
-        else:
+            recording = assembler.recording() if len(assembler) else _empty(path, outcome)
+        if outcome is None:
             ahead.abandon()
-            why += _what_was_heard(recording, ours.name, listened)
-    stem = path.with_suffix("") if not arguments.record else folder / path.stem
-    return recording, why, stem, ahead.ended_at
+            why = STOPPED if arguments.listen else STOPPED_TWICE
+        else:
+            if recording.serial is None:
+                recording = replace(recording, serial=outcome.serial)
+            why = outcome.why
+            if outcome.degraded:
+                say(outcome.degraded)
+            if not outcome.complete:
+                ahead.abandon()
+                why += _what_was_heard(recording, ours.name, listened)
+            elif not ahead.finish(deadline, stop):
+                ahead.abandon()
+                why = "" if stop.is_set() else deadline.reason("work ahead")
+    return _Heard(recording, why, path.stem, ahead.ended_at, deadline)
 
 
 def _connect(
@@ -256,13 +286,14 @@ def _unused(folder: Path, test: str, stamp: str) -> Path:
     number = 1
     while True:
         suffix = f"-{number}" if number > 1 else ""
-        path = folder / f"{stamp}-{Path(test).name}{suffix}.blf"
-        if not path.exists():
+        path = folder / f"{stamp}-{plain_name(test)}{suffix}.blf"
+        if not os.path.lexists(path):
             return path
         number += 1
 
 
-def _empty(path: Path, outcome: Outcome) -> Recording:
+def _empty(path: Path, came: TesterOutcome | None) -> Recording:
+    outcome = Outcome() if came is None else came.outcome
     return Recording(str(path), None, None, None, outcome, Environment(), Quality())
 
 

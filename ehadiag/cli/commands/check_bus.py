@@ -7,7 +7,7 @@ import time
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import progress_bar
+from ehadiag.cli.output import progress_bar, put
 
 __all__ = ["add_parser", "run"]
 
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.log is not None:
         table = read_frames(arguments.log)
-        print(f"log {arguments.log}")
+        put(f"log {arguments.log}")
     else:
         with (
             options.open_transport(arguments, transmit=False) as transport,
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
                 display("listening", (time.monotonic() - begin) / arguments.duration)
             listened = time.monotonic() - begin
         table = collected.table()
-        print(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
+        put(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
     report = report_bus(table, bus_map)
-    print(render(report))
+    put(render(report))
     return NOT_USABLE if report.problems else 0

@@ -39,7 +39,7 @@ class Diagnoser:
         """Run a case from request to verdict."""
         came = run(case, test=self.test, at=STRIKE)
         if not came.outcome.complete:
-            why = not_tested(came.recording, self.test, default_actuator(), [came.outcome.why])
+            why = not_tested([came.recording], [self.test], default_actuator(), [came.outcome.why])
             return Judged(came, why)
         return Judged(came, self.diagnose(came.recording))
 
