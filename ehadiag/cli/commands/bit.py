@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
-from ehadiag.cli.ahead import working_ahead
+from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.cli.beforehand import refuse_beforehand
 from ehadiag.cli.deadline import Deadline
 from ehadiag.cli.interrupt import interrupt_on_signals, stop_on_signals
@@ -233,10 +233,17 @@ def _acquire(
             if not outcome.complete:
                 ahead.abandon()
                 why += _what_was_heard(recording, ours.name, listened)
-            elif not ahead.finish(deadline, stop):
+            elif not _finished(ahead, deadline, stop):
                 ahead.abandon()
-                why = "" if stop.is_set() else deadline.reason("work ahead")
+                why = deadline.reason("work ahead") if deadline.passed else STOPPED
     return _Heard(recording, why, path.stem, ahead.ended_at, deadline)
+
+
+def _finished(ahead: Ahead, deadline: Deadline, stop: threading.Event) -> bool:
+    """Wait for what runs ahead; a signal or the time limit ends the wait."""
+    with suppress(KeyboardInterrupt):
+        return ahead.finish(deadline, stop)
+    return False
 
 
 def _connect(

@@ -14,6 +14,7 @@ from places import LOGS
 from ehadiag.assess.acceptance import nothing_is_under_way
 from ehadiag.assess.online import OnlineIdentification
 from ehadiag.cli.ahead import Ahead, working_ahead
+from ehadiag.cli.deadline import Deadline
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import BitState, Recording
 from ehadiag.core.stored_test import resolve_test
@@ -61,7 +62,7 @@ def test_stages_run_when_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
         for tenth in range(54):
             ahead.watch(Progress(Phase.RUNNING, tenth / 10.0, TEST.duration, 0, None))
         assert all(taken.acquire(timeout=60.0) for _ in range(due))
-        ahead.finish()
+        assert ahead.finish(Deadline(60.0), threading.Event())
     assert due == 4
     assert len(online.memory) == 5, "first approximation, three stages of search, refinement"
     assert online.memory.reused == 3 * 5, "the log has all of them at the first of four instants"
@@ -115,7 +116,7 @@ def test_the_end_does_not_wait_for_stale_snapshots(monkeypatch: pytest.MonkeyPat
             join(timeout)
 
         monkeypatch.setattr(ahead._thread, "join", waiting)
-        ahead.finish()
+        assert ahead.finish(Deadline(60.0), threading.Event())
     assert online.taken == [1, 4]
 
 
@@ -124,7 +125,7 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
 ) -> None:
     told: list[str] = []
 
-    def interrupted(_: Ahead) -> None:
+    def interrupted(*_: object) -> bool:
         told.append("finish")
         raise KeyboardInterrupt
 
@@ -135,15 +136,29 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
     leave = Ahead.abandon
     monkeypatch.setattr(Ahead, "finish", interrupted)
     monkeypatch.setattr(Ahead, "abandon", abandon)
-    result = run("bit", "--simulate", "--fast", "--test", "open", "--record", "a.blf")
-    assert (result.code, told) == (130, ["finish", "abandon"])
+    result = run("bit", "--simulate", "--fast", "--json", "--test", "open", "--record", "a.blf")
+    assert (result.code, told) == (30, ["finish", "abandon"])
+    assert result.objects[0]["reasons"] == ["stopped by the user"]
+
+
+def test_the_wait_for_what_runs_ahead_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    online: Any = Blocked()
+    assembler: Any = Numbered()
+    with working_ahead(online, assembler, TEST) as ahead:
+        watched(ahead, online)
+        assert not ahead.finish(Deadline(0.01), threading.Event())
+        stop = threading.Event()
+        stop.set()
+        assert not ahead.finish(Deadline(60.0), stop)
+        ahead.abandon()
+    online.go_on.set()
 
 
 def test_a_test_that_is_all_there_needs_no_more_listening() -> None:
     online = OnlineIdentification(TEST, default_actuator())
     with working_ahead(online, heard("paper-open-1.blf"), TEST) as ahead:
         assert ahead.all_there()
-        ahead.finish()
+        assert ahead.finish(Deadline(60.0), threading.Event())
     assert ahead.whole is not None
     assert ahead.whole.outcome.state is BitState.COMPLETE
     assert ahead.ended_at is not None

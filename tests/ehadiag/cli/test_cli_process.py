@@ -15,7 +15,7 @@ import pytest
 from cli_result import COMMAND, REPOSITORY
 from places import LOGS
 
-from ehadiag.compile.kernels import cache_folder
+from ehadiag.compile.kernel_cache import cache_folder
 from ehadiag.core.recording import BitState
 from firmware_iface.logs.reader import read_recording
 
