@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import itertools
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -90,7 +91,7 @@ class Results:
                 written.append(f"{stem}.json")
             with _said(codes):
                 self._print(diagnosis, line, spent)
-            if stem is not None and diagnosis.identification is not None and not came.is_set():
+            if stem is not None and _can_be_drawn(diagnosis) and not came.is_set():
                 with _said(codes):
                     self._draw(diagnosis, f"{stem}.png")
                     written.append(f"{stem}.png")
@@ -148,6 +149,12 @@ class Results:
         except OSError as error:
             place = self._folder.path / name
             raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
+
+
+def _can_be_drawn(diagnosis: Diagnosis) -> bool:
+    """Whether there is a modelled response, of numbers."""
+    found = diagnosis.identification
+    return found is not None and all(math.isfinite(item.value) for item in found.estimates)
 
 
 @contextlib.contextmanager

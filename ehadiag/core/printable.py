@@ -4,8 +4,8 @@ from __future__ import annotations
 
 __all__ = ["plain_name", "printable", "printable_lines", "valid_text"]
 
-LONGEST_NAME = 120
-"""Characters; at most four bytes each, with room for a number and a suffix in the usual 255."""
+LONGEST_NAME = 200
+"""Bytes: room for a number and a suffix in the usual 255."""
 NOT_IN_NAMES = '/\\:*?"<>|'
 """The separators of paths, and what some file systems refuse."""
 ESCAPED_BYTES = range(0xDC80, 0xDD00)
@@ -39,7 +39,8 @@ def plain_name(text: str) -> str:
     """
     kept = "".join(
         item if item.isprintable() and item not in NOT_IN_NAMES else "_" for item in text
-    )[:LONGEST_NAME].strip()
+    )
+    kept = kept.encode()[:LONGEST_NAME].decode(errors="ignore").strip()
     return f"_{kept.lstrip('.-')}" if kept[:1] in ("", ".", "-") else kept
 
 

@@ -56,7 +56,7 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
             "after_test": None if spent.after_test is None else _rounded(spent.after_test),
         },
     }
-    return json.dumps(tree, allow_nan=False)
+    return json.dumps(_finite(tree), allow_nan=False)
 
 
 def source_name(diagnosis: Diagnosis) -> str:
@@ -93,8 +93,8 @@ def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
         return None
     fit = diagnosis.identification.fit
     return {
-        "spool_rms": _finite(fit.spool_rms),
-        "pressure_rms": _finite(fit.pressure_rms),
+        "spool_rms": fit.spool_rms,
+        "pressure_rms": fit.pressure_rms,
         "outliers": fit.outliers,
         "spool_noise_mm": fit.spool_noise * 1e3,
         "pressure_noise_MPa": fit.pressure_noise * 1e-6,
@@ -131,5 +131,10 @@ def _rounded(seconds: float) -> float:
     return round(seconds, 4)
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(node: Any) -> Any:
+    """Put null in the place of numbers that are none: JSON has no others."""
+    if isinstance(node, dict):
+        return {key: _finite(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_finite(value) for value in node]
+    return None if isinstance(node, float) and not math.isfinite(node) else node
