@@ -7,7 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli_result import COMMAND
 from places import LOGS
+
+from ehadiag.compile.kernel_cache import kept_kernels
 
 SHOW = """
 import sys
@@ -22,8 +25,6 @@ sys.exit(code)
 BUSES = {"can", "cantools", "serial", "asammdf", "pandas"}
 REPORTS = {"matplotlib"}
 NUMERICS = {"scipy.linalg", "scipy.optimize", "scipy.special", "scipy.stats", "pygad"}
-COMPILER_TABLES = {"numba.np.arraymath", "numba.np.npyimpl", "numba.np.linalg"}
-"""What numba loads once it compiles: a kernel that needs them was not cached, or inlines them."""
 
 
 def loaded(arguments: list[str], environment: dict[str, str]) -> set[str]:
@@ -51,16 +52,42 @@ def test_what_needs_no_model_loads_no_compiler(
 
 
 @pytest.mark.parametrize("name", ["paper-open-1.blf", "paper-closed-1.blf"])
-def test_diagnosis_of_a_recording_loads_neither_bus_nor_compiler(
-    name: str, environment: dict[str, str]
-) -> None:
+def test_diagnosis_of_a_recording_loads_no_bus(name: str, environment: dict[str, str]) -> None:
     command = ["diagnose", "--json", str(LOGS / name)]
     loaded(command, environment)  # the first one may have to read the DBC
     found = loaded(command, environment)
     assert {"numba", "ehadiag.identify.pipeline"} <= found
-    assert not found & (BUSES | REPORTS | NUMERICS | COMPILER_TABLES | {"rich"})
+    assert not found & (BUSES | REPORTS | NUMERICS | {"rich"})
 
 
 def test_a_picture_does_load_what_draws_it(environment: dict[str, str], tmp_path: Path) -> None:
     log = str(LOGS / "healthy-open.blf")
     assert loaded(["diagnose", "--out", str(tmp_path), log], environment) > REPORTS
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["diagnose", "--json", str(LOGS / "paper-open-1.blf"), str(LOGS / "paper-closed-1.blf")],
+        ["diagnose", "--json", "--solver", "pygad", str(LOGS / "paper-open-1.blf")],
+        ["bit", "--json", "--simulate", "--fast", "--test", "closed"],
+    ],
+)
+def test_after_warmup_nobody_waits_for_the_compiler(
+    command: list[str], environment: dict[str, str], tmp_path: Path
+) -> None:
+    """A kernel that is compiled is kept; so what is kept afterwards is what was compiled."""
+    before = set(kept_kernels())
+    assert before
+    done = subprocess.run(
+        [*COMMAND, *command],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode in (0, 10), done.stderr
+    assert "compil" not in done.stderr
+    assert set(kept_kernels()) == before

@@ -90,7 +90,7 @@ def test_what_takes_the_folders_place_is_not_written_to(folder: Folder, tmp_path
 def test_a_folder_that_is_a_link_is_not_opened(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    with pytest.raises(OSError, match="Not a directory|symbolic links"):
+    with pytest.raises(OSError, match=r"Not a directory|symbolic links"):
         Folder.at(tmp_path / "link", RESULT_MODE)
     with Folder.at(tmp_path / "link", RESULT_MODE, follow=True) as folder:
         assert folder.names() == []
@@ -129,7 +129,7 @@ def test_a_failed_write_leaves_what_was_there(
         def __exit__(self, *_: object) -> None:
             self.file.close()
 
-    monkeypatch.setattr(folder_module, "open", lambda *a: Full(open(*a)), raising=False)
+    monkeypatch.setattr(folder_module, "open", lambda *a: Full(os.fdopen(*a)), raising=False)
     monkeypatch.setattr(os, "fsync", fail)
     if call == "fsync" and write is WRITES[1]:
         write(folder)  # does not wait for the disk
