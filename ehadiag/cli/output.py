@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -23,9 +24,9 @@ __all__ = [
     "emit",
     "progress_bar",
     "put",
+    "rendered",
     "say",
     "say_if_compiling",
-    "wide_console",
 ]
 
 LEAST_WIDTH = 100
@@ -88,14 +89,29 @@ def say_if_compiling(*, simulation: bool = False, identification: bool = True) -
         say(f"compiling the model's kernels, {often} (up to half a minute)")
 
 
-def wide_console() -> Console:
-    """Standard output wide enough for our tables: a pipe must not cut them."""
+def rendered(draw: Callable[[Console], None]) -> str:
+    """Return what is drawn on a console like standard output's, for `emit`.
+
+    Wide enough for our tables: a pipe must not cut them. Not written by the console itself, which
+    ends the program where a pipe is closed.
+    """
     from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
 
-    console = Console(highlight=False)
-    width = max(console.width, LEAST_WIDTH) if console.is_terminal else PIPE_WIDTH
+    there = Console()
+    width = max(there.width, LEAST_WIDTH) if there.is_terminal else PIPE_WIDTH
+    out = io.StringIO()
     # Names of others are no markup.
-    return Console(highlight=False, markup=False, emoji=False, width=width)
+    draw(
+        Console(
+            file=out,
+            force_terminal=there.is_terminal,
+            highlight=False,
+            markup=False,
+            emoji=False,
+            width=width,
+        )
+    )
+    return out.getvalue()
 
 
 @contextmanager

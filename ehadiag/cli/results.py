@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.cli.interrupt import keep_signals
-from ehadiag.cli.output import emit, say, wide_console
+from ehadiag.cli.output import emit, rendered, say
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import plain_name
@@ -67,7 +67,7 @@ class Results:
         else:
             import ehadiag.report.table  # noqa: F401, PLC0415
 
-            wide_console()
+            rendered(lambda _: None)
 
     def deliver(self, diagnosis: Diagnosis, spent: Spent, name: str) -> int:
         """Write and print one result; return its exit code.
@@ -106,11 +106,7 @@ class Results:
             return
         from ehadiag.report.table import print_diagnosis  # noqa: PLC0415
 
-        # Not by the console itself: it ends the program where a pipe is closed.
-        console = wide_console()
-        with console.capture() as text:
-            print_diagnosis(diagnosis, console, spent)
-        emit(text.get())
+        emit(rendered(lambda console: print_diagnosis(diagnosis, console, spent)))
 
     def _write_json(self, line: str, wanted: str) -> str | None:
         """Write the object under the first name that no other recording's result has."""
