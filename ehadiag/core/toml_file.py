@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.input_file import read_file
+from ehadiag.core.small_file import read_small_file
 
 __all__ = ["MAX_BYTES", "decode_toml", "read_toml"]
 
@@ -20,6 +20,7 @@ MAX_BYTES = 256 << 10
 MAX_DOTS = 50
 """In a line, besides those of numbers: the parser's work grows with the square of a key's parts."""
 NUMBER = re.compile(rb"\d\.\d[\d_]*(?:[eE][+-]?\d+)?(?=[\s,\]}]|$)")
+PLACE = re.compile(r"\(at line (\d+), column (\d+)\)$")
 
 T = TypeVar("T")
 
@@ -29,10 +30,10 @@ def read_toml(path: Path, kind: type[T], what: str) -> T:
 
     Raises
     ------
-    InputOutputError: the file cannot be read.
+    InputOutputError: the file cannot be read, or is no regular file.
     ConfigurationError: too large, not TOML, or not what `kind` demands.
     """
-    return decode_toml(read_file(path, what, MAX_BYTES + 1), kind, f"{what} {path}")
+    return decode_toml(read_small_file(path, MAX_BYTES, what), kind, f"{what} {path}")
 
 
 def decode_toml(text: bytes, kind: type[T], where: str) -> T:
@@ -48,7 +49,7 @@ def decode_toml(text: bytes, kind: type[T], where: str) -> T:
     except msgspec.ValidationError as error:
         raise ConfigurationError(f"{where}: {_one_line(error)}") from None
     except (ValueError, RecursionError) as error:  # a number may have too many digits
-        raise ConfigurationError(f"{where}: not valid TOML: {_one_line(error)}") from None
+        raise ConfigurationError(f"{where}: not valid TOML{_place(error)}") from None
 
 
 def _refuse_non_finite(node: Any, where: str, at: str) -> None:
@@ -60,6 +61,12 @@ def _refuse_non_finite(node: Any, where: str, at: str) -> None:
             _refuse_non_finite(value, where, f"{at}[{index}]")
     elif isinstance(node, float) and not math.isfinite(node):
         raise ConfigurationError(f"{where}: a finite number is needed at {at}, not {node}")
+
+
+def _place(error: Exception) -> str:
+    """Where the parser stumbled, without a word of what stands there: it may be any file."""
+    found = PLACE.search(str(error))
+    return f" at line {found[1]}, column {found[2]}" if found else ""
 
 
 def _one_line(error: Exception) -> str:
