@@ -7,9 +7,10 @@ import math
 import os
 from typing import TYPE_CHECKING, Any
 
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+from ehadiag.core.stored_test import StoredTest
+from ehadiag.facade import inputs
 
 if TYPE_CHECKING:
     from firmware_iface.mapping.bus_map import BusMap
@@ -195,27 +196,19 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    return load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    return inputs.the_actuator(arguments.actuator or None)
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
-
-    if arguments.mapping:
-        return load_map(arguments.mapping, arguments.dbc)
-    if arguments.dbc:
+    if arguments.dbc and not arguments.mapping:
         raise ConfigurationError("--dbc: needs --mapping, which names the signals")
-    return default_map()
+    return inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
 
 
 def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
     """Return the bundled tests and those of the named files; a file's number wins."""
-    tests = {test.id: test for test in bundled_tests().values()}
-    for name in files:
-        test = resolve_test(name)
-        tests[test.id] = test
-    return tuple(tests.values())
+    return inputs.the_tests(files)
 
 
 def has_bus(arguments: argparse.Namespace) -> bool:
