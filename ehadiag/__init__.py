@@ -79,21 +79,23 @@ _HOMES = {
 """Which module has which name; the imports above tell the same to type checkers and editors."""
 
 
-def __getattr__(name: str) -> object:
-    """Load a public name when it is first used (PEP 562)."""
-    if name == "__version__":
-        from importlib.metadata import version  # noqa: PLC0415 - as lazy as the rest
+if not TYPE_CHECKING:  # or a type checker would take any name for granted
 
-        value: object = version("ehadiag")
-    else:
-        home = next((home for home, names in _HOMES.items() if name in names), None)
-        if home is None:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from importlib import import_module  # noqa: PLC0415
+    def __getattr__(name: str) -> object:
+        """Load a public name when it is first used (PEP 562)."""
+        if name == "__version__":
+            from importlib.metadata import version  # noqa: PLC0415 - as lazy as the rest
 
-        value = getattr(import_module(home), name)
-    globals()[name] = value
-    return value
+            value: object = version("ehadiag")
+        else:
+            home = next((home for home, names in _HOMES.items() if name in names), None)
+            if home is None:
+                raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+            from importlib import import_module  # noqa: PLC0415
+
+            value = getattr(import_module(home), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -28,7 +28,7 @@ def modules_after(code: str, *, besides: str = "") -> set[str]:
 
 def test_what_runs_and_what_type_checkers_see_are_the_same_names() -> None:
     tree = ast.parse((ROOT / "ehadiag" / "__init__.py").read_text(encoding="utf-8"))
-    (typed,) = (node for node in tree.body if isinstance(node, ast.If))
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
     seen = {
         node.module: tuple(alias.name for alias in node.names)
         for node in typed.body
