@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
+from ehadiag.facade.compiling import log_if_compiling
 from ehadiag.facade.inputs import PathLike, the_actuator, the_bus_map, the_test, the_tests
 from ehadiag.report.spent import Spent
 
@@ -99,6 +100,7 @@ def simulate(
         known = ", ".join(item.name for kind in given for item in fields(kind))
         raise TypeError(f"simulate: no condition {', '.join(conditions)}; there are {known}")
     stored = the_test(test)
+    log_if_compiling(simulation=True, identification=False)
     done = run(the_actuator(actuator), stored, *suffered, seed=seed)
     return done.recording(f"simulated {stored.name}")
 
@@ -163,6 +165,7 @@ def diagnose(
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
 
     made = make_solver(solver) if isinstance(solver, str) else solver
+    log_if_compiling()
     diagnosis = run(
         found,
         chosen,

@@ -16,6 +16,7 @@ from places import LOGS, ROOT
 import ehadiag
 from ehadiag.assess.diagnosis import diagnose as core_diagnose
 from ehadiag.cli.main import main
+from ehadiag.facade.compiling import NOTICE, log_if_compiling
 from ehadiag.identify.search.solvers import CompactGa
 from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
@@ -229,3 +230,17 @@ def test_conditions_that_there_are_not() -> None:
         ehadiag.simulate(FSS=1.5)
     with pytest.raises(ehadiag.ConfigurationError, match="test 'opne'"):
         ehadiag.simulate("opne")
+
+
+def test_who_will_wait_for_the_compiler_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("ehadiag.compile.kernels.cache_folder", lambda: tmp_path)
+    log_if_compiling()
+    assert caplog.messages == [f"ehadiag: {NOTICE}"]
+    caplog.clear()
+    (tmp_path / "stages.ehadiag_identify.nbi").touch()
+    log_if_compiling()
+    assert caplog.messages == []
+    log_if_compiling(simulation=True)
+    assert caplog.messages == [f"ehadiag: {NOTICE}"]
