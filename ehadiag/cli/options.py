@@ -7,10 +7,9 @@ import math
 import os
 from typing import TYPE_CHECKING, Any
 
-from ehadiag.core.actuator import Actuator
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.stored_test import StoredTest
-from ehadiag.facade import inputs
+from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 
 if TYPE_CHECKING:
     from firmware_iface.mapping.bus_map import BusMap
@@ -196,19 +195,27 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    return inputs.the_actuator(arguments.actuator or None)
+    return load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    if arguments.dbc and not arguments.mapping:
+    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
+
+    if arguments.mapping:
+        return load_map(arguments.mapping, arguments.dbc)
+    if arguments.dbc:
         raise ConfigurationError("--dbc: needs --mapping, which names the signals")
-    return inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
+    return default_map()
 
 
 def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
     """Return the bundled tests and those of the named files; a file's number wins."""
-    return inputs.the_tests(files)
+    tests = {test.id: test for test in bundled_tests().values()}
+    for name in files:
+        test = resolve_test(name)
+        tests[test.id] = test
+    return tuple(tests.values())
 
 
 def has_bus(arguments: argparse.Namespace) -> bool:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.core.errors import InputOutputError
-from ehadiag.facade.compiling import NOTICE, compiling
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,6 +33,8 @@ __all__ = [
 
 LEAST_WIDTH = 100
 PIPE_WIDTH = 200
+IDENTIFICATION, SIMULATION = "ehadiag_identify", "ehadiag_sim"
+"""Packages of kernels, as the names of their cache files hold them."""
 
 
 def say(text: str) -> None:
@@ -48,8 +49,11 @@ def damage(transport: Transport) -> str:
 
 def say_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:
     """Tell that the first run takes longer, where what it needs is not in the cache."""
-    if compiling(simulation=simulation, identification=identification):
-        say(NOTICE)
+    from ehadiag.compile.kernels import cache_folder  # noqa: PLC0415 - loads numba
+
+    needed = [SIMULATION] * simulation + [IDENTIFICATION] * identification
+    if not all(any(cache_folder().glob(f"*{kind}*.nbi")) for kind in needed):
+        say("compiling the model's kernels, once for this installation (up to half a minute)")
 
 
 def wide_console() -> Console:

@@ -92,9 +92,9 @@ class Result:
         """
         if not self.identified:
             raise NotTestedError(f"{self.source}: nothing to plot: {'; '.join(self.reasons)}")
-        from ehadiag.report.picture import picture_of  # noqa: PLC0415 - matplotlib is slow
+        from ehadiag.report.picture import diagnosis_figure  # noqa: PLC0415 - matplotlib is slow
 
-        return picture_of(self.diagnosis)
+        return diagnosis_figure(self.diagnosis)
 
     def __str__(self) -> str:
         """Return the command line's table."""

@@ -1,4 +1,4 @@
-"""The faults of a diagnosis by name, as every report shows them."""
+"""The severities of a diagnosis by the faults' names, as every report shows them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Fault", "faults_of"]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One progressive fault as estimated: 0 as new, 1 at the limit of damage.
+    """Severity of one progressive fault: 0 as new, 1 at the limit of damage.
 
     Where nothing could be identified all numbers are NaN and there are no flags.
     """
@@ -26,7 +26,7 @@ class Fault:
     meaning: str
     """What it is, in two words."""
     value: float
-    """The estimate, after the refinement."""
+    """The estimated severity, after the refinement."""
     std: float
     """Its standard deviation."""
     interval: tuple[float, float]

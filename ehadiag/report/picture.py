@@ -18,7 +18,7 @@ from ehadiag.identify.result import Identification
 from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
 
-__all__ = ["Picture", "draw_diagnosis", "picture_of"]
+__all__ = ["Picture", "diagnosis_figure", "draw_diagnosis"]
 
 MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
 DPI = 110
@@ -41,14 +41,14 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     InputOutputError: the file cannot be written.
     ValueError: nothing was identified.
     """
-    figure = picture_of(diagnosis)
+    figure = diagnosis_figure(diagnosis)
     try:
         figure.savefig(path, dpi=DPI)
     except OSError as error:
         raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
 
 
-def picture_of(diagnosis: Diagnosis) -> Picture:
+def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
     """Draw one column for each recording: current, spool, pressure, and their gaps.
 
     Raises

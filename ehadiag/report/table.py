@@ -53,11 +53,6 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent | None 
     ----------
     spent: around the diagnosis; where nothing is known of it the diagnosis' own time is told.
     """
-
-    def tell(line: str) -> None:
-        # Names come from files and buses: brackets in them are no markup, :words: no emoji.
-        console.print(line, soft_wrap=True, highlight=False, markup=False, emoji=False)
-
     serials = [str(item.serial) for item in diagnosis.recordings if item.serial is not None]
     verdict = diagnosis.verdict
     head = Text()
@@ -65,16 +60,22 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent | None 
     head.append(f"  {source_name(diagnosis)}")
     console.print(head, soft_wrap=True)
     serial = f", serial {serials[0]}" if serials else ""
-    tell(f"  test {test_name(diagnosis) or 'unknown'}, actuator {diagnosis.actuator.name}{serial}")
+    test = test_name(diagnosis) or "unknown"
+    _line(console, f"test {test}, actuator {diagnosis.actuator.name}{serial}")
     for reason in diagnosis.reasons:
-        tell(f"  - {reason}")
+        _line(console, f"- {reason}")
     if diagnosis.identification is not None:
         console.print(_constants(diagnosis), crop=False)
-    tell(f"  {_quality(diagnosis)}")
+    _line(console, _quality(diagnosis))
     for note in diagnosis.notes:
-        tell(f"  note: {note}")
+        _line(console, f"note: {note}")
     if diagnosis.identification is not None:
-        tell(f"  {_effort(diagnosis, spent)}")
+        _line(console, _effort(diagnosis, spent))
+
+
+def _line(console: Console, text: str) -> None:
+    """Print a line as it is: what others named is no markup."""
+    console.print(f"  {text}", soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 def _page() -> Console:
