@@ -40,7 +40,7 @@ def read(
 
     Parameters
     ----------
-    path: BLF, ASC, CSV, TRC, or MF4 (needs `ehadiag[mf4]`).
+    path: BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); also packed as `.gz`.
     mapping: file that says which signals of a DBC are which channels; None: the computer's own bus.
     dbc: DBC to use instead of the mapping's own.
     every: all tests in the log in order of time, not only the last complete one.
