@@ -104,12 +104,14 @@ class Samples:
 
         Returns
         -------
-        frame: index `time`, the start of each tick in s; columns `command`, `current`, `spool`,
+        pandas.DataFrame
+            Index `time`, the start of each tick in s; columns `command`, `current`, `spool`,
             `pressure`, `position` as the arrays hold them: SI, NaN where nothing arrived.
 
         Raises
         ------
-        ImportError: pandas is not installed.
+        ImportError
+            pandas is not installed.
         """
         try:
             import pandas  # noqa: PLC0415 - optional, and slow
@@ -196,10 +198,17 @@ class Recording:
     def to_frame(self) -> pandas.DataFrame:
         """Return the samples as a data frame, see `Samples.to_frame`.
 
+        Returns
+        -------
+        pandas.DataFrame
+            One row a tick.
+
         Raises
         ------
-        NotTestedError: there are no samples.
-        ImportError: pandas is not installed.
+        NotTestedError
+            There are no samples.
+        ImportError
+            pandas is not installed.
         """
         if self.samples is None:
             raise NotTestedError(f"{self.source}: no telemetry of a test in it")

@@ -40,19 +40,26 @@ def read(
 
     Parameters
     ----------
-    path: BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); also packed as `.gz`.
-    mapping: file that says which signals of a DBC are which channels; None: the computer's own bus.
-    dbc: DBC to use instead of the mapping's own.
-    every: all tests in the log in order of time, not only the last complete one.
+    path : PathLike
+        BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); also packed as `.gz`.
+    mapping : BusMap | PathLike | None
+        Which signals of a DBC are which channels; None: the computer's own bus.
+    dbc : PathLike | None
+        DBC to use instead of the mapping's own.
+    every : bool
+        All tests in the log in order of time, not only the last complete one.
 
     Returns
     -------
-    list of recordings: at least one; without samples where the log has no test.
+    list[Recording]
+        At least one; without samples where the log has no test.
 
     Raises
     ------
-    InputOutputError: the log is missing, unreadable, or not what its suffix says.
-    ConfigurationError: unknown kind of log; mapping or DBC unfit.
+    InputOutputError
+        The log is missing, unreadable, or not what its suffix says.
+    ConfigurationError
+        Unknown kind of log; mapping or DBC unfit.
     """
     bus_map = the_bus_map(mapping, dbc)
     from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - slow
@@ -75,21 +82,32 @@ def simulate(
 
     Parameters
     ----------
-    test: a test, the name of a stored one, or a test file.
-    actuator: actuator, or its file; None: the reference actuator.
-    faults, effects, sensors: what the simulated actuator suffers from; None: nothing but the noise
-        of its converters.
-    seed: of the converters' noise; the same seed gives the same recording.
-    conditions: single fields of the three instead, `FSS=0.6, oil_temperature=70.0, noise_lsb=0.0`.
+    test : StoredTest | PathLike
+        A test, the name of a stored one, or a test file.
+    actuator : Actuator | PathLike | None
+        Actuator, or its file; None: the reference actuator.
+    faults : Faults | None
+        Severities; None: as new.
+    effects : Effects | None
+        What else happens to the actuator; None: nothing.
+    sensors : Sensors | None
+        How the converters err; None: by their usual noise.
+    seed : int
+        Of the converters' noise; the same seed gives the same recording.
+    **conditions : Any
+        Fields of these three, by name: `FSS=0.6, oil_temperature=70.0, noise_lsb=0.0`.
 
     Returns
     -------
-    recording: as an acquisition without a fault would hand it over.
+    Recording
+        As an acquisition without a fault would hand it over.
 
     Raises
     ------
-    TypeError: a condition that there is not, or that is given as an object too.
-    ConfigurationError: a value out of its range; test and controller at different rates.
+    TypeError
+        There is no such condition, or its object is given too.
+    ConfigurationError
+        A value out of its range; test and controller at different rates.
     """
     from ehadiag_sim.plant.conditions import Effects, Faults, Sensors  # noqa: PLC0415 - slow
     from ehadiag_sim.plant.simulator import simulate as run  # noqa: PLC0415
@@ -133,25 +151,38 @@ def diagnose(
 
     Parameters
     ----------
-    recordings: a recording, a log, or several of them: then all are of one actuator, and there is
-        one estimate from all. Of a log its last complete test is taken, see `read`.
-    actuator: actuator, or its file; None: the reference actuator.
-    test: test that a recording may be of besides the stored ones: a test, a name, a file, or a
-        list of them. One alone also stands for recordings whose bus carries no test number.
-    levels: from which severity on an actuator is degraded, or at fault; None: 0.25 and 0.75.
-    solver: `cga`, `pygad`, or a solver.
-    seed: of the search; the same seed gives the same digits on the same machine.
-    progress: called with the stage and its share done, 0 … 1.
-    mapping, dbc: of logs, see `read`.
+    recordings : Source | Iterable[Source]
+        A recording, a log, or several of them: then all are of one actuator, and there is one
+        estimate from all. Of a log its last complete test is taken, see `read`.
+    actuator : Actuator | PathLike | None
+        Actuator, or its file; None: the reference actuator.
+    test : StoredTest | PathLike | Iterable[StoredTest | PathLike] | None
+        Further test that a recording may be of, besides the stored ones: a test, a name, a file, or
+        several. One alone also stands for recordings whose bus carries no test number.
+    levels : Levels | None
+        From which severity on an actuator is degraded, or at fault; None: 0.25 and 0.75.
+    solver : Solver | str
+        `cga`, `pygad`, or a solver.
+    seed : int
+        Of the search; the same seed gives the same digits on the same machine.
+    progress : Callable[[str, float], None] | None
+        Called with the stage and its share done, 0 … 1.
+    mapping : BusMap | PathLike | None
+        Of logs, see `read`.
+    dbc : PathLike | None
+        Of logs, see `read`.
 
     Returns
     -------
-    result: also where no verdict can be given: then it is `NOT_TESTED`, and `reasons` say why.
+    Result
+        Also where no verdict can be given: it is then `NOT_TESTED`, and `reasons` say why.
 
     Raises
     ------
-    InputOutputError: a log or a file cannot be read.
-    ConfigurationError: a file, a name or a value is wrong; nothing to diagnose.
+    InputOutputError
+        A log or a file cannot be read.
+    ConfigurationError
+        A file, a name or a value is wrong; nothing to diagnose.
     """
     chosen, (tests, default) = the_actuator(actuator), _tests(test)
     found, begin = [], time.perf_counter()

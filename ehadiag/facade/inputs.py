@@ -19,24 +19,14 @@ PathLike: TypeAlias = str | os.PathLike[str]
 
 
 def the_actuator(given: Actuator | PathLike | None) -> Actuator:
-    """Return the actuator itself, or that of a file; None: the reference actuator.
-
-    Raises
-    ------
-    InputOutputError, ConfigurationError: see `ehadiag.core.actuator.load_actuator`.
-    """
+    """Return the actuator itself, or that of a file (`load_actuator`); None: the reference."""
     if given is None:
         return default_actuator()
     return given if isinstance(given, Actuator) else load_actuator(os.fspath(given))
 
 
 def the_test(given: StoredTest | PathLike) -> StoredTest:
-    """Return the test itself, the stored one of that name, or that of a file.
-
-    Raises
-    ------
-    InputOutputError, ConfigurationError: see `ehadiag.core.stored_test.resolve_test`.
-    """
+    """Return the test itself, the stored one of that name, or that of a file (`resolve_test`)."""
     return given if isinstance(given, StoredTest) else resolve_test(os.fspath(given))
 
 
@@ -50,11 +40,24 @@ def the_tests(given: Iterable[StoredTest | PathLike]) -> tuple[StoredTest, ...]:
 
 
 def the_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusMap:
-    """Return the meaning of the bus's frames; None: of the computer's own bus.
+    """Return the meaning of the bus's frames (`load_map`); None: of the computer's own bus.
+
+    Parameters
+    ----------
+    mapping : BusMap | PathLike | None
+        The meaning itself, or a mapping file.
+    dbc : PathLike | None
+        DBC to use instead of the mapping file's own.
+
+    Returns
+    -------
+    BusMap
+        What each signal is.
 
     Raises
     ------
-    ConfigurationError: a DBC without a mapping file that names its signals; see `load_map`.
+    ConfigurationError
+        A DBC without a mapping file that names its signals.
     """
     from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
 

@@ -86,9 +86,15 @@ class Result:
     def plot(self) -> Figure:
         """Draw measured against modelled response, one column for each recording.
 
+        Returns
+        -------
+        Figure
+            Not one of pyplot's; a notebook shows it by itself.
+
         Raises
         ------
-        NotTestedError: nothing was identified, so there is no modelled response.
+        NotTestedError
+            Nothing was identified, so there is no modelled response.
         """
         if not self.identified:
             raise NotTestedError(f"{self.source}: nothing to plot: {'; '.join(self.reasons)}")

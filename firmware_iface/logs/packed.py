@@ -41,12 +41,21 @@ def unpacked(path: Path, most: int) -> Iterator[Unpacked]:
 
     Parameters
     ----------
-    most: bytes that it may unpack to.
+    path : Path
+        Log, packed or not.
+    most : int
+        Bytes that it may unpack to.
+
+    Yields
+    ------
+    Unpacked
+        The log to read, until the block ends.
 
     Raises
     ------
-    InputOutputError: not packed by gzip, larger than `most`, no room for it. Errors of the block
-        that name the temporary file name the packed one instead.
+    InputOutputError
+        Not packed by gzip, larger than `most`, no room for it. Errors of the block that name the
+        temporary file name the packed one instead.
     """
     if path.suffix.lower() != PACKED:
         yield Unpacked(path, "")
