@@ -16,7 +16,7 @@ from places import LOGS
 
 from ehadiag.core.errors import InputOutputError
 from firmware_iface.logs.candump_log import candump_frames
-from firmware_iface.logs.reader import read_frames, read_frames_noted, read_recording
+from firmware_iface.logs.reader import read_frames, read_recording
 from firmware_iface.transport.frames import Frame
 
 
@@ -78,9 +78,8 @@ def test_a_line_that_holds_no_frame(line: str, caplog: pytest.LogCaptureFixture)
 def test_lines_that_hold_no_frame_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "mixed.log"
     path.write_text("(1.0) can0 123#01\nnoise\n(2.0) can0 12\n(3.0) can0 123#03\n")
-    table, notes = read_frames_noted(path)
-    assert table.time_ns.tolist() == [10**9, 3 * 10**9]
-    assert notes == ("2 lines of the log could not be read",)
+    assert read_frames(path).time_ns.tolist() == [10**9, 3 * 10**9]
+    assert "2 lines of the log could not be read" in read_recording(path).quality.notes
 
 
 def test_another_log_of_that_name_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from places import LOGS
 
 from ehadiag.core.errors import InputOutputError
-from firmware_iface.logs import reader
+from firmware_iface.logs.packed import unpacked
 from firmware_iface.logs.reader import read_frames, read_recording
 
 LOG = LOGS / "paper-open-1.blf"
@@ -73,12 +73,10 @@ def test_what_is_wrong_names_the_packed_log(tmp_path: Path, temporary: Path) -> 
     assert list(temporary.iterdir()) == []
 
 
-def test_a_bomb_is_not_unpacked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, temporary: Path
-) -> None:
-    monkeypatch.setattr(reader, "MAX_LOG_BYTES", 4 << 20)
+def test_a_bomb_is_not_unpacked(tmp_path: Path, temporary: Path) -> None:
     path = tmp_path / "bomb.log.gz"
     path.write_bytes(gzip.compress(bytes(40 << 20)))
-    with pytest.raises(InputOutputError, match=r"bomb\.log\.gz: unpacks to more than 4 MiB"):
-        read_frames(path)
+    why = r"bomb\.log\.gz: unpacks to more than 4 MiB"
+    with pytest.raises(InputOutputError, match=why), unpacked(path, 4 << 20):
+        pass
     assert list(temporary.iterdir()) == []
