@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ from places import LOGS, ROOT
 import ehadiag
 from ehadiag.assess.diagnosis import diagnose as core_diagnose
 from ehadiag.cli.main import main
-from ehadiag.facade.compiling import NOTICE, log_if_compiling
+from ehadiag.facade.compiling import log_if_compiling
 from ehadiag.identify.search.solvers import CompactGa
 from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
@@ -233,14 +236,18 @@ def test_conditions_that_there_are_not() -> None:
 
 
 def test_who_will_wait_for_the_compiler_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, result: ehadiag.Result, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("ehadiag.compile.kernels.cache_folder", lambda: tmp_path)
-    log_if_compiling()
-    assert caplog.messages == [f"ehadiag: {NOTICE}"]
-    caplog.clear()
-    (tmp_path / "stages.ehadiag_identify.nbi").touch()
-    log_if_compiling()
+    log_if_compiling()  # a diagnosis was made, so its kernels are kept
     assert caplog.messages == []
-    log_if_compiling(simulation=True)
-    assert caplog.messages == [f"ehadiag: {NOTICE}"]
+    code = "from ehadiag.facade.compiling import log_if_compiling as log; log()"
+    nothing_kept = os.environ | {"EHADIAG_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=nothing_kept,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert done.stderr.startswith("ehadiag: compiling the model's kernels, once")
