@@ -22,6 +22,14 @@ class Verdict(IntEnum):
     FAULT = 20
     NOT_TESTED = 30
 
+    def __str__(self) -> str:
+        """Return the name, as in the JSON result."""
+        return self.name
+
+    def __format__(self, specification: str) -> str:
+        """Format the name."""
+        return format(self.name, specification)
+
 
 @dataclass(frozen=True, slots=True)
 class Levels:

@@ -6,12 +6,12 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn
 
 from ehadiag.cli.commands import bit, diagnose, replay, sim, tests, warmup
 from ehadiag.cli.commands import check_bus as checkbus
+from ehadiag.cli.version import ShowVersions
 from ehadiag.core.errors import EhadiagError, InputOutputError
 
 __all__ = ["main"]
@@ -77,7 +77,12 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"ehadiag {version('ehadiag')}")
+    parser.add_argument(
+        "--version",
+        action=ShowVersions,
+        nargs=0,
+        help="print versions, also of libraries, and exit",
+    )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     for command in (bit, diagnose, sim, tests, checkbus, replay, warmup):
         command.add_parser(subparsers)

@@ -5,9 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ehadiag.core.errors import NotTestedError
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = [
     "BitReason",
@@ -88,6 +94,35 @@ class Samples:
         """Number of rows."""
         return len(self.spool)
 
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """Start of each tick, s from the start of the test, shape (ticks,)."""
+        return np.arange(self.ticks, dtype=np.float64) * (self.period_ns * 1e-9)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the samples as a data frame, one row a tick.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Index `time`, the start of each tick in s; columns `command`, `current`, `spool`,
+            `pressure`, `position` as the arrays hold them: SI, NaN where nothing arrived.
+
+        Raises
+        ------
+        ImportError
+            pandas is not installed.
+        """
+        try:
+            import pandas  # noqa: PLC0415 - optional, and slow
+        except ImportError:
+            raise ImportError("a data frame needs pandas: pip install 'ehadiag[pandas]'") from None
+        names = ("command", "current", "spool", "pressure", "position")
+        return pandas.DataFrame(
+            {name: getattr(self, name) for name in names},
+            index=pandas.Index(self.time, name="time"),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Environment:
@@ -159,3 +194,22 @@ class Recording:
     outcome: Outcome
     environment: Environment
     quality: Quality
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the samples as a data frame, see `Samples.to_frame`.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a tick.
+
+        Raises
+        ------
+        NotTestedError
+            There are no samples.
+        ImportError
+            pandas is not installed.
+        """
+        if self.samples is None:
+            raise NotTestedError(f"{self.source}: no telemetry of a test in it")
+        return self.samples.to_frame()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -16,24 +17,50 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
 from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.scalar.response import respond
+from ehadiag.report.faults import faults_of
 
-__all__ = ["draw_diagnosis"]
+__all__ = ["Picture", "diagnosis_figure", "draw_diagnosis"]
 
 MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
+DPI = 110
+
+
+class Picture(Figure):
+    """A figure that a notebook shows by itself, whether or not pyplot is loaded."""
+
+    def _repr_png_(self) -> bytes:
+        out = io.BytesIO()
+        self.savefig(out, format="png", dpi=DPI)
+        return out.getvalue()
 
 
 def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
-    """Write a PNG: one column for each recording; current, spool, pressure and their gaps.
+    """Write the picture of a diagnosis as a PNG.
 
     Raises
     ------
     InputOutputError: the file cannot be written.
+    ValueError: nothing was identified.
+    """
+    figure = diagnosis_figure(diagnosis)
+    try:
+        figure.savefig(path, dpi=DPI)
+    except OSError as error:
+        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+
+
+def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
+    """Draw one column for each recording: current, spool, pressure, and their gaps.
+
+    Raises
+    ------
+    ValueError: nothing was identified, so there is no modelled response to draw.
     """
     found = diagnosis.identification
     if found is None:
         raise ValueError("nothing was identified, so there is no modelled response to draw")
     columns = len(diagnosis.experiments)
-    figure = Figure(figsize=(9.5 * columns, 9.0), layout="constrained")
+    figure = Picture(figsize=(9.5 * columns, 9.0), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(
         5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
@@ -41,17 +68,13 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     for column, experiment in enumerate(diagnosis.experiments):
         _draw_column([axes[column] for axes in grid], experiment, found)
     constants = ",  ".join(
-        f"{item.name} {item.value:.5f} ({item.interval95[0]:.5f} … {item.interval95[1]:.5f})"
-        for item in found.estimates
+        f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
+        for fault in faults_of(diagnosis).values()
     )
     names = " + ".join(Path(recording.source).name for recording in diagnosis.recordings)
-    figure.suptitle(
-        f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}", fontsize=11
-    )
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+    title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}"
+    figure.suptitle(title, fontsize=11)
+    return figure
 
 
 def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:

@@ -1,4 +1,4 @@
-"""Recordings on disk (BLF, ASC, CSV, TRC, MF4): into columns of frames, and into tests."""
+"""Recordings on disk (BLF, ASC, CSV, TRC, MF4, candump; packed): into columns, and into tests."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from ehadiag.core.recording import BitState, Recording
 from firmware_iface.alignment.align import assemble
 from firmware_iface.logs.asc_lines import open_asc, open_text
 from firmware_iface.logs.blf import read_blf
+from firmware_iface.logs.candump_log import candump_frames
+from firmware_iface.logs.packed import kind_of, unpacked
 from firmware_iface.mapping.bus_map import BusMap, default_map
 from firmware_iface.transport.columns import ColumnBuilder
 from firmware_iface.transport.frames import MAX_PAYLOAD, FrameTable
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SUFFIXES", "read_frames", "read_recording", "read_recordings"]
 
-SUFFIXES = (".blf", ".asc", ".csv", ".trc", ".mf4")
+SUFFIXES = (".blf", ".asc", ".csv", ".trc", ".mf4", ".log")
 MAX_LOG_BYTES = 2 << 30
 """Largest log that is read: some ten hours of this bus."""
 MAX_FRAMES = 100_000_000
@@ -87,23 +89,33 @@ def read_frames_noted(path: Path | str) -> tuple[FrameTable, tuple[str, ...]]:
             pass
     except OSError as error:
         raise InputOutputError(f"log {path}: {error.strerror or error}") from None
-    suffix = path.suffix.lower()
+    suffix = kind_of(path)
     if suffix not in SUFFIXES:
         raise ConfigurationError(
-            f"log {path}: unknown kind {suffix or 'without a suffix'}; known: {', '.join(SUFFIXES)}"
+            f"log {path}: unknown kind {suffix or 'without a suffix'}; known: "
+            f"{', '.join(SUFFIXES)}, and these packed as .gz"
         )
     if size > MAX_LOG_BYTES:
         raise InputOutputError(f"log {path}: larger than {MAX_LOG_BYTES >> 20} MiB; split it")
     if size == 0:
         raise InputOutputError(f"log {path}: the file is empty")
-    return _collect(path, suffix)
+    with unpacked(path, MAX_LOG_BYTES) as plain:
+        table, notes = _collect(plain.path, suffix)
+    if plain.trouble:
+        notes += (f"{plain.trouble} after {len(table)} frames; the rest is lost",)
+    return table, notes
 
 
 def _collect(path: Path, suffix: str) -> tuple[FrameTable, tuple[str, ...]]:
     columns = ColumnBuilder()
     notes: tuple[str, ...] = ()
     with _Complaints() as complaints:
-        trouble = read_blf(path, columns) if suffix == ".blf" else _read_text(path, suffix, columns)
+        if suffix == ".blf":
+            trouble = read_blf(path, columns)
+        elif suffix == ".log":
+            trouble = _read_candump(path, columns)
+        else:
+            trouble = _read_text(path, suffix, columns)
     if len(columns) == 0:
         reason = f" ({trouble})" if trouble else ""
         raise InputOutputError(f"log {path}: no frames in it{reason}")
@@ -141,6 +153,27 @@ class _Complaints(logging.Handler):
     def _tell(self, what: Any) -> None:
         if not getattr(what.object, "__module__", "").startswith("asammdf."):
             self._hook(what)
+
+
+def _read_candump(path: Path, columns: ColumnBuilder) -> str:
+    lines = open_text(path)
+    try:
+        for frame, _ in candump_frames(lines):
+            columns.add(
+                frame.time_ns,
+                frame.can_id,
+                frame.data,
+                extended=frame.extended,
+                fd=frame.fd,
+                error=frame.error,
+                remote=frame.remote,
+                sent=frame.sent,
+            )
+            if len(columns) > MAX_FRAMES:
+                raise InputOutputError(f"log {path}: more than {MAX_FRAMES} frames; split it")
+    finally:
+        lines.close()
+    return "" if len(columns) else "no line as candump -l writes it"
 
 
 def _read_text(path: Path, suffix: str, columns: ColumnBuilder) -> str:

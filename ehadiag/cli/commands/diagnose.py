@@ -26,7 +26,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command."""
     parser = subparsers.add_parser(
         "diagnose",
-        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4)",
+        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4, candump; .gz)",
         description="Diagnose actuators from recordings of their bus.",
         allow_abbrev=False,
     )
