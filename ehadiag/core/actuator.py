@@ -1,4 +1,4 @@
-"""Data of an actuator: what the contract calls `actuator.toml`, validated."""
+"""Data of one actuator (controller, servovalve, jack), read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Position controller of the flight-control computer (model.md section 1)."""
+    """Position controller of the flight-control computer (PHY-2)."""
 
     IM: Positive
     """Rated current and saturation, A."""
@@ -33,7 +33,7 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Two-stage flapper-nozzle servovalve, SI units (model.md section 2)."""
+    """Two-stage flapper-nozzle servovalve, SI units (PHY-4 to 6, PHY-11)."""
 
     GM: Positive
     """Torque-motor gain, N m/A."""
@@ -74,7 +74,7 @@ class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Jack and control surface, SI units (model.md section 2)."""
+    """Jack and control surface, SI units (PHY-7, PHY-11)."""
 
     AJ: Positive
     """Active area, m²."""

@@ -23,14 +23,14 @@ __all__ = [
 
 
 class CommandMode(IntEnum):
-    """What a command is (bus.md, `CommandMode`)."""
+    """What a command is (BUS-4, `CommandMode`)."""
 
     CURRENT = 1
     POSITION = 2
 
 
 class BitState(IntEnum):
-    """State of the built-in test (bus.md, `BitState`)."""
+    """State of the built-in test (BUS-10, `BitState`)."""
 
     IDLE = 0
     ARMING = 1
@@ -41,7 +41,7 @@ class BitState(IntEnum):
 
 
 class BitReason(IntEnum):
-    """Why the flight-control computer refused (bus.md, `BitReason`)."""
+    """Why the flight-control computer refused (BUS-11, `BitReason`)."""
 
     NONE = 0
     UNKNOWN_TEST = 1

@@ -150,7 +150,7 @@ def load_test(path: Path | str) -> StoredTest:
 
 
 def bundled_tests() -> dict[str, StoredTest]:
-    """Return the stored tests of the contract by name."""
+    """Return the stored tests that come with the package (PHY-25, PHY-26), by name."""
     folder = resources.files("ehadiag").joinpath("data/tests")
     tests = {}
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):

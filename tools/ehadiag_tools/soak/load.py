@@ -43,7 +43,7 @@ def sent_at_us(data: bytes) -> int:
 
 
 def send_own(options: BusOptions, stop: Event, sent: Synchronized[int]) -> None:
-    """Send telemetry and command, with the contract's counter and check sum, every tick."""
+    """Send telemetry and command every tick, with counter (BUS-5) and check sum (BUS-6)."""
     headers = [(item, struct.pack("<H", item)) for item in (COMMAND, TELEMETRY)]
     tick = 0
     with PythonCanTransport(options, transmit=True) as bus:
