@@ -46,9 +46,17 @@ def make_core(
 def emulator_beside(core: FccCore, transport: Transport) -> Iterator[None]:
     """Run the computer on a bus in a thread of its own while the block runs.
 
+    Parameters
+    ----------
+    core : FccCore
+        The emulated computer.
+    transport : Transport
+        The bus to send and receive on.
+
     Raises
     ------
-    EhadiagError: the emulator's bus failed meanwhile.
+    EhadiagError
+        The emulator's bus failed meanwhile.
     """
     stop = threading.Event()
     failure: list[EhadiagError] = []

@@ -104,10 +104,22 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 def load_actuator(path: Path | str) -> Actuator:
     """Read an actuator file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    Actuator
+        The actuator's data, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, a value out of its range.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, a value out of its range.
     """
     return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
 

@@ -62,15 +62,24 @@ class Samples:
 
     Attributes
     ----------
-    period_ns: length of a tick, ns.
-    current: servovalve current, A.
-    spool: spool position, m.
-    pressure: differential pressure, Pa.
-    position: jack position, m.
-    command: command, A (current mode) or m (position mode).
-    mode: what the command is.
-    saturated: shape (4, ticks), the channel's converter stood at its end.
-    host_ns: host time stamp of each telemetry row, ns; -1 where none arrived.
+    period_ns : int
+        Length of a tick, ns.
+    mode : CommandMode
+        What the command is.
+    current : NDArray[np.float64]
+        Servovalve current, A.
+    spool : NDArray[np.float64]
+        Spool position, m.
+    pressure : NDArray[np.float64]
+        Differential pressure, Pa.
+    position : NDArray[np.float64]
+        Jack position, m.
+    command : NDArray[np.float64]
+        Command, A (current mode) or m (position mode).
+    saturated : NDArray[np.bool_]
+        Shape (4, ticks), the channel's converter stood at its end.
+    host_ns : NDArray[np.int64]
+        Host time stamp of each telemetry row, ns; -1 where none arrived.
     """
 
     period_ns: int

@@ -141,10 +141,22 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 def load_test(path: Path | str) -> StoredTest:
     """Read a test file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    StoredTest
+        The test, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, times out of order, windows outside.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, times out of order, windows outside.
     """
     return _checked(read_toml(Path(path), StoredTest, "test file"), f"test file {path}")
 
