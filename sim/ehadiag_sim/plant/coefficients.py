@@ -11,17 +11,17 @@ from ehadiag_sim.plant.conditions import Effects, Faults
 __all__ = ["Coefficients", "coefficients", "relative_viscosity"]
 
 CLOGGING = 0.8
-"""Share of the first-stage flow gain that is lost at the limit of damage (PHY-13)."""
+"""Share of the first-stage flow gain that is lost at the limit of damage (model.md section 3)."""
 
 KELVIN = 273.15
 REFERENCE_DEGC = 40.0
 KNOWN_VISCOSITIES = ((40.0, 14.5), (100.0, 3.5))
-"""degC and mm²/s of MIL-PRF-83282 (PHY-19)."""
+"""degC and mm²/s of MIL-PRF-83282 (model.md section 4)."""
 WALTHER_SHIFT = 0.7
 
 
 class Coefficients(NamedTuple):
-    """Symbols of docs/reference/physics.md, SI units, with faults and effects already in them."""
+    """Symbols of model.md, SI units, with faults and effects already in them."""
 
     GM: float
     JF: float
@@ -59,9 +59,9 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(actuator: Actuator, faults: Faults, effects: Effects) -> Coefficients:
-    """Scale the actuator's data by faults (PHY-13 to 15) and effects (PHY-16 to 20).
+    """Scale the actuator's data by faults (model.md section 3) and effects (section 4).
 
-    The first-stage pressure gain does not follow the supply (PHY-20).
+    The first-stage pressure gain does not follow the supply: model.md names PSR only.
     """
     valve, jack = actuator.servovalve, actuator.jack
     thickness = relative_viscosity(effects.oil_temperature)

@@ -12,7 +12,7 @@ __all__ = ["Effects", "Faults", "Sensors"]
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """The three progressive faults (PHY-12 to 15), each 0 (as new) … 1 (limit of damage).
+    """The three progressive faults (model.md section 3), each 0 (as new) … 1 (limit of damage).
 
     Raises
     ------
@@ -33,7 +33,7 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """What the three faults leave out (PHY-16 to 20).
+    """What the three faults leave out (model.md section 4).
 
     Raises
     ------
@@ -66,7 +66,7 @@ class Effects:
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """How the four converters err (PHY-21, PHY-22), in LSB of each channel.
+    """How the four converters err (model.md section 5), in LSB of each channel.
 
     Raises
     ------

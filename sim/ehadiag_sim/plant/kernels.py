@@ -2,7 +2,7 @@
 
 Each sub-step takes flapper, spool, pressure and jack in the order of the chain. Forces that grow
 with a mass's own velocity are implicit (the hydraulic ones have time constants of microseconds),
-the rest is explicit; dry friction follows Borello's algorithm (PHY-8).
+the rest is explicit; dry friction follows Borello's algorithm (model.md section 1).
 """
 
 from __future__ import annotations
