@@ -1,4 +1,4 @@
-"""The result for people: verdict, reasons, a table of the fault constants, data quality."""
+"""The result for people: verdict, reasons, a table of the severities, data quality."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent) -> Non
 
 def _constants(diagnosis: Diagnosis) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
-    table.add_column("constant", no_wrap=True)
+    table.add_column("severity", no_wrap=True)
     for name in ("first", "search", "estimate", "std", "95 % interval"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("fault", no_wrap=True)
@@ -90,7 +90,7 @@ def _effort(diagnosis: Diagnosis, spent: Spent) -> str:
     after = spent.after_test
     took = f"{diagnosis.elapsed:.2f} s" if after is None else f"{after:.2f} s after the test"
     return (
-        f"gap rms spool {found.fit.spool_rms:.2f}, pressure {found.fit.pressure_rms:.2f} of the "
+        f"residual rms spool {found.fit.spool_rms:.2f}, pressure {found.fit.pressure_rms:.2f} of the "
         f"noise, {found.fit.outliers:.2%} outliers; solver {found.solver}, seed {found.seed}, "
         f"{found.evaluations} model runs, {took}"
     )

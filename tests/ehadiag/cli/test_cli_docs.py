@@ -74,8 +74,8 @@ def test_limits_are_the_documented_ones() -> None:
         f"at least {1000 * fitness.LEAST_MISSED_S:g} ms missing",
         f"converter's end | {100 * fitness.MOST_SATURATED:g} % |",
         f"outside −{-low:g} … {high:g} °C",
-        f"more than {100 * fitness.MOST_OUTLIERS:g} % of the gaps",
-        f"rms gap above {fitness.MOST_RMS:g} times",
+        f"more than {100 * fitness.MOST_OUTLIERS:g} % of the residuals",
+        f"rms residual above {fitness.MOST_RMS:g} times",
     ):
         assert limit in page
 
