@@ -49,7 +49,7 @@ def lossy(frames: list[Frame], share: float, rng: np.random.Generator) -> list[F
 
 
 def holed(frames: list[Frame], count: int, length: int, rng: np.random.Generator) -> list[Frame]:
-    """Frames with holes of some ms anywhere in the test."""
+    """Frames with dropouts of some ms anywhere in the test."""
     begun = next(item.time_ns for item in frames if item.can_id == COMMAND and item.data[5])
     first = rng.integers(300, 5400 - length, count)
     gone = {tick for item in first.tolist() for tick in range(item, item + length)}
@@ -112,7 +112,7 @@ def main(seeds: int) -> None:
         for count, length in HOLES:
             rng = np.random.default_rng((seed, count, length))
             frames = holed(clean.frames, count, length, rng)
-            name = f"{count} hole{'s' * (count > 1)} of {length} ms"
+            name = f"{count} dropout{'s' * (count > 1)} of {length} ms"
             found.setdefault(name, []).append(compared(frames, sound, truth))
     for name, outcomes in found.items():
         print(row(name, outcomes))
