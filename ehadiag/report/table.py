@@ -91,6 +91,6 @@ def _effort(diagnosis: Diagnosis, spent: Spent) -> str:
     took = f"{diagnosis.elapsed:.2f} s" if after is None else f"{after:.2f} s after the test"
     return (
         f"residual rms spool {found.fit.spool_rms:.2f}, pressure {found.fit.pressure_rms:.2f} "
-        f"of the noise, {found.fit.outliers:.2%} outliers; solver {found.solver}, seed {found.seed}, "
-        f"{found.evaluations} model runs, {took}"
+        f"of the noise, {found.fit.outliers:.2%} outliers; solver {found.solver}, "
+        f"seed {found.seed}, {found.evaluations} model runs, {took}"
     )
