@@ -1,4 +1,4 @@
-"""What `ehadiag bit` refuses before anything is compiled, written, or moves."""
+"""Checks before `ehadiag bit` starts: options, rates and buses that could not lead to a verdict."""
 
 from __future__ import annotations
 

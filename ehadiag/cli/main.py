@@ -1,4 +1,4 @@
-"""Command line `ehadiag`: one parser, one place where errors become exit codes."""
+"""Entry point of `ehadiag`: one parser, and one place where errors become exit codes."""
 
 from __future__ import annotations
 

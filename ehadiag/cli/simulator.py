@@ -1,4 +1,4 @@
-"""The emulated flight-control computer, for commands that run it."""
+"""Builds and runs the emulated flight-control computer for `sim` and `bit --simulate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the acquisition hands to the diagnosis: aligned samples and how good they are."""
+"""What acquisition hands to diagnosis: samples on the tick grid, and their quality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a diagnosis: measured against modelled response, and what is left over."""
+"""Draws a diagnosis: measured and modelled response, and their residuals."""
 
 from __future__ import annotations
 

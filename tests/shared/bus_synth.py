@@ -1,4 +1,4 @@
-"""Made-up tests on the default bus with a known truth, and the faults done to them."""
+"""Synthetic tests on the default bus with known truth, and damage done to their frames."""
 
 from __future__ import annotations
 

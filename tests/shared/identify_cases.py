@@ -1,4 +1,4 @@
-"""Experiments with known truth for the tests of the identification."""
+"""Experiments with known truth for tests of the identification."""
 
 from functools import lru_cache
 

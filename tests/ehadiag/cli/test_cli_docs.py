@@ -1,4 +1,4 @@
-"""The documentation says what the program does: options, keys, limits, links."""
+"""The documentation matches the program: options, keys, limits, links."""
 
 from __future__ import annotations
 

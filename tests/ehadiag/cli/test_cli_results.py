@@ -1,4 +1,4 @@
-"""What commands print and write: JSON as promised, tables whole, exit codes, seeds."""
+"""Output of the commands: JSON schema, tables, exit codes, seeds."""
 
 from __future__ import annotations
 

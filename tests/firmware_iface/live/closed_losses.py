@@ -1,4 +1,4 @@
-"""What lost frames cost the closed-loop test: prints the rows of the table in the docs.
+"""Measures what lost frames cost the closed-loop test; prints rows for the page on bus faults.
 
 python tests/firmware_iface/live/closed_losses.py 20
 

@@ -1,4 +1,4 @@
-"""Faults of a harness and what becomes of a test under each; also prints the table of the docs.
+"""Harness faults with the outcome stated for each; prints docs/reference/bus-faults.md.
 
 python tests/firmware_iface/live/fault_cases.py > docs/reference/bus-faults.md
 """

@@ -1,4 +1,4 @@
-"""Logs of a whole stored test, damaged: what becomes of the diagnosis."""
+"""Damaged logs of a whole stored test, with the outcome stated for each."""
 
 from __future__ import annotations
 

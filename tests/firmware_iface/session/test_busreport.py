@@ -1,4 +1,4 @@
-"""What check-bus says of a bus."""
+"""The report of check-bus."""
 
 from __future__ import annotations
 

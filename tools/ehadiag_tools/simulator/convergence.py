@@ -1,4 +1,4 @@
-"""Integration step of the simulator against its error, by a stiff solver with event location.
+"""`tools/convergence`: error of the simulator against its integration step, by a stiff solver.
 
 The currents of a whole stored test (closed loop: of one simulated run) drive both.
 """

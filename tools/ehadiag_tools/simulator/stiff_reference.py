@@ -1,4 +1,4 @@
-"""Slow, readable reference of the plant: a stiff solver with event location and a mode automaton.
+"""Slow, readable reference of the plant: a stiff solver with event location.
 
 Written from PHY-1 to PHY-15 alone; it shares no code with the kernels. Friction
 and stops are modes; the instants of sticking, breaking away and striking a stop are roots that

@@ -1,4 +1,4 @@
-"""What a soaked bus carries: telemetry and command at 1 kHz, and frames of other devices.
+"""Senders of a soak: telemetry and command at 1 kHz, and frames of other devices.
 
 Every payload begins with the time of sending, so that its reader knows its age: 48 bits of
 microseconds on the machine's monotonic clock, which all processes share.
