@@ -110,20 +110,9 @@ def show(diagnosis: Diagnosis, arguments: argparse.Namespace, spent: Spent) -> N
 def make_folder(name: str) -> Path:
     """Create the output folder.
 
-    Parameters
-    ----------
-    name : str
-        Folder, made with its parents where it is missing.
-
-    Returns
-    -------
-    Path
-        The folder.
-
     Raises
     ------
-    InputOutputError
-        It cannot be created.
+    InputOutputError: it cannot be created.
     """
     folder = Path(name)
     try:
@@ -138,21 +127,9 @@ def write_report(
 ) -> None:
     """Write `stem`.json and, where a model was fitted, `stem`.png.
 
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        What was found.
-    stem : Path
-        Path without suffix; `.json` and `.png` are added.
-    arguments : argparse.Namespace
-        The parsed command line, for solver and seed.
-    spent : Spent
-        Time spent around the diagnosis.
-
     Raises
     ------
-    InputOutputError
-        One of them cannot be written.
+    InputOutputError: one of them cannot be written.
     """
     from ehadiag.report.json_line import json_line  # noqa: PLC0415
 

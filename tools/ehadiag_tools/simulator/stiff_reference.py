@@ -1,6 +1,6 @@
-"""Slow, readable reference of the plant: a stiff solver with event location.
+"""Slow, readable reference of the plant: a stiff solver with event location and a mode automaton.
 
-Written from PHY-1 to PHY-15 alone; it shares no code with the kernels. Friction
+Written from model.md sections 1 to 3 alone; it shares no code with the kernels. Friction
 and stops are modes; the instants of sticking, breaking away and striking a stop are roots that
 scipy locates. Between them the equations are smooth but for the corners of the saturations.
 """
