@@ -125,7 +125,7 @@ def load_actuator(path: Path | str) -> Actuator:
 
 
 def default_actuator() -> Actuator:
-    """Return the reference actuator that the package brings along."""
+    """Return the reference actuator, which comes with the package."""
     text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
     return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from fault_cases import Case, run
 
-from ehadiag.assess import acceptance as fitness
+from ehadiag.assess import acceptance
 from ehadiag.assess import diagnosis
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
@@ -93,11 +93,11 @@ def row(name: str, outcomes: list[Outcome]) -> str:
     )
 
 
-LIMIT = fitness.MOST_GUESSED
+LIMIT = acceptance.MOST_GUESSED
 
 
 def main(seeds: int) -> None:
-    fitness.MOST_GUESSED = 1.0
+    acceptance.MOST_GUESSED = 1.0
     found: dict[str, list[Outcome]] = {}
     for seed in range(seeds):
         truth = PAPER[seed % len(PAPER)]

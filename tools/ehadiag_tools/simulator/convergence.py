@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         nargs=3,
         default=(0.3, 0.6, 0.3),
         metavar=("KINTAS", "FSS", "FDJ"),
-        help="fault constants (%(default)s)",
+        help="severities (%(default)s)",
     )
     parser.add_argument("--ticks", type=int, help="only the first so many ticks")
     parser.add_argument(
