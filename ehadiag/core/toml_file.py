@@ -1,4 +1,4 @@
-"""Reads TOML configuration files into checked, frozen structures."""
+"""Configuration files: TOML into validated, frozen structures."""
 
 from __future__ import annotations
 
@@ -22,26 +22,10 @@ T = TypeVar("T")
 def read_toml(path: Path, kind: type[T], what: str) -> T:
     """Read `path` into `kind` (a msgspec structure); `what` names the file in errors.
 
-    Parameters
-    ----------
-    path : Path
-        File to read.
-    kind : type[T]
-        Structure that the file must have.
-    what : str
-        What the file is, for error messages ("actuator file").
-
-    Returns
-    -------
-    T
-        The contents, of type `kind`.
-
     Raises
     ------
-    InputOutputError
-        The file cannot be read.
-    ConfigurationError
-        Too large, not TOML, or not what `kind` demands.
+    InputOutputError: the file cannot be read.
+    ConfigurationError: too large, not TOML, or not what `kind` demands.
     """
     try:
         with path.open("rb") as file:

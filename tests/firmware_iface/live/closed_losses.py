@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from fault_cases import Case, run
 
-from ehadiag.assess import acceptance
-from ehadiag.assess import diagnosis
+from ehadiag.assess import acceptance, diagnosis
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import Recording
