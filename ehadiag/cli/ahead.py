@@ -1,4 +1,4 @@
-"""Identifies in a thread of its own while `ehadiag bit` still runs the test."""
+"""Runs the identification in a thread while `ehadiag bit` is still running the test."""
 
 from __future__ import annotations
 

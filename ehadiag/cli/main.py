@@ -1,4 +1,4 @@
-"""Command line `ehadiag`: one parser, one place where errors become exit codes."""
+"""Entry point of `ehadiag`: one parser, and one place where errors become exit codes."""
 
 from __future__ import annotations
 
@@ -35,9 +35,20 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code.
 
+    Parameters
+    ----------
+    argv : Sequence[str] | None
+        Arguments after the program's name; None: those of the process.
+
+    Returns
+    -------
+    int
+        Exit code.
+
     Raises
     ------
-    SystemExit: wrong usage (code 2), `--help` and `--version`.
+    SystemExit
+        Wrong usage (code 2), `--help` and `--version`.
     """
     _fill_closed_streams()
     arguments = _parser().parse_args(argv)

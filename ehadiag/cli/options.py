@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they stand for."""
+"""Command-line options that several commands share, and the objects made from them."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.25,
         metavar="K",
-        help="DEGRADED at or above this fault constant (default 0.25)",
+        help="DEGRADED at or above this severity (default 0.25)",
     )
     parser.add_argument(
         "--limit",
         type=float,
         default=0.75,
         metavar="K",
-        help="FAULT at or above this fault constant (default 0.75)",
+        help="FAULT at or above this severity (default 0.75)",
     )
     parser.add_argument(
         "--json",

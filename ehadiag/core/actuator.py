@@ -1,4 +1,4 @@
-"""Data of an actuator: what the contract calls `actuator.toml`, validated."""
+"""Data of one actuator (controller, servovalve, jack), read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Position controller of the flight-control computer (model.md section 1)."""
+    """Position controller of the flight-control computer (PHY-2)."""
 
     IM: Positive
     """Rated current and saturation, A."""
@@ -41,7 +41,7 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Two-stage flapper-nozzle servovalve, SI units (model.md section 2)."""
+    """Two-stage flapper-nozzle servovalve, SI units (PHY-4 to 6, PHY-11)."""
 
     GM: Positive
     """Torque-motor gain, N m/A."""
@@ -82,7 +82,7 @@ class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Jack and control surface, SI units (model.md section 2)."""
+    """Jack and control surface, SI units (PHY-7, PHY-11)."""
 
     AJ: Positive
     """Active area, m²."""
@@ -124,16 +124,28 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 def load_actuator(path: Path | str) -> Actuator:
     """Read an actuator file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    Actuator
+        The actuator's data, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, a value out of its range.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, a value out of its range.
     """
     return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
 
 
 def default_actuator() -> Actuator:
-    """Return the reference actuator that the package brings along."""
+    """Return the reference actuator, which comes with the package."""
     text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
     return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
 

@@ -1,4 +1,4 @@
-"""What the acquisition hands to the diagnosis: aligned samples and how good they are."""
+"""What acquisition hands to diagnosis: samples on the tick grid, and their quality."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ __all__ = [
 
 
 class CommandMode(IntEnum):
-    """What a command is (bus.md, `CommandMode`)."""
+    """What a command is (BUS-4, `CommandMode`)."""
 
     CURRENT = 1
     POSITION = 2
 
 
 class BitState(IntEnum):
-    """State of the built-in test (bus.md, `BitState`)."""
+    """State of the built-in test (BUS-10, `BitState`)."""
 
     IDLE = 0
     ARMING = 1
@@ -47,7 +47,7 @@ class BitState(IntEnum):
 
 
 class BitReason(IntEnum):
-    """Why the flight-control computer refused (bus.md, `BitReason`)."""
+    """Why the flight-control computer refused (BUS-11, `BitReason`)."""
 
     NONE = 0
     UNKNOWN_TEST = 1
@@ -68,15 +68,24 @@ class Samples:
 
     Attributes
     ----------
-    period_ns: length of a tick, ns.
-    current: servovalve current, A.
-    spool: spool position, m.
-    pressure: differential pressure, Pa.
-    position: jack position, m.
-    command: command, A (current mode) or m (position mode).
-    mode: what the command is.
-    saturated: shape (4, ticks), the channel's converter stood at its end.
-    host_ns: host time stamp of each telemetry row, ns; -1 where none arrived.
+    period_ns : int
+        Length of a tick, ns.
+    mode : CommandMode
+        What the command is.
+    current : NDArray[np.float64]
+        Servovalve current, A.
+    spool : NDArray[np.float64]
+        Spool position, m.
+    pressure : NDArray[np.float64]
+        Differential pressure, Pa.
+    position : NDArray[np.float64]
+        Jack position, m.
+    command : NDArray[np.float64]
+        Command, A (current mode) or m (position mode).
+    saturated : NDArray[np.bool_]
+        Shape (4, ticks), the channel's converter stood at its end.
+    host_ns : NDArray[np.int64]
+        Host time stamp of each telemetry row, ns; -1 where none arrived.
     """
 
     period_ns: int

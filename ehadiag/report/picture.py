@@ -1,4 +1,4 @@
-"""The picture of a diagnosis: measured against modelled response, and what is left over."""
+"""Draws a diagnosis: measured and modelled response, and their residuals."""
 
 from __future__ import annotations
 
@@ -126,6 +126,6 @@ def _pair(
     upper.plot(time, modelled, color=MODELLED, lw=0.8, label="modelled")
     upper.set_ylabel(label)
     lower.plot(time, (measured - modelled) * gap_scale, color=GAP, lw=0.5)
-    lower.set_ylabel(f"gap, {gap_unit}")
+    lower.set_ylabel(f"residual, {gap_unit}")
     spread = np.nanpercentile(np.abs(measured - modelled), 99.5) * gap_scale
     lower.set_ylim(-2.0 * spread, 2.0 * spread)

@@ -1,4 +1,4 @@
-"""Time spent around a diagnosis."""
+"""Times that a result reports besides the identification's own: reading, total, after the test."""
 
 from __future__ import annotations
 

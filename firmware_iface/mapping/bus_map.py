@@ -103,7 +103,7 @@ class BusMap:
 
 
 def default_map() -> BusMap:
-    """Return the contract's own bus (`data/eha_fcc.dbc`)."""
+    """Return the default bus (BUS-2, `data/eha_fcc.dbc`)."""
     folder = resources.files("firmware_iface").joinpath("data")
     where = "bundled mapping eha_fcc.toml"
     tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)

@@ -1,4 +1,4 @@
-"""The kept inputs of the fuzzer, and what its targets must be able to notice."""
+"""The fuzzer's kept inputs raise nothing unexpected, and its targets notice planted errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`ehadiag check-bus`: listens, and reports what of a bus can be used."""
+"""`ehadiag check-bus`: listens, and reports which signals of a bus are usable."""
 
 from __future__ import annotations
 

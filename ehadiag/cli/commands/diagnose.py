@@ -1,4 +1,4 @@
-"""`ehadiag diagnose`: recordings in, verdicts out."""
+"""`ehadiag diagnose`: diagnoses recordings."""
 
 from __future__ import annotations
 

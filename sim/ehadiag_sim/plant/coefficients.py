@@ -1,4 +1,4 @@
-"""Numbers that the plant's kernel needs, from actuator data, faults and effects."""
+"""Coefficients of the plant's kernel, from actuator data, faults and effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a simulated actuator suffers from: faults, effects, and how its sensors err."""
+"""State of a simulated actuator: its faults, its effects, and the errors of its sensors."""
 
 from __future__ import annotations
 

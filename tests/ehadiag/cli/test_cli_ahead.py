@@ -1,4 +1,4 @@
-"""Working ahead of the end of a test: when there is nothing left to listen for."""
+"""Identification while the test runs: same digits as afterwards, and no listening beyond need."""
 
 from __future__ import annotations
 

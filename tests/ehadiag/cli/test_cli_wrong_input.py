@@ -1,4 +1,4 @@
-"""Wrong input: each with its exit code and one line that says what, where and how."""
+"""Wrong input gives its exit code and one line that says what, where and how to fix it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames with every fault of a harness onto the tick grid: nothing invented, everything counted."""
+"""Alignment of damaged frame streams: nothing invented, everything counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of every kind and every defect, in one line or read as far as they go."""
+"""Logs of every format and defect: read as far as they go, or refused in one line."""
 
 from __future__ import annotations
 

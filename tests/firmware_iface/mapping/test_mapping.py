@@ -1,4 +1,4 @@
-"""Mappings and DBCs from strangers: checked, explained in one line, never trusted."""
+"""Untrusted mappings and DBC files are checked, and refused in one line."""
 
 from __future__ import annotations
 

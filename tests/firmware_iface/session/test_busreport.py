@@ -1,4 +1,4 @@
-"""What check-bus says of a bus."""
+"""The report of check-bus."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from bus_synth import COMMAND, START, TELEMETRY, TICK, flip, make_truth, play, tick_of
 
-from ehadiag.assess import acceptance as fitness
+from ehadiag.assess import acceptance
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.session.bus_report import LONGEST_GAP_S, render, report_bus
 from firmware_iface.transport.frames import Frame, FrameTable
@@ -99,7 +99,7 @@ def test_a_pause_in_which_the_counter_turns_is_told(encoder, bus_map):
 
 
 def test_the_pause_that_is_borne_is_the_diagnosis_own():
-    assert LONGEST_GAP_S == fitness.LONGEST_GAP_S
+    assert LONGEST_GAP_S == acceptance.LONGEST_GAP_S
 
 
 def test_a_mapping_without_a_command_is_told(encoder, bus_map):

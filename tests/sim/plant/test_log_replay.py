@@ -1,4 +1,4 @@
-"""The tool that drives the simulator with a recording's own currents, and its two launchers."""
+"""compare_logs: the simulator, driven by a recording's currents, reproduces the recording."""
 
 import dataclasses
 

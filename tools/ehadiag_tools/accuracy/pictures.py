@@ -1,4 +1,4 @@
-"""Pictures of an identification: parity, gaps over time, objective along each constant."""
+"""Pictures of identifications: parity, residuals over time, objective along each severity."""
 
 from __future__ import annotations
 

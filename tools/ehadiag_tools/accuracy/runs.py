@@ -1,4 +1,4 @@
-"""One identification with known truth: where its recording comes from, what came out."""
+"""One identification with known truth: its recording, its estimate, its errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From samples to an estimate with its interval, warm: wall and CPU time by stage."""
+"""Benchmark of one estimate: from samples to interval, wall and CPU time by stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Latency of the streaming monitor's push, alone and beside a diagnosis."""
+"""Benchmark of the monitor's push: latency alone and beside a diagnosis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the lanes would gain and lose in single precision, by their algorithm in C."""
+"""What the vector kernel would gain and lose in single precision, measured in C."""
 
 from __future__ import annotations
 

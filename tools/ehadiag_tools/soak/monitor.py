@@ -1,4 +1,4 @@
-"""The monitor in the receive thread of a live bus, with diagnoses running beside it.
+"""Soak of the monitor in the receive thread of a live bus, with diagnoses beside it.
 
 One more process is the flight-control computer: the detailed simulator in closed loop, telemetry
 and command at 1 kHz. This one is the product: its receive thread decodes the frames, puts them
