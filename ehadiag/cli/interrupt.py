@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and time limits as an event that loops look at."""
+"""Handling of Ctrl-C, SIGTERM and hang-up in each part of a command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`ehadiag --version`: the versions of what decides which digits come out, and which buses work."""
+"""`ehadiag --version`: versions of all libraries that affect digits or buses."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How spool position becomes pressure: model.md section 1, or orifices of section 8."""
+    """How spool position becomes pressure: PHY-6, or the orifices of PHY-39."""
 
     kind: Literal["linear", "orifice"] = "linear"
     """`linear`: saturating pressure gain, stiff oil; `orifice`: two lands, compressible oil."""

@@ -1,4 +1,4 @@
-"""Folders of this user's own for what can be made again: compiled kernels, digested DBC files."""
+"""Cache folders of this user only: compiled kernels, contents of DBC files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a program prints what a page says it prints, whatever machine it runs on."""
+"""Compares a program's output with what a page says, independent of the machine."""
 
 from __future__ import annotations
 

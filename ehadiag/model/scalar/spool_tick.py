@@ -1,7 +1,7 @@
 """First stage and spool over one tick, integrated exactly: kernel of the monitoring model.
 
-Between events, flapper and spool obey linear equations with constant coefficients (model.md
-section 1, the current being held over a tick), so the state moves by a transition matrix, without
+Between events, flapper and spool obey linear equations with constant coefficients (PHY-4,
+PHY-5, the current being held over a tick), so the state moves by a transition matrix, without
 error. Events switch the equations: the flapper meets or leaves a stop; the spool sticks, breaks
 away or meets a stop. A step that contains an event is halved until the event is located.
 The matrices are made once for each candidate (`ehadiag.model.scalar.transition`).

@@ -1,4 +1,4 @@
-"""Filters, sampling instant, gains, probes: what the converters make of the plant."""
+"""Sensor filters, sampling instant, gains and probes of the simulated plant."""
 
 import msgspec
 import numpy as np

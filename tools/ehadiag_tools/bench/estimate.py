@@ -6,6 +6,7 @@ import statistics
 import time
 
 from ehadiag.identify.pipeline import identify
+
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import LOG, TRUTH, experiment
 from ehadiag_tools.bench.rivals import rivals

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from ehadiag.identify.refine.residual_model import FAULT_COUNT, KINK, STEP
 from numpy.typing import NDArray
 
 from ehadiag.core.channels import PRESSURE, SPOOL
-from ehadiag.identify.refine.residual_model import FAULT_COUNT, KINK, STEP
 from ehadiag.identify.search.objective import SEARCH_CAP
 from ehadiag.model.scalar.residuals import Batch
 from ehadiag.model.simd.residuals import lane_work
