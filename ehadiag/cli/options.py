@@ -82,6 +82,13 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="FAULT at or above this severity (default 0.75)",
     )
     parser.add_argument(
+        "--rule",
+        choices=("interval", "estimate"),
+        default="interval",
+        help="verdict by the chance that a severity is at or above a level (default), or by the"
+        " estimates alone",
+    )
+    parser.add_argument(
         "--json",
         action="store_true",
         help="print one JSON object a line to standard output, nothing else there",

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.ahead import working_ahead
 from ehadiag.cli.beforehand import refuse_beforehand
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the test and print the verdict."""
     actuator = options.the_actuator(arguments)
     test = resolve_test(arguments.test)
-    levels = Levels(arguments.advisory, arguments.limit)
+    levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
     bus_map = options.the_bus_map(arguments)
     refuse_beforehand(arguments, test, actuator, bus_map)
     folder = make_folder(arguments.out)

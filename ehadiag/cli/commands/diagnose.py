@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
 from ehadiag.core.errors import EhadiagError
@@ -96,7 +96,7 @@ class _Diagnosis:
         self._tests = options.known_tests(arguments.test)
         only = arguments.test[0] if len(arguments.test) == 1 else None
         self._default = resolve_test(only) if only else None
-        self._levels = Levels(arguments.advisory, arguments.limit)
+        self._levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
         self._bus_map = options.the_bus_map(arguments)
         self._folder = make_folder(arguments.out) if arguments.out else None
         self._names: set[str] = set()
