@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from ehadiag.core.recording import BitReason, BitState
 from firmware_iface.codec.live_messages import BitStatus, Request, Sample
-from firmware_iface.codec.protection import crc8
+from firmware_iface.codec.validity import intact
 from firmware_iface.mapping.bus_map import BusMap, MessageMap, Role, default_map
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.transport.frames import Frame
@@ -44,7 +44,7 @@ class LiveDecoder:
     def decode(self, frame: Frame) -> BitStatus | Sample | Request | None:
         """Content of a frame; None for foreign, damaged and all other frames."""
         message = self._messages.get((frame.can_id, frame.extended))
-        if message is None or frame.error or frame.remote or not _intact(message, frame.data):
+        if message is None or frame.error or frame.remote or not intact(message, frame.data):
             return None
         values = _values(message, frame.data)
         if any(name in self._last for name in values):
@@ -77,23 +77,13 @@ class LiveDecoder:
 
 def checked_values(message: MessageMap, data: bytes) -> dict[str, float] | None:
     """SI value of each role in a payload; None where its length or its check sum is wrong."""
-    return _values(message, data) if _intact(message, data) else None
+    return _values(message, data) if intact(message, data) else None
 
 
 def bit_pattern(signal: SignalLayout, data: bytes) -> int:
     """Bits of a signal in a payload, as an unsigned number."""
     words = {True: int.from_bytes(data, "big"), False: int.from_bytes(data, "little")}
     return _pattern(signal, words, 8 * len(data))
-
-
-def _intact(message: MessageMap, data: bytes) -> bool:
-    if len(data) != message.length:
-        return False
-    if message.crc is None:
-        return True
-    at = message.crc.lead // 8
-    header = struct.pack("<H", message.can_id & 0xFFFF)
-    return crc8(header + data[:at] + data[at + 1 :]) == data[at]
 
 
 def _values(message: MessageMap, data: bytes) -> dict[str, float]:

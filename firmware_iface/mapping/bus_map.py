@@ -79,6 +79,11 @@ class MessageMap:
         """Counts per turn of the counter."""
         return 1 << self.counter.length if self.counter else 0
 
+    @property
+    def measures(self) -> bool:
+        """Whether it brings a measured channel."""
+        return any(role.name.startswith("channels.") for role in self.roles)
+
 
 @dataclass(frozen=True, slots=True)
 class BusMap:
@@ -92,6 +97,8 @@ class BusMap:
     states: Mapping[int, BitState]
     requests: Mapping[str, int]
     policy: Policy
+    channel: int | None = None
+    """Adapter channel of a recording that is the actuator's, from 1; None: the only one."""
 
     def find(self, role: str) -> tuple[MessageMap, Role] | None:
         """Message and signal of a role (`command.mode`); None if the mapping leaves it out."""
@@ -174,6 +181,7 @@ def resolve(
         states=states,
         requests={str(key): value for key, value in tree.request.codes.items()},
         policy=tree.policy,
+        channel=tree.channel,
     )
 
 
