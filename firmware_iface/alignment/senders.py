@@ -64,11 +64,16 @@ def drop_conflicts(
     ticks = {} if axis is None else dict(axis.ticks)
     found: dict[str, Conflicts] = {}
     for name, item in decoded.messages.items():
-        if item.counter is None or len(item.row) < 2:
+        counter = item.message.counter
+        if counter is None or item.counter is None or len(item.row) < 2:
             continue
+        counted = counter.present(item.data)
         if axis is not None and name in ticks:
             position = _positions(item, ticks[name], axis.every[name])
             bad = conflicting(position, item.data)
+            if counted is not None:
+                bad = np.zeros(len(item.row), dtype=np.bool_)
+                bad[counted] = conflicting(position[counted], item.data[counted])
             if bad.any():
                 ticks[name] = np.where(bad, OUTSIDE, ticks[name])
         else:
@@ -77,6 +82,8 @@ def drop_conflicts(
             position[has] = some
             bad = np.zeros(len(item.row), dtype=np.bool_)
             bad[has] = conflicting(some, item.data[has])
+            if counted is not None:
+                bad &= counted
             if bad.any():
                 messages[name] = item.without(bad)
         if bad.any():

@@ -48,6 +48,8 @@ STANDING = 3
 """Frames in a row with one counter from which on it stands still; two senders make pairs."""
 REMEMBERED = 128
 """Counter values that the live watch looks back: half a turn of eight bits."""
+RECENT = 500
+"""Frames after which what the live watch saw weighs half."""
 
 Rows = NDArray[np.int64]
 
@@ -159,41 +161,55 @@ def event_positions(counter: Rows, time_ns: Rows, modulus: int) -> tuple[NDArray
 class SenderWatch:
     """Looks for a second sender under one identifier, a frame at a time; memory is constant.
 
+    Parameters
+    ----------
+    modulus: counts per turn.
+    period_ns: usual time between two counts.
+
     Attributes
     ----------
-    frames: frames seen, repeats left out.
     conflicts: counter values that came with two payloads within half a turn.
     """
 
-    def __init__(self, modulus: int) -> None:
+    def __init__(self, modulus: int, period_ns: int) -> None:
         self._reach = min(REMEMBERED, max(modulus // 2, 1))
-        self._seen: OrderedDict[int, tuple[bytes, int]] = OrderedDict()
+        self._half_turn_ns = self._reach * period_ns
+        self._seen: OrderedDict[tuple[int, ...], tuple[bytes, int]] = OrderedDict()
+        self._last: tuple[int, ...] = ()
         self._standing = 0
-        self._last = -1
-        self.frames = 0
+        self._recent = [0, 0]
         self.conflicts = 0
 
-    def take(self, counter: int, data: bytes) -> bool:
-        """Take a sound frame; return whether its counter was used with another payload."""
+    def take(self, counter: tuple[int, ...], data: bytes, time_ns: int) -> bool:
+        """Take a sound frame; return whether its counter was just used with another payload.
+
+        `counter` is the counter's value, and the page that it counts where there are several.
+        """
         known = self._seen.pop(counter, None)
-        if known is not None and known[0] == data:
-            self._seen[counter] = known
-            return False
-        self.frames += 1
-        conflict = known is not None and self.frames - known[1] <= 2 * self._reach
-        self._standing = self._standing + 1 if counter == self._last else 1
-        self._last = counter
-        self._seen[counter] = (data, self.frames)
+        self._seen[counter] = (data, time_ns)
         if len(self._seen) > self._reach:
             self._seen.popitem(last=False)
+        if known is not None and known[0] == data:
+            return False
+        self._standing = self._standing + 1 if counter == self._last else 1
+        self._last = counter
+        conflict = known is not None and abs(time_ns - known[1]) <= self._half_turn_ns
         if conflict and self._standing >= STANDING:
             if self._standing == STANDING:
-                self.conflicts -= 1  # what looked like a pair is a counter that stands still
+                self._count(-1)  # what looked like a pair is a counter that stands still
             return False
-        self.conflicts += conflict
+        self._count(int(conflict))
         return conflict
+
+    def _count(self, conflicts: int) -> None:
+        self.conflicts += conflicts
+        self._recent[0] += 1
+        self._recent[1] += conflicts
+        if self._recent[0] >= RECENT:
+            self._recent = [item // 2 for item in self._recent]
 
     @property
     def second_sender(self) -> bool:
-        """Whether there are more conflicts than chance makes."""
-        return self.conflicts > max(LEAST_CONFLICTS, MOST_CONFLICTS * self.frames)
+        """Whether there are more conflicts of late than chance makes."""
+        frames, conflicts = self._recent
+        return conflicts > max(LEAST_CONFLICTS, MOST_CONFLICTS * frames)

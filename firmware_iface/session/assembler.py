@@ -51,6 +51,7 @@ class Assembler:
             error=frame.error,
             remote=frame.remote,
             sent=frame.sent,
+            channel=frame.channel,
         )
 
     def extend(self, frames: Iterable[Frame]) -> None:
