@@ -26,7 +26,11 @@ ACTIVE = (BitState.ARMING, BitState.RUNNING)
 
 
 def recordings_of(
-    tables: Iterable[FrameTable], bus_map: BusMap, source: str, held: int
+    tables: Iterable[FrameTable],
+    bus_map: BusMap,
+    source: str,
+    held: int,
+    least: int = WINDOW,
 ) -> Iterator[Recording]:
     """Tests of a stream of frames in order of time; one recording without samples if there is none.
 
@@ -36,11 +40,12 @@ def recordings_of(
     bus_map: what they mean.
     source: file or bus, for reports.
     held: frames that a window may have at most; a test beyond that is cut, and said to be.
+    least: frames from which on a window is closed where no test runs.
     """
     reading = _Reading(bus_map, source)
     empty: Recording | None = None
     found = False
-    for window, cut in _windows(tables, reading, held):
+    for window, cut in _windows(tables, reading, held, least):
         for recording in reading.recordings(window, cut):
             if recording.samples is not None or recording.test_id is not None:
                 found = True
@@ -56,11 +61,11 @@ def _says_more(new: Recording, old: Recording) -> bool:
 
 
 def _windows(
-    tables: Iterable[FrameTable], reading: _Reading, held: int
+    tables: Iterable[FrameTable], reading: _Reading, held: int, least: int
 ) -> Iterator[tuple[FrameTable, bool]]:
     """Windows, and whether one was cut for its length."""
     pending: list[FrameTable] = []
-    size, look_at = 0, WINDOW
+    size, look_at = 0, least
     for table in tables:
         pending.append(table)
         size += len(table)
@@ -70,10 +75,10 @@ def _windows(
         end = reading.quiet_row(window)
         if end:
             yield window.rows(slice(0, end)), False
-            pending, size, look_at = [window.rows(slice(end, None))], size - end, WINDOW
+            pending, size, look_at = [window.rows(slice(end, None))], size - end, least
         elif size >= held:
             yield window, True
-            pending, size, look_at = [], 0, WINDOW
+            pending, size, look_at = [], 0, least
         else:
             pending, look_at = [window], min(2 * size, held)
     if size:
