@@ -20,7 +20,7 @@ from firmware_iface.codec.validity import (
 )
 from firmware_iface.mapping.bus_map import BusMap
 
-__all__ = ["Conflicts", "crowded", "drop_conflicts", "second_senders"]
+__all__ = ["Conflicts", "crowded", "drop_conflicts", "second_senders", "too_many"]
 
 MOST_FRAMES = 1.25
 """Different frames in a tick beyond which a message without a counter has two senders."""
@@ -44,6 +44,11 @@ class Conflicts:
     row: Rows
     position: Rows
     apart: NDArray[np.bool_]
+
+    @property
+    def count(self) -> int:
+        """Counter values in conflict."""
+        return len(np.unique(self.position))
 
     def within(self, begin: int, end: int) -> int:
         """Counter values in conflict among the rows in [begin, end)."""
@@ -121,6 +126,11 @@ def _positions(item: Decoded, tick: Rows, every: int) -> Rows:
     return position * (int(stream.max(initial=0)) + 1) + stream
 
 
+def too_many(conflicts: int, values: int) -> bool:
+    """Whether so many of a message's counter values are in conflict that chance did not do it."""
+    return conflicts > max(LEAST_CONFLICTS, MOST_CONFLICTS * values)
+
+
 def second_senders(
     counts: Mapping[str, MessageCounts],
     conflicts: Mapping[str, Conflicts],
@@ -132,7 +142,7 @@ def second_senders(
     reasons = []
     for name, item in counts.items():
         values = item.accepted + item.lost
-        if item.conflicts <= max(LEAST_CONFLICTS, MOST_CONFLICTS * values):
+        if not too_many(item.conflicts, values):
             continue
         message = bus_map.messages[name]
         how = "the same counters twice"
