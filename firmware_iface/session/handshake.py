@@ -126,6 +126,7 @@ class Handshake:
     _aborted_at: int = field(init=False, default=0)
     _before: BitStatus | None = field(init=False, default=None)
     _status: BitStatus | None = field(init=False, default=None)
+    _serial: int | None = field(init=False, default=None)
     _other_serial: int = field(init=False, default=0)
     _went_back: int = field(init=False, default=0)
     _why: str = field(init=False, default="")
@@ -233,11 +234,12 @@ class Handshake:
         before = self._status
         if before is None or self.phase not in (Phase.ARMING, Phase.RUNNING, Phase.TRAILING):
             return ""
-        if None not in (before.serial, status.serial) and status.serial != before.serial:
+        self._serial = before.serial if self._serial is None else self._serial
+        if None not in (self._serial, status.serial) and status.serial != self._serial:
             self._other_serial += 1
             if self._other_serial >= TWICE:
                 return (
-                    f"status of two actuators, serial {before.serial} and {status.serial}: a second"
+                    f"status of two actuators, serial {self._serial} and {status.serial}: a second"
                     " sender on the bus"
                 )
         both_run = before.state is BitState.RUNNING is status.state
