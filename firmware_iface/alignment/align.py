@@ -1,4 +1,4 @@
-"""Decoded frames onto the tick grid of each test, with the counts of what was wrong."""
+"""Builds recordings of tests from frames: samples at their ticks, losses as NaN and counted."""
 
 from __future__ import annotations
 

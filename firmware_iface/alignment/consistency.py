@@ -1,4 +1,4 @@
-"""Whether all that was said during a test is of one test on one unit."""
+"""Checks that everything said during a test concerns one test on one unit."""
 
 from __future__ import annotations
 

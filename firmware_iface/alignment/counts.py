@@ -1,4 +1,4 @@
-"""Counts of what was wrong with the frames of a message over the span of a test."""
+"""Counts the lost, repeated, late and damaged frames of a message during a test."""
 
 from __future__ import annotations
 

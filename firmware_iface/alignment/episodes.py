@@ -1,4 +1,4 @@
-"""Where the tests lie in a recording: first tick, length and outcome of each."""
+"""Finds the tests in a recording: where each begins, how long it is and how it ended."""
 
 from __future__ import annotations
 

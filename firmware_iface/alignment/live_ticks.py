@@ -1,4 +1,4 @@
-"""Live telemetry and commands put together, tick by tick, as a monitor wants them.
+"""Assembles live telemetry and commands into control ticks, one by one, for the monitor.
 
 A whole test is put together afterwards, from columns, by `firmware_iface.alignment.align`.
 """

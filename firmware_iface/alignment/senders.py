@@ -1,4 +1,4 @@
-"""A second sender under an identifier of ours: its frames taken out, and what gives it away."""
+"""Finds a second sender: drops the frames in conflict and says what gave it away."""
 
 from __future__ import annotations
 

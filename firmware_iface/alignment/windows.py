@@ -1,4 +1,4 @@
-"""A long recording in windows, each of which holds whole tests, so that memory stays constant."""
+"""Cuts a long stream of frames into windows of whole tests, so that memory stays constant."""
 
 from __future__ import annotations
 
@@ -122,11 +122,11 @@ class _Reading:
         half = len(window) // 2
         told = told[told >= half]
         edges = np.concatenate(([half], told, [len(window)]))
-        gaps = np.diff(edges)
-        longest = int(gaps.argmax())
-        if gaps[longest] < QUIET:
+        quiet = np.diff(edges)
+        longest = int(quiet.argmax())
+        if quiet[longest] < QUIET:
             return 0
-        return int(edges[longest] + gaps[longest] // 2)
+        return int(edges[longest] + quiet[longest] // 2)
 
     def _rows_of_a_test(self, window: FrameTable) -> NDArray[np.int64]:
         decoded = decode(window, self._telling)

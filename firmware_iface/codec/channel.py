@@ -1,4 +1,4 @@
-"""Which adapter channel of a recording is the actuator's.
+"""Chooses the adapter channel of a recording that carries the actuator's bus.
 
 A frame belongs to its channel, bus and identifier: equal identifiers on two channels are two
 streams, never one.

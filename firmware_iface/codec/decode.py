@@ -1,4 +1,4 @@
-"""Frames in bulk to checked signal columns in SI, one set per message."""
+"""Decodes frames in bulk into SI values: one set of columns for each message."""
 
 from __future__ import annotations
 

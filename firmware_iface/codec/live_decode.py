@@ -1,4 +1,4 @@
-"""Frames one at a time, as they come: what the handshake, its limits and the emulator act on.
+"""Decodes single frames as they arrive, for the handshake, the limits and the emulator.
 
 Diagnosis does not read through here: it works on columns of the whole test (`decode`).
 """

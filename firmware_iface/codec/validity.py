@@ -1,4 +1,4 @@
-"""When a frame counts: its length, its check sum, and that nobody else sends under its name.
+"""Decides which frames to believe: length, CRC, range, and the counter where two send.
 
 All that decides whether a frame of a mapped message is believed stands here, for frames in columns
 and for one at a time:

@@ -1,4 +1,4 @@
-"""ASC text with its two kinds of time made one, for python-can's reader.
+"""Lets python-can read ASC logs with relative time stamps, and lines without an end.
 
 `timestamps relative` means that each stamp counts from the event before it, whatever that event
 is; python-can takes every stamp for an absolute one.

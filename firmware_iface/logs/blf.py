@@ -1,4 +1,4 @@
-"""BLF recordings a block at a time: objects into columns, without a Python object per frame.
+"""Reads BLF recordings in blocks, without a Python object for each frame.
 
 python-can's reader is the oracle in the tests; it makes a message of every frame, which takes
 about fifty times as long. Layouts after its source and Vector's published headers.

@@ -1,4 +1,4 @@
-"""Files of frames (BLF, ASC, CSV, TRC, MF4), read a block at a time and within a budget."""
+"""Reads log files (BLF, ASC, CSV, TRC, MF4) as blocks of frames, within a budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of a recording is read: frames, bytes, seconds, and what is held in memory at once."""
+"""Limits what reading a recording may cost: frames, bytes, seconds, memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests that a log holds: all of them one after another, or the one to be diagnosed."""
+"""Reads the tests of a log: all of them, or the one to be diagnosed."""
 
 from __future__ import annotations
 

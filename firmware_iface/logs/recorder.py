@@ -1,4 +1,4 @@
-"""Raw frames to disk, before anything is decoded."""
+"""Records raw frames to disk as they arrive, before anything is decoded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs as a source of frames, and back onto a bus."""
+"""Plays logs: as a source of frames, or onto a bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A mapping resolved against its DBC: what decoder and encoder work from."""
+"""Resolves a mapping file against its DBC into what decoder and encoder work from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A DBC file as plain data: read by cantools, remembered in the user's cache.
+"""Reads a DBC file with cantools, and keeps the result in the user's cache.
 
 cantools takes a quarter of a second to load (it loads python-can, and that whatever reads MF4), so
 what it found in a file is kept, as JSON under a hash of the file's bytes.

@@ -1,4 +1,4 @@
-"""The mapping file: which messages and signals of a DBC play which role here.
+"""The schema of a mapping file: which signal of which message plays which role.
 
 Untrusted input: every key is known, sizes are limited, and nothing in it is executed.
 """

@@ -1,4 +1,4 @@
-"""What a bus or a log carries for us: what maps, what is missing, rates, pauses, range use."""
+"""Reports what a bus carries: which messages map, what is missing, rates, pauses, range use."""
 
 from __future__ import annotations
 

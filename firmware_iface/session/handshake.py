@@ -1,4 +1,4 @@
-"""Requesting a built-in test: the handshake as a state machine, without bus, threads or clock.
+"""The handshake that requests a test, as a state machine without bus, threads or clock.
 
     SETTLING -> REQUESTED -> ARMING -> RUNNING -> TRAILING -> DONE
                      \\_________\\_________\\-> ABORTING -> DONE
@@ -170,11 +170,11 @@ class Handshake:
                 actions = [Action.ABORT]
         return actions
 
-    def excuse(self, gap_ns: int) -> None:
+    def excuse(self, pause_ns: int) -> None:
         """Take out a time in which the reader itself did not run: what came then still waits."""
-        self._since += gap_ns
-        self._heard += gap_ns
-        self._watch.excuse(gap_ns)
+        self._since += pause_ns
+        self._heard += pause_ns
+        self._watch.excuse(pause_ns)
 
     def on_status(self, now: int, status: BitStatus) -> list[Action]:
         """Take a valid status message."""

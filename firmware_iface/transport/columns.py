@@ -1,4 +1,4 @@
-"""Columns of frames that grow: by the frame or by the block, about 25 bytes a frame."""
+"""Growing columns of frames, filled one frame or one block at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames as they come from a bus or a recording: one at a time, and in bulk as columns."""
+"""The types for frames: a single one, and many as columns."""
 
 from __future__ import annotations
 

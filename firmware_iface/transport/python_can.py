@@ -1,4 +1,4 @@
-"""Every python-can interface, by its name, as a transport."""
+"""Makes every python-can interface a transport."""
 
 from __future__ import annotations
 
