@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 from ehadiag.core.errors import ConfigurationError
@@ -74,8 +75,9 @@ FAULT_CHANCE = 0.5
 def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tuple[str, ...]]:
     """Verdict on estimates that can carry one, and why.
 
-    By the interval rule FAULT goes before NOT TESTED (a severity of which the test says nothing: its
-    interval reaches from below the advisory level to above the limit), and that before DEGRADED.
+    By the interval rule FAULT goes before NOT TESTED (a severity of which the test says nothing:
+    its interval reaches from below the advisory level to above the limit), and that before
+    DEGRADED.
     """
     if levels.rule is Rule.ESTIMATE:
         return _by_estimate(identification.estimates, levels)
@@ -141,9 +143,8 @@ def _by_chance(estimates: Sequence[Estimate], levels: Levels) -> tuple[Verdict, 
 
 def chance_above(item: Estimate, level: float) -> float:
     """Chance that a severity is at or above a level: of a normal density within 0 … 1."""
-    from scipy.special import ndtr  # noqa: PLC0415 - not before something is to be judged
-
     if item.std <= 0.0:
         return float(item.value >= level)
-    low, at, high = (ndtr((x - item.value) / item.std) for x in (0.0, level, 1.0))
-    return float((high - at) / (high - low)) if high > low else float(item.value >= level)
+    density = NormalDist(item.value, item.std)
+    low, at, high = (density.cdf(x) for x in (0.0, level, 1.0))
+    return (high - at) / (high - low) if high > low else float(item.value >= level)

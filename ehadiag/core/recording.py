@@ -156,6 +156,8 @@ class MessageCounts:
     """Counter gaps, and frames missing at the ends of the test."""
     repeated: int = 0
     out_of_order: int = 0
+    conflicts: int = 0
+    """Counter values that came with different payloads; all their frames are dropped, and lost."""
     crc_errors: int = 0
     length_errors: int = 0
     range_errors: int = 0
@@ -203,6 +205,15 @@ class Recording:
     outcome: Outcome
     environment: Environment
     quality: Quality
+    channel: int | None = None
+    """Adapter channel of the recording; None where it has only one or does not say."""
+    start_ns: int | None = None
+    """Host time of the test's first sample, ns since the epoch (or the log's start)."""
+
+    @property
+    def duration(self) -> float:
+        """Length of the test, s; 0 without samples."""
+        return 0.0 if self.samples is None else self.samples.ticks * self.samples.period_ns * 1e-9
 
     def to_frame(self) -> pandas.DataFrame:
         """Return the samples as a data frame, see `Samples.to_frame`.

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.small_file import read_small_file
 
 __all__ = ["MAX_BYTES", "decode_toml", "read_toml"]
 
 MAX_BYTES = 1 << 20
 """Largest configuration file that is read; configuration is untrusted input."""
+
+MAX_PARTS = 16
+DEEP_KEY = re.compile(rb"(?<![\"'\w-])(?:[\"'\w-]+[ \t]*\.[ \t]*){%d}" % MAX_PARTS)
+"""Dotted keys cost the parser the square of their length; numbers between commas do not match."""
+PLACE = re.compile(r"\(at line (\d+), column (\d+)\)$")
 
 T = TypeVar("T")
 
@@ -24,25 +31,22 @@ def read_toml(path: Path, kind: type[T], what: str) -> T:
 
     Raises
     ------
-    InputOutputError: the file cannot be read.
+    InputOutputError: the file cannot be read, or is no regular file.
     ConfigurationError: too large, not TOML, or not what `kind` demands.
     """
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputOutputError(f"{what} {path}: {error.strerror or error}") from None
-    return decode_toml(text, kind, f"{what} {path}")
+    return decode_toml(read_small_file(path, MAX_BYTES, what), kind, f"{what} {path}")
 
 
 def decode_toml(text: bytes, kind: type[T], where: str) -> T:
     """Decode TOML bytes into `kind`; `where` begins each error text."""
     if len(text) > MAX_BYTES:
         raise ConfigurationError(f"{where}: larger than {MAX_BYTES} bytes, not a configuration")
+    if DEEP_KEY.search(text):
+        raise ConfigurationError(f"{where}: a key of more than {MAX_PARTS} parts")
     try:
         tree = tomllib.loads(text.decode("utf-8"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigurationError(f"{where}: not valid TOML: {_one_line(error)}") from None
+        raise ConfigurationError(f"{where}: not valid TOML{_place(error)}") from None
     _refuse_non_finite(tree, where, "$")
     try:
         return msgspec.convert(tree, kind)
@@ -59,6 +63,12 @@ def _refuse_non_finite(node: Any, where: str, at: str) -> None:
             _refuse_non_finite(value, where, f"{at}[{index}]")
     elif isinstance(node, float) and not math.isfinite(node):
         raise ConfigurationError(f"{where}: a finite number is needed at {at}, not {node}")
+
+
+def _place(error: Exception) -> str:
+    """Where the parser stumbled, without a word of what stands there: it may be any file."""
+    found = PLACE.search(str(error))
+    return f" at line {found[1]}, column {found[2]}" if found else ""
 
 
 def _one_line(error: Exception) -> str:

@@ -114,6 +114,7 @@ def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
         "frames": total("received"),
         "lost": total("lost"),
         "repeated": total("repeated"),
+        "conflicts": total("conflicts"),
         "crc_errors": total("crc_errors"),
         "out_of_order": total("out_of_order"),
         "length_errors": total("length_errors"),

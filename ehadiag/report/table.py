@@ -111,7 +111,7 @@ def _quality(diagnosis: Diagnosis) -> str:
 
     return (
         f"frames {total('received')}, lost {total('lost')}, repeated {total('repeated')}, "
-        f"CRC errors {total('crc_errors')}"
+        f"conflicts {total('conflicts')}, CRC errors {total('crc_errors')}"
     )
 
 

@@ -1,4 +1,4 @@
-"""End-to-end protection: check sums and counters, over whole columns at once."""
+"""End-to-end protection: the CRC, and the unlimited position that a wrapping counter means."""
 
 from __future__ import annotations
 

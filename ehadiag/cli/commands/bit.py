@@ -220,18 +220,18 @@ def _connect(
 
     if not arguments.simulate:
         ours = options.open_transport(arguments, transmit=not arguments.listen)
-        return stack.enter_context(ours), Recorder(path)
+        return stack.enter_context(ours), Recorder(path, channel=bus_map.channel)
     from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415 - loads numba
     from ehadiag_sim.fcc.emulator import EmulatorTransport  # noqa: PLC0415
 
     core = make_core(arguments, actuator, [test], bus_map)
     if arguments.fast:
-        return stack.enter_context(EmulatorTransport(core)), Recorder(path)
+        return stack.enter_context(EmulatorTransport(core)), Recorder(path, channel=bus_map.channel)
     if not options.has_bus(arguments):
         arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
     theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
     ours = stack.enter_context(options.open_transport(arguments, transmit=True))
-    recorder = Recorder(path)
+    recorder = Recorder(path, channel=bus_map.channel)
     stack.enter_context(emulator_beside(core, theirs))
     return ours, recorder
 

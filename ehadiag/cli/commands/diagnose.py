@@ -50,15 +50,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="the logs are of one actuator: one estimate from all of them",
     )
     parser.add_argument("--all", action="store_true", help="every test in a log, not its last one")
+    parser.add_argument(
+        "--list", action="store_true", help="list the tests that each log holds, diagnose none"
+    )
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
+    options.add_log_options(parser)
     options.add_diagnosis_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose each log; return the worst exit code."""
+    if arguments.list:
+        return _list(arguments)
     # What is wrong with the options is said before anything slow is loaded.
     diagnosis = _Diagnosis(arguments)
     codes = [0]
@@ -87,6 +93,23 @@ def run(arguments: argparse.Namespace) -> int:
     return max(codes)
 
 
+def _list(arguments: argparse.Namespace) -> int:
+    """Print what the logs hold."""
+    from ehadiag.cli.listing import print_list  # noqa: PLC0415
+    from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
+
+    bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
+    code = 0
+    for log in arguments.logs:
+        try:
+            found = iterate_recordings(log, bus_map, budget)
+            print_list(log, found, as_json=arguments.json)
+        except EhadiagError as error:
+            say(str(error))
+            code = max(code, error.exit_code)
+    return code
+
+
 class _Diagnosis:
     """What all logs of one call have in common."""
 
@@ -98,16 +121,21 @@ class _Diagnosis:
         self._default = resolve_test(only) if only else None
         self._levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
         self._bus_map = options.the_bus_map(arguments)
+        self._budget = options.the_budget(arguments)
         self._folder = make_folder(arguments.out) if arguments.out else None
         self._names: set[str] = set()
         say_if_compiling()
 
     def read(self, log: str) -> list[Recording]:
         """Read what is to be diagnosed of one log."""
-        from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - loads cantools
+        from firmware_iface.logs.reader import (  # noqa: PLC0415 - loads cantools
+            read_recording,
+            read_recordings,
+        )
 
-        found = read_recordings(log, self._bus_map)
-        return list(found) if self._arguments.all else [choose(found)]
+        if self._arguments.all:
+            return list(read_recordings(log, self._bus_map, self._budget))
+        return [read_recording(log, self._bus_map, self._budget)]
 
     def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
         """Diagnose, print and write one result; return its exit code."""

@@ -326,6 +326,14 @@ CLOSED_LOSSES = """\
 """Measured by closed_losses.py."""
 
 
+SECOND_SENDER = """
+## What a second sender does to a test
+
+Its frames are dropped and counted as conflicts, or the answer is NOT TESTED and names it:
+[a second sender](second-sender.md).
+"""
+
+
 def table() -> str:
     """The tables of the docs."""
     from fault_logs import LOG_CASES  # builds upon this module
@@ -375,7 +383,7 @@ The recording of the same test, damaged, and read as `ehadiag diagnose` reads it
 
 | log | diagnosis |
 | --- | --- |
-{logs}"""
+{logs}{SECOND_SENDER}"""
 
 
 if __name__ == "__main__":
