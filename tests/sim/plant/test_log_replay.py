@@ -96,6 +96,23 @@ def test_convergence_prints_a_table(capsys):
     assert [row.split("|")[1].strip() for row in rows] == ["step, µs", "---", "8", "4"]
 
 
+def test_convergence_of_units_falls_with_the_step(capsys):
+    words = "--units 1 --test open --ticks 500 --steps 16 2"
+    assert convergence.main(words.split()) == 0
+    stages = ("| linear |", "| orifice |")
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line.split("|") for line in lines if line.startswith(stages)]
+    cells = [(row[1].strip(), row[2].strip(), float(row[3].split()[0])) for row in rows]
+    assert [cell[:2] for cell in cells] == [
+        ("linear", "16"),
+        ("linear", "2"),
+        ("orifice", "16"),
+        ("orifice", "2"),
+    ]
+    assert cells[1][2] < 0.3 * cells[0][2]
+    assert cells[3][2] < 0.3 * cells[2][2]
+
+
 @pytest.mark.parametrize(
     ("options", "words"), [(["--faults", "2", "0", "0"], "Kintas"), (["--ticks", "0"], "--ticks")]
 )

@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         faults = Faults(*options.faults)
         for name in options.test or ("open", "closed"):
             if options.units:
-                unit_table(resolve_test(name), options.units, options.steps)
+                unit_table(resolve_test(name), options.units, options.steps, options.ticks)
                 continue
             table(name, faults, options.steps, options.ticks)
     except EhadiagError as error:

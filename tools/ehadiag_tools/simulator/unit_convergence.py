@@ -25,8 +25,13 @@ FINEST = 0.0625e-6
 LSB = np.array([[SPOOL.lsb], [PRESSURE.lsb], [POSITION.lsb]])
 
 
-def unit_table(test: StoredTest, count: int, steps_us: Sequence[float]) -> None:
-    """Print the error per step over `count` random units, of either second stage."""
+def unit_table(
+    test: StoredTest, count: int, steps_us: Sequence[float], ticks: int | None = None
+) -> None:
+    """Print the error per step over `count` random units, of either second stage.
+
+    `ticks`: only the first so many.
+    """
     print(
         f"Test {test.name}, {count} random units each, faults random too: LSB rms, median (largest)"
     )
@@ -40,7 +45,7 @@ def unit_table(test: StoredTest, count: int, steps_us: Sequence[float]) -> None:
             unit = random_unit(rng, data=True, friction=True, orifice=orifice)
             faults = Faults(*rng.random(3).tolist())
             run = simulate(unit.actuator, test, faults, unit.effects, unit.sensors, seed=seed)
-            fixed = unit.actuator, run.current, faults, unit.effects
+            fixed = unit.actuator, run.current[:ticks], faults, unit.effects
             reference = respond(*fixed, step=FINEST)
             for step in steps_us:
                 began = time.process_time()
