@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=int,
         default=0,
         metavar="N",
-        help="instead of the stiff solver: N random units of either second stage",
+        help="instead of the stiff solver: N random units of either stage and friction",
     )
     options = parser.parse_args(argv)
     try:
