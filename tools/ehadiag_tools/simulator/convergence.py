@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=int,
         default=0,
         metavar="N",
-        help="instead of the stiff solver: N random units of either second stage",
+        help="instead of the stiff solver: N random units of either stage and friction",
     )
     options = parser.parse_args(argv)
     try:
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         faults = Faults(*options.faults)
         for name in options.test or ("open", "closed"):
             if options.units:
-                unit_table(resolve_test(name), options.units, options.steps)
+                unit_table(resolve_test(name), options.units, options.steps, options.ticks)
                 continue
             table(name, faults, options.steps, options.ticks)
     except EhadiagError as error:
