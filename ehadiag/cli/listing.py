@@ -1,4 +1,4 @@
-"""What `ehadiag diagnose --list` prints: one line for each test that a recording holds."""
+"""`ehadiag diagnose --list`: one line for each test in a recording."""
 
 from __future__ import annotations
 

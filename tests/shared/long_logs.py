@@ -1,4 +1,4 @@
-"""Recordings of many hours, written fast: the same stretch of a bus again and again."""
+"""Writes recordings of many hours quickly, by repeating a stretch of a bus."""
 
 from __future__ import annotations
 
