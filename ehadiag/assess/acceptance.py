@@ -85,7 +85,7 @@ def objections_to_recording(
         return ["the test was aborted"]
     samples = recording.samples
     if samples is None:
-        return ["no telemetry of a test in the recording"]
+        return [*recording.quality.refused, "no telemetry of a test in the recording"]
     if test is None and recording.test_id is None:
         return ["the recording does not say which test it is of: name the test by --test"]
     if test is None:
@@ -123,11 +123,11 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
         present = np.flatnonzero(np.isfinite(values[: test.ticks]))
         share = 1.0 - len(present) / test.ticks
         edges = np.concatenate([[-1], present, [test.ticks]])
-        gap = float(np.diff(edges).max() - 1) / test.rate
+        longest = float(np.diff(edges).max() - 1) / test.rate
         if share > MOST_LOST:
             out.append(f"{share:.0%} of the {name} samples are missing (limit {MOST_LOST:.0%})")
-        elif gap > LONGEST_GAP_S:
-            out.append(f"no {name} sample for {gap:.2f} s (limit {LONGEST_GAP_S:g} s)")
+        elif longest > LONGEST_GAP_S:
+            out.append(f"no {name} sample for {longest:.2f} s (limit {LONGEST_GAP_S:g} s)")
     both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])
     for search in ("FDJ", "Kintas", "FSS", "refinement"):
         for start, end in getattr(test.windows, search):
@@ -164,18 +164,18 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     out = []
     trace, test = experiment.trace, experiment.test
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-    if trace.command_gap > FRAME_TOLERANCE[mode]:
+    if trace.command_deviation > FRAME_TOLERANCE[mode]:
         unit = "mm" if test.closed_loop else "mA"
         out.append(
             f"the command differs from test {test.name!r} by up to "
-            f"{trace.command_gap * 1e3:.3g} {unit}: another test was played"
+            f"{trace.command_deviation * 1e3:.3g} {unit}: another test was played"
         )
     # The current's own noise is not to be had in closed loop; the other converters' stands for it.
     noise_lsb = min(experiment.spool_noise / SPOOL.lsb, experiment.pressure_noise / PRESSURE.lsb)
     limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
-    if trace.gap_lsb > limit_lsb:
+    if trace.residual_lsb > limit_lsb:
         out.append(
-            f"servovalve current {trace.gap_lsb:.1f} LSB rms from what the "
+            f"servovalve current {trace.residual_lsb:.1f} LSB rms from what the "
             f"{'control law' if test.closed_loop else 'command'} gives (limit "
             f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
         )
@@ -198,8 +198,8 @@ def objections_to_estimate(identification: Identification) -> list[str]:
     rms = max(fit.spool_rms, fit.pressure_rms)
     if fit.outliers > MOST_OUTLIERS or not rms <= MOST_RMS:
         out.append(
-            f"the model does not explain the recording: {fit.outliers:.1%} of the gaps beyond "
-            f"three times the noise (limit {MOST_OUTLIERS:.1%}), rms gap {rms:.2f} (limit "
+            f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
+            f"three times the noise (limit {MOST_OUTLIERS:.1%}), rms residual {rms:.2f} (limit "
             f"{MOST_RMS:g}): other actuator data, or an effect that the three faults leave out"
         )
     hidden = [item.name for item in identification.estimates if not item.shown]

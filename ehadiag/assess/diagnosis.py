@@ -6,23 +6,29 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ehadiag.assess.acceptance import (
     objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
+    out_of_range,
     remarks_on_recording,
 )
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
-from ehadiag.identify.experiment import Experiment, build_experiment
-from ehadiag.identify.pipeline import identify
+from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
 from ehadiag.identify.result import Identification
-from ehadiag.identify.search.solvers import Solver
-from ehadiag.identify.search.stages import Memory, Progress
+from ehadiag.identify.search.solvers import CompactGa, Solver
+from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
+from ehadiag.identify.session import Session
 
-__all__ = ["Diagnosis", "diagnose", "match_tests", "not_tested"]
+__all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
+
+LEAST_SHARE = 0.75
+"""Share of samples without which nothing is worked out of a running test."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +50,117 @@ class Diagnosis:
     """s from samples to verdict."""
 
 
+class DiagnosisSession:
+    """A diagnosis that is fed a recording as it grows, and is asked to finish.
+
+    A finished recording is the same path, fed once: `diagnose`. What was worked out of a test's
+    beginning is used where the finished recording has the same samples to the last bit, so that the
+    answer is that of the recording alone, only sooner. One thread at a time.
+
+    Parameters
+    ----------
+    actuator : Actuator
+    tests : iterable of StoredTest
+        The tests that a recording may be of, told apart by number.
+    default : StoredTest, optional
+        Test of recordings whose bus does not carry a number.
+    levels : Levels, optional
+        Advisory level and limit.
+    solver : Solver, optional
+        Global search; the compact genetic algorithm unless given.
+    seed : int
+        The same seed gives the same answer on the same machine.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        tests: Iterable[StoredTest],
+        *,
+        default: StoredTest | None = None,
+        levels: Levels | None = None,
+        solver: Solver | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._actuator = actuator
+        self._tests = tuple(tests)
+        self._default = default
+        self._levels = levels or Levels()
+        self._session = Session(solver, seed)
+
+    @property
+    def reused(self) -> int:
+        """Stages that did not have to run again when the diagnosis was finished."""
+        return self._session.reused
+
+    def due_s(self, test: StoredTest) -> tuple[float, ...]:
+        """Instants of a running test (s) from which there is something more to work out.
+
+        None for a solver that holds the interpreter, nor for a test without a quiet first part.
+        """
+        if not isinstance(self._session.solver, CompactGa) or not noise_is_judged_early(test):
+            return ()
+        ends = {first_ends_at(test), *(stage_ends_at(test, i) for i in range(len(STAGES)))}
+        return tuple(sorted(end for end in ends if end < test.duration))
+
+    def feed(self, recording: Recording) -> None:
+        """Work out all that the samples so far allow; nothing of what cannot carry a verdict."""
+        samples, test = recording.samples, _match(recording, self._tests, self._default)
+        if samples is None or samples.ticks == 0 or test is None or not self.due_s(test):
+            return
+        if out_of_range(recording.environment, samples, self._actuator):
+            return
+        experiment = build_experiment(samples, recording.environment, test, self._actuator)
+        for values in (experiment.spool, experiment.pressure):
+            if np.isfinite(values).mean() < LEAST_SHARE:
+                return
+        self._session.feed([experiment])
+
+    def finish(
+        self, recordings: Sequence[Recording], progress: Progress | None = None
+    ) -> Diagnosis:
+        """Diagnose one actuator from one complete recording, or from several together."""
+        begin = time.perf_counter()
+        matched = match_tests(recordings, self._tests, self._default)
+        experiments, reasons = self._experiments(recordings, matched)
+        identification: Identification | None = None
+        verdict, why = Verdict.NOT_TESTED, tuple(reasons)
+        if not reasons:
+            identification = self._session.finish(experiments, progress)
+            why = tuple(objections_to_estimate(identification))
+            if not why:
+                verdict, why = judge(identification, self._levels)
+        return Diagnosis(
+            recordings=tuple(recordings),
+            tests=matched,
+            actuator=self._actuator,
+            verdict=verdict,
+            reasons=why,
+            identification=identification,
+            experiments=tuple(experiments) if identification else (),
+            notes=_notes(recordings, matched, self._actuator),
+            elapsed=time.perf_counter() - begin,
+        )
+
+    def _experiments(
+        self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]
+    ) -> tuple[list[Experiment], list[str]]:
+        """What is identified from, and why that cannot be."""
+        reasons, experiments = [], []
+        for recording, test in zip(recordings, matched, strict=True):
+            objections = objections_to_recording(recording, test, self._actuator)
+            if not objections and test is not None and recording.samples is not None:
+                experiment = build_experiment(
+                    recording.samples, recording.environment, test, self._actuator
+                )
+                objections = objections_to_experiment(experiment)
+                experiments.append(experiment)
+            reasons += objections
+        if len({recording.serial for recording in recordings} - {None}) > 1:
+            reasons.append("the recordings are of actuators with different serial numbers")
+        return experiments, reasons
+
+
 def diagnose(
     recordings: Sequence[Recording],
     actuator: Actuator,
@@ -54,58 +171,12 @@ def diagnose(
     solver: Solver | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-    memory: Memory | None = None,
 ) -> Diagnosis:
-    """Diagnose one actuator from one recording, or from several together.
-
-    Parameters
-    ----------
-    tests: the tests that a recording may be of, told apart by number.
-    default: test of recordings whose bus does not carry a number.
-    memory: what was worked out ahead (see `ehadiag.assess.online`); it does not change the
-        answer.
-    """
-    begin = time.perf_counter()
-    matched = match_tests(recordings, tests, default)
-
-    def result(
-        verdict: Verdict,
-        reasons: Sequence[str],
-        identification: Identification | None = None,
-        experiments: tuple[Experiment, ...] = (),
-    ) -> Diagnosis:
-        return Diagnosis(
-            recordings=tuple(recordings),
-            tests=matched,
-            actuator=actuator,
-            verdict=verdict,
-            reasons=tuple(reasons),
-            identification=identification,
-            experiments=experiments,
-            notes=_notes(recordings, matched, actuator),
-            elapsed=time.perf_counter() - begin,
-        )
-
-    reasons, experiments = [], []
-    for recording, test in zip(recordings, matched, strict=True):
-        objections = objections_to_recording(recording, test, actuator)
-        if not objections and test is not None and recording.samples is not None:
-            experiment = build_experiment(recording.samples, recording.environment, test, actuator)
-            objections = objections_to_experiment(experiment)
-            experiments.append(experiment)
-        reasons += objections
-    if len({recording.serial for recording in recordings} - {None}) > 1:
-        reasons.append("the recordings are of actuators with different serial numbers")
-    if reasons:
-        return result(Verdict.NOT_TESTED, reasons)
-    identification = identify(
-        experiments, solver=solver, seed=seed, progress=progress, memory=memory
+    """Diagnose one actuator from complete recordings: see `DiagnosisSession`."""
+    session = DiagnosisSession(
+        actuator, tests, default=default, levels=levels, solver=solver, seed=seed
     )
-    doubts = objections_to_estimate(identification)
-    if doubts:
-        return result(Verdict.NOT_TESTED, doubts, identification, tuple(experiments))
-    verdict, why = judge(identification, levels or Levels())
-    return result(verdict, why, identification, tuple(experiments))
+    return session.finish(recordings, progress)
 
 
 def not_tested(
@@ -140,6 +211,15 @@ def match_tests(
     return tuple(_match(recording, known, default) for recording in recordings)
 
 
+def _match(
+    recording: Recording, tests: Sequence[StoredTest], default: StoredTest | None
+) -> StoredTest | None:
+    """Find the test that a recording is of."""
+    if recording.test_id is None:
+        return default
+    return next((test for test in tests if test.id == recording.test_id), None)
+
+
 def _notes(
     recordings: Sequence[Recording], tests: Sequence[StoredTest | None], actuator: Actuator
 ) -> tuple[str, ...]:
@@ -149,12 +229,3 @@ def _notes(
         for recording, test in zip(recordings, tests, strict=True)
     )
     return tuple(dict.fromkeys(note for notes in each for note in notes))
-
-
-def _match(
-    recording: Recording, tests: Sequence[StoredTest], default: StoredTest | None
-) -> StoredTest | None:
-    """Find the test that a recording is of."""
-    if recording.test_id is None:
-        return default
-    return next((test for test in tests if test.id == recording.test_id), None)

@@ -22,7 +22,7 @@ from ehadiag.core.recording import Environment, Outcome, Quality, Recording
 from ehadiag.core.stored_test import StoredTest
 
 if TYPE_CHECKING:
-    from ehadiag.assess.online import OnlineIdentification
+    from ehadiag.assess.diagnosis import DiagnosisSession
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.session.tester import Progress, TesterOutcome
@@ -55,7 +55,7 @@ def acquire(
     test: StoredTest,
     bus_map: BusMap,
     folder: Path,
-    online: OnlineIdentification,
+    session: DiagnosisSession,
     stop: threading.Event,
 ) -> Heard:
     """Run the test on the bus."""
@@ -67,7 +67,7 @@ def acquire(
     path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
     assembler = Assembler(str(path), bus_map)
     outcome, why, listened = None, STOPPED, 0.0
-    with working_ahead(online, assembler, test) as ahead:
+    with working_ahead(session, assembler, test) as ahead:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
             bus = ours.name
@@ -143,18 +143,18 @@ def _connect(
 
     if not arguments.simulate:
         ours = options.open_transport(arguments, transmit=not arguments.listen)
-        return stack.enter_context(ours), Recorder(path)
+        return stack.enter_context(ours), Recorder(path, channel=bus_map.channel)
     from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415 - loads numba
     from ehadiag_sim.fcc.emulator import EmulatorTransport  # noqa: PLC0415
 
     core = make_core(arguments, actuator, [test], bus_map)
     if arguments.fast:
-        return stack.enter_context(EmulatorTransport(core)), Recorder(path)
+        return stack.enter_context(EmulatorTransport(core)), Recorder(path, channel=bus_map.channel)
     if not options.has_bus(arguments):
         arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
     theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
     ours = stack.enter_context(options.open_transport(arguments, transmit=True))
-    recorder = Recorder(path)
+    recorder = Recorder(path, channel=bus_map.channel)
     stack.enter_context(emulator_beside(core, theirs))
     return ours, recorder
 

@@ -1,4 +1,4 @@
-"""Identifies in a thread of its own while `ehadiag bit` still runs the test."""
+"""Runs the identification in a thread while `ehadiag bit` is still running the test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ehadiag.assess.online import OnlineIdentification
+    from ehadiag.assess.diagnosis import DiagnosisSession
     from ehadiag.cli.deadline import Deadline
     from ehadiag.core.recording import Recording
     from ehadiag.core.stored_test import StoredTest
@@ -29,13 +29,11 @@ MARGIN_S = 0.02
 class Ahead:
     """Takes snapshots of a running test, and has them worked on."""
 
-    def __init__(
-        self, online: OnlineIdentification, assembler: Assembler, test: StoredTest
-    ) -> None:
-        self._online = online
+    def __init__(self, session: DiagnosisSession, assembler: Assembler, test: StoredTest) -> None:
+        self._session = session
         self._assembler = assembler
         self._test = test
-        self._due = list(online.due_s)
+        self._due = list(session.due_s(test))
         self._abandoned = False
         self._work: queue.SimpleQueue[FrameTable | None] = queue.SimpleQueue()
         self.ended_at: float | None = None
@@ -91,15 +89,15 @@ class Ahead:
                 return
             # Whatever is wrong with the recording, its diagnosis will tell: this is only ahead.
             with contextlib.suppress(Exception):
-                self._online.take(self._assembler.recording_of(table))
+                self._session.feed(self._assembler.recording_of(table))
 
 
 @contextmanager
 def working_ahead(
-    online: OnlineIdentification, assembler: Assembler, test: StoredTest
+    session: DiagnosisSession, assembler: Assembler, test: StoredTest
 ) -> Iterator[Ahead]:
     """Work ahead; where the context ends by an exception, the work is abandoned."""
-    ahead = Ahead(online, assembler, test)
+    ahead = Ahead(session, assembler, test)
     try:
         yield ahead
     except BaseException:

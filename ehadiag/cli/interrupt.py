@@ -1,8 +1,8 @@
-"""What Ctrl-C, SIGTERM and a hang-up do in each part of a command; all three do the same.
+"""Handling of Ctrl-C, SIGTERM and hang-up in each part of a command.
 
-Before a test and in commands without one they interrupt; while a test runs the first asks for its
-abort and the second does not wait for the answer; a verdict that is known they do not change.
-A hang-up that was ignored when the program began (`nohup`) stays ignored.
+All three do the same. Before a test and in commands without one they interrupt; while a test runs
+the first asks for its abort and the second does not wait for the answer; a verdict that is known
+they do not change. A hang-up that was ignored when the program began (`nohup`) stays ignored.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Command line `ehadiag`: one parser, one place where errors become exit codes."""
+"""Entry point of `ehadiag`: one parser, and one place where errors become exit codes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import io
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn
 
@@ -15,6 +14,7 @@ from ehadiag.cli.commands import bit, diagnose, replay, sim, tests, warmup
 from ehadiag.cli.commands import check_bus as checkbus
 from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
 from ehadiag.cli.output import abandon, say
+from ehadiag.cli.version import ShowVersions
 from ehadiag.core.errors import EhadiagError, InputOutputError
 from ehadiag.core.printable import printable
 
@@ -38,9 +38,20 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code.
 
+    Parameters
+    ----------
+    argv : Sequence[str] | None
+        Arguments after the program's name; None: those of the process.
+
+    Returns
+    -------
+    int
+        Exit code.
+
     Raises
     ------
-    SystemExit: wrong usage (code 2), `--help` and `--version`.
+    SystemExit
+        Wrong usage (code 2), `--help` and `--version`.
     """
     with signals_restored():
         interrupt_on_signals()
@@ -102,7 +113,12 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"ehadiag {version('ehadiag')}")
+    parser.add_argument(
+        "--version",
+        action=ShowVersions,
+        nargs=0,
+        help="print versions, also of libraries, and exit",
+    )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     for command in (bit, diagnose, sim, tests, checkbus, replay, warmup):
         command.add_parser(subparsers)

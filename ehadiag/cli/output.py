@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TextIO, cast
 
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.printable import printable, printable_lines
+from ehadiag.facade.compiling import compiling_notice
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,8 +32,6 @@ __all__ = [
 
 LEAST_WIDTH = 100
 PIPE_WIDTH = 200
-IDENTIFICATION, SIMULATION = "ehadiag_identify", "ehadiag_sim"
-"""Packages of kernels, as the names of their cache files hold them."""
 
 
 def say(text: str) -> None:
@@ -78,15 +77,9 @@ def damage(transport: Transport) -> str:
 
 def say_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:
     """Tell that the first run takes longer, where what it needs is not in the cache."""
-    from ehadiag.compile.kernel_cache import cache_folder, kept_kernels  # noqa: PLC0415 - loads numba
-
-    needed = [SIMULATION] * simulation + [IDENTIFICATION] * identification
-    kept = kept_kernels()
-    if not all(any(kind in name for name in kept) for kind in needed):
-        often = (
-            "in memory, at each start" if cache_folder() is None else "once for this installation"
-        )
-        say(f"compiling the model's kernels, {often} (up to half a minute)")
+    notice = compiling_notice(simulation=simulation, identification=identification)
+    if notice:
+        say(notice)
 
 
 def rendered(draw: Callable[[Console], None]) -> str:

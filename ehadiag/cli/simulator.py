@@ -1,4 +1,4 @@
-"""The emulated flight-control computer, for commands that run it."""
+"""Builds and runs the emulated flight-control computer for `sim` and `bit --simulate`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
+
+from ehadiag.cli.effects import the_effects, the_sensors
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import EhadiagError
 from ehadiag.core.stored_test import StoredTest
+from ehadiag_sim.faults.hardware import Hardware, break_hardware
 from ehadiag_sim.fcc.computer import FccCore
 from ehadiag_sim.fcc.emulator import run_emulator
-from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.conditions import Faults
 from firmware_iface.mapping.bus_map import BusMap
 from firmware_iface.transport.interface import Transport
 
@@ -25,18 +29,26 @@ def make_core(
     tests: Iterable[StoredTest],
     bus_map: BusMap,
 ) -> FccCore:
-    """Return the computer with the actuator that the options describe, its kernels loaded."""
+    """Return the computer with the actuator that the options describe, its kernels loaded.
+
+    Raises
+    ------
+    ConfigurationError: a value out of its range, an unknown kind of broken hardware.
+    """
+    item = Hardware(actuator, the_effects(arguments), the_sensors(arguments))
+    if arguments.broken:
+        rng = np.random.default_rng(arguments.simulator_seed)
+        item = break_hardware(arguments.broken, rng, item)
     core = FccCore(
-        actuator,
+        item.actuator,
         tests,
         faults=Faults(arguments.Kintas, arguments.FSS, arguments.FDJ),
-        effects=Effects(
-            oil_temperature=arguments.oil_temperature, supply_pressure=arguments.supply * 1e6
-        ),
-        sensors=Sensors(arguments.noise, tuple(arguments.offsets)),
+        effects=item.effects,
+        sensors=item.sensors,
         seed=arguments.simulator_seed,
         serial=arguments.serial_number,
         bus_map=bus_map,
+        channel_faults=item.channel_faults,
     )
     core.step()
     return core
@@ -46,9 +58,17 @@ def make_core(
 def emulator_beside(core: FccCore, transport: Transport) -> Iterator[None]:
     """Run the computer on a bus in a thread of its own while the block runs.
 
+    Parameters
+    ----------
+    core : FccCore
+        The emulated computer.
+    transport : Transport
+        The bus to send and receive on.
+
     Raises
     ------
-    EhadiagError: the emulator's bus failed meanwhile.
+    EhadiagError
+        The emulator's bus failed meanwhile.
     """
     stop = threading.Event()
     failure: list[EhadiagError] = []

@@ -1,4 +1,4 @@
-"""Vectors of lanes in kernels: a number of WIDTH candidates in one variable.
+"""A numba type for SIMD vectors: one variable holds a number for each of WIDTH candidates.
 
 numba leaves it to the compiler to find vector instructions in loops, and it finds them now and
 then. Here a vector is a type: arithmetic on it is vector instructions, of whatever width the
@@ -169,12 +169,32 @@ def _lesser(builder: Any, sign: str, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered(sign, a, b, flags=FLAGS), a, b)
 
 
+def _of_numbers(function: Any, emit: Callable[..., Any], count: int) -> None:
+    """Let kernels apply a function of vectors to plain numbers too."""
+
+    @type_callable(function)
+    def _typed(_context: Any) -> Any:
+        def typer_of_two(a: Any, b: Any) -> Any:
+            return types.float64 if a == b == types.float64 else None
+
+        def typer_of_one(a: Any) -> Any:
+            return types.float64 if a == types.float64 else None
+
+        return typer_of_one if count == 1 else typer_of_two
+
+    @lower_builtin(function, *[types.float64] * count)
+    def _lowered(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return emit(builder, *arguments)
+
+
 _binary(operator.add, _VECTOR, lambda b, x, y: b.fadd(x, y, flags=FLAGS))
 _binary(operator.sub, _VECTOR, lambda b, x, y: b.fsub(x, y, flags=FLAGS))
 _binary(operator.mul, _VECTOR, lambda b, x, y: b.fmul(x, y, flags=FLAGS))
 _binary(operator.truediv, _VECTOR, lambda b, x, y: b.fdiv(x, y, flags=FLAGS))
 _binary(least, _VECTOR, lambda b, x, y: _lesser(b, "<", x, y))
 _binary(most, _VECTOR, lambda b, x, y: _lesser(b, ">", x, y))
+_of_numbers(least, lambda b, x, y: _lesser(b, "<", x, y), 2)
+_of_numbers(most, lambda b, x, y: _lesser(b, ">", x, y), 2)
 _binary(operator.lt, _MASK, lambda b, x, y: b.fcmp_ordered("<", x, y, flags=FLAGS))
 _binary(operator.gt, _MASK, lambda b, x, y: b.fcmp_ordered(">", x, y, flags=FLAGS))
 _binary(operator.le, _MASK, lambda b, x, y: b.fcmp_ordered("<=", x, y, flags=FLAGS))
@@ -227,9 +247,15 @@ def _typed_magnitude(_context: Any) -> Any:
 
 @lower_builtin(magnitude, _VECTOR)
 def _magnitude(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-    kind = ir.FunctionType(_DOUBLES, [_DOUBLES])
-    name = f"llvm.fabs.v{WIDTH}f64"
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
+    return _fabs(builder, arguments[0], f"llvm.fabs.v{WIDTH}f64")
+
+
+def _fabs(builder: Any, value: Any, name: str) -> Any:
+    kind = ir.FunctionType(value.type, [value.type])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
+
+
+_of_numbers(magnitude, lambda b, x: _fabs(b, x, "llvm.fabs.f64"), 1)
 
 
 @type_callable(where)

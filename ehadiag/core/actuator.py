@@ -1,24 +1,32 @@
-"""Data of an actuator: what the contract calls `actuator.toml`, validated."""
+"""Data of one actuator (controller, servovalve, jack), read from a TOML file and checked."""
 
 from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.toml_file import decode_toml, read_toml
 
-__all__ = ["Actuator", "Controller", "Jack", "Servovalve", "default_actuator", "load_actuator"]
+__all__ = [
+    "Actuator",
+    "Controller",
+    "Jack",
+    "SecondStage",
+    "Servovalve",
+    "default_actuator",
+    "load_actuator",
+]
 
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
 # Each range is some decades about what is built, so that no product of them leaves the numbers.
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Position controller of the flight-control computer (model.md section 1)."""
+    """Position controller of the flight-control computer (PHY-2)."""
 
     IM: Annotated[float, msgspec.Meta(ge=1e-4, le=10)]
     """Rated current and saturation, A."""
@@ -33,7 +41,7 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Two-stage flapper-nozzle servovalve, SI units (model.md section 2)."""
+    """Two-stage flapper-nozzle servovalve, SI units (PHY-4 to 6, PHY-11)."""
 
     GM: Annotated[float, msgspec.Meta(ge=1e-4, le=1e4)]
     """Torque-motor gain, N m/A."""
@@ -74,7 +82,7 @@ class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Jack and control surface, SI units (model.md section 2)."""
+    """Jack and control surface, SI units (PHY-7, PHY-11)."""
 
     AJ: Annotated[float, msgspec.Meta(ge=1e-6, le=10)]
     """Active area, m²."""
@@ -92,28 +100,52 @@ class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """External load, N."""
 
 
+class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How spool position becomes pressure: PHY-6, or the orifices of PHY-39."""
+
+    kind: Literal["linear", "orifice"] = "linear"
+    """`linear`: saturating pressure gain, stiff oil; `orifice`: two lands, compressible oil."""
+    beta: Annotated[float, msgspec.Meta(ge=1e7, le=3e9)] = 7.5e8
+    """Effective bulk modulus of the oil, Pa; of orifices only."""
+    volume: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1.6e-4
+    """Volume of both chambers together, m³; of orifices only."""
+
+
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One actuator: its name, controller, servovalve and jack."""
+    """One actuator: its name, controller, servovalve, second stage and jack."""
 
     name: Name
     controller: Controller
     servovalve: Servovalve
     jack: Jack
+    second_stage: SecondStage = SecondStage()
 
 
 def load_actuator(path: Path | str) -> Actuator:
     """Read an actuator file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    Actuator
+        The actuator's data, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, a value out of its range.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, a value out of its range.
     """
     return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
 
 
 def default_actuator() -> Actuator:
-    """Return the reference actuator that the package brings along."""
+    """Return the reference actuator, which comes with the package."""
     text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
     return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
 

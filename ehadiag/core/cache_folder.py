@@ -1,4 +1,4 @@
-"""Folders of this user's own for what can be made again: compiled kernels, digested DBC files.
+"""Cache folders of this user only: compiled kernels, contents of DBC files.
 
 What is kept here is trusted when it is read back (compiled kernels are code), so a folder is used
 only if nobody but this user and the system's administrator could have put something into it, or

@@ -154,16 +154,28 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 def load_test(path: Path | str) -> StoredTest:
     """Read a test file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    StoredTest
+        The test, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, times out of order, windows outside.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, times out of order, windows outside.
     """
     return _checked(read_toml(Path(path), StoredTest, "test file"), f"test file {path}")
 
 
 def bundled_tests() -> dict[str, StoredTest]:
-    """Return the stored tests of the contract by name."""
+    """Return the stored tests that come with the package (PHY-25, PHY-26), by name."""
     folder = resources.files("ehadiag").joinpath("data/tests")
     tests = {}
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):

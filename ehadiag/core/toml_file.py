@@ -1,4 +1,4 @@
-"""Configuration files: TOML into validated, frozen structures."""
+"""Reads TOML configuration files into checked, frozen structures."""
 
 from __future__ import annotations
 

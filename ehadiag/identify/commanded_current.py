@@ -2,7 +2,7 @@
 
 Measured current carries the converter's noise; the commanded one is known better. In open loop it
 is the command. In closed loop the control law is repeated on the *digitised* jack position, as the
-flight-control computer saw it (bus.md: the position of the tick before feeds the control law).
+flight-control computer saw it (BUS-7: the position of the tick before feeds the control law).
 Where that sample is lost, its code follows from the measured current: one code of position is
 many codes of current.
 """
@@ -18,6 +18,7 @@ from ehadiag.core.actuator import Controller
 from ehadiag.core.channels import CURRENT, POSITION
 from ehadiag.core.recording import CommandMode, Samples
 from ehadiag.core.stored_test import StoredTest
+from ehadiag.model.control import ControlLaw, commanded_currents
 
 __all__ = ["CurrentTrace", "commanded_current"]
 
@@ -29,7 +30,7 @@ LONG_HOLE = 50
 """Ticks of a hole that count as guessed: amidst a longer one there is no sample either that a wrong
 current could be held against. An integral in the control law remembers all of them."""
 CONTROL_LAW_LSB = 4.0
-"""Gap (LSB rms) beyond which the control law does not explain the measured current."""
+"""Residual (LSB rms) beyond which the control law does not explain the measured current."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,19 +40,19 @@ class CurrentTrace:
     Attributes
     ----------
     current: A, shape (n,).
-    gap_lsb: rms of measured less commanded current, converter steps; NaN without measurement.
+    residual_lsb: rms of measured less commanded current, converter steps; NaN without measurement.
     offset: constant error of the measured current, A.
     rebuilt: whether the measured current bears it out.
-    command_gap: largest distance of a command frame from the stored test, A or m.
+    command_deviation: largest distance of a command frame from the stored test, A or m.
     guessed: share of ticks whose current follows from a position that was lost, and that the
         measured current does not tell either; of a hole at most `LONG_HOLE` ticks count.
     """
 
     current: NDArray[np.float64]
-    gap_lsb: float
+    residual_lsb: float
     offset: float
     rebuilt: bool
-    command_gap: float
+    command_deviation: float
     guessed: float = 0.0
 
 
@@ -60,15 +61,24 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     n = samples.ticks
     stored = _fit_length(test.command(), n)
     known = np.isfinite(samples.command)
-    gap = np.abs(samples.command - stored)[known]
-    command_gap = float(gap.max()) if gap.size else 0.0
+    deviation = np.abs(samples.command - stored)[known]
+    command_deviation = float(deviation.max()) if deviation.size else 0.0
     command = np.where(known, samples.command, _as_sent(stored, samples.command[known]))
     guessed = 0.0
     if samples.mode is CommandMode.CURRENT:
         current = np.clip(command, -controller.IM, controller.IM)
     else:
         seen, unknown = _positions_seen(command, samples, controller)
-        current = _control_law(command, seen, samples.period_ns * 1e-9, controller)
+        current = commanded_currents(
+            ControlLaw(
+                controller.IM,
+                controller.GAP,
+                controller.GAI,
+                controller.GAD,
+                samples.period_ns * 1e-9,
+            ),
+            command - seen,
+        )
         # What the control law did after the last sample explains none.
         last = np.flatnonzero(np.isfinite(samples.spool) | np.isfinite(samples.pressure))
         until = int(last[-1]) + 1 if last.size else n
@@ -77,13 +87,13 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     finite = np.isfinite(samples.current) & ~samples.saturated[0]
     difference = samples.current[finite] - current[finite]
     if difference.size == 0:
-        return CurrentTrace(current, float("nan"), 0.0, True, command_gap, guessed)
+        return CurrentTrace(current, float("nan"), 0.0, True, command_deviation, guessed)
     offset = float(np.median(difference))
     # A handful of ticks may be far off where samples were lost: compare most of them.
     spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
-    gap_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
-    rebuilt = gap_lsb < CONTROL_LAW_LSB
-    return CurrentTrace(current, gap_lsb, offset, rebuilt, command_gap, guessed)
+    residual_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
+    rebuilt = residual_lsb < CONTROL_LAW_LSB
+    return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed)
 
 
 def _guessed_share(unknown: NDArray[np.bool_], longest: int) -> float:
@@ -111,28 +121,6 @@ def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[
         return stored
     resolution = float(np.diff(levels).min())
     return np.asarray(np.round(stored / resolution) * resolution)
-
-
-def _control_law(
-    command: NDArray[np.float64], seen: NDArray[np.float64], period: float, controller: Controller
-) -> NDArray[np.float64]:
-    """Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt), Err = Com − XJm (model.md section 1)."""
-    error = command - seen
-    demand = controller.GAP * error
-    if controller.GAD:
-        demand += controller.GAD * np.diff(error, prepend=error[0]) / period
-    if not controller.GAI:
-        return np.clip(demand, -controller.IM, controller.IM)
-    out = np.empty_like(demand)
-    integral = 0.0
-    for k in range(len(demand)):
-        trial = integral + error[k] * period
-        wanted = demand[k] + controller.GAI * trial
-        out[k] = min(max(wanted, -controller.IM), controller.IM)
-        # Conditional integration: the integral rests while it would push further into saturation.
-        if wanted == out[k] or (wanted - out[k]) * error[k] < 0.0:
-            integral = trial
-    return out
 
 
 def _positions_seen(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ __all__ = ["Estimate", "Fit", "Identification", "Timing"]
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """One fault constant as each stage left it."""
+    """One severity as each stage left it."""
 
     name: str
     first: float
@@ -24,9 +25,9 @@ class Estimate:
     std: float
     interval95: tuple[float, float]
     at_bound: bool
-    """The estimate stands at 0 or 1."""
+    """The estimate stands at a bound."""
     shown: bool
-    """Whether the test shows this constant at all."""
+    """Whether the test shows this fault at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +36,9 @@ class Fit:
 
     Attributes
     ----------
-    spool_rms, pressure_rms: rms gap in units of the channel's own noise, squares capped at nine;
-        about 1 where the model explains all.
-    outliers: share of gaps beyond three deviations, both channels (0.003 for noise alone).
+    spool_rms, pressure_rms: rms residual in units of the signal's own noise, squares capped at
+        nine; about 1 where the model explains all.
+    outliers: share of residuals beyond three deviations, both channels (0.003 for noise alone).
     spool_noise, pressure_noise: noise of the channels, m and Pa.
     spool_offset, pressure_offset: constant errors of the channels, m and Pa.
     anchored: how often the model had to be put back on the measured spool.
@@ -67,8 +68,10 @@ class Identification:
     """What the recordings say about the actuator's faults."""
 
     estimates: tuple[Estimate, ...]
+    nuisances: Mapping[str, float]
+    """What was estimated beside the severities, SI by name."""
     covariance: NDArray[np.float64]
-    """Of the three constants, shape (3, 3)."""
+    """Of the severities, in the order of `estimates`, shape (k, k)."""
     fit: Fit
     solver: str
     seed: int
@@ -80,6 +83,19 @@ class Identification:
     attempts: int
     """Searches that it took; more than one where the first did not explain the recording."""
     timing: Timing
+
+    def named(self, name: str) -> Estimate:
+        """Return the estimate of that name.
+
+        Raises
+        ------
+        KeyError
+            There is none.
+        """
+        for item in self.estimates:
+            if item.name == name:
+                return item
+        raise KeyError(name)
 
     @property
     def rescued(self) -> bool:

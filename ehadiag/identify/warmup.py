@@ -8,8 +8,8 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import CommandMode, Environment, Samples
 from ehadiag.core.stored_test import Line, StoredTest, Windows
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.pipeline import identify
 from ehadiag.identify.search.solvers import CompactGa
+from ehadiag.identify.session import identify
 
 __all__ = ["warm_up"]
 

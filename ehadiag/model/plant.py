@@ -1,50 +1,127 @@
-"""Constants of the monitoring model: actuator data at the oil and supply of the day."""
+"""Physical constants of an actuator: what every kernel of the monitoring model is given.
+
+A candidate of the identification is one `PlantConstants`: severities and nuisance parameters have
+been turned into physical constants before (`ehadiag.model.parameters`), so no kernel knows what a
+fault is.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.rows import unpacker
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Environment
 
-__all__ = ["REFERENCE_TEMPERATURE", "PlantConstants", "plant_constants", "relative_viscosity"]
+__all__ = [
+    "FIELDS",
+    "REFERENCE_TEMPERATURE",
+    "PlantConstants",
+    "Value",
+    "plant_constants",
+    "plant_of",
+    "plant_row",
+    "relative_viscosity",
+]
 
+Value = Any
+"""A number, or an array with one of each candidate, shape (n,)."""
 REFERENCE_TEMPERATURE = 40.0
-"""degC at which an actuator's viscous coefficients are given (model.md section 2)."""
-
+"""degC at which an actuator's viscous coefficients are given (PHY-19)."""
 WALTHER_POINTS = ((40.0, 14.5), (100.0, 3.5))
-"""MIL-PRF-83282: temperature (degC), kinematic viscosity (mm²/s) (model.md section 4)."""
+"""MIL-PRF-83282: temperature (degC), kinematic viscosity (mm²/s) (PHY-19)."""
 
 
 class PlantConstants(NamedTuple):
-    """What the kernels need besides the fault constants; SI units, symbols of model.md."""
+    """Physical constants at the oil and supply of the day; SI units.
 
-    GM: float
-    JF: float
-    CF: float
-    KF: float
-    KSF: float
-    XFM: float
-    GQF: float
-    GPF: float
-    AS: float
-    MS: float
-    CS: float
-    XSM: float
-    FSS0: float
-    FSS1: float
-    PSR: float
-    GP: float
-    GQ: float
-    CLK: float
-    AJ: float
-    MJ: float
-    CJ: float
-    XJM: float
-    FDJ0: float
-    FDJ1: float
-    FR: float
+    Symbols are those of the specification (docs/reference/physics.md). `FSS` and `FDJ` are the
+    frictions of the unit as it is, `FSS1` and `FDJ1` those at the limit of damage, which only the
+    scales of severity use.
+    """
+
+    IM: Value
+    """Rated current, A."""
+    IB: Value
+    """Null bias of the torque motor, A."""
+    HYS: Value
+    """Hysteresis of the torque motor: width of the loop over rated current."""
+    NPL: Value
+    """Number of plays whose mean the hysteresis is."""
+    GM: Value
+    """Torque-motor gain, N m/A."""
+    JF: Value
+    """Flapper inertia, N m/(m/s²)."""
+    CF: Value
+    """Flapper damping, N m/(m/s)."""
+    KF: Value
+    """Net flapper stiffness, N m/m."""
+    KSF: Value
+    """Feedback-wire stiffness, N m/m."""
+    XFM: Value
+    """Flapper stop, m."""
+    GQF: Value
+    """First-stage flow gain, m²/s."""
+    GPF: Value
+    """First-stage pressure gain, Pa/m."""
+    AS: Value
+    """Spool end area, m²."""
+    MS: Value
+    """Spool mass, kg."""
+    CS: Value
+    """Spool viscous coefficient, N s/m."""
+    XSM: Value
+    """Spool stop, m."""
+    BKL: Value
+    """Half-width of the backlash between spool and feedback spring, m."""
+    FSS: Value
+    """Static dry friction of the spool, N."""
+    FSS1: Value
+    """Static dry friction of the spool at the limit of damage, N."""
+    PSR: Value
+    """Supply minus return pressure, Pa."""
+    GP: Value
+    """Pressure gain, Pa/m."""
+    GQ: Value
+    """Flow gain, m²/s."""
+    CLK: Value
+    """Leakage, m³/(s Pa)."""
+    AJ: Value
+    """Active area of the jack, m²."""
+    MJ: Value
+    """Equivalent mass of jack and surface, kg."""
+    CJ: Value
+    """Viscous coefficient of the jack, N s/m."""
+    XJM: Value
+    """Jack stop, m."""
+    FDJ: Value
+    """Dynamic dry friction of the jack, N."""
+    FDJ1: Value
+    """Dynamic dry friction of the jack at the limit of damage, N."""
+    FR: Value
+    """External load, N."""
+    OXS: Value
+    """Constant error of the spool's sensor, m."""
+    OPD: Value
+    """Constant error of the sensor of differential pressure, Pa."""
+    DLY: Value
+    """Time before the end of the tick at which the spool is sampled, s."""
+
+
+FIELDS = len(PlantConstants._fields)
+"""Numbers of a candidate as kernels are given it, a row of an array."""
+
+plant_of = unpacker(PlantConstants)
+"""Compiled: the constants that a row of `FIELDS` numbers holds."""
+
+
+def plant_row(constants: PlantConstants) -> NDArray[np.float64]:
+    """One candidate as a row that kernels take, shape (FIELDS,)."""
+    return np.array(constants, dtype=np.float64)
 
 
 def relative_viscosity(temperature: float) -> float:
@@ -61,11 +138,11 @@ def relative_viscosity(temperature: float) -> float:
 
 
 def plant_constants(actuator: Actuator, environment: Environment | None = None) -> PlantConstants:
-    """Constants at the oil temperature and supply that the bus reports.
+    """Constants of the unit as new, at the oil temperature and supply that the bus reports.
 
     Without an environment, or for a quantity it does not state, the actuator's own data hold:
     40 degC and its `PSR`. Viscous coefficients scale with the relative viscosity, the leakage with
-    its inverse (model.md section 4).
+    its inverse (PHY-19).
     """
     valve, jack = actuator.servovalve, actuator.jack
     viscosity, supply = 1.0, valve.PSR
@@ -75,6 +152,10 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         if environment.supply_pressure is not None and environment.return_pressure is not None:
             supply = environment.supply_pressure - environment.return_pressure
     return PlantConstants(
+        IM=actuator.controller.IM,
+        IB=0.0,
+        HYS=0.0,
+        NPL=1.0,
         GM=valve.GM,
         JF=valve.JF,
         CF=valve.CF,
@@ -87,7 +168,8 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         MS=valve.MS,
         CS=valve.CS * viscosity,
         XSM=valve.XSM,
-        FSS0=valve.FSS0,
+        BKL=0.0,
+        FSS=valve.FSS0,
         FSS1=valve.FSS1,
         PSR=supply,
         GP=valve.GP,
@@ -97,7 +179,10 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         MJ=jack.MJ,
         CJ=jack.CJ * viscosity,
         XJM=jack.XJM,
-        FDJ0=jack.FDJ0,
+        FDJ=jack.FDJ0,
         FDJ1=jack.FDJ1,
         FR=jack.FR,
+        OXS=0.0,
+        OPD=0.0,
+        DLY=0.0,
     )

@@ -2,62 +2,131 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final, NamedTuple
 
+from ehadiag.compile.rows import packer, unpacker
+from ehadiag.model.control import ControlLaw, ControlState
+from ehadiag.model.jack import JackState
+from ehadiag.model.laws import DriveLaw, JackLaw, SpoolLaw
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import FINEST
 
-NUMBER: Final = 8  # bytes
+NUMBER: Final = 8
+"""Bytes."""
 
-# Parameters: constants of the plant, scalars of the spool (ehadiag.model), then:
-SCALARS: Final = 25
-TICK: Final = 31  # s
-DYNAMIC: Final = 32  # dry friction of the moving jack, N
-IM: Final = 33  # control law, see ehadiag.core.actuator.Controller
-GAP: Final = 34
-GAI: Final = 35
-GAD: Final = 36
-CLOSED: Final = 37  # not 0: the command is a position
-INVERTIBLE: Final = 38  # not 0: a lost position's code follows from the current
-LINEAR: Final = 39  # below this current (A) it does
-CODE_POSITION: Final = 40  # converter step of the position, m
-ANCHOR_GAIN: Final = 41
-ANCHOR_SMALL: Final = 42
-ANCHOR_LARGE: Final = 43
-OFFSETS: Final = 44  # of spool and pressure sensor, m and Pa
-WEIGHTS: Final = 46  # reciprocal noise of both
-REFERENCE: Final = 48  # CUSUM: k, h, largest residual that counts
-THRESHOLD: Final = 49
-LIMIT: Final = 50
-DEVIATION: Final = 51  # a lost command did not go on where the current is off by more, A
 
-# State. Flapper (m, m/s) and spool (m, m/s); direction of motion +1, -1, 0; flapper on its stop.
-XF: Final = 52
-WF: Final = 53
-XS: Final = 54
-VS: Final = 55
-DIRECTION: Final = 56
-CLAMPED: Final = 57
-FILTERED: Final = 58  # innovation, m
-# Jack: velocity, position, direction, and where it has the spool.
-JACK_VELOCITY: Final = 59
-JACK_POSITION: Final = 60
-JACK_DIRECTION: Final = 61
-JACK_SPOOL: Final = 62
-# Control law.
-SEEN: Final = 63  # measured position of the tick before, m; NaN if lost
-ERROR_BEFORE: Final = 64
-INTEGRAL: Final = 65
-STARTED: Final = 66
-COMMAND: Final = 67  # of the tick before, known or not, its rise over a tick, ticks lost since
-SLOPE: Final = 68
-LOST: Final = 69
-# Results.
-PREDICTED: Final = 70  # spool, pressure, position
-RESIDUAL: Final = 73  # spool, pressure
-CUSUM: Final = 75  # spool upper, lower; pressure upper, lower
-MOVING: Final = 79  # ehadiag.model.scalar.transition.SpoolTables
-STUCK: Final = MOVING + 16 * (FINEST + 1)
-DECAY: Final = STUCK + 4 * (FINEST + 1)
-NODES: Final = DECAY + FINEST + 1  # path of the spool, scratch
+class Settings(NamedTuple):
+    """What a monitor is made with, beside the laws.
+
+    Attributes
+    ----------
+    plays: number of plays of the hysteresis.
+    closed: not 0: the command is a position.
+    invertible: not 0: a lost position's code follows from the current.
+    linear: below this current it does, A.
+    code_position: converter step of the position, m.
+    anchor_gain, anchor_small, anchor_large: see `ehadiag.model.anchor.Anchor`.
+    spool_offset, pressure_offset: constant errors of the sensors, m and Pa.
+    spool_weight, pressure_weight: reciprocal noise of both.
+    reference, threshold, limit: of the CUSUM: k, h, largest residual that counts.
+    deviation: a lost command did not go on where the current is off by more, A.
+    """
+
+    plays: float
+    closed: float
+    invertible: float
+    linear: float
+    code_position: float
+    anchor_gain: float
+    anchor_small: float
+    anchor_large: float
+    spool_offset: float
+    pressure_offset: float
+    spool_weight: float
+    pressure_weight: float
+    reference: float
+    threshold: float
+    limit: float
+    deviation: float
+
+
+class Moving(NamedTuple):
+    """Flapper and spool between two ticks, as numbers; see `ehadiag.model.spool_events.SpoolState`.
+
+    Attributes
+    ----------
+    filtered: innovation of the re-anchoring, m.
+    jack_spool: where the jack has the spool, m.
+    """
+
+    xf: float
+    wf: float
+    xs: float
+    vs: float
+    wire: float
+    direction: float
+    clamped: float
+    filtered: float
+    jack_spool: float
+
+
+class Followed(NamedTuple):
+    """What is known of command and position between two ticks.
+
+    Attributes
+    ----------
+    seen: measured position of the tick before, m; NaN if lost.
+    command: of the tick before, known or not.
+    slope: its rise over a tick.
+    lost: ticks lost since one was known.
+    """
+
+    seen: float
+    command: float
+    slope: float
+    lost: float
+
+
+def _place(start: int, kind: Any) -> int:
+    """Behind a part that begins at `start`."""
+    return start + len(kind._fields)
+
+
+DRIVE_LAW: Final = 0
+SPOOL_LAW: Final = _place(DRIVE_LAW, DriveLaw)
+JACK_LAW: Final = _place(SPOOL_LAW, SpoolLaw)
+CONTROL_LAW: Final = _place(JACK_LAW, JackLaw)
+SETTINGS: Final = _place(CONTROL_LAW, ControlLaw)
+STATE: Final = _place(SETTINGS, Settings)
+MOVING: Final = STATE
+JACK: Final = _place(MOVING, Moving)
+CONTROL: Final = _place(JACK, JackState)
+FOLLOWED: Final = _place(CONTROL, ControlState)
+PREDICTED: Final = _place(FOLLOWED, Followed)
+"""Spool, pressure, position."""
+RESIDUAL: Final = PREDICTED + 3
+"""Spool, pressure."""
+CUSUM: Final = RESIDUAL + 2
+"""Upper and lower sum of the spool, then of the pressure."""
+PLAYS: Final = CUSUM + 4
+"""What the plays of the hysteresis hold, A; how many is in the settings."""
+MOST_PLAYS: Final = 16
+TABLES: Final = PLAYS + MOST_PLAYS
+SLIDE: Final = TABLES
+"""See `ehadiag.model.scalar.transition.SpoolTables`: spool moving with
+and without the feedback wire, at rest, flapper on its stop."""
+LOOSE: Final = SLIDE + 16 * (FINEST + 1)
+RING: Final = LOOSE + 16 * (FINEST + 1)
+DECAY: Final = RING + 4 * (FINEST + 1)
+NODES: Final = DECAY + FINEST + 1
+"""The path of a tick, behind all tables."""
 SIZE: Final = NODES + NODES_PER_TICK * NODE_COLUMNS
+
+drive_law_of = unpacker(DriveLaw, DRIVE_LAW)
+spool_law_of, jack_law_of = unpacker(SpoolLaw, SPOOL_LAW), unpacker(JackLaw, JACK_LAW)
+control_law_of = unpacker(ControlLaw, CONTROL_LAW)
+settings_of = unpacker(Settings, SETTINGS)
+moving_of, keep_moving = unpacker(Moving, MOVING), packer(Moving, MOVING)
+jack_of, keep_jack = unpacker(JackState, JACK), packer(JackState, JACK)
+control_of, keep_control = unpacker(ControlState, CONTROL), packer(ControlState, CONTROL)
+followed_of, keep_followed = unpacker(Followed, FOLLOWED), packer(Followed, FOLLOWED)

@@ -12,13 +12,16 @@ from numba import types
 from numpy.typing import NDArray
 
 from ehadiag.compile.address import entry_point
-from ehadiag.core.actuator import Actuator, Controller
+from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import CURRENT, POSITION, PRESSURE, SPOOL
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import CommandMode, Environment
-from ehadiag.model.plant import PlantConstants, plant_constants
-from ehadiag.model.scalar.response import Anchor
-from ehadiag.model.scalar.transition import SpoolScalars, spool_tables
+from ehadiag.model.anchor import Anchor
+from ehadiag.model.control import ControlLaw
+from ehadiag.model.laws import SpoolLaw, drive_law, jack_law
+from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.model.plant import plant_constants
+from ehadiag.model.scalar.transition import spool_tables
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
@@ -29,7 +32,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 NOISE_LSB = math.sqrt(0.5**2 + 1.0 / 12.0)
-"""Noise of a channel of the contract (bus.md), its converter's rounding included."""
+"""Noise of a channel (PHY-22), its converter's rounding included."""
 ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
 RESIDUAL_LIMIT = 4.0
 """Noise; a residual beyond counts no more: one break-away at another tick gives no alarm."""
@@ -90,12 +93,13 @@ class Monitor:
     Parameters
     ----------
     actuator: data of the actuator.
-    faults: (Kintas, FSS, FDJ), each 0 … 1, as last identified.
+    faults: severities in the order of the registry (Kintas, FSS, FDJ), each 0 … 1, as last
+        identified.
     environment: oil and supply; None: as the actuator's data say.
     mode: what commands are.
     hours: mean time between false alarms of the monitor as a whole, on white noise, h.
     shift: of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
-    noise: standard deviation of spool (m) and pressure (Pa), white; None: the contract's.
+    noise: standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
     offsets: constant errors of spool (m) and pressure sensor (Pa).
     anchor: how the modelled spool is kept on the measured one.
 
@@ -117,37 +121,57 @@ class Monitor:
         offsets: tuple[float, float] = (0.0, 0.0),
         anchor: Anchor = ANCHOR,
     ) -> None:
-        tick = 1.0 / actuator.controller.rate
+        law = actuator.controller
+        tick = 1.0 / law.rate
         noise = noise or (NOISE_LSB * SPOOL.lsb, NOISE_LSB * PRESSURE.lsb)
         values = _checked(faults, noise, offsets, tick)
-        constants = plant_constants(actuator, environment)
-        tables = spool_tables(constants, values[0], values[1], tick)
+        unknowns = Unknowns(FAULTS, (plant_constants(actuator, environment),), {})
+        constants = unknowns.constants(np.array(values))
+        tables = spool_tables(constants, tick)
+        self._law = SpoolLaw(*tables.law)
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
+        settings = layout.Settings(
+            plays=constants.NPL,
+            closed=float(mode is CommandMode.POSITION),
+            invertible=float(
+                law.GAP * POSITION.lsb > 6.0 * CURRENT.lsb and not law.GAI and not law.GAD
+            ),
+            linear=law.IM - 3.0 * CURRENT.lsb,
+            code_position=POSITION.lsb,
+            anchor_gain=anchor.gain,
+            anchor_small=anchor.small,
+            anchor_large=anchor.large,
+            spool_offset=offsets[0],
+            pressure_offset=offsets[1],
+            spool_weight=1.0 / noise[0],
+            pressure_weight=1.0 / noise[1],
+            reference=self.design.reference,
+            threshold=self.design.threshold,
+            limit=RESIDUAL_LIMIT,
+            deviation=DEVIATION_LSB * CURRENT.lsb,
+        )
+        control = ControlLaw(law.IM, law.GAP, law.GAI, law.GAD, tick)
         p = np.zeros(layout.SIZE)
-        p[: layout.SCALARS] = constants
-        p[layout.SCALARS : layout.TICK] = tables.scalars
-        p[layout.TICK] = tick
-        p[layout.DYNAMIC] = constants.FDJ0 + values[2] * (constants.FDJ1 - constants.FDJ0)
-        p[layout.IM : layout.CODE_POSITION + 1] = _control(actuator.controller, mode)
-        p[layout.ANCHOR_GAIN : layout.OFFSETS] = anchor.as_array()
-        p[layout.OFFSETS : layout.WEIGHTS] = offsets
-        p[layout.WEIGHTS : layout.REFERENCE] = 1.0 / noise[0], 1.0 / noise[1]
-        p[layout.REFERENCE] = self.design.reference
-        p[layout.THRESHOLD] = self.design.threshold
-        p[layout.LIMIT] = RESIDUAL_LIMIT
-        p[layout.DEVIATION] = DEVIATION_LSB * CURRENT.lsb
-        p[layout.MOVING : layout.STUCK] = tables.moving.ravel()
-        p[layout.STUCK : layout.DECAY] = tables.stuck.ravel()
+        p[: layout.STATE] = [
+            *drive_law(constants),
+            *tables.law,
+            *jack_law(constants),
+            *control,
+            *settings,
+        ]
+        p[layout.SLIDE : layout.LOOSE] = tables.moving.ravel()
+        p[layout.LOOSE : layout.RING] = tables.loose.ravel()
+        p[layout.RING : layout.DECAY] = tables.stuck.ravel()
         p[layout.DECAY : layout.NODES] = tables.decay
         self._memory, self._address = p, p.ctypes.data
-        self._tick = entry_point(push_tick, types.intp, types.UniTuple(types.float64, 5))
+        self._push = entry_point(push_tick, types.intp, types.UniTuple(types.float64, 5))
         self._alarms = 0
         self._alarmed = np.zeros((2, 2), dtype=np.bool_)
         self.reading: Reading = Reading(
             _view(p[layout.PREDICTED : layout.RESIDUAL]),
             _view(p[layout.RESIDUAL : layout.CUSUM]),
-            _view(p[layout.CUSUM : layout.MOVING].reshape(2, 2)),
+            _view(p[layout.CUSUM : layout.PLAYS].reshape(2, 2)),
             _view(self._alarmed),
         )
         """What the last push left."""
@@ -167,7 +191,7 @@ class Monitor:
             it was.
         """
         try:
-            alarms = self._tick(self._address, sample)
+            alarms = self._push(self._address, sample)
         except (TypeError, ValueError):
             raise TypeError(f"a tick is a tuple of five numbers, not {sample!r}") from None
         if alarms != self._alarms:
@@ -181,15 +205,14 @@ class Monitor:
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""
-        p = self._memory
-        constants = PlantConstants(*p[: layout.SCALARS])
-        breakaway = SpoolScalars(*p[layout.SCALARS : layout.TICK]).breakaway
-        p[layout.XF : layout.MOVING] = 0.0
+        p, law = self._memory, self._law
+        p[layout.STATE : layout.TABLES] = 0.0
         self._alarms, self._alarmed[:] = 0, False
-        xs = min(max(spool, -constants.XSM), constants.XSM)
-        p[layout.XS] = p[layout.JACK_SPOOL] = xs
-        p[layout.XF] = min(max(-constants.KSF * xs / constants.KF, -breakaway), breakaway)
-        p[layout.SEEN] = math.nan
+        xs = min(max(spool, -law.stroke), law.stroke)
+        xf = min(max(-law.ratio * xs, -law.breakaway), law.breakaway)
+        rest = layout.Moving(xf, 0.0, xs, 0.0, xs, 0.0, 0.0, 0.0, xs)
+        p[layout.MOVING : layout.JACK] = rest
+        p[layout.FOLLOWED : layout.PREDICTED] = layout.Followed(math.nan, 0.0, 0.0, 0.0)
 
 
 def _checked(
@@ -199,8 +222,9 @@ def _checked(
     tick: float,
 ) -> tuple[float, ...]:
     values = tuple(float(value) for value in faults)
-    if len(values) != 3 or not all(0.0 <= value <= 1.0 for value in values):
-        raise ConfigurationError(f"fault constants {values}: need Kintas, FSS, FDJ, each 0 … 1")
+    if len(values) != len(FAULTS) or not all(0.0 <= value <= 1.0 for value in values):
+        names = ", ".join(item.name for item in FAULTS)
+        raise ConfigurationError(f"severities {values}: need {names}, each 0 … 1")
     if not all(0.0 < value < math.inf for value in noise):
         raise ConfigurationError(f"noise {noise}: need two positive numbers, m and Pa")
     if not all(math.isfinite(value) for value in offsets):
@@ -208,21 +232,6 @@ def _checked(
     if not TICKS_S[0] <= tick <= TICKS_S[1]:
         raise ConfigurationError(f"controller.rate {1.0 / tick:g} Hz: need 10 … 1e5 Hz")
     return values
-
-
-def _control(law: Controller, mode: CommandMode) -> tuple[float, ...]:
-    """Parameters IM … CODE_POSITION of the layout."""
-    clear = law.GAP * POSITION.lsb > 6.0 * CURRENT.lsb
-    return (
-        law.IM,
-        law.GAP,
-        law.GAI,
-        law.GAD,
-        float(mode is CommandMode.POSITION),
-        float(clear and not law.GAI and not law.GAD),
-        law.IM - 3.0 * CURRENT.lsb,
-        POSITION.lsb,
-    )
 
 
 def _view(array: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.core.printable import valid_text
-from ehadiag.model.parameters import FAULT_NAMES
+from ehadiag.report.faults import Fault, faults_of
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
@@ -37,7 +37,10 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
         "serial": serials[0] if serials else None,
         "verdict": diagnosis.verdict.name,
         "reasons": [valid_text(reason) for reason in diagnosis.reasons],
-        "faults": _faults(diagnosis),
+        "faults": {
+            name: _fault(fault, identified=found is not None)
+            for name, fault in faults_of(diagnosis).items()
+        },
         "fit": _fit(diagnosis),
         "quality": _quality(diagnosis),
         "solver": {
@@ -70,22 +73,18 @@ def test_name(diagnosis: Diagnosis) -> str | None:
     return "+".join(names) or None
 
 
-def _faults(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
-    if diagnosis.identification is None:
-        empty = {"first": None, "search": None, "estimate": None, "std": None, "interval95": None}
-        return {name: dict(empty, flags=[]) for name in FAULT_NAMES}
-    out = {}
-    for item in diagnosis.identification.estimates:
-        flags = ["at_bound"] * item.at_bound + ["not_shown"] * (not item.shown)
-        out[item.name] = {
-            "first": item.first,
-            "search": item.search,
-            "estimate": item.value,
-            "std": item.std,
-            "interval95": list(item.interval95),
-            "flags": flags,
-        }
-    return out
+def _fault(fault: Fault, *, identified: bool) -> dict[str, Any]:
+    if not identified:
+        empty = dict.fromkeys(("first", "search", "estimate", "std", "interval95"))
+        return {**empty, "flags": []}
+    return {
+        "first": fault.first,
+        "search": fault.search,
+        "estimate": fault.value,
+        "std": fault.std,
+        "interval95": list(fault.interval),
+        "flags": list(fault.flags),
+    }
 
 
 def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
@@ -116,6 +115,7 @@ def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
         "frames": total("received"),
         "lost": total("lost"),
         "repeated": total("repeated"),
+        "conflicts": total("conflicts"),
         "crc_errors": total("crc_errors"),
         "out_of_order": total("out_of_order"),
         "length_errors": total("length_errors"),

@@ -1,4 +1,4 @@
-"""python-can's log writers, opened so that a killed process leaves a readable file.
+"""Opens python-can's log writers so that a killed process leaves a readable file.
 
 Imported only where a recording is written: python-can takes half a second to import.
 """

@@ -1,4 +1,4 @@
-"""Experiments with known truth for the tests of the identification."""
+"""Experiments with known truth for tests of the identification."""
 
 from functools import lru_cache
 
@@ -19,7 +19,7 @@ PAPER_FAULTS = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.
 
 @lru_cache(maxsize=16)
 def recorded(file, test):
-    """Experiment of a recording of the contract (not from the project's simulator)."""
+    """Experiment of a reference recording (PHY-41; not from the project's simulator)."""
     recording = read_recording(LOGS / file)
     return build_experiment(
         recording.samples, recording.environment, resolve_test(test), default_actuator()

@@ -70,7 +70,7 @@ static inline void powers(const double *rates, int n, double tick, double *out)
         product(out + (j - 1) * n * n, out + n * n, out + j * n * n, n, 1.0);
 }
 
-/* What hangs on the recording alone: steps of a spool at rest. */
+/* What depends on the recording alone: steps of a spool at rest. */
 static void tabulate_rest(const Fixed *f, Tables *m)
 {
     const Plant *c = &f->c;

@@ -159,7 +159,7 @@ static Approach approach(const Plant *c, double load, double per_span, double ve
     return p;
 }
 
-/* Run the model from rest over n ticks; fdj is the fault constant. */
+/* Run the model from rest over n ticks; fdj is the severity FDJ. */
 void eha_respond(const Plant *c, const Scalars *t, const double (*moving)[4][4],
                  const double (*stuck)[2][2], const double *decay, double fdj,
                  const double *current, long n, double tick, double *spool_out,

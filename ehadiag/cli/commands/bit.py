@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.acquire import STOPPED, acquire
 from ehadiag.cli.beforehand import refuse_beforehand
@@ -84,13 +84,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the test and print the verdict."""
     actuator = options.the_actuator(arguments)
     test = resolve_test(arguments.test)
-    levels = Levels(arguments.advisory, arguments.limit)
+    levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
     bus_map = options.the_bus_map(arguments)
     refuse_beforehand(arguments, test, actuator, bus_map)
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
-    from ehadiag.assess.diagnosis import diagnose, not_tested  # noqa: PLC0415 - loads numba
-    from ehadiag.assess.online import OnlineIdentification  # noqa: PLC0415
+    from ehadiag.assess.diagnosis import (  # noqa: PLC0415 - loads numba
+        DiagnosisSession,
+        not_tested,
+    )
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
 
@@ -99,10 +101,16 @@ def run(arguments: argparse.Namespace) -> int:
     results = Results(arguments, folder)
     results.load()
     begin = time.perf_counter()
-    solver = make_solver(arguments.solver)
-    online = OnlineIdentification(test, actuator, solver=solver, seed=arguments.seed)
+    session = DiagnosisSession(
+        actuator,
+        [test],
+        default=test,
+        levels=levels,
+        solver=make_solver(arguments.solver),
+        seed=arguments.seed,
+    )
     with stop_on_signals() as stop:
-        heard = acquire(arguments, actuator, test, bus_map, folder.path, online, stop)
+        heard = acquire(arguments, actuator, test, bus_map, folder.path, session, stop)
     read_s = time.perf_counter() - begin
     recordings, why = [heard.recording], heard.why
     try:
@@ -110,17 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise KeyboardInterrupt
         if not why:
             with progress_bar() as progress:
-                result = diagnose(
-                    recordings,
-                    actuator,
-                    [test],
-                    default=test,
-                    levels=levels,
-                    solver=solver,
-                    seed=arguments.seed,
-                    progress=heard.deadline.watch(progress),
-                    memory=online.memory,
-                )
+                result = session.finish(recordings, heard.deadline.watch(progress))
     except KeyboardInterrupt:
         why = STOPPED
     except NotTestedError as error:

@@ -1,4 +1,4 @@
-"""`ehadiag check-bus`: listens, and reports what of a bus can be used."""
+"""`ehadiag check-bus`: listens, and reports which signals of a bus are usable."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="how long to listen (default 3)",
     )
     options.add_mapping_options(parser)
+    options.add_log_options(parser)
     options.add_bus_options(parser)
     parser.set_defaults(run=run)
 
@@ -49,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     from firmware_iface.transport.receiver import Receiver  # noqa: PLC0415
 
     if arguments.log is not None:
-        table = read_frames(arguments.log)
+        table = read_frames(arguments.log, options.the_budget(arguments))
         put(f"log {arguments.log}")
     else:
         with (

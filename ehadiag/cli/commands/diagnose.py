@@ -1,4 +1,4 @@
-"""`ehadiag diagnose`: recordings in, verdicts out."""
+"""`ehadiag diagnose`: diagnoses recordings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.deadline import Deadline
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
@@ -29,7 +29,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command."""
     parser = subparsers.add_parser(
         "diagnose",
-        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4)",
+        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4, candump; .gz)",
         description="Diagnose actuators from recordings of their bus.",
         allow_abbrev=False,
     )
@@ -53,15 +53,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="the logs are of one actuator: one estimate from all of them",
     )
     parser.add_argument("--all", action="store_true", help="every test in a log, not its last one")
+    parser.add_argument(
+        "--list", action="store_true", help="list the tests that each log holds, diagnose none"
+    )
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
+    options.add_log_options(parser)
     options.add_diagnosis_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose each log; return the worst exit code."""
+    if arguments.list:
+        return _list(arguments)
     # What is wrong with the options is said before anything slow is loaded.
     diagnosis = _Diagnosis(arguments)
     codes = [0]
@@ -95,6 +101,23 @@ def run(arguments: argparse.Namespace) -> int:
     return max(codes)
 
 
+def _list(arguments: argparse.Namespace) -> int:
+    """Print what the logs hold."""
+    from ehadiag.cli.listing import print_list  # noqa: PLC0415
+    from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
+
+    bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
+    code = 0
+    for log in arguments.logs:
+        try:
+            found = iterate_recordings(log, bus_map, budget)
+            print_list(log, found, as_json=arguments.json)
+        except EhadiagError as error:
+            say(str(error))
+            code = max(code, error.exit_code)
+    return code
+
+
 class _Diagnosis:
     """What all logs of one call have in common."""
 
@@ -104,8 +127,9 @@ class _Diagnosis:
         self._tests = options.known_tests(arguments.test)
         only = arguments.test[0] if len(arguments.test) == 1 else None
         self._default = resolve_test(only) if only else None
-        self._levels = Levels(arguments.advisory, arguments.limit)
+        self._levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
         self._bus_map = options.the_bus_map(arguments)
+        self._budget = options.the_budget(arguments)
         self._results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
         self.stopped = False
         """Whether a signal came: nothing further is diagnosed."""
@@ -113,11 +137,15 @@ class _Diagnosis:
 
     def read(self, log: str) -> list[Recording]:
         """Read what is to be diagnosed of one log."""
-        from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - loads cantools
+        from firmware_iface.logs.reader import (  # noqa: PLC0415 - loads cantools
+            read_recording,
+            read_recordings,
+        )
 
         interrupt_on_signals()
-        found = read_recordings(log, self._bus_map)
-        return list(found) if self._arguments.all else [choose(found)]
+        if self._arguments.all:
+            return list(read_recordings(log, self._bus_map, self._budget))
+        return [read_recording(log, self._bus_map, self._budget)]
 
     def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
         """Diagnose, write and print one result; return its exit code."""

@@ -5,48 +5,46 @@ What is left for the whole test is one step (`ehadiag.identify.refine.update`), 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.stored_test import Window
-from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, judge_noise, make_batch
-from ehadiag.identify.refine.least_squares import (
-    Refinement,
-    describe,
-    gaps_of,
-    median_offsets,
-    refine,
-)
-from ehadiag.identify.refine.residual_model import CAP, FAULT_COUNT
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives
+from ehadiag.identify.refine.least_squares import Refinement, describe, median_offsets, refine
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import CompactGa
-from ehadiag.identify.search.stages import STAGES, Memory, digest, first_ends_at, stage_ends_at
-from ehadiag.model.scalar.residuals import Batch
+from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
+from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
+from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["Prefix", "anchored", "prefix_ticks", "refine_prefix", "refine_whole"]
-
-Spans = Sequence[Sequence[Window]]
-"""Of each test, s."""
+__all__ = ["FirstPart", "anchored_derivatives", "first_spans", "refine_first_part", "residuals_at"]
 
 POLISH = CompactGa(budget=800, virtual_population=70.0, tolerance=1e-7)
 POLISH_REACH = 6.0
-"""Deviations, of each constant, over which the polish begins to draw."""
+"""Deviations, of each severity, over which the polish begins to draw."""
 POLISH_SPREAD = (2e-4, 2e-3)
-"""Fault constants: out of a narrow basin, which looks well known, and not further than is shown."""
+"""Severities: out of a narrow basin, which looks well known, and not further than is shown."""
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
+CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6),)
+"""Half a step of a plant that is integrated at 0.25 µs is of this size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prefix:
+class FirstPart:
     """Optimum on the first part of one or more tests.
 
-    noise: of spool (m) and pressure (Pa) of each test, as the gaps show it.
-    evaluations: runs of the model, all told.
+    Attributes
+    ----------
+    refined : Refinement
+    noise : tuple
+        Of spool (m) and pressure (Pa) of each test, as the residuals show it.
+    evaluations : int
+        Runs of the model, all told.
     """
 
     refined: Refinement
@@ -61,59 +59,42 @@ class Prefix:
         ]
 
 
-def prefix_ticks(experiment: Experiment) -> int:
-    """Ticks that some stage before has seen the end of: windows of the test, in any order."""
-    test = experiment.test
-    seconds = max(first_ends_at(test), stage_ends_at(test, len(STAGES) - 1))
-    return min(round(seconds / experiment.tick), experiment.ticks)
+def refine_first_part(
+    experiments: Sequence[Experiment], until: Sequence[int], start: Mapping[str, float]
+) -> FirstPart:
+    """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
-
-def refine_prefix(
-    experiments: Sequence[Experiment], start: NDArray[np.float64], memory: Memory
-) -> Prefix:
-    """Refine the optimum of a search on the first parts of the tests.
-
-    `start`: fault constants, shape (3,). The same inputs are answered from memory.
+    `start`: severities by name.
     """
-    until = [prefix_ticks(item) for item in experiments]
-    free = make_batch(experiments, _spans(experiments, until))
-    return memory.recall(
-        digest("prefix", [*free, start]),
-        Prefix,
-        lambda: _refine_first(experiments, until, start),
-    )
-
-
-def refine_whole(experiments: Sequence[Experiment], start: NDArray[np.float64]) -> Prefix:
-    """Refine on all of the tests, as if they were their own first parts."""
-    return _refine_first(experiments, [item.ticks for item in experiments], start)
-
-
-def _refine_first(
-    experiments: Sequence[Experiment], until: Sequence[int], start: NDArray[np.float64]
-) -> Prefix:
-    """Refine on the first `until` ticks of each test, weighing by the noise that the gaps show."""
-    spans = _spans(experiments, until)
-    free = make_batch(experiments, spans)
-    gaps = gaps_of(free, start)
-    offsets = median_offsets(free, gaps)
-    experiments = _judged(experiments, until, gaps)
-    best = _refine(experiments, spans, start, offsets)
+    spans = first_spans(experiments, until)
+    free, residuals = residuals_at(experiments, spans, start)
+    start = {**start, **median_offsets(free, residuals)}
+    experiments = _judged(experiments, until, residuals)
+    best = _refine(experiments, spans, start)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [(item.spool_noise, item.pressure_noise) for item in experiments]
-        judged = _judged(experiments, until, best.gaps)
+        judged = _judged(experiments, until, best.residuals)
         after = [(item.spool_noise, item.pressure_noise) for item in judged]
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
-        best = _refine(experiments, spans, best.values, best.offsets)
+        best = _refine(experiments, spans, best.values)
         evaluations += best.evaluations
     if best.jagged:
         best = _polish(experiments, spans, best)
         evaluations += best.evaluations
     noise = tuple((item.spool_noise, item.pressure_noise) for item in experiments)
-    return Prefix(best, noise, evaluations)
+    return FirstPart(best, noise, evaluations)
+
+
+def residuals_at(
+    experiments: Sequence[Experiment], spans: Spans | None, start: Mapping[str, float]
+) -> tuple[SimdModel, NDArray[np.float64]]:
+    """A model that runs free, and its residuals at severities by name, no offsets taken off."""
+    model = SimdModel(lay_out(experiments, spans), unknowns_of(experiments))
+    point = np.array([[start.get(item.name, 0.0) for item in model.unknowns.free]])
+    return model, model.residuals(point)[0][0]
 
 
 def _polish(experiments: Sequence[Experiment], spans: Spans, best: Refinement) -> Refinement:
@@ -121,44 +102,48 @@ def _polish(experiments: Sequence[Experiment], spans: Spans, best: Refinement) -
 
     The seed is fixed: the answer depends on the recording, not on the search before.
     """
-    batch, noise = anchored(experiments, spans)
-    objective = Objective(batch, best.offsets, cap=CAP)
-    normal = best.jacobian[:, best.used] @ best.jacobian[:, best.used].T
-    deviation = np.sqrt(np.diag(np.linalg.pinv(normal, hermitian=True)))[:FAULT_COUNT]
+    offsets = {item.name: best.values[item.name] for item in OFFSETS}
+    unknowns = unknowns_of(experiments, FAULTS).holding(offsets)
+    model = SimdModel(lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB), unknowns)
+    objective = Objective(model, cap=CAP)
+    searched = [k for k, item in enumerate(best.parameters) if item in FAULTS]
+    start = best.x[searched] * best.scale[searched]
+    deviation = np.sqrt(np.diag(np.linalg.pinv(best.normal, hermitian=True)))[searched]
     spread = np.clip(POLISH_REACH * deviation, *POLISH_SPREAD)
-    found = POLISH.minimise(objective, best.values, spread, seed=0)
-    start = found.best if found.cost < best.cost else best.values
-    other = describe(batch, start, best.offsets, noise, converged=best.converged)
+    at_start = float(objective(start[None, :])[0])
+    found = POLISH.minimise(objective, start, spread, seed=0)
+    chosen = found.best if found.cost < at_start else start
+    severities = {item.name: float(value) for item, value in zip(FAULTS, chosen, strict=True)}
+    derivatives = anchored_derivatives(experiments, spans)
+    other = describe(derivatives, {**offsets, **severities}, converged=best.converged)
     return replace(other, evaluations=other.evaluations + found.evaluations)
 
 
 def _refine(
-    experiments: Sequence[Experiment],
-    spans: Spans,
-    start: NDArray[np.float64],
-    offsets: NDArray[np.float64],
+    experiments: Sequence[Experiment], spans: Spans, start: Mapping[str, float]
 ) -> Refinement:
-    batch, noise = anchored(experiments, spans)
-    return refine(batch, start, offsets, noise)
+    return refine(anchored_derivatives(experiments, spans), start)
 
 
-def anchored(
-    experiments: Sequence[Experiment],
-    spans: Spans | None = None,
-    lead: float = 0.0,
-) -> tuple[Batch, tuple[float, float]]:
-    """Spans of the tests, re-anchored on the spool, and the noise in which offsets are sought."""
-    batch = make_batch(experiments, spans, lead=lead, anchor_lsb=ANCHOR_LSB)
-    return batch, (experiments[0].spool_noise, experiments[0].pressure_noise)
+def anchored_derivatives(
+    experiments: Sequence[Experiment], spans: Spans | None = None, lead: float = 0.0
+) -> Derivatives:
+    """Spans of the tests, re-anchored on the spool, in coordinates scaled by the noise."""
+    batch = lay_out(experiments, spans, lead=lead, anchor_lsb=ANCHOR_LSB)
+    considered = [item.parameter for item in CONSIDERED]
+    model = SimdModel(batch, unknowns_of(experiments, (*FAULTS, *OFFSETS, *considered)))
+    noise = (experiments[0].spool_noise, experiments[0].pressure_noise)
+    return Derivatives(model, noise, CONSIDERED)
 
 
-def _spans(experiments: Sequence[Experiment], until: Sequence[int]) -> Spans:
+def first_spans(experiments: Sequence[Experiment], until: Sequence[int]) -> Spans:
+    """The first ticks of each test as spans."""
     return [[(0.0, ticks * item.tick)] for item, ticks in zip(experiments, until, strict=True)]
 
 
 def _judged(
-    experiments: Sequence[Experiment], until: Sequence[int], gaps: NDArray[np.float64]
+    experiments: Sequence[Experiment], until: Sequence[int], residuals: NDArray[np.float64]
 ) -> list[Experiment]:
-    """Weigh all experiments by the noise that their gaps show, shape (2, sum of `until`)."""
-    parts = np.split(gaps, np.cumsum(until)[:-1], axis=1)
+    """Weigh all experiments by the noise that residuals show, shape (SIGNALS, sum of `until`)."""
+    parts = np.split(residuals, np.cumsum(until)[:-1], axis=1)
     return [judge_noise(item, part) for item, part in zip(experiments, parts, strict=True)]

@@ -1,25 +1,27 @@
-"""Deterministic refinement: robust least squares on a test, and what it leaves.
+"""Deterministic refinement: robust least squares from the optimum of a search.
 
-Damped Gauss-Newton on the weighted gaps of spool and pressure, the model re-anchored on the
-measured spool. Gaps beyond three times the noise are left out of a step (their square is capped),
-and so are rows whose two-sided differences disagree: there a break-away goes one way on one side
-and the other way on the other. Constant offsets of both sensors are estimated beside the faults;
-being constant they are told apart from the faults, which act alike in both directions.
+Damped Gauss-Newton on the weighted residuals of spool and pressure, the model re-anchored on the
+measured spool. Residuals beyond three times the noise are left out of a step (their square is
+capped), and so are rows whose two-sided differences disagree: there a break-away goes one way on
+one side and the other way on the other. Constant errors of both sensors are estimated beside the
+severities; being constant they are told apart from the faults, which act alike in both directions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.refine.bounded_step import bounded_step
-from ehadiag.identify.refine.plateau import centre, settle
-from ehadiag.identify.refine.residual_model import CAP, FAULT_COUNT, GapModel, Slope, capped
-from ehadiag.model.scalar.residuals import Batch, residuals, workspace
+from ehadiag.identify.refine.derivatives import CAP, Derivatives, Slope, capped
+from ehadiag.identify.refine.plateau import centre, vertex
+from ehadiag.model.interface import ResidualModel
+from ehadiag.model.parameters import Parameter
 
-__all__ = ["Refinement", "describe", "gaps_of", "median_offsets", "refine"]
+__all__ = ["Refinement", "describe", "median_offsets", "refine"]
 
 ITERATIONS = 20
 CONVERGED = 1e-6
@@ -35,32 +37,44 @@ MOST_DAMPING = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """Optimum of the robust least squares.
+    """Optimum of the robust least squares; k parameters, N ticks.
 
     Attributes
     ----------
-    values: Kintas, FSS, FDJ, shape (3,).
-    offsets: spool (m) and pressure (Pa), shape (2,).
-    cost: capped sum of squares there.
-    gaps: weighted gaps there, shape (2, N), 0 where no sample.
-    jacobian: derivative of the gaps by the fault constants and, scaled by the noise, by the
-        offsets; 0 in rows left out; shape (5, 2, N).
-    spool_rate: velocity of the modelled spool at the end of each tick, weighted like its gap, 1/s,
-        shape (N,).
-    used: rows that took part, shape (2, N).
-    weighted: rows that have a sample, shape (2, N).
-    evaluations: runs of the model.
-    converged: whether the last step was below 1e-6.
-    jagged: break-aways make steps in the cost about the optimum: a descent may stop beside it.
-    anchored: how often the model was re-anchored at the optimum.
+    parameters : tuple of Parameter
+        What was estimated.
+    x : shape (k,)
+        The optimum, in units of `scale`.
+    scale : shape (k,)
+    cost : float
+        Capped sum of squares there.
+    residuals : shape (SIGNALS, N)
+        Weighted, there; 0 where no sample.
+    jacobian : shape (k, SIGNALS, N)
+        Derivative of the residuals by x; 0 in rows left out.
+    considered : shape (c, SIGNALS, N)
+        Change of the residuals by a standard deviation of each considered parameter.
+    used : shape (SIGNALS, N)
+        Rows that took part.
+    weighted : shape (SIGNALS, N)
+        Rows that have a sample.
+    evaluations : int
+        Runs of the model.
+    converged : bool
+        Whether the last step was below 1e-6.
+    jagged : bool
+        Break-aways make steps in the cost about the optimum: a descent may stop beside it.
+    anchored : int
+        How often the model was re-anchored at the optimum.
     """
 
-    values: NDArray[np.float64]
-    offsets: NDArray[np.float64]
+    parameters: tuple[Parameter, ...]
+    x: NDArray[np.float64]
+    scale: NDArray[np.float64]
     cost: float
-    gaps: NDArray[np.float64]
+    residuals: NDArray[np.float64]
     jacobian: NDArray[np.float64]
-    spool_rate: NDArray[np.float64]
+    considered: NDArray[np.float64]
     used: NDArray[np.bool_]
     weighted: NDArray[np.bool_]
     evaluations: int
@@ -68,30 +82,29 @@ class Refinement:
     jagged: bool
     anchored: int
 
+    @property
+    def values(self) -> dict[str, float]:
+        """Estimates by name, SI."""
+        values = (self.x * self.scale).tolist()
+        return {item.name: value for item, value in zip(self.parameters, values, strict=True)}
 
-def refine(
-    batch: Batch,
-    start: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    noise: tuple[float, float],
-) -> Refinement:
-    """Minimise the capped sum of squares.
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """JᵀJ of the rows that took part, in units of `scale`, shape (k, k)."""
+        rows = self.jacobian[:, self.used]
+        return np.asarray(rows @ rows.T)
 
-    Parameters
-    ----------
-    start: fault constants, shape (3,).
-    offsets: of spool (m) and pressure (Pa) at the start, shape (2,).
-    noise: that of spool (m) and pressure (Pa), the unit in which offsets are sought.
-    """
-    model = GapModel(batch, noise)
-    x = np.concatenate([np.clip(start, 0.0, 1.0), offsets / np.array(noise)])
-    slope = model.slopes([x])[0]
+
+def refine(model: Derivatives, start: Mapping[str, float]) -> Refinement:
+    """Minimise the capped sum of squares from a start, values by name (0 where not named)."""
+    x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
+    slope = model.slopes([np.clip(x, model.lower, model.upper)])[0]
     damping = LEAST_DAMPING
     converged = False
     for _ in range(ITERATIONS):
         cautious = max(MORE * damping, CAUTIOUS_DAMPING)
-        trials = [_stepped(slope, damping), _stepped(slope, cautious)]
-        size = float(np.abs(trials[0] - slope.x)[:FAULT_COUNT].max())
+        trials = [_stepped(model, slope, damping), _stepped(model, slope, cautious)]
+        size = float(np.abs(trials[0] - slope.x)[model.curved].max())
         if size < CONVERGED:
             converged = True
             break
@@ -109,33 +122,26 @@ def refine(
             break
         else:
             damping = MOST_DAMPING
-    bowl = settle(model, slope)
+    bowl = vertex(model, slope)
     return _described(model, bowl.x, bowl.slope, converged=converged, jagged=not bowl.smooth)
 
 
-def _stepped(slope: Slope, damping: float) -> NDArray[np.float64]:
+def _stepped(model: Derivatives, slope: Slope, damping: float) -> NDArray[np.float64]:
     """Point that a damped Gauss-Newton step leads to, within the bounds."""
     x, used = slope.x, slope.used
     rows = slope.jacobian[:, used]
     normal = rows @ rows.T
     normal += np.diag(damping * np.diag(normal) + 1e-12)
-    return bounded_step(x, normal, rows @ slope.gaps[used])
+    return bounded_step(x, normal, rows @ slope.residuals[used], model.lower, model.upper)
 
 
-def describe(
-    batch: Batch,
-    values: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    noise: tuple[float, float],
-    *,
-    converged: bool,
-) -> Refinement:
+def describe(model: Derivatives, start: Mapping[str, float], *, converged: bool) -> Refinement:
     """What `refine` returns, for a point beside steps in the cost that something else has found.
 
-    The point is moved to the middle of the ground that the steps leave.
+    The point is moved to the middle of the plateau that the steps leave.
     """
-    model = GapModel(batch, noise)
-    slope = model.trusted_slope(np.concatenate([values, offsets / np.array(noise)]))
+    x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
+    slope = model.trusted_slope(x)
     x = centre(model, slope)
     if x is not slope.x:
         slope = model.trusted_slope(x)
@@ -143,20 +149,20 @@ def describe(
 
 
 def _described(
-    model: GapModel, x: NDArray[np.float64], slope: Slope, *, converged: bool, jagged: bool
+    model: Derivatives, x: NDArray[np.float64], slope: Slope, *, converged: bool, jagged: bool
 ) -> Refinement:
     """Put together what is known at x; `slope` is that of a point so near that it holds there."""
-    gaps, anchored = model.one(x)
-    weighted = model.batch.weight > 0.0
-    used = slope.smooth & (gaps**2 < CAP) & weighted
-    jacobian = np.where(used, slope.jacobian, 0.0)
+    residuals, considered, anchored = model.at(x)
+    weighted = model.model.batch.weight > 0.0
+    used = slope.smooth & (residuals**2 < CAP) & weighted
     return Refinement(
-        values=x[:FAULT_COUNT],
-        offsets=x[FAULT_COUNT:] * model.scale[FAULT_COUNT:],
-        cost=capped(gaps),
-        gaps=gaps,
-        jacobian=jacobian,
-        spool_rate=model.spool_rate(x),
+        parameters=model.estimated,
+        x=x,
+        scale=model.scale,
+        cost=capped(residuals),
+        residuals=residuals,
+        jacobian=np.where(used, slope.jacobian, 0.0),
+        considered=considered,
         used=used,
         weighted=weighted,
         evaluations=model.evaluations,
@@ -166,22 +172,16 @@ def _described(
     )
 
 
-def gaps_of(batch: Batch, faults: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weighted gaps, shape (2, N), at fault constants of shape (3,), no offsets taken off."""
-    gaps = np.empty((2, len(batch.current)))
-    residuals(batch, np.concatenate([faults, [0.0, 0.0]]), workspace(batch), gaps)
-    return gaps
+def median_offsets(model: ResidualModel, residuals: NDArray[np.float64]) -> dict[str, float]:
+    """Median residual of each signal as the constant error of its sensor, SI by name.
 
-
-def median_offsets(batch: Batch, gaps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Median gap of spool (m) and pressure (Pa), shape (2,), of weighted gaps of shape (2, N).
-
-    For a batch that runs free: re-anchoring would take most of an offset away.
+    For a model that runs free: re-anchoring would take most of an offset away.
     """
-    out = np.zeros(2)
-    for channel in range(2):
-        weight = batch.weight[channel]
-        used = weight > 0.0
-        if used.any():
-            out[channel] = float(np.median(gaps[channel, used] / weight[used]))
+    out = {}
+    for item in model.unknowns.free:
+        if item.adds_to is not None:
+            weight = model.batch.weight[item.adds_to]
+            used = weight > 0.0
+            shares = residuals[item.adds_to, used] / weight[used]
+            out[item.name] = float(np.median(shares)) if used.any() else 0.0
     return out

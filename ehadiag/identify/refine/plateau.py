@@ -1,7 +1,7 @@
-"""The bottom of a cost that has steps: past what break-aways make of it.
+"""Minimum of a cost that break-aways make jump: the vertex of the smooth bowl beneath the jumps.
 
-A break-away that comes a tick earlier or later makes a step in the cost, on which a descent stops
-wherever it comes from.
+A break-away that comes a tick earlier or later makes a step in the cost, and a descent stops at it,
+wherever it comes from. Parabolas through many points see past the steps.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.refine.residual_model import FAULT_COUNT, GapModel, Slope, capped, wide_sides
+from ehadiag.identify.refine.derivatives import Derivatives, Slope, capped
 
-__all__ = ["Bowl", "centre", "settle"]
+__all__ = ["Bowl", "centre", "vertex"]
 
 SETTLINGS = 2
 REACH = 2.0
@@ -26,14 +26,14 @@ FINE_SHARES = np.delete(np.linspace(-REACH, REACH, 33), 16)
 """Points beside the middle of the longest axis, deviations: two blocks of runs."""
 LEAST_POINTS = 5
 LONGEST_AXIS = 0.005
-"""Fault constants; a constant that the test hardly shows is not followed further."""
+"""Scaled; a coordinate that the test hardly shows is not followed further."""
 MIDDLE_WORSE = 1.0
-"""Cost by which the middle of level ground may lie above its best point: further up there is a step
+"""Cost by which the middle of a plateau may lie above its best point: further up there is a step
 between two basins."""
 WORSE = 4.0
 """Cost by which the bowl's vertex may lie above a chance minimum beside it."""
 NEAR = 1e-4
-"""Fault constants over which derivatives do not change."""
+"""Scaled coordinates over which derivatives do not change."""
 FAR = 1.0
 """Deviations by which a descent may miss the vertex; steps must have held it up if it is more."""
 ROUGH = 3.0
@@ -44,7 +44,7 @@ ROUGH = 3.0
 class Bowl:
     """Where the cost's smooth bowl has its vertex.
 
-    x: the vertex, shape (5,).
+    x: the vertex, shape (k,).
     smooth: whether the cost is a smooth bowl about it.
     slope: near the vertex, with the rows that can be trusted.
     """
@@ -54,7 +54,7 @@ class Bowl:
     slope: Slope
 
 
-def settle(model: GapModel, slope: Slope) -> Bowl:
+def vertex(model: Derivatives, slope: Slope) -> Bowl:
     """Move to the vertex of the smooth bowl that the cost is, its small jumps apart.
 
     Parabolas through the cost over some deviations, along the axes of the uncertainty, see past
@@ -62,13 +62,13 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
     """
     smooth = True
     for _ in range(SETTLINGS):
-        axes = _axes(slope)
-        lines = [_line(slope.x, axis, SHARES) for axis in axes]
-        sides = wide_sides(slope.x)
+        axes = _axes(model, slope)
+        lines = [_line(model, slope.x, axis, SHARES) for axis in axes]
+        sides = model.wide_sides(slope.x)
         runs = model.many(np.vstack([sides, *(points for _, points in lines)]))
         trusted = model.trusted(slope, runs[: len(sides)])
-        costs = [capped(gaps) for gaps in runs[len(sides) :]]
-        smooth &= _trusted_share(slope, trusted) > LEAST_TRUSTED
+        costs = [capped(run) for run in runs[len(sides) :]]
+        smooth &= _trusted_share(model, slope, trusted) > LEAST_TRUSTED
         x, far = slope.x.copy(), 0.0
         for axis, (shares, _) in zip(axes, lines, strict=True):
             share, rough = _vertex(
@@ -80,8 +80,8 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
             far = max(far, abs(share))
         if not smooth:
             return Bowl(slope.x, False, trusted)
-        x[:FAULT_COUNT] = np.clip(x[:FAULT_COUNT], 0.0, 1.0)
-        if far < FAR and np.abs(x - slope.x)[:FAULT_COUNT].max() < NEAR:
+        x = np.clip(x, model.lower, model.upper)
+        if far < FAR and np.abs(x - slope.x)[model.curved].max() < NEAR:
             return Bowl(x, True, trusted)
         moved = model.slopes([x])[0]
         if moved.cost > slope.cost + WORSE:
@@ -90,61 +90,58 @@ def settle(model: GapModel, slope: Slope) -> Bowl:
     return Bowl(slope.x, far < FAR, model.trusted(slope))
 
 
-def centre(model: GapModel, slope: Slope) -> NDArray[np.float64]:
+def centre(model: Derivatives, slope: Slope) -> NDArray[np.float64]:
     """Mean of the likelihood along the longest axis of the uncertainty, steps and all."""
-    axes = _axes(slope)
+    axes = _axes(model, slope)
     x = slope.x
     if not axes:
         return x
-    shares, points = _line(x, axes[0], FINE_SHARES)
-    values = np.append([capped(gaps) for gaps in model.many(points)], slope.cost)
+    shares, points = _line(model, x, axes[0], FINE_SHARES)
+    values = np.append([capped(run) for run in model.many(points)], slope.cost)
     weight = np.exp(-0.5 * (values - values.min()))
     middle = x + float(np.append(shares, 0.0) @ weight / weight.sum()) * axes[0]
-    return middle if capped(model.one(middle)[0]) < slope.cost + MIDDLE_WORSE else x
+    return middle if capped(model.many(middle[None, :])[0]) < slope.cost + MIDDLE_WORSE else x
 
 
-def _inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Points whose fault constants are 0 … 1."""
-    faults = points[:, :FAULT_COUNT]
-    return np.asarray(np.all((faults >= 0.0) & (faults <= 1.0), axis=1))
+def _axes(model: Derivatives, slope: Slope) -> list[NDArray[np.float64]]:
+    """Axes of the uncertainty of the coordinates that act through the model, the longest first.
 
-
-def _axes(slope: Slope) -> list[NDArray[np.float64]]:
-    """Axes of the uncertainty of the constants inside their bounds, the longest first.
-
-    Each is one deviation long, shape (5,).
+    Coordinates at a bound are left out. Each axis is one deviation long, shape (k,).
     """
-    x = slope.x
+    x, curved = slope.x, model.curved
     rows = slope.jacobian[:, slope.used]
-    free = (x[:FAULT_COUNT] > 0.0) & (x[:FAULT_COUNT] < 1.0)
-    kept = np.concatenate([free, np.ones(len(x) - FAULT_COUNT, dtype=np.bool_)])
+    inside = (x > model.lower) & (x < model.upper)
+    kept = np.flatnonzero(inside)
     spread = np.linalg.pinv((rows @ rows.T)[np.ix_(kept, kept)], hermitian=True)
-    count = int(free.sum())
-    variances, axes = np.linalg.eigh(spread[:count, :count])
+    free = np.isin(kept, curved)
+    variances, axes = np.linalg.eigh(spread[np.ix_(free, free)])
     out = []
     for variance, axis in zip(variances[::-1], axes.T[::-1], strict=True):
         direction = np.zeros(len(x))
-        direction[:FAULT_COUNT][free] = axis * min(np.sqrt(max(variance, 0.0)), LONGEST_AXIS)
+        direction[kept[free]] = axis * min(np.sqrt(max(variance, 0.0)), LONGEST_AXIS)
         out.append(direction)
     return out
 
 
 def _line(
-    x: NDArray[np.float64], axis: NDArray[np.float64], shares: NDArray[np.float64]
+    model: Derivatives,
+    x: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    shares: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Shares of an axis that lead from x to points within the bounds, and these, shape (n, 5)."""
+    """Shares of an axis that lead from x to points within the bounds, and these, shape (n, k)."""
     points = x + shares[:, None] * axis
-    inside = _inside(points)
+    inside = np.all((points >= model.lower) & (points <= model.upper), axis=1)
     return shares[inside], points[inside]
 
 
-def _trusted_share(slope: Slope, trusted: Slope) -> float:
+def _trusted_share(model: Derivatives, slope: Slope, trusted: Slope) -> float:
     """Least share of a constant's information that rows keep which can be trusted.
 
     Where break-aways make most of it, a narrow basin among many looks smooth and well known.
     """
-    most = (slope.jacobian[:FAULT_COUNT, slope.used] ** 2).sum(axis=1)
-    kept = (slope.jacobian[:FAULT_COUNT, trusted.used] ** 2).sum(axis=1)
+    most = (slope.jacobian[model.curved][:, slope.used] ** 2).sum(axis=1)
+    kept = (slope.jacobian[model.curved][:, trusted.used] ** 2).sum(axis=1)
     return float((kept[most > 0.0] / most[most > 0.0]).min(initial=1.0))
 
 

@@ -1,4 +1,4 @@
-"""Real-valued compact genetic algorithm, compiled as a whole.
+"""Real-valued compact genetic algorithm: a probability vector instead of a population.
 
 Mininno, Cupertino, Naso, "Real-Valued Compact Genetic Algorithms for Embedded Microcontroller
 Optimization", IEEE Trans. Evolutionary Computation 12(2), 2008. A probability vector (mean and
@@ -19,15 +19,14 @@ generations or the size of the virtual population.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
-from ehadiag.model.scalar.residuals import Batch
-from ehadiag.model.simd.residuals import LaneWork, run_blocks
 
-__all__ = ["compact_ga", "state_bytes"]
+__all__ = ["CompactGaState", "draw", "learn", "start", "state_bytes"]
 
 PULL = 0.5
 """Share of its distance from the elite by which the mean moves after a generation."""
@@ -35,9 +34,35 @@ REACH = 1.5
 """Least deviation after a generation, in steps of the elite."""
 
 
+class CompactGaState(NamedTuple):
+    """What the search remembers between two generations; k genes.
+
+    Attributes
+    ----------
+    mean, spread, elite : shape (k,)
+        Probability vector and best individual, in shares of the bounds 0 … 1.
+    best : shape (1,)
+        Cost of the elite.
+    generator : shape (1,)
+        State of the random numbers.
+    """
+
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    elite: NDArray[np.float64]
+    best: NDArray[np.float64]
+    generator: NDArray[np.uint64]
+
+
 def state_bytes(genes: int) -> int:
     """Memory of the search itself: mean, deviation and elite of each gene, cost, generator."""
-    return genes * 3 * 8 + 8 + 8
+    return sum(part.nbytes for part in start(np.zeros(genes), np.zeros(genes), 0))
+
+
+def start(mean: NDArray[np.float64], spread: NDArray[np.float64], seed: int) -> CompactGaState:
+    """State before the first generation."""
+    generator = np.array([seed], dtype=np.uint64)
+    return CompactGaState(mean.copy(), spread.copy(), mean.copy(), np.array([np.inf]), generator)
 
 
 @kernel
@@ -59,84 +84,52 @@ def _next_normal(state: NDArray[np.uint64]) -> float:
 
 
 @kernel
-def compact_ga(
-    batch: Batch,
-    work: LaneWork,
-    offsets: NDArray[np.float64],
-    cap: float,
-    start: NDArray[np.float64],
-    deviation: NDArray[np.float64],
+def draw(state: CompactGaState, out: NDArray[np.float64]) -> None:
+    """Draw a generation: out, shape (samples, k), each gene in 0 … 1."""
+    for i in range(out.shape[0]):
+        for g in range(out.shape[1]):
+            value = state.mean[g] + state.spread[g] * _next_normal(state.generator)
+            out[i, g] = min(max(value, 0.0), 1.0)
+
+
+@kernel
+def learn(
+    state: CompactGaState,
+    population: NDArray[np.float64],
+    costs: NDArray[np.float64],
     virtual_population: float,
-    samples: int,
-    budget: int,
     tolerance: float,
-    seed: int,
-    control: NDArray[np.int64],
-    history: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float, int, int]:
-    """Search from `start`, all genes in 0 … 1.
+) -> None:
+    """Let the elite compete with a generation, and move the probability vector towards winners.
 
     Parameters
     ----------
-    batch, work, cap: see `ehadiag.model.simd.residuals.run_blocks`.
-    offsets: sensor offsets, held, shape (2,).
-    start, deviation: mean and deviation of the first probability vector, shape (3,).
-    virtual_population: size N_p of the population that the vector stands for.
-    samples: individuals drawn a generation.
-    budget: evaluations at most.
-    tolerance: stop once all deviations are below.
-    control: shape (2,); [0] set to non-zero by another thread stops the search, [1] is the number
-        of evaluations done so far.
-    history: out, best cost after each generation, shape (at least budget / samples,).
-
-    Returns
-    -------
-    Elite, its cost, evaluations, generations.
+    population : shape (samples, k)
+    costs : shape (samples,)
+    virtual_population : float
+        Size N_p of the population that the vector stands for.
+    tolerance : float
+        Deviation at which the search is done; a gene's own is kept above a quarter of it.
     """
-    genes = start.shape[0]
-    state = np.empty(1, dtype=np.uint64)
-    state[0] = np.uint64(seed)
-    mean, spread = start.copy(), deviation.copy()
-    population = np.empty((samples, genes + 2))
-    for i in range(samples):
-        population[i, genes], population[i, genes + 1] = offsets[0], offsets[1]
-    values = np.empty(samples)
-    elite, best, before = start.copy(), np.inf, np.empty(genes)
-    used, generation = 0, 0
-    while used + samples <= budget and control[0] == 0:
-        for i in range(samples):
-            for g in range(genes):
-                value = mean[g] + spread[g] * _next_normal(state)
-                population[i, g] = min(max(value, 0.0), 1.0)
-        if generation == 0:
-            population[0, :genes] = start
-        run_blocks(batch, population, cap, work, values, work.uncounted, work.no_gaps)
-        used += samples
-        for g in range(genes):
-            before[g] = elite[g]
-        for i in range(samples):
-            wins = values[i] < best
-            for g in range(genes):
-                winner = population[i, g] if wins else elite[g]
-                loser = elite[g] if wins else population[i, g]
-                change = (winner - loser) / virtual_population
-                square = (
-                    spread[g] ** 2
-                    + ((winner - mean[g]) ** 2 - (loser - mean[g]) ** 2) / virtual_population
-                    - change**2
-                )
-                mean[g] = min(max(mean[g] + change, 0.0), 1.0)
-                spread[g] = math.sqrt(max(square, (0.25 * tolerance) ** 2))
-                if wins:
-                    elite[g] = population[i, g]
+    mean, spread, elite = state.mean, state.spread, state.elite
+    before = elite.copy()
+    for i in range(population.shape[0]):
+        wins = costs[i] < state.best[0]
+        for g in range(population.shape[1]):
+            winner = population[i, g] if wins else elite[g]
+            loser = elite[g] if wins else population[i, g]
+            change = (winner - loser) / virtual_population
+            square = (
+                spread[g] ** 2
+                + ((winner - mean[g]) ** 2 - (loser - mean[g]) ** 2) / virtual_population
+                - change**2
+            )
+            mean[g] = min(max(mean[g] + change, 0.0), 1.0)
+            spread[g] = math.sqrt(max(square, (0.25 * tolerance) ** 2))
             if wins:
-                best = values[i]
-        for g in range(genes):
-            mean[g] += PULL * (elite[g] - mean[g])
-            spread[g] = max(spread[g], REACH * abs(elite[g] - before[g]))
-        history[generation] = best
-        generation += 1
-        control[1] = used
-        if spread.max() < tolerance:
-            break
-    return elite, best, used, generation
+                elite[g] = population[i, g]
+        if wins:
+            state.best[0] = costs[i]
+    for g in range(population.shape[1]):
+        mean[g] += PULL * (elite[g] - mean[g])
+        spread[g] = max(spread[g], REACH * abs(elite[g] - before[g]))

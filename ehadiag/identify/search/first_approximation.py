@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,13 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
-from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
+from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.search.objective import Objective
-from ehadiag.model.plant import PlantConstants
+from ehadiag.identify.spans import ANCHOR_LSB, lay_out, unknowns_of
+from ehadiag.model.batch import Batch
+from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.model.plant import plant_of
 from ehadiag.model.scalar.jack import jack_response
-from ehadiag.model.scalar.residuals import Batch
+from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["FirstApproximation", "FirstInputs", "first_approximation", "first_inputs"]
+__all__ = ["PRECISION", "FirstApproximation", "FirstInputs", "first_approximation", "first_inputs"]
 
 GRID = 32
 """Points of the coarse search over 0 … 1."""
@@ -42,6 +45,8 @@ FINER_GRID = 16
 TOLERANCE = 6e-4
 """Spacing of the last grid."""
 LEAD_S = 0.05
+PRECISION: Mapping[str, float] = {"Kintas": 1.0, "FSS": 1.0, "FDJ": 0.2}
+"""Typical errors of the three searches in proportion to each other: FDJ is known best."""
 CREEP_PRESSURE_CAP = 25.0
 CREEP_CAP = 100.0
 """A stick-slip jump at another tick counts no more than ten times the noise."""
@@ -51,8 +56,8 @@ CREEP_CAP = 100.0
 class FirstApproximation:
     """Result of the three searches."""
 
-    values: tuple[float, float, float]
-    """Kintas, FSS, FDJ."""
+    values: Mapping[str, float]
+    """Severities by name."""
     evaluations: int
 
 
@@ -60,14 +65,17 @@ class FirstApproximation:
 class FirstInputs:
     """All that the three searches look at."""
 
+    unknowns: Unknowns
+    """Of the severities."""
     creeps: tuple[_Creep, ...]
     slewing: Batch
     creeping: Batch
 
     def arrays(self) -> Iterator[NDArray[np.float64] | NDArray[np.int64]]:
         """Return every number in it."""
+        yield np.array(self.unknowns.base)
         for creep in self.creeps:
-            yield np.array([*creep.constants, creep.before, creep.noise])
+            yield np.array([creep.test, creep.before, creep.noise])
             yield creep.nodes
             yield creep.pressure
         yield from self.slewing
@@ -77,14 +85,19 @@ class FirstInputs:
 def first_inputs(experiments: Sequence[Experiment]) -> FirstInputs:
     """Lay out the windows of the three searches."""
     return FirstInputs(
-        creeps=tuple(piece for experiment in experiments for piece in _creeps(experiment)),
-        slewing=make_batch(
+        unknowns=unknowns_of(experiments, FAULTS),
+        creeps=tuple(
+            piece
+            for test, experiment in enumerate(experiments)
+            for piece in _creeps(experiment, test)
+        ),
+        slewing=lay_out(
             experiments,
             [experiment.test.windows.Kintas for experiment in experiments],
             lead=LEAD_S,
             channels=(True, False),
         ),
-        creeping=make_batch(
+        creeping=lay_out(
             experiments,
             [experiment.test.windows.FSS for experiment in experiments],
             lead=LEAD_S,
@@ -97,19 +110,19 @@ def first_inputs(experiments: Sequence[Experiment]) -> FirstInputs:
 def first_approximation(inputs: FirstInputs) -> FirstApproximation:
     """Search FDJ, then Kintas, then FSS; then Kintas and FSS twice more."""
     counter = _Counter()
-    slewing = Objective(inputs.slewing, cap=np.inf)
-    creeping = Objective(inputs.creeping, cap=CREEP_CAP)
+    slewing = Objective(SimdModel(inputs.slewing, inputs.unknowns), cap=np.inf)
+    creeping = Objective(SimdModel(inputs.creeping, inputs.unknowns), cap=CREEP_CAP)
 
     def fdj_cost(grid: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.sum(
-            [_pressure_costs(*creep, grid, CREEP_PRESSURE_CAP) for creep in inputs.creeps], axis=0
-        )
+        candidates = inputs.unknowns.candidates(_points(inputs.unknowns, FDJ=grid))
+        costs = [_pressure_costs(creep, candidates, CREEP_PRESSURE_CAP) for creep in inputs.creeps]
+        return np.asarray(np.sum(costs, axis=0))
 
     def kintas_cost(grid: NDArray[np.float64], fss: float) -> NDArray[np.float64]:
-        return slewing(np.column_stack([grid, np.full_like(grid, fss), np.zeros_like(grid)]))
+        return slewing(_points(inputs.unknowns, Kintas=grid, FSS=fss))
 
     def fss_cost(grid: NDArray[np.float64], kintas: float) -> NDArray[np.float64]:
-        return creeping(np.column_stack([np.full_like(grid, kintas), grid, np.zeros_like(grid)]))
+        return creeping(_points(inputs.unknowns, Kintas=kintas, FSS=grid))
 
     fdj = _search(counter, fdj_cost, 0.0, 1.0, GRID)
     kintas = _search(counter, lambda grid: kintas_cost(grid, 0.0), 0.0, 1.0, GRID)
@@ -129,7 +142,13 @@ def first_approximation(inputs: FirstInputs) -> FirstApproximation:
             fss + fss_range,
             FINER_GRID,
         )
-    return FirstApproximation((kintas, fss, fdj), counter.count)
+    return FirstApproximation({"Kintas": kintas, "FSS": fss, "FDJ": fdj}, counter.count)
+
+
+def _points(unknowns: Unknowns, **severities: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Points in the space of the severities, those not named at 0; shape (n, k)."""
+    columns = [np.asarray(severities.get(item.name, 0.0)) for item in unknowns.free]
+    return np.column_stack(np.broadcast_arrays(*columns))
 
 
 class _Counter:
@@ -174,21 +193,21 @@ def _vertex(grid: NDArray[np.float64], values: NDArray[np.float64], best: int) -
 class _Creep(NamedTuple):
     """Span in which the jack creeps, driven by the spool as it was measured.
 
-    constants: of the plant.
+    test: which of the tests it is of.
     before: spool position before the span, m.
     nodes: the spool's path in the form that the jack's kernel takes.
     pressure: measured, Pa, shape (n,).
     noise: of the pressure, Pa.
     """
 
-    constants: PlantConstants
+    test: int
     before: float
     nodes: NDArray[np.float64]
     pressure: NDArray[np.float64]
     noise: float
 
 
-def _creeps(experiment: Experiment) -> Iterator[_Creep]:
+def _creeps(experiment: Experiment, test: int) -> Iterator[_Creep]:
     ticks = np.arange(experiment.ticks)
     seen = np.isfinite(experiment.spool)
     spool = np.interp(ticks, ticks[seen], experiment.spool[seen])
@@ -198,7 +217,7 @@ def _creeps(experiment: Experiment) -> Iterator[_Creep]:
         if b - a > 1:
             before = float(spool[a - 1]) if a else 0.0
             yield _Creep(
-                experiment.constants,
+                test,
                 before,
                 _straight_path(spool[a:b], before, experiment.tick),
                 experiment.pressure[a:b],
@@ -215,23 +234,18 @@ def _straight_path(spool: NDArray[np.float64], before: float, tick: float) -> ND
 
 @kernel
 def _pressure_costs(
-    constants: PlantConstants,
-    before: float,
-    nodes: NDArray[np.float64],
-    measured: NDArray[np.float64],
-    noise: float,
-    grid: NDArray[np.float64],
-    cap: float,
+    creep: _Creep, candidates: NDArray[np.float64], cap: float
 ) -> NDArray[np.float64]:
-    """Capped squared pressure gap for each FDJ of the grid, shape (len(grid),)."""
-    n = measured.shape[0]
+    """Capped squared pressure residuals of candidates, rows of constants; shape (n,)."""
+    n = creep.pressure.shape[0]
     node_end = np.arange(1, n + 1)
     pressure, position = np.empty(n), np.empty(n)
-    out = np.zeros(grid.shape[0])
-    for i in range(grid.shape[0]):
-        jack_response(constants, grid[i], before, nodes, node_end, pressure, position)
+    out = np.zeros(candidates.shape[0])
+    for i in range(candidates.shape[0]):
+        constants = plant_of(candidates[i, creep.test])
+        jack_response(constants, creep.before, creep.nodes, node_end, pressure, position)
         for k in range(n):
-            gap = (measured[k] - pressure[k]) / noise
-            if math.isfinite(gap):
-                out[i] += min(gap * gap, cap)
+            residual = (creep.pressure[k] - constants.OPD - pressure[k]) / creep.noise
+            if math.isfinite(residual):
+                out[i] += min(residual * residual, cap)
     return out

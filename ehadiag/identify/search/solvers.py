@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -12,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.identify.search.compact_ga import compact_ga
+from ehadiag.identify.search import compact_ga
 from ehadiag.identify.search.objective import Objective
 
 __all__ = ["SOLVERS", "CompactGa", "PygadGa", "SearchResult", "Solver", "make_solver"]
 
 Progress = Callable[[int, int], None]
 """Called with evaluations done and budget."""
-POLL_S = 0.05
 PARENTS, ELITE, MUTATION = 3, 1, 0.8
 """Of pygad: parents of a generation, individuals kept, probability that a gene mutates."""
 
@@ -29,7 +27,7 @@ class SearchResult:
     """Outcome of one global search."""
 
     best: NDArray[np.float64]
-    """Shape (3,)."""
+    """Shape (k,)."""
     cost: float
     evaluations: int
     generations: int
@@ -38,7 +36,7 @@ class SearchResult:
 
 
 class Solver(Protocol):
-    """Minimises an objective over the unit cube, from a start with a deviation."""
+    """Minimises an objective within its bounds, from a start with a deviation."""
 
     @property
     def name(self) -> str:
@@ -64,14 +62,14 @@ class Solver(Protocol):
     ) -> SearchResult:
         """Search; the same seed gives the same answer.
 
-        `start` has shape (3,), `deviation` about it too, or is one for all genes.
+        `start` has shape (k,), `deviation` about it too, or is one for all genes.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class CompactGa:
-    """The compact genetic algorithm, model and all in one compiled call."""
+    """The compact genetic algorithm (`ehadiag.identify.search.compact_ga`)."""
 
     budget: int = 600
     """Evaluations at most."""
@@ -94,46 +92,27 @@ class CompactGa:
         seed: int,
         progress: Progress | None = None,
     ) -> SearchResult:
-        """Search; with `progress`, Ctrl-C stops it between two generations."""
-        control = np.zeros(2, dtype=np.int64)
-        history = np.empty(self.budget // self.samples + 1)
-        outcome: list[tuple[NDArray[np.float64], float, int, int]] = []
-
-        def work() -> None:
-            outcome.append(
-                compact_ga(
-                    objective.batch,
-                    objective.work,
-                    objective.offsets,
-                    objective.cap,
-                    np.asarray(start, dtype=np.float64),
-                    np.broadcast_to(np.asarray(deviation, np.float64), len(start)).copy(),
-                    self.virtual_population,
-                    self.samples,
-                    self.budget,
-                    self.tolerance,
-                    seed,
-                    control,
-                    history,
-                )
-            )
-
-        if progress is None:
-            work()
-        else:
-            thread = threading.Thread(target=work, name="ehadiag-search")
-            thread.start()
-            try:
-                while thread.is_alive():
-                    thread.join(POLL_S)
-                    progress(int(control[1]), self.budget)
-            except BaseException:
-                control[0] = 1
-                thread.join()
-                raise
-        best, cost, used, generations = outcome[0]
-        objective.evaluations += used
-        return SearchResult(best, float(cost), used, generations, history[:generations].copy())
+        """Search, see the protocol."""
+        width = objective.upper - objective.lower
+        first = (np.asarray(start, dtype=np.float64) - objective.lower) / width
+        state = compact_ga.start(first, np.broadcast_to(deviation / width, first.shape), seed)
+        population = np.empty((self.samples, len(first)))
+        history: list[float] = []
+        used = 0
+        while used + self.samples <= self.budget:
+            compact_ga.draw(state, population)
+            if not history:
+                population[0] = first
+            costs = objective(objective.lower + population * width)
+            compact_ga.learn(state, population, costs, self.virtual_population, self.tolerance)
+            used += self.samples
+            history.append(float(state.best[0]))
+            if progress is not None:
+                progress(used, self.budget)
+            if state.spread.max() < self.tolerance:
+                break
+        best = objective.lower + state.elite * width
+        return SearchResult(best, float(state.best[0]), used, len(history), np.array(history))
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +146,14 @@ class PygadGa:
 
         widest = float(np.max(deviation))
         rng = np.random.default_rng(seed)
-        first = np.clip(rng.normal(start, deviation, (self.population, len(start))), 0.0, 1.0)
+        lower, upper = objective.lower, objective.upper
+        first = np.clip(rng.normal(start, deviation, (self.population, len(start))), lower, upper)
         first[0] = start
         before = objective.evaluations
         history: list[float] = []
 
         def fitness(_: Any, solutions: NDArray[np.float64], __: Any) -> NDArray[np.float64]:
-            return -objective(np.clip(solutions, 0.0, 1.0))
+            return -objective(np.clip(solutions, lower, upper))
 
         generations = max(1, (self.budget - self.population) // (self.population - ELITE))
 
@@ -210,7 +190,7 @@ class PygadGa:
             best, value, _ = ga.best_solution(ga.last_generation_fitness)
         used = objective.evaluations - before
         return SearchResult(
-            np.clip(np.asarray(best, dtype=np.float64), 0.0, 1.0),
+            np.clip(np.asarray(best, dtype=np.float64), lower, upper),
             -float(value),
             used,
             len(history),

@@ -17,14 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.stored_test import StoredTest, Window
-from ehadiag.identify.experiment import Experiment, make_batch
+from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.search.first_approximation import (
+    PRECISION,
     FirstApproximation,
     first_approximation,
     first_inputs,
 )
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import SearchResult, Solver
+from ehadiag.identify.spans import lay_out, unknowns_of
+from ehadiag.model.parameters import FAULTS
+from ehadiag.model.simd.model import SimdModel
 
 __all__ = [
     "DEVIATION",
@@ -54,11 +58,11 @@ What comes later is for the last step of the refinement, so that all else is don
 BUDGET = 0.375
 """Budgets of the solver, for all stages together."""
 DEVIATION = 0.004
-"""Of the first stage about the first approximation, fault constants."""
+"""Of the first stage about the first approximation, severities."""
 NARROWING = 0.5
 """Ratio of the deviations of two stages."""
-DEVIATION_SHARE = np.array([1.0, 1.0, 0.2])
-"""The first approximation knows FDJ best."""
+DEVIATION_SHARE = np.array([PRECISION[item.name] for item in FAULTS])
+"""Of each severity, as the first approximation knows them."""
 LEAD_S = 0.1
 """Run-in before a window, s."""
 
@@ -113,21 +117,11 @@ def first_stage(experiments: Sequence[Experiment], memory: Memory) -> FirstAppro
     )
 
 
-def staged_search(
-    experiments: Sequence[Experiment],
-    start: NDArray[np.float64],
-    solver: Solver,
-    seed: int,
-    memory: Memory,
-    tell: Progress,
-) -> SearchResult:
-    """Search the window as it grows; stages that memory knows are not run again.
-
-    `start`: fault constants, shape (3,).
-    """
+def staged_search(stages: Iterator[SearchResult], tell: Progress) -> SearchResult:
+    """Run the stages of a search to the end, as one result."""
     tell("search", 0.0)
     results = []
-    for result in search_stages(experiments, start, solver, seed, memory):
+    for result in stages:
         results.append(result)
         tell("search", len(results) / len(STAGES))
     return SearchResult(
@@ -164,13 +158,14 @@ def _search_stage(
 ) -> SearchResult:
     """One stage of the genetic search, from memory if the inputs are the same."""
     windows = [_grown(item.test.windows.refinement, STAGES[stage]) for item in experiments]
-    batch = make_batch(experiments, windows, lead=LEAD_S)
+    batch = lay_out(experiments, windows, lead=LEAD_S)
+    unknowns = unknowns_of(experiments, FAULTS)
     spread = DEVIATION * NARROWING**stage * DEVIATION_SHARE
     part = solver.with_budget(round(solver.budget * BUDGET / len(STAGES)))
     return memory.recall(
-        digest(f"search {seed} {part!r}", [*batch, start, spread]),
+        digest(f"search {seed} {part!r}", [*batch, np.array(unknowns.base), start, spread]),
         SearchResult,
-        lambda: part.minimise(Objective(batch), start, spread, seed + stage),
+        lambda: part.minimise(Objective(SimdModel(batch, unknowns)), start, spread, seed + stage),
     )
 
 

@@ -1,7 +1,6 @@
-"""Kernels of the objective: many candidates against one or more recordings.
+"""Residuals of candidates by the scalar kernels, one candidate at a time.
 
-Candidates are rows of a matrix; recordings stand one behind the other in flat arrays, so that one
-compiled function serves any number of either.
+What the target computer runs, and the reference for the vector kernels.
 """
 
 from __future__ import annotations
@@ -13,41 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
-from ehadiag.model.plant import PlantConstants
+from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch, longest_span
+from ehadiag.model.parameters import Unknowns
+from ehadiag.model.plant import plant_of
 from ehadiag.model.scalar.jack import jack_response
-from ehadiag.model.scalar.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
+from ehadiag.model.scalar.spool import spool_response
+from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import spool_tables
 
-__all__ = ["Batch", "Workspace", "constants_of", "costs", "residuals", "spool_rates", "workspace"]
+__all__ = ["ScalarModel"]
 
 
-class Batch(NamedTuple):
-    """Recordings (or spans of them) to explain; m of them, N ticks in all.
-
-    constants: shape (m, fields of PlantConstants).
-    tick: s, shape (m,).
-    start: first tick of each span in the flat arrays, then N, shape (m + 1,).
-    origin: spool position before the first tick of each span, m, shape (m,).
-    current_before: current before the first tick of each span, A, shape (m,).
-    current: A, shape (N,).
-    spool, pressure: measured, m and Pa, shape (N,), NaN where missing.
-    weight: reciprocal noise of spool and pressure, 0 where not used, shape (2, N).
-    anchor: re-anchoring in each span (see `Anchor`), shape (m, 3).
-    """
-
-    constants: NDArray[np.float64]
-    tick: NDArray[np.float64]
-    start: NDArray[np.int64]
-    origin: NDArray[np.float64]
-    current_before: NDArray[np.float64]
-    current: NDArray[np.float64]
-    spool: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    anchor: NDArray[np.float64]
-
-
-class Workspace(NamedTuple):
+class _Workspace(NamedTuple):
     """Scratch arrays, so that no evaluation allocates; one for each thread."""
 
     spool: NDArray[np.float64]
@@ -57,10 +33,9 @@ class Workspace(NamedTuple):
     node_end: NDArray[np.int64]
 
 
-def workspace(batch: Batch) -> Workspace:
-    """Scratch for a batch."""
-    longest = int(np.diff(batch.start).max())
-    return Workspace(
+def _workspace(batch: Batch) -> _Workspace:
+    longest = longest_span(batch)
+    return _Workspace(
         spool=np.empty(longest),
         pressure=np.empty(longest),
         position=np.empty(longest),
@@ -70,53 +45,30 @@ def workspace(batch: Batch) -> Workspace:
 
 
 @kernel
-def constants_of(row: NDArray[np.float64]) -> PlantConstants:
-    """Constants of a span, `row` of `Batch.constants`."""
-    return PlantConstants(
-        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], row[9],
-        row[10], row[11], row[12], row[13], row[14], row[15], row[16], row[17], row[18], row[19],
-        row[20], row[21], row[22], row[23], row[24],
-    )  # fmt: skip
-
-
-@kernel
-def _run_spool(batch: Batch, candidate: NDArray[np.float64], work: Workspace, index: int) -> int:
-    """Spool's path of one span into the workspace; returns how often it was re-anchored."""
-    a, b = batch.start[index], batch.start[index + 1]
-    constants = constants_of(batch.constants[index])
-    tick = batch.tick[index]
-    return spool_response(
-        constants,
-        spool_tables(constants, candidate[0], candidate[1], tick),
-        batch.current[a:b],
-        tick,
-        batch.origin[index],
-        batch.current_before[index],
-        batch.spool[a:b] - candidate[3],
-        batch.anchor[index],
-        work.spool[: b - a],
-        work.nodes,
-        work.node_end[: b - a],
-    )
-
-
-@kernel
-def residuals(
-    batch: Batch, candidate: NDArray[np.float64], work: Workspace, out: NDArray[np.float64]
+def _residuals(
+    batch: Batch, candidate: NDArray[np.float64], work: _Workspace, out: NDArray[np.float64]
 ) -> int:
-    """Weighted gaps, measured less modelled, of spool and pressure: out, shape (2, N).
-
-    `candidate` is (Kintas, FSS, FDJ, spool offset in m, pressure offset in Pa). A missing sample
-    gives 0. Returns how often the model was re-anchored.
-    """
+    """Weighted residuals of one candidate, rows of constants of shape (tests, FIELDS)."""
     anchored = 0
     for index in range(batch.tick.shape[0]):
         a, b = batch.start[index], batch.start[index + 1]
         n = b - a
-        anchored += _run_spool(batch, candidate, work, index)
+        constants, tick = plant_of(candidate[batch.test[index]]), batch.tick[index]
+        anchored += spool_response(
+            constants,
+            spool_tables(constants, tick),
+            batch.current[batch.since[index] : batch.since[index] + n],
+            tick,
+            batch.origin[index],
+            batch.current[batch.since[index] - batch.history[index] : batch.since[index]],
+            batch.spool[a:b],
+            batch.anchor[index],
+            work.spool[:n],
+            work.nodes,
+            work.node_end[:n],
+        )
         jack_response(
-            constants_of(batch.constants[index]),
-            candidate[2],
+            constants,
             batch.origin[index],
             work.nodes,
             work.node_end[:n],
@@ -124,39 +76,35 @@ def residuals(
             work.position[:n],
         )
         for k in range(n):
-            gap = (batch.spool[a + k] - candidate[3] - work.spool[k]) * batch.weight[0, a + k]
-            out[0, a + k] = gap if math.isfinite(gap) else 0.0
-            gap = (batch.pressure[a + k] - candidate[4] - work.pressure[k]) * batch.weight[1, a + k]
-            out[1, a + k] = gap if math.isfinite(gap) else 0.0
+            spool = batch.spool[a + k] - constants.OXS - work.spool[k]
+            spool *= batch.weight[SPOOL_ROW, a + k]
+            out[SPOOL_ROW, a + k] = spool if math.isfinite(spool) else 0.0
+            pressure = batch.pressure[a + k] - constants.OPD - work.pressure[k]
+            pressure *= batch.weight[PRESSURE_ROW, a + k]
+            out[PRESSURE_ROW, a + k] = pressure if math.isfinite(pressure) else 0.0
     return anchored
 
 
-@kernel
-def spool_rates(
-    batch: Batch, candidate: NDArray[np.float64], work: Workspace, out: NDArray[np.float64]
-) -> None:
-    """Velocity of the modelled spool at the end of each tick: out, m/s, shape (N,)."""
-    for index in range(batch.tick.shape[0]):
-        _run_spool(batch, candidate, work, index)
-        a = batch.start[index]
-        for k in range(batch.start[index + 1] - a):
-            out[a + k] = work.nodes[work.node_end[k] - 1, 3]
+class ScalarModel:
+    """A `ehadiag.model.interface.ResidualModel` of scalar kernels."""
 
+    def __init__(self, batch: Batch, unknowns: Unknowns) -> None:
+        self.batch = batch
+        self.unknowns = unknowns
+        self.evaluations = 0
+        self._work = _workspace(batch)
 
-@kernel
-def costs(
-    batch: Batch,
-    candidates: NDArray[np.float64],
-    cap: float,
-    work: Workspace,
-    gaps: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    """Summed squared weighted gap of each candidate, each square at most `cap`: out, shape (n,)."""
-    for i in range(candidates.shape[0]):
-        residuals(batch, candidates[i], work, gaps)
-        total = 0.0
-        for channel in range(2):
-            for k in range(gaps.shape[1]):
-                total += min(gaps[channel, k] * gaps[channel, k], cap)
-        out[i] = total
+    def residuals(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """See the protocol."""
+        out = np.empty((len(points), SIGNALS, self.batch.weight.shape[1]))
+        anchored = np.empty(len(points), dtype=np.int64)
+        for i, candidate in enumerate(self.unknowns.candidates(points)):
+            anchored[i] = _residuals(self.batch, candidate, self._work, out[i])
+        self.evaluations += len(points)
+        return out, anchored
+
+    def costs(self, points: NDArray[np.float64], cap: float) -> NDArray[np.float64]:
+        """See the protocol."""
+        return np.asarray(np.minimum(self.residuals(points)[0] ** 2, cap).sum(axis=(1, 2)))

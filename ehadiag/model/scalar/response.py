@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from ehadiag.model.anchor import FREE_RUN, Anchor
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.jack import jack_response
-from ehadiag.model.scalar.spool import NODE_COLUMNS, NODES_PER_TICK, spool_response
+from ehadiag.model.scalar.spool import spool_response
+from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import spool_tables
 
 __all__ = ["FREE_RUN", "Anchor", "Response", "respond"]
@@ -32,12 +33,11 @@ class Response:
 
 def respond(
     constants: PlantConstants,
-    faults: NDArray[np.float64],
     current: NDArray[np.float64],
     tick: float,
     *,
     origin: float = 0.0,
-    current_before: float = 0.0,
+    history: NDArray[np.float64] | None = None,
     measured: NDArray[np.float64] | None = None,
     anchor: Anchor = FREE_RUN,
 ) -> Response:
@@ -45,31 +45,32 @@ def respond(
 
     Parameters
     ----------
-    faults: (Kintas, FSS, FDJ), each 0 … 1.
+    constants: of the candidate; its sensors' errors are not added to the response.
     current: servovalve current of each tick, A, shape (n,).
     tick: length of a tick, s.
     origin: spool position before the first tick, m.
-    current_before: current before the first tick, A.
+    history: current before the first tick, A, shape (h,); None: the hysteresis is unloaded.
     measured: spool position to re-anchor on, m, shape (n,), NaN where missing.
     """
     n = len(current)
     spool, pressure, position = np.empty(n), np.empty(n), np.empty(n)
     nodes = np.empty((n * NODES_PER_TICK, NODE_COLUMNS))
     node_end = np.empty(n, dtype=np.int64)
-    tables = spool_tables(constants, float(faults[0]), float(faults[1]), tick)
+    plant = PlantConstants(*(float(value) for value in constants))
+    tables = spool_tables(plant, tick)
     reference = np.full(n, np.nan) if measured is None else measured
     anchored = spool_response(
-        constants,
+        plant,
         tables,
         current,
         tick,
         origin,
-        current_before,
+        np.zeros(0) if history is None else history,
         reference,
         anchor.as_array(),
         spool,
         nodes,
         node_end,
     )
-    jack_response(constants, float(faults[2]), origin, nodes, node_end, pressure, position)
+    jack_response(plant, origin, nodes, node_end, pressure, position)
     return Response(spool, pressure, position, anchored)

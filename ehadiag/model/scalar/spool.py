@@ -7,11 +7,14 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
 from ehadiag.model.anchor import re_anchored
+from ehadiag.model.laws import drive_law
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, spool_rest, spool_tick
+from ehadiag.model.scalar.drive import deflection_held, drive
+from ehadiag.model.scalar.spool_tick import sampled_path, spool_rest, spool_tick
 from ehadiag.model.scalar.transition import SpoolTables
+from ehadiag.model.spool_events import SpoolState
 
-__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "spool_response"]
+__all__ = ["spool_response"]
 
 
 @kernel
@@ -21,7 +24,7 @@ def spool_response(
     current: NDArray[np.float64],
     tick: float,
     origin: float,
-    current_before: float,
+    history: NDArray[np.float64],
     measured: NDArray[np.float64],
     anchor: NDArray[np.float64],
     spool: NDArray[np.float64],
@@ -35,10 +38,11 @@ def spool_response(
     current: servovalve current of each tick, A, shape (n,).
     tick: s.
     origin: spool position before the first tick, m.
-    current_before: current before the first tick, A; the flapper is in equilibrium with both.
+    history: current of all ticks before, A, shape (h,): it has loaded the hysteresis, and the
+        flapper is in equilibrium with its last.
     measured: measured spool position, m, shape (n,), NaN where missing; used only to re-anchor.
     anchor: (gain, small, large), see `ehadiag.model.anchor.Anchor`.
-    spool: out, m, shape (n,), the prediction before any re-anchoring.
+    spool: out, m, shape (n,), as it is sampled, the prediction before any re-anchoring.
     nodes: out, shape (n * NODES_PER_TICK, NODE_COLUMNS), the path as `spool_tick` writes it, with
         the jump that a re-anchoring adds after a tick's last piece.
     node_end: out, shape (n,), index one past the last node of each tick.
@@ -47,35 +51,23 @@ def spool_response(
     -------
     How many times the model was re-anchored.
     """
-    c, t = constants, tables.scalars
-    moving, stuck, decay = tables.moving, tables.stuck, tables.decay
-    xf, xs = spool_rest(c, t, current_before, origin)
-    wf, vs, direction, clamped = 0.0, 0.0, 0, False
+    motor, law = drive_law(constants), tables.law
+    held = np.zeros(int(constants.NPL))
+    for k in range(history.shape[0]):
+        drive(motor, held, history[k])
+    s = spool_rest(law, deflection_held(motor, held), origin)
     count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
-        xf, wf, xs, vs, direction, clamped, count = spool_tick(
-            c,
-            t,
-            moving,
-            stuck,
-            decay,
-            c.GM * current[k],
-            tick,
-            xf,
-            wf,
-            xs,
-            vs,
-            direction,
-            clamped,
-            nodes,
-            count,
-        )
+        before = s.xs
+        s, count = spool_tick(tables, drive(motor, held, current[k]), tick, s, nodes, count)
         node_end[k] = count
-        spool[k] = xs
+        spool[k] = sampled_path(constants, nodes, count, before)
         xs, filtered, moved = re_anchored(
-            measured[k] - xs, anchor[0], anchor[1], anchor[2], xs, filtered, c.XSM
-        )
+            measured[k] - constants.OXS - spool[k], anchor[0], anchor[1], anchor[2],
+            s.xs, filtered, law.stroke,
+        )  # fmt: skip
         if moved:
-            nodes[count - 1, 4] = xs - spool[k]
+            nodes[count - 1, 4] = xs - s.xs
+            s = SpoolState(s.xf, s.wf, xs, s.vs, s.wire + (xs - s.xs), s.direction, s.clamped)
             anchored += 1
     return anchored

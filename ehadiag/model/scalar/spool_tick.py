@@ -1,11 +1,10 @@
 """First stage and spool over one tick, integrated exactly: kernel of the monitoring model.
 
-Between events, flapper and spool obey linear equations with constant coefficients (model.md
-section 1, the current being held over a tick), so the state moves by a transition matrix, without
+Between events, flapper and spool obey linear equations with constant coefficients (PHY-4,
+PHY-5, the current being held over a tick), so the state moves by a transition matrix, without
 error. Events switch the equations: the flapper meets or leaves a stop; the spool sticks, breaks
 away or meets a stop. A step that contains an event is halved until the event is located.
-Coefficients depend on one fault constant only, `Kintas`, so the matrices are made once for each
-candidate (`ehadiag.model.scalar.transition`).
+The matrices are made once for each candidate (`ehadiag.model.scalar.transition`).
 """
 
 from __future__ import annotations
@@ -16,17 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import inlined
+from ehadiag.model.laws import (
+    SpoolLaw,
+    flapper_held,
+    play,
+    sampled,
+    sensor_law,
+    slide_base,
+    steady_rate,
+    still_flapper,
+)
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.spool_events import (
+from ehadiag.model.scalar.transition import FINEST, SpoolTables
+from ehadiag.model.spool_events import (
     NOTHING,
+    SpoolState,
+    carried,
     clamped_event,
     moving_event,
     stuck_event,
     switch,
 )
-from ehadiag.model.scalar.transition import FINEST, SpoolScalars
 
-__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "spool_rest", "spool_tick"]
+__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "sampled_path", "spool_rest", "spool_tick"]
 
 Matrix = NDArray[np.float64]
 BASE = 3
@@ -46,50 +57,73 @@ BEND = 0.05e-6
 
 
 @inlined
-def _rests(
-    c: PlantConstants, t: SpoolScalars, torque: float, xf: float, wf: float, xs: float
-) -> bool:
-    """Whether a spool at rest stays so while this torque lasts: the flapper rings too little."""
+def _rests(t: SpoolLaw, deflection: float, s: SpoolState) -> bool:
+    """Whether a spool at rest stays so while this current lasts: the flapper rings too little."""
     if t.ring_rate <= 0.0:
         return False
-    rest_xf = (torque - c.KSF * xs) / c.KF
-    a = xf - rest_xf
-    b = (wf + t.ring_damping * a) / t.ring_rate
-    return abs(rest_xf) + math.sqrt(a * a + b * b) < min(t.breakaway, c.XFM)
+    still = still_flapper(t.ratio, deflection, s.wire)
+    a = s.xf - still
+    b = (s.wf + t.ring_damping * a) / t.ring_rate
+    return abs(still) + math.sqrt(a * a + b * b) < min(t.breakaway, t.flapper_stop)
 
 
 @inlined
-def _slide(
-    c: PlantConstants,
-    t: SpoolScalars,
-    m: Matrix,
-    torque: float,
-    xf: float,
-    wf: float,
-    xs: float,
-    vs: float,
-    direction: int,
-) -> tuple[float, float, float, float]:
+def _slide(t: SpoolLaw, m: Matrix, deflection: float, s: SpoolState) -> SpoolState:
     """Flapper free, spool moving: a step about the point where both would rest."""
-    rest_xf = t.dynamic * direction / t.force
-    rest_xs = (torque - c.KF * rest_xf) / c.KSF
-    a, b = xf - rest_xf, xs - rest_xs
-    return (
-        rest_xf + m[0, 0] * a + m[0, 1] * wf + m[0, 2] * b + m[0, 3] * vs,
-        m[1, 0] * a + m[1, 1] * wf + m[1, 2] * b + m[1, 3] * vs,
-        rest_xs + m[2, 0] * a + m[2, 1] * wf + m[2, 2] * b + m[2, 3] * vs,
-        m[3, 0] * a + m[3, 1] * wf + m[3, 2] * b + m[3, 3] * vs,
+    rest_xf = t.dry * s.direction
+    rest_xs = slide_base(t, deflection, float(s.direction))
+    a, w, b, v = s.xf - rest_xf, s.wf, s.xs - rest_xs, s.vs
+    return SpoolState(
+        rest_xf + m[0, 0] * a + m[0, 1] * w + m[0, 2] * b + m[0, 3] * v,
+        m[1, 0] * a + m[1, 1] * w + m[1, 2] * b + m[1, 3] * v,
+        rest_xs + m[2, 0] * a + m[2, 1] * w + m[2, 2] * b + m[2, 3] * v,
+        m[3, 0] * a + m[3, 1] * w + m[3, 2] * b + m[3, 3] * v,
+        s.wire,
+        s.direction,
+        s.clamped,
     )
 
 
 @inlined
-def _ring(
-    c: PlantConstants, n: Matrix, torque: float, xf: float, wf: float, xs: float
-) -> tuple[float, float]:
+def _slide_loose(t: SpoolLaw, m: Matrix, h: float, deflection: float, s: SpoolState) -> SpoolState:
+    """Flapper free, spool moving within its backlash: the wire stays, the flapper rings."""
+    still = still_flapper(t.ratio, deflection, s.wire)
+    steady = steady_rate(t, still, float(s.direction))
+    a, w, v = s.xf - still, s.wf, s.vs - steady
+    return SpoolState(
+        still + m[0, 0] * a + m[0, 1] * w,
+        m[1, 0] * a + m[1, 1] * w,
+        s.xs + steady * h + m[2, 0] * a + m[2, 1] * w + m[2, 3] * v,
+        steady + m[3, 0] * a + m[3, 1] * w + m[3, 3] * v,
+        s.wire,
+        s.direction,
+        s.clamped,
+    )
+
+
+@inlined
+def _ring(t: SpoolLaw, n: Matrix, deflection: float, s: SpoolState) -> SpoolState:
     """Flapper free, spool at rest: a step of the flapper about its rest."""
-    rest_xf = (torque - c.KSF * xs) / c.KF
-    a = xf - rest_xf
-    return rest_xf + n[0, 0] * a + n[0, 1] * wf, n[1, 0] * a + n[1, 1] * wf
+    still = still_flapper(t.ratio, deflection, s.wire)
+    a = s.xf - still
+    return SpoolState(
+        still + n[0, 0] * a + n[0, 1] * s.wf,
+        n[1, 0] * a + n[1, 1] * s.wf,
+        s.xs,
+        s.vs,
+        s.wire,
+        s.direction,
+        s.clamped,
+    )
+
+
+@inlined
+def _slide_clamped(t: SpoolLaw, h: float, fade: float, s: SpoolState) -> SpoolState:
+    """Flapper on its stop, spool moving: its velocity decays towards a steady one."""
+    steady = steady_rate(t, s.xf, float(s.direction))
+    xs = s.xs + steady * h + (s.vs - steady) * (1.0 - fade) * t.mass / t.damping
+    vs = steady + (s.vs - steady) * fade
+    return SpoolState(s.xf, s.wf, xs, vs, s.wire, s.direction, s.clamped)
 
 
 @inlined
@@ -103,43 +137,28 @@ def _node_wanted(event: int, done: int, bend: float) -> bool:
 
 
 @inlined
-def spool_rest(
-    c: PlantConstants, t: SpoolScalars, current: float, origin: float
-) -> tuple[float, float]:
-    """Positions of flapper and spool (m) at rest with a current (A) and the spool at `origin`."""
-    xs = min(max(origin, -c.XSM), c.XSM)
-    xf = (c.GM * current - c.KSF * xs) / c.KF
-    return min(max(xf, -t.breakaway), t.breakaway), xs
+def spool_rest(t: SpoolLaw, deflection: float, origin: float) -> SpoolState:
+    """Flapper and spool at rest, the spool at `origin` (m) within its stroke."""
+    xs = min(max(origin, -t.stroke), t.stroke)
+    return SpoolState(flapper_held(t, deflection, xs), 0.0, xs, 0.0, xs, 0, False)
 
 
 @inlined
 def spool_tick(
-    c: PlantConstants,
-    t: SpoolScalars,
-    moving: Matrix,
-    stuck: Matrix,
-    decay: Matrix,
-    torque: float,
+    tables: SpoolTables,
+    deflection: float,
     tick: float,
-    xf: float,
-    wf: float,
-    xs: float,
-    vs: float,
-    direction: int,
-    clamped: bool,
+    state: SpoolState,
     nodes: Matrix,
     first: int,
-) -> tuple[float, float, float, float, int, bool, int]:
+) -> tuple[SpoolState, int]:
     """Flapper and spool over one tick.
 
     Parameters
     ----------
-    moving, stuck, decay: see `ehadiag.model.scalar.transition.SpoolTables`.
-    torque: of the motor, N, held over the tick.
+    deflection: of the flapper by the current alone, held over the tick, m.
     tick: s.
-    xf, wf, xs, vs: position and velocity of flapper and spool, m and m/s.
-    direction: of the spool's motion, +1 or -1; 0 at rest.
-    clamped: whether the flapper is on its stop.
+    state: before.
     nodes: out, shape (at least first + NODES_PER_TICK, NODE_COLUMNS), one row a piece of the path:
         duration (s), position at its end (m), velocity at its start and at its end (m/s); the last
         column, the jump after the piece (m), is set to 0.
@@ -147,42 +166,44 @@ def spool_tick(
 
     Returns
     -------
-    xf, wf, xs, vs, direction and clamped at the end, and the index one past the last node.
+    State at the end, and the index one past the last node.
     """
+    t = tables.law
     full = first + NODES_PER_TICK - 1
     count, done, since, level = first, 0, 0, BASE
-    if direction == 0 and not clamped and _rests(c, t, torque, xf, wf, xs):
+    s = state
+    if s.direction == 0 and not s.clamped and _rests(t, deflection, s):
         level = 0
-    begin, slowest, fastest = vs, vs, vs
+    begin, slowest, fastest = s.vs, s.vs, s.vs
     while done < WHOLE:
         while (WHOLE >> level) > WHOLE - done:
             level += 1
         h = tick / (1 << level)
-        new_xf, new_wf, new_xs, new_vs = xf, wf, xs, vs
-        if clamped:
-            if direction != 0:
-                steady = (t.force * xf - t.dynamic * direction) / t.damping
-                fade = decay[level]
-                new_xs += steady * h + (vs - steady) * (1.0 - fade) * c.MS / t.damping
-                new_vs = steady + (vs - steady) * fade
-            event = clamped_event(c, t, torque, xf, new_xs, new_vs, direction)
-        elif direction != 0:
-            new_xf, new_wf, new_xs, new_vs = _slide(
-                c, t, moving[level], torque, xf, wf, xs, vs, direction
+        new = s
+        if s.clamped:
+            if s.direction != 0:
+                new = _slide_clamped(t, h, tables.decay[level], s)
+            wire = play(s.wire, new.xs, t.backlash)
+            event = clamped_event(t, deflection, s.xf, new.xs, new.vs, wire, s.direction)
+        elif s.direction != 0:
+            loose = not carried(t, s.direction, s.xs, s.wire)
+            if loose:
+                new = _slide_loose(t, tables.loose[level], h, deflection, s)
+            else:
+                new = _slide(t, tables.moving[level], deflection, s)
+            event = moving_event(
+                t, h, s.xf, s.wf, new.xf, new.wf, new.xs, new.vs, s.wire, loose, s.direction
             )
-            event = moving_event(c, t, h, xf, wf, new_xf, new_wf, new_xs, new_vs, direction)
         else:
-            new_xf, new_wf = _ring(c, stuck[level], torque, xf, wf, xs)
-            event = stuck_event(c, t, h, xf, wf, new_xf, new_wf, xs)
+            new = _ring(t, tables.stuck[level], deflection, s)
+            event = stuck_event(t, h, s.xf, s.wf, new.xf, new.wf, s.xs)
         if level == 0:
             event = NOTHING  # `_rests` has looked
         if event != NOTHING and level < FINEST:
             level += 1
             continue
-        end = new_vs
-        xf, wf, xs, vs, direction, clamped = switch(
-            c, t, event, new_xf, new_wf, new_xs, new_vs, direction, clamped
-        )
+        end = new.vs
+        s = switch(t, event, new)
         done += WHOLE >> level
         since += WHOLE >> level
         slowest, fastest = min(slowest, end), max(fastest, end)
@@ -190,13 +211,26 @@ def spool_tick(
         wanted = _node_wanted(event, done, 0.125 * (fastest - slowest) * span)
         if wanted and (done == WHOLE or count < full):
             nodes[count, 0] = span
-            nodes[count, 1] = xs
+            nodes[count, 1] = s.xs
             nodes[count, 2] = begin
             nodes[count, 3] = end
             nodes[count, 4] = 0.0
             count += 1
-            begin, slowest, fastest = vs, vs, vs
+            begin, slowest, fastest = s.vs, s.vs, s.vs
             since = 0
         if level > BASE and done & ((WHOLE >> (level - 1)) - 1) == 0:
             level -= 1
-    return xf, wf, xs, vs, direction, clamped, count
+    return s, count
+
+
+@inlined
+def sampled_path(c: PlantConstants, nodes: Matrix, end: int, before: float) -> float:
+    """Spool as its sensor samples it in a tick, m, from the path's last piece.
+
+    nodes, end: the path up to the tick's end; before: position before the path's last piece where
+    that is the first of all, m.
+    """
+    last = end - 1
+    start = nodes[last - 1, 1] + nodes[last - 1, 4] if last > 0 else before
+    law = sensor_law(c, nodes[last, 0])
+    return sampled(law, start, nodes[last, 1], nodes[last, 2], nodes[last, 3])

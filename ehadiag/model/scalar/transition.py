@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
+from ehadiag.model.laws import SpoolLaw, spool_law
 from ehadiag.model.plant import PlantConstants
 
-__all__ = ["FINEST", "SpoolScalars", "SpoolTables", "spool_tables"]
+__all__ = ["FINEST", "SpoolTables", "spool_tables"]
 
 FINEST = 10
 """Finest level; events are located to tick / 2^FINEST (1 µs at 1 kHz)."""
@@ -19,37 +20,20 @@ TAYLOR_ORDER = 12
 TAYLOR_HALVINGS = 3
 
 
-class SpoolScalars(NamedTuple):
-    """Coefficients of one candidate that do not depend on the step.
-
-    force: force on the spool per flapper position, AS GPF, N/m.
-    damping: viscous coefficient of the moving spool, N s/m.
-    dynamic: dynamic dry friction of the spool, N.
-    breakaway: flapper position that overcomes the static friction, m.
-    ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper alone; rate 0 where it
-        does not ring.
-    """
-
-    force: float
-    damping: float
-    dynamic: float
-    breakaway: float
-    ring_damping: float
-    ring_rate: float
-
-
 class SpoolTables(NamedTuple):
     """Coefficients of one candidate; of the arrays one row a level.
 
     moving: shape (FINEST + 1, 4, 4), flapper free, spool moving; state (XF, DXF, XS, DXS).
+    loose: the same without the feedback wire, shape (FINEST + 1, 4, 4).
     stuck: shape (FINEST + 1, 2, 2), flapper free, spool at rest; state (XF, DXF).
     decay: shape (FINEST + 1,), exp(-h / tau) of the spool velocity with the flapper on a stop.
     """
 
     moving: NDArray[np.float64]
+    loose: NDArray[np.float64]
     stuck: NDArray[np.float64]
     decay: NDArray[np.float64]
-    scalars: SpoolScalars
+    law: SpoolLaw
 
 
 @kernel
@@ -92,36 +76,27 @@ def _transition(rates: NDArray[np.float64], tick: float) -> NDArray[np.float64]:
 
 
 @kernel
-def spool_tables(constants: PlantConstants, kintas: float, fss: float, tick: float) -> SpoolTables:
-    """Coefficients for a candidate's `Kintas` and `FSS` (0 … 1), tick in s."""
+def spool_tables(constants: PlantConstants, tick: float) -> SpoolTables:
+    """Law and transition matrices of a candidate, tick in s."""
     c = constants
-    flow_gain = c.GQF * (1.0 - 0.8 * kintas)
-    damping = c.GPF / flow_gain * c.AS * c.AS + c.CS
-    static = c.FSS0 + fss * (c.FSS1 - c.FSS0)
-    force = c.AS * c.GPF
+    law = spool_law(c)
     rates = np.zeros((4, 4))
     rates[0, 1] = 1.0
     rates[1, 0] = -c.KF / c.JF
     rates[1, 1] = -c.CF / c.JF
     rates[1, 2] = -c.KSF / c.JF
     rates[2, 3] = 1.0
-    rates[3, 0] = force / c.MS
-    rates[3, 3] = -damping / c.MS
-    ring_damping = 0.5 * c.CF / c.JF
-    square = c.KF / c.JF - ring_damping * ring_damping
+    rates[3, 0] = law.force / c.MS
+    rates[3, 3] = -law.damping / c.MS
+    without = rates.copy()
+    without[1, 2] = 0.0
     decay = np.empty(FINEST + 1)
     for level in range(FINEST + 1):
-        decay[level] = math.exp(-(tick * damping / c.MS) / 2.0**level)
+        decay[level] = math.exp(-(tick * law.damping / c.MS) / 2.0**level)
     return SpoolTables(
         moving=_transition(rates, tick),
+        loose=_transition(without, tick),
         stuck=_transition(rates[:2, :2].copy(), tick),
         decay=decay,
-        scalars=SpoolScalars(
-            force=force,
-            damping=damping,
-            dynamic=0.5 * static,
-            breakaway=static / force,
-            ring_damping=ring_damping,
-            ring_rate=math.sqrt(square) if square > 0.0 else 0.0,
-        ),
+        law=law,
     )

@@ -1,4 +1,4 @@
-"""Coefficients of many candidates at once."""
+"""Coefficients of a block of candidates, from their physical constants."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.kernels import bare_kernel, kernel
+from ehadiag.compile.kernels import bare_kernel, inlined, kernel
 from ehadiag.compile.vector import WIDTH, load, packed, store
-from ehadiag.model.plant import PlantConstants
+from ehadiag.model.laws import SpoolLaw, drive_law, jack_law, sensor_law, spool_law
+from ehadiag.model.plant import PlantConstants, plant_of
 from ehadiag.model.scalar.transition import FINEST, TAYLOR_HALVINGS
 from ehadiag.model.simd.layout import (
-    BREAK,
-    DAMPING,
-    DRY,
-    DYNAMIC,
-    JACK_FRICTION,
     LANES,
+    LOOSE,
     MOVE,
-    PRESSURE_OFFSET,
+    NODES,
     REST,
+    RING_TIME,
     ROOM,
-    SPOOL_OFFSET,
+    keep_drive_law,
+    keep_jack_law,
+    keep_sensor_law,
+    keep_spool_law,
+    spool_law_of_lane,
 )
 
 __all__ = ["MOVING_SIZE", "SHIFTS", "STUCK_SIZE", "tabulate"]
@@ -36,8 +38,9 @@ MOVING_ROWS, STUCK_ROWS = 18, 4
 """Vectors for steps of one length: 4 x 4 transitions, time in s, decay of the spool's velocity with
 the flapper on its stop; 2 x 2 transitions."""
 MOVING_SIZE = LANES * len(SHIFTS) * MOVING_ROWS * WIDTH
-STUCK_SIZE = len(SHIFTS) * STUCK_ROWS * WIDTH
+STUCK_SIZE = LANES * len(SHIFTS) * STUCK_ROWS * WIDTH
 TAYLOR_ORDER = 8
+NEVER = 1e30
 
 
 @packed
@@ -90,12 +93,11 @@ def _smallest(rates: NDArray[np.float64], n: int, tick: float) -> NDArray[np.flo
 
 @kernel
 def _powers(
-    rates: NDArray[np.float64], n: int, tick: float, lanes: int, rows: int,
-    table: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """Transitions over the steps of `SHIFTS`, of the first lanes.
+    rates: NDArray[np.float64], n: int, tick: float, rows: int, table: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Transitions over the steps of `SHIFTS`.
 
-    table: out, shape (lanes, 3, rows, WIDTH), flat; the first n² rows are written.
+    table: out, shape (LANES, 3, rows, WIDTH), flat; the first n² rows are written.
     Returns transitions of all lanes over a quarter of a tick and over a whole one.
     """
     size = n * n
@@ -104,7 +106,7 @@ def _powers(
     for level in range(len(SHIFTS) - 1, -1, -1):
         _copy(one, power, 0)
         for step in range(WIDTH):
-            for i in range(lanes):
+            for i in range(LANES):
                 for e in range(size):
                     place = ((i * len(SHIFTS) + level) * rows + e) * WIDTH + step
                     table[place] = power[e * LANES + i]
@@ -121,59 +123,73 @@ def _powers(
     return quarter, power
 
 
+@inlined
+def _laws(c: PlantConstants, tick: float, i: int, out: NDArray[np.float64]) -> SpoolLaw:
+    """Write the laws of lane `i`; returns that of the spool."""
+    t = spool_law(c)
+    keep_drive_law(out, i, drive_law(c))
+    keep_spool_law(out, i, t)
+    keep_jack_law(out, i, jack_law(c))
+    keep_sensor_law(out, i, sensor_law(c, tick / NODES))
+    out[ROOM * LANES + i] = min(t.breakaway, t.flapper_stop)
+    # A flapper that does not ring is never taken to rest: slower, not wrong.
+    out[RING_TIME * LANES + i] = 1.0 / t.ring_rate if t.ring_rate > 0.0 else NEVER
+    return t
+
+
 @kernel
 def tabulate(
-    c: PlantConstants,
-    tick: float,
     candidates: NDArray[np.float64],
+    tick: float,
     coefficients: NDArray[np.float64],
     moving: NDArray[np.float64],
+    loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
-) -> None:
-    """Coefficients of all lanes.
+) -> bool:
+    """Coefficients of all lanes; returns whether any has backlash.
 
     Parameters
     ----------
-    candidates: (Kintas, FSS, FDJ, spool offset in m, pressure offset in Pa), shape (LANES, 5).
+    candidates: a row of physical constants a lane, shape (LANES, FIELDS).
+    tick: s.
     coefficients: out, shape (COEFFICIENT_ROWS * LANES,).
     moving: out, what goes on over 1 … WIDTH steps of each length of `SHIFTS` with the spool moving,
         shape (LANES, 3, MOVING_ROWS, WIDTH), flat.
-    stuck: out, the same with the spool at rest, of all lanes, shape (3, STUCK_ROWS, WIDTH), flat.
+    loose: out, the same without the feedback wire, where a lane has backlash.
+    stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
-    force = c.AS * c.GPF
+    any_backlash = False
     for i in range(LANES):
-        flow_gain = c.GQF * (1.0 - 0.8 * candidates[i, 0])
-        damping = c.GPF / flow_gain * c.AS * c.AS + c.CS
-        static = c.FSS0 + candidates[i, 1] * (c.FSS1 - c.FSS0)
-        coefficients[DRY * LANES + i] = 0.5 * static / force
-        coefficients[BREAK * LANES + i] = static / force
-        coefficients[ROOM * LANES + i] = min(static / force, c.XFM)
-        coefficients[DAMPING * LANES + i] = damping
-        coefficients[DYNAMIC * LANES + i] = 0.5 * static
-        coefficients[JACK_FRICTION * LANES + i] = c.FDJ0 + candidates[i, 2] * (c.FDJ1 - c.FDJ0)
-        coefficients[SPOOL_OFFSET * LANES + i] = candidates[i, 3]
-        coefficients[PRESSURE_OFFSET * LANES + i] = candidates[i, 4]
+        c = plant_of(candidates[i])
+        t = _laws(c, tick, i, coefficients)
+        any_backlash = any_backlash or t.backlash > 0.0
+        stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
-        rates[4 * LANES + i], rates[5 * LANES + i], rates[6 * LANES + i] = (
-            -c.KF / c.JF,
-            -c.CF / c.JF,
-            -c.KSF / c.JF,
-        )
-        rates[12 * LANES + i], rates[15 * LANES + i] = force / c.MS, -damping / c.MS
-        ring[1 * LANES + i], ring[2 * LANES + i], ring[3 * LANES + i] = (
-            1.0,
-            -c.KF / c.JF,
-            -c.CF / c.JF,
-        )
-    quarter, _ = _powers(rates, 4, tick, LANES, MOVING_ROWS, moving)
+        rates[4 * LANES + i], rates[5 * LANES + i] = stiffness, friction
+        rates[6 * LANES + i] = -c.KSF / c.JF
+        rates[12 * LANES + i] = t.force / t.mass
+        rates[15 * LANES + i] = -t.damping / t.mass
+        ring[1 * LANES + i], ring[2 * LANES + i], ring[3 * LANES + i] = 1.0, stiffness, friction
+    quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, moving)
     _copy(quarter, coefficients, MOVE * LANES)
     for i in range(LANES):
+        t = spool_law_of_lane(coefficients, i)
+        rate = t.damping / t.mass
         for level, shift in enumerate(SHIFTS):
             for step in range(WIDTH):
                 time = tick / (1 << FINEST) * ((step + 1) << shift)
                 place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH + step
                 moving[place] = time
-                moving[place + WIDTH] = math.exp(-time * coefficients[DAMPING * LANES + i] / c.MS)
-    _, whole = _powers(ring, 2, tick, 1, STUCK_ROWS, stuck)
+                moving[place + WIDTH] = math.exp(-time * rate)
+    _, whole = _powers(ring, 2, tick, STUCK_ROWS, stuck)
     _copy(whole, coefficients, REST * LANES)
+    if any_backlash:
+        rates[6 * LANES : 7 * LANES] = 0.0
+        quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, loose)
+        _copy(quarter, coefficients, LOOSE * LANES)
+        for i in range(LANES):
+            for level in range(len(SHIFTS)):
+                place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH
+                loose[place : place + WIDTH] = moving[place : place + WIDTH]
+    return any_backlash

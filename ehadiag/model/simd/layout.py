@@ -5,22 +5,71 @@ Arrays are flat, row r of lane i at r * LANES + i.
 
 from __future__ import annotations
 
+from ehadiag.compile.rows import lane_of, lane_packer, lanes_of
 from ehadiag.compile.vector import WIDTH
+from ehadiag.model.laws import DriveLaw, JackLaw, SensorLaw, SpoolLaw
 
 LANES = 2 * WIDTH
 NODES = 4
 """Pieces of the spool's path in a tick."""
 
-# Rows of the state.
-FLAPPER, FLAPPER_RATE, SPOOL, SPOOL_RATE, DIRECTION, CLAMPED, BUSY = 0, 1, 2, 3, 4, 5, 6
-JACK, JACK_VELOCITY, JACK_DIRECTION, PRESSURE, FILTERED = 7, 8, 9, 10, 11
-FRESH, DONE, ANCHORED = 12, 13, 14
-"""FRESH: the jack has just started or stopped; DONE: it has taken this tick beside the spool."""
-STATE_ROWS = 15
-# Rows of the path: position and velocity of the spool at the nodes 0 … NODES.
+(
+    FLAPPER,
+    FLAPPER_RATE,
+    SPOOL,
+    SPOOL_RATE,
+    DIRECTION,
+    CLAMPED,
+    BUSY,
+    JACK,
+    JACK_VELOCITY,
+    JACK_DIRECTION,
+    PRESSURE,
+    FILTERED,
+    FRESH,
+    DONE,
+    DEFLECTION,
+    WIRE,
+    SEEN,
+    ANCHORED,
+    PLAYS,
+) = range(19)
+"""Rows of the state. DEFLECTION: of the flapper by the current alone; SEEN:
+spool as it is sampled; WIRE: end of the feedback wire; FRESH: the jack has just
+started or stopped; DONE: it has taken this tick beside the spool; ANCHORED: how often the lane was
+re-anchored, which goes on from span to span."""
+
+MOST_PLAYS = 16
+STATE_ROWS = PLAYS + MOST_PLAYS
+"""What the plays of the hysteresis hold stands in the last rows."""
 PLACE, SLOPE = 0, NODES + 1
 PATH_ROWS = 2 * (NODES + 1)
-# Rows of the coefficients: the step of a whole tick at rest (2 x 2), of a quarter tick (4 x 4).
-DRY, BREAK, ROOM, DAMPING, DYNAMIC, JACK_FRICTION = 0, 1, 2, 3, 4, 5
-SPOOL_OFFSET, PRESSURE_OFFSET, REST, MOVE = 6, 7, 8, 12
-COEFFICIENT_ROWS = 28
+"""Rows of the path: position and velocity of the spool at the nodes 0 … NODES."""
+
+DRIVE_LAW = 0
+SPOOL_LAW = DRIVE_LAW + len(DriveLaw._fields)
+JACK_LAW = SPOOL_LAW + len(SpoolLaw._fields)
+SENSOR_LAW = JACK_LAW + len(JackLaw._fields)
+ROOM = SENSOR_LAW + len(SensorLaw._fields)
+RING_TIME = ROOM + 1
+REST = RING_TIME + 1
+MOVE = REST + 4
+LOOSE = MOVE + 16
+COEFFICIENT_ROWS = LOOSE + 16
+"""Rows of the coefficients: the laws' fields; flapper deflection within which a resting spool
+stays; reciprocal of the ringing's rate; transitions over a whole tick at rest (2 x 2), over a
+quarter of a tick moving (4 x 4), and the same without the feedback wire."""
+
+drive_laws = lanes_of(DriveLaw, DRIVE_LAW, LANES)
+spool_laws = lanes_of(SpoolLaw, SPOOL_LAW, LANES)
+jack_laws = lanes_of(JackLaw, JACK_LAW, LANES)
+sensor_laws = lanes_of(SensorLaw, SENSOR_LAW, LANES)
+"""Compiled, of an array and a lane: laws of the WIDTH lanes from there."""
+spool_law_of_lane = lane_of(SpoolLaw, SPOOL_LAW, LANES)
+jack_law_of_lane = lane_of(JackLaw, JACK_LAW, LANES)
+"""Compiled, of an array and a lane: laws of that lane."""
+keep_drive_law = lane_packer(DriveLaw, DRIVE_LAW, LANES)
+keep_spool_law = lane_packer(SpoolLaw, SPOOL_LAW, LANES)
+keep_jack_law = lane_packer(JackLaw, JACK_LAW, LANES)
+keep_sensor_law = lane_packer(SensorLaw, SENSOR_LAW, LANES)
+"""Compiled, of an array, a lane and a law: write that lane's."""

@@ -1,4 +1,4 @@
-"""Kernels of the objective for many candidates at a time."""
+"""Residuals of many candidates at a time by the vector kernels."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.residuals import Batch, constants_of
+from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch
+from ehadiag.model.plant import FIELDS, plant_of
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
 from ehadiag.model.simd.jack import jack_lanes, pressures
 from ehadiag.model.simd.jack_events import jack_events
@@ -30,16 +30,23 @@ from ehadiag.model.simd.layout import (
     COEFFICIENT_ROWS,
     LANES,
     PATH_ROWS,
+    PLAYS,
     PRESSURE,
-    PRESSURE_OFFSET,
-    SPOOL,
-    SPOOL_OFFSET,
+    SEEN,
     STATE_ROWS,
+    sensor_laws,
 )
-from ehadiag.model.simd.spool import anchor_lanes, rest, spool_lanes
+from ehadiag.model.simd.spool import (
+    anchor_lanes,
+    deflect_lanes,
+    drive_lanes,
+    rest_lanes,
+    see_lanes,
+    spool_lanes,
+)
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
 
-__all__ = ["LaneWork", "lane_costs", "lane_residuals", "lane_work", "run_blocks", "work_beside"]
+__all__ = ["Scratch", "block_costs", "block_residuals", "scratch_beside", "scratch_for"]
 
 BOW = 0.008e-6
 """Distance (m) of the spool's path from its chord from which the jack takes two steps a tick, where
@@ -54,17 +61,23 @@ CROSSING = 5.0e-6
 sixteen."""
 
 
-class LaneWork(NamedTuple):
+class Scratch(NamedTuple):
     """Scratch of the kernels below, one for each thread.
 
-    levels: how often the jack's ticks are halved, 0 … 4, shape (N,). The same for every
-        candidate, so that none's answer hangs on the others in its block. Of no meaning where no
-        pressure counts: there the jack is left out.
-    state, path, coefficients, moving, stuck: see `ehadiag.model.simd.layout`.
-    rows: candidates of a block, shape (LANES, 5).
-    sums: shape (LANES,).
-    gaps: shape (LANES,).
-    no_costs, uncounted, no_gaps: what is not wanted, of no candidate.
+    Attributes
+    ----------
+    levels : shape (N,)
+        How often the jack's ticks are halved, 0 … 4. The same for every candidate, so that no
+        answer depends on the others in its block. Of no meaning where no pressure counts: there
+        the jack is left out.
+    state, path, coefficients, moving, loose, stuck
+        See `ehadiag.model.simd.layout`.
+    rows : shape (LANES, FIELDS)
+        Candidates of a block, in the test of the span at hand.
+    sums, sample : shape (LANES,)
+        Costs, and residuals of one sample.
+    no_costs, uncounted, no_residuals
+        What is not wanted, of no candidate.
     """
 
     levels: NDArray[np.int64]
@@ -72,44 +85,46 @@ class LaneWork(NamedTuple):
     path: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     moving: NDArray[np.float64]
+    loose: NDArray[np.float64]
     stuck: NDArray[np.float64]
     rows: NDArray[np.float64]
     sums: NDArray[np.float64]
-    gaps: NDArray[np.float64]
+    sample: NDArray[np.float64]
     no_costs: NDArray[np.float64]
     uncounted: NDArray[np.int64]
-    no_gaps: NDArray[np.float64]
+    no_residuals: NDArray[np.float64]
 
 
-def lane_work(batch: Batch) -> LaneWork:
-    """Scratch for a batch, the jack's steps found by a run of candidates all over the cube."""
-    work = LaneWork(
-        levels=np.full(len(batch.current), -1, dtype=np.int64),
+def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
+    """Scratch for a batch, the jack's steps found by a run of candidates all over the space.
+
+    `scattered`: their constants, shape (LANES, tests, FIELDS).
+    """
+    work = Scratch(
+        levels=np.full(batch.weight.shape[1], -1, dtype=np.int64),
         state=np.zeros(STATE_ROWS * LANES),
         path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
         moving=np.zeros(MOVING_SIZE),
+        loose=np.zeros(MOVING_SIZE),
         stuck=np.zeros(STUCK_SIZE),
-        rows=np.zeros((LANES, 5)),
+        rows=np.zeros((LANES, FIELDS)),
         sums=np.zeros(LANES),
-        gaps=np.zeros(LANES),
+        sample=np.zeros(LANES),
         no_costs=np.zeros(0),
         uncounted=np.zeros(0, dtype=np.int64),
-        no_gaps=np.zeros((0, 2, 0)),
+        no_residuals=np.zeros((0, SIGNALS, 0)),
     )
-    if batch.weight[1].any():
-        scattered = np.zeros((LANES, 5))
-        scattered[:, 0] = np.linspace(0.0, 1.0, LANES)
-        scattered[:, 1] = scattered[:, 0] * 7.0 % 1.0
+    if batch.weight[PRESSURE_ROW].any():
         # Without weights the jack is left out, and the spool's path is all that is looked at.
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
-        lane_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
+        block_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
     return work
 
 
-def work_beside(work: LaneWork) -> LaneWork:
+def scratch_beside(work: Scratch) -> Scratch:
     """Scratch of another thread, with the same steps of the jack."""
-    return LaneWork._make(part.copy() for part in work)
+    return Scratch._make(part.copy() for part in work)
 
 
 @packed
@@ -137,28 +152,25 @@ def _level(path: NDArray[np.float64]) -> int:
 
 
 @packed
-def _gaps(
-    measured: float,
-    weight: float,
-    cap: float,
-    row: int,
-    offset: int,
-    state: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
-    gaps: NDArray[np.float64],
-    sums: NDArray[np.float64],
-) -> None:
-    """Weighted gap of one sample in every lane, its capped square added to the sums."""
+def _hold_against(
+    measured: float, weight: float, cap: float, row: int, signal: int,
+    state: NDArray[np.float64], coefficients: NDArray[np.float64],
+    sample: NDArray[np.float64], sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Weighted residual of one sample in every lane, its capped square added to the sums.
+
+    row: of the state; signal: row of the residuals.
+    """
     for o in range(0, LANES, WIDTH):
-        seen = measured - load(coefficients, offset * LANES + o)
-        gap = (seen - load(state, row * LANES + o)) * weight
-        store(gaps, o, gap)
-        store(sums, o, load(sums, o) + least(gap * gap, cap))
+        law = sensor_laws(coefficients, o)
+        offset = law.spool_offset if signal == SPOOL_ROW else law.pressure_offset
+        residual = (measured - offset - load(state, row * LANES + o)) * weight
+        store(sample, o, residual)
+        store(sums, o, load(sums, o) + least(residual * residual, cap))
 
 
 @packed
 def _jack_tick(
-    c: PlantConstants,
     tick: float,
     level: int,
     state: NDArray[np.float64],
@@ -167,115 +179,121 @@ def _jack_tick(
 ) -> None:
     """Jack of all lanes over a tick cut into 2^level steps."""
     for step in range(1 << level):
-        if jack_lanes(c, level, step, tick, state, path, coefficients):
-            jack_events(c, level, step, tick, state, path, coefficients)
+        if jack_lanes(level, step, tick, state, path, coefficients):
+            jack_events(level, step, tick, state, path, coefficients)
 
 
 @merged
-def _block(batch: Batch, cap: float, work: LaneWork, out: NDArray[np.float64]) -> None:
-    """Costs of the candidates in `work.rows` into `work.sums`, gaps of the first ones into `out`.
+def _block(
+    batch: Batch, candidates: NDArray[np.float64], cap: float, work: Scratch,
+    out: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Costs of up to LANES candidates into `work.sums`, residuals of the first ones into `out`.
 
-    out: shape (LANES or less, 2, N), or of no candidate.
+    out: shape (LANES or less, SIGNALS, N), or of no candidate.
     """
     state, path, coefficients = work.state, work.path, work.coefficients
-    moving, stuck, rows, sums, gaps = work.moving, work.stuck, work.rows, work.sums, work.gaps
+    moving, loose, stuck, rows = work.moving, work.loose, work.stuck, work.rows
+    sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
     weight, levels, start = batch.weight, work.levels, batch.start
-    wanted = out.shape[0]
+    wanted, last_candidate = out.shape[0], candidates.shape[0] - 1
     sums[:] = 0.0
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
-        c, tick = constants_of(batch.constants[index]), batch.tick[index]
+        tick, test = batch.tick[index], batch.test[index]
         gain, small, large = batch.anchor[index]
         anchored = math.isfinite(small) or math.isfinite(large)
-        tabulate(c, tick, rows, coefficients, moving, stuck)
-        rest(c, batch.current_before[index], batch.origin[index], coefficients, state)
-        damping = 0.5 * c.CF / c.JF
-        square = c.KF / c.JF - damping * damping
-        # A flapper that does not ring is never taken to rest: slower, not wrong.
-        ring_time = 1.0 / math.sqrt(square) if square > 0.0 else 1e30
+        for i in range(LANES):
+            for field in range(FIELDS):
+                rows[i, field] = candidates[min(i, last_candidate), test, field]
+        backlash = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
+        state[PLAYS * LANES :] = 0.0
+        for k in range(since - batch.history[index], since):
+            drive_lanes(current[k], plays, state, coefficients)
+        deflect_lanes(plays, state, coefficients)
+        rest_lanes(batch.origin[index], state, coefficients)
         last = start[index + 1] - 1
-        while last >= start[index] and weight[1, last] == 0.0:
+        while last >= start[index] and weight[PRESSURE_ROW, last] == 0.0:
             last -= 1
         for k in range(start[index], start[index + 1]):
-            torque = c.GM * current[k]
-            if spool_lanes(c, torque, tick, damping, ring_time, state, path, coefficients):
-                event_ticks(c, torque, tick, state, path, coefficients, moving, stuck)
+            drive_lanes(current[since + k - start[index]], plays, state, coefficients)
+            if spool_lanes(tick, backlash, state, path, coefficients):
+                event_ticks(tick, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
-            if weight[0, k] != 0.0 and seen:
-                _gaps(
-                    spool[k], weight[0, k], cap, SPOOL, SPOOL_OFFSET,
-                    state, coefficients, gaps, sums,
+            if seen:
+                see_lanes(state, path, coefficients)
+            if weight[SPOOL_ROW, k] != 0.0 and seen:
+                _hold_against(
+                    spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_ROW,
+                    state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
-                    out[i, 0, k] = gaps[i]
+                    out[i, SPOOL_ROW, k] = sample[i]
             if levels[k] < 0:
                 levels[k] = _level(path)
-            if k <= last:  # nothing hangs on the jack but the pressure
-                _jack_tick(c, tick, levels[k], state, path, coefficients)
-            if weight[1, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(c, state, path)
-                _gaps(
-                    pressure[k], weight[1, k], cap, PRESSURE, PRESSURE_OFFSET,
-                    state, coefficients, gaps, sums,
+            if k <= last:  # nothing depends on the jack but the pressure
+                _jack_tick(tick, levels[k], state, path, coefficients)
+            if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
+                pressures(state, path, coefficients)
+                _hold_against(
+                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_ROW,
+                    state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
-                    out[i, 1, k] = gaps[i]
+                    out[i, PRESSURE_ROW, k] = sample[i]
             if anchored and seen:
-                anchor_lanes(c, spool[k], gain, small, large, state, coefficients)
+                anchor_lanes(spool[k], gain, small, large, state, coefficients)
 
 
 @kernel
-def run_blocks(
+def _run_blocks(
     batch: Batch,
     candidates: NDArray[np.float64],
     cap: float,
-    work: LaneWork,
+    work: Scratch,
     costs: NDArray[np.float64],
     anchored: NDArray[np.int64],
-    gaps: NDArray[np.float64],
+    residuals: NDArray[np.float64],
 ) -> None:
-    """Run the candidates LANES at a time; out are costs, counts and gaps of all or of none."""
+    """Run the candidates LANES at a time; out are costs, counts and residuals of all or of none."""
     n = candidates.shape[0]
     for first in range(0, n, LANES):
         here = min(LANES, n - first)
-        for i in range(LANES):
-            for j in range(5):
-                work.rows[i, j] = candidates[min(first + i, n - 1), j]
-        _block(batch, cap, work, gaps[first : first + here])
+        _block(batch, candidates[first : first + here], cap, work, residuals[first : first + here])
         for i in range(min(here, costs.shape[0] - first)):
             costs[first + i] = work.sums[i]
         for i in range(min(here, anchored.shape[0] - first)):
             anchored[first + i] = int(work.state[ANCHORED * LANES + i])
 
 
-def lane_costs(
+def block_costs(
     batch: Batch,
     candidates: NDArray[np.float64],
     cap: float,
-    work: LaneWork,
+    work: Scratch,
     out: NDArray[np.float64],
 ) -> None:
-    """Summed squared weighted gap of each candidate, each square at most `cap`: out, shape (n,).
+    """Summed squared weighted residuals of each candidate, each square at most `cap`: out, (n,).
 
-    As `ehadiag.model.scalar.residuals.costs`; `candidates` has shape (n, 5). Blocks of LANES
-    candidates run at once; a last block that is not full takes as long as a full one.
+    `candidates` has shape (n, tests, FIELDS). Blocks of LANES candidates run at once; a last block
+    that is not full takes as long as a full one.
     """
-    run_blocks(batch, candidates, cap, work, out, work.uncounted, work.no_gaps)
+    _run_blocks(batch, candidates, cap, work, out, work.uncounted, work.no_residuals)
 
 
-def lane_residuals(
+def block_residuals(
     batch: Batch,
     candidates: NDArray[np.float64],
-    work: LaneWork,
+    work: Scratch,
     out: NDArray[np.float64],
     anchored: NDArray[np.int64],
 ) -> None:
-    """Weighted gaps, measured less modelled, of every candidate: out, shape (n, 2, N).
+    """Weighted residuals, measured less modelled, of every candidate: out, shape (n, SIGNALS, N).
 
-    As `ehadiag.model.scalar.residuals.residuals`; `candidates` has shape (n, 5). A
-    missing sample gives 0.
+    `candidates` has shape (n, tests, FIELDS). A missing sample gives 0.
     anchored: out, how often the model was re-anchored, shape (n,).
     """
     out[:] = 0.0
-    run_blocks(batch, candidates, math.inf, work, work.no_costs, anchored, out)
+    _run_blocks(batch, candidates, math.inf, work, work.no_costs, anchored, out)

@@ -22,30 +22,38 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.plant import PlantConstants
+from ehadiag.model.laws import play, sampled, slide_base, still_flapper
 from ehadiag.model.simd.layout import (
     ANCHORED,
-    BREAK,
     BUSY,
     CLAMPED,
+    DEFLECTION,
     DIRECTION,
     DONE,
-    DRY,
     FILTERED,
     FLAPPER,
     FLAPPER_RATE,
     LANES,
+    LOOSE,
     MOVE,
+    NODES,
     PLACE,
+    PLAYS,
     REST,
+    RING_TIME,
     ROOM,
+    SEEN,
     SLOPE,
     SPOOL,
-    SPOOL_OFFSET,
     SPOOL_RATE,
+    WIRE,
+    drive_laws,
+    sensor_laws,
+    spool_laws,
 )
+from ehadiag.model.spool_events import TOUCH
 
-__all__ = ["anchor_lanes", "rest", "spool_lanes"]
+__all__ = ["anchor_lanes", "deflect_lanes", "drive_lanes", "rest_lanes", "see_lanes", "spool_lanes"]
 
 BIG = 1e30
 LEAST_DEPTH = -1e-14
@@ -56,27 +64,51 @@ denormal numbers, which cost a hundred times as much."""
 
 
 @packed
-def rest(
-    c: PlantConstants,
-    current_before: float,
-    origin: float,
-    coefficients: NDArray[np.float64],
-    state: NDArray[np.float64],
+def drive_lanes(
+    current: float, plays: int, state: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
-    """State of all lanes before the first tick: at rest, the flapper in equilibrium if it can.
-
-    The count of re-anchorings goes on from span to span.
-    """
-    xs = min(max(origin, -c.XSM), c.XSM)
-    state[: ANCHORED * LANES] = 0.0
+    """Flapper deflection that the current (A) of a tick alone makes, all lanes, into the state."""
     for o in range(0, LANES, WIDTH):
-        held = load(coefficients, BREAK * LANES + o)
-        store(
-            state,
-            FLAPPER * LANES + o,
-            most(least((c.GM * current_before - c.KSF * xs) / c.KF, held), -held),
-        )
+        law = drive_laws(coefficients, o)
+        value = law.bias + current
+        total = value * 0.0
+        for i in range(plays):
+            row = (PLAYS + i) * LANES + o
+            held = play(load(state, row), value, law.spacing * (i + 0.5))
+            store(state, row, held)
+            total = total + held
+        store(state, DEFLECTION * LANES + o, law.gain * law.share * total)
+
+
+@packed
+def deflect_lanes(
+    plays: int, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> None:
+    """Flapper deflection by what the plays hold, all lanes, into the state."""
+    for o in range(0, LANES, WIDTH):
+        law = drive_laws(coefficients, o)
+        total = law.bias * 0.0
+        for i in range(plays):
+            total = total + load(state, (PLAYS + i) * LANES + o)
+        store(state, DEFLECTION * LANES + o, law.gain * law.share * total)
+
+
+@packed
+def rest_lanes(
+    origin: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> None:
+    """All lanes at rest, the spool at `origin` (m), the flapper in equilibrium if it can be.
+
+    The deflection by the current is in the state; the count of re-anchorings goes on.
+    """
+    state[: DEFLECTION * LANES] = 0.0
+    for o in range(0, LANES, WIDTH):
+        t = spool_laws(coefficients, o)
+        xs = most(least(t.stroke * 0.0 + origin, t.stroke), -t.stroke)
+        still = still_flapper(t.ratio, load(state, DEFLECTION * LANES + o), xs)
+        store(state, FLAPPER * LANES + o, most(least(still, t.breakaway), -t.breakaway))
         store(state, SPOOL * LANES + o, xs)
+        store(state, WIRE * LANES + o, xs)
 
 
 @packed
@@ -97,32 +129,46 @@ def _quarter(
 
 
 @packed
+def _loose_quarter(
+    m: tuple[Vector, ...], a: Vector, w: Vector, b: Vector, v: Vector, bow: float,
+    lift: Vector, dry: Vector, slowest: Vector, lowest: Vector, widest: Vector, steady: Vector,
+) -> tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector]:  # fmt: skip
+    """As `_quarter` within the backlash; a from the flapper's rest, b and v beside `steady`."""
+    na, nw = m[0] * a + m[1] * w, m[2] * a + m[3] * w
+    nb = b + m[4] * a + m[5] * w + m[6] * v
+    nv = m[7] * a + m[8] * w + m[9] * v
+    swing = bow * most(magnitude(w), magnitude(nw))
+    inside = where(w * nw < 0.0, least(a, na) + lift - dry - swing, BIG)
+    widest = most(widest, magnitude(na + lift) + swing)
+    return na, nw, nb, nv, least(slowest, nv + steady), least(lowest, inside), widest
+
+
+@packed
 def spool_lanes(
-    c: PlantConstants,
-    torque: float,
     tick: float,
-    ring_damping: float,
-    ring_time: float,
+    backlash: bool,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> bool:
-    """Flapper and spool of all lanes over a tick without events.
+    """Flapper and spool of all lanes over a tick without events; backlash: of any lane.
 
-    `ring_time`: reciprocal of the flapper's angular frequency, s. Lanes in which an event may hide
-    are marked BUSY and left as they were; returns whether there are any.
+    Lanes in which an event may hide are marked BUSY and left as they were; returns whether there
+    are any.
     """
     any_busy = False
-    bow, by_KSF, by_KF = tick / 16.0, 1.0 / c.KSF, 1.0 / c.KF
+    bow = tick / 16.0
     for o in range(0, LANES, WIDTH):
         xf, wf = load(state, FLAPPER * LANES + o), load(state, FLAPPER_RATE * LANES + o)
         xs, vs = load(state, SPOOL * LANES + o), load(state, SPOOL_RATE * LANES + o)
         d, clamped = load(state, DIRECTION * LANES + o), load(state, CLAMPED * LANES + o)
-        dry = load(coefficients, DRY * LANES + o)
+        deflection, wire = load(state, DEFLECTION * LANES + o), load(state, WIRE * LANES + o)
+        t = spool_laws(coefficients, o)
+        dry = t.dry
         # At rest, if the flapper rings too little to end that.
-        still = (torque - c.KSF * xs) * by_KF
+        still = still_flapper(t.ratio, deflection, wire)
         ra = xf - still
-        rb = (wf + ring_damping * ra) * ring_time
+        rb = (wf + t.ring_damping * ra) * load(coefficients, RING_TIME * LANES + o)
         room = load(coefficients, ROOM * LANES + o) - magnitude(still)
         free = clamped == 0.0
         rests = (d == 0.0) & free & (room > 0.0) & (ra * ra + rb * rb < room * room)
@@ -147,7 +193,7 @@ def spool_lanes(
                 load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
                 load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
             )  # fmt: skip
-            base = (torque - c.KF * dry * d) * by_KSF
+            base = slide_base(t, deflection, d)
             a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
             s, n, x = zero + BIG, zero + BIG, zero
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
@@ -158,8 +204,9 @@ def spool_lanes(
             b3, u3 = base + d * b, d * v
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
             b4, u4 = base + d * b, d * most(v, CREEP)
-            moves = (d != 0.0) & free & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
-            moves = moves & (x < c.XFM) & (d * b4 < c.XSM)
+            loose = d * (xs - wire) < t.backlash - TOUCH
+            moves = (d != 0.0) & free & ~loose & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
+            moves = moves & (x < t.flapper_stop) & (d * b4 < t.stroke)
             w = where(magnitude(w) > CREEP, w, 0.0)
             x1, x2 = where(moves, b1, xs), where(moves, b2, xs)
             x3, x4 = where(moves, b3, xs), where(moves, b4, xs)
@@ -167,6 +214,39 @@ def spool_lanes(
             v3, v4 = where(moves, u3, 0.0), where(moves, u4, vs)
             new_xf, new_wf = where(moves, (a + dry) * d, new_xf), where(moves, w * d, new_wf)
             fine = moves | rests
+            if backlash and anywhere(loose & (d != 0.0) & free):
+                k = LOOSE * LANES + o
+                q = (
+                    load(coefficients, k), load(coefficients, k + LANES),
+                    load(coefficients, k + 4 * LANES), load(coefficients, k + 5 * LANES),
+                    load(coefficients, k + 8 * LANES), load(coefficients, k + 9 * LANES),
+                    load(coefficients, k + 11 * LANES), load(coefficients, k + 12 * LANES),
+                    load(coefficients, k + 13 * LANES), load(coefficients, k + 15 * LANES),
+                )  # fmt: skip
+                # All positive along the motion; the flapper rings about `still`.
+                lift, step = still * d, 0.25 * tick
+                steady = (t.force * lift - t.dynamic) / t.damping
+                a, w, b, v = xf * d - lift, wf * d, zero, vs * d - steady
+                s, n, x = zero + BIG, zero + BIG, zero
+                a, w, b, v, s, n, x = _loose_quarter(q, a, w, b, v, bow, lift, dry, s, n, x, steady)
+                b1, u1 = xs + d * (b + step * steady), d * (v + steady)
+                a, w, b, v, s, n, x = _loose_quarter(q, a, w, b, v, bow, lift, dry, s, n, x, steady)
+                b2, u2 = xs + d * (b + 2.0 * step * steady), d * (v + steady)
+                a, w, b, v, s, n, x = _loose_quarter(q, a, w, b, v, bow, lift, dry, s, n, x, steady)
+                b3, u3 = xs + d * (b + 3.0 * step * steady), d * (v + steady)
+                a, w, b, v, s, n, x = _loose_quarter(q, a, w, b, v, bow, lift, dry, s, n, x, steady)
+                b4, u4 = xs + d * (b + 4.0 * step * steady), d * (v + steady)
+                slips = (d != 0.0) & free & loose & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
+                slips = slips & (x < t.flapper_stop) & (d * b4 < t.stroke)
+                slips = slips & (d * (b4 - wire) < t.backlash - TOUCH)
+                x1, x2 = where(slips, b1, x1), where(slips, b2, x2)
+                x3, x4 = where(slips, b3, x3), where(slips, b4, x4)
+                v1, v2 = where(slips, u1, v1), where(slips, u2, v2)
+                v3, v4 = where(slips, u3, v3), where(slips, u4, v4)
+                new_xf = where(slips, (a + lift) * d, new_xf)
+                new_wf = where(slips, w * d, new_wf)
+                fine = fine | slips
+        store(state, WIRE * LANES + o, play(wire, x4, t.backlash))
         store(path, PLACE * LANES + o, xs)
         store(path, SLOPE * LANES + o, vs)
         store(path, (PLACE + 1) * LANES + o, x1)
@@ -189,8 +269,23 @@ def spool_lanes(
 
 
 @packed
+def see_lanes(
+    state: NDArray[np.float64], path: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> None:
+    """Spool of all lanes as it is sampled in a tick, into the state."""
+    for o in range(0, LANES, WIDTH):
+        seen = sampled(
+            sensor_laws(coefficients, o),
+            load(path, (PLACE + NODES - 1) * LANES + o),
+            load(path, (PLACE + NODES) * LANES + o),
+            load(path, (SLOPE + NODES - 1) * LANES + o),
+            load(path, (SLOPE + NODES) * LANES + o),
+        )
+        store(state, SEEN * LANES + o, seen)
+
+
+@packed
 def anchor_lanes(
-    c: PlantConstants,
     measured: float,
     gain: float,
     small: float,
@@ -201,7 +296,8 @@ def anchor_lanes(
     """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`)."""
     for o in range(0, LANES, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
-        error = measured - load(coefficients, SPOOL_OFFSET * LANES + o) - xs
+        offset = sensor_laws(coefficients, o).spool_offset
+        error = measured - offset - load(state, SEEN * LANES + o)
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)
@@ -210,4 +306,7 @@ def anchor_lanes(
         store(
             state, ANCHORED * LANES + o, load(state, ANCHORED * LANES + o) + where(jumps, 1.0, 0.0)
         )
-        store(state, SPOOL * LANES + o, most(least(xs + move, c.XSM), -c.XSM))
+        stroke = spool_laws(coefficients, o).stroke
+        placed = most(least(xs + move, stroke), -stroke)
+        store(state, SPOOL * LANES + o, placed)
+        store(state, WIRE * LANES + o, load(state, WIRE * LANES + o) + (placed - xs))

@@ -23,44 +23,43 @@ from ehadiag.compile.vector import (
     packed,
     store,
 )
-from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.spool_events import (
-    BREAKAWAY,
-    FLAPPER_STOP,
-    NOTHING,
-    REVERSAL,
-    SPOOL_STOP,
-    clamped_event,
-    held,
-    switch,
-)
-from ehadiag.model.scalar.transition import FINEST, SpoolScalars
+from ehadiag.model.jack import Piece, jack_piece
+from ehadiag.model.laws import SpoolLaw, play, slide_base, steady_rate, still_flapper
+from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.simd.coefficients import MOVING_ROWS, SHIFTS, STUCK_ROWS
-from ehadiag.model.simd.jack_events import jack_piece
+from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack
 from ehadiag.model.simd.layout import (
-    BREAK,
     BUSY,
     CLAMPED,
-    DAMPING,
+    DEFLECTION,
     DIRECTION,
     DONE,
-    DRY,
-    DYNAMIC,
     FLAPPER,
     FLAPPER_RATE,
-    FRESH,
-    JACK,
-    JACK_DIRECTION,
-    JACK_FRICTION,
-    JACK_VELOCITY,
     LANES,
     NODES,
     PATH_ROWS,
     PLACE,
-    ROOM,
     SLOPE,
     SPOOL,
     SPOOL_RATE,
+    WIRE,
+    jack_law_of_lane,
+    spool_law_of_lane,
+)
+from ehadiag.model.spool_events import (
+    BREAKAWAY,
+    ENGAGE,
+    FLAPPER_STOP,
+    NOTHING,
+    REVERSAL,
+    SPOOL_STOP,
+    TOUCH,
+    SpoolState,
+    carried,
+    clamped_event,
+    held,
+    switch,
 )
 
 __all__ = ["SCRATCH_SIZE", "event_ticks"]
@@ -77,32 +76,32 @@ SCRATCH_SIZE = 4 * MOST_PIECES + 4 * WIDTH
 
 @bare_kernel
 def event_ticks(
-    c: PlantConstants,
-    torque: float,
     tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
     moving: NDArray[np.float64],
+    loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> None:
     """Flapper and spool of BUSY lanes over a tick with events, located to tick / 2^FINEST."""
     for i in range(LANES):
         if state[BUSY * LANES + i] != 0.0:
-            _event_tick(c, i, torque, tick, state, path, coefficients, moving, stuck)
+            _event_tick(i, tick, state, path, coefficients, moving, loose, stuck)
 
 
 @packed
 def _moving_instants(
-    c: PlantConstants, table: NDArray[np.float64], place: int, h: float, fine: bool, dry: float,
-    base: float, d: float, xf: float, wf: float, xs: float, vs: float, path: NDArray[np.float64],
+    t: SpoolLaw, table: NDArray[np.float64], place: int, h: float, fine: bool, base: float,
+    s: SpoolState, path: NDArray[np.float64],
 ) -> Mask:  # fmt: skip
     """Moving spool and flapper after 1 … WIDTH steps of `h` seconds, into the path's scratch.
 
     All is positive along the motion d, about the point (dry, base d) where both would rest.
     Returns where an event has come or, steps not being the finest, may hide.
     """
-    a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
+    d, dry = float(s.direction), t.dry
+    a, w, b, v = s.xf * d - dry, s.wf * d, (s.xs - base) * d, s.vs * d
     k = place * MOVING_ROWS * WIDTH
     na = load(table, k) * a + load(table, k + WIDTH) * w
     na = na + load(table, k + 2 * WIDTH) * b + load(table, k + 3 * WIDTH) * v
@@ -117,27 +116,63 @@ def _moving_instants(
     store(path, INSTANTS + 2 * WIDTH, nb * d + base)
     store(path, INSTANTS + 3 * WIDTH, nv * d)
     size = magnitude(na + dry)
-    found = (nv <= 0.0) | (nb >= c.XSM - base * d) | (size >= c.XFM)
+    found = (nv <= 0.0) | (nb >= t.stroke - base * d) | (size >= t.flapper_stop)
     if not fine:
         # Where an extreme of the flapper lies inside a step the spool may stop, the flapper touch.
         before_a, before_w = behind(a, na), behind(w, nw)
         swing = 0.25 * h * most(magnitude(before_w), magnitude(nw))
         low = least(before_a, na) - swing <= 0.0
-        far = most(behind(abs(a + dry), size), size) + swing >= c.XFM
+        far = most(behind(abs(a + dry), size), size) + swing >= t.flapper_stop
+        found = found | ((before_w * nw < 0.0) & (low | far))
+    return found
+
+
+@packed
+def _loose_instants(
+    t: SpoolLaw, table: NDArray[np.float64], place: int, h: float, fine: bool, still: float,
+    s: SpoolState, path: NDArray[np.float64],
+) -> Mask:  # fmt: skip
+    """As `_moving_instants` within the backlash, without the feedback wire."""
+    d = float(s.direction)
+    lift = still * d
+    steady = (t.force * lift - t.dynamic) / t.damping
+    a, w, v = s.xf * d - lift, s.wf * d, s.vs * d - steady
+    k = place * MOVING_ROWS * WIDTH
+    na = load(table, k) * a + load(table, k + WIDTH) * w
+    nw = load(table, k + 4 * WIDTH) * a + load(table, k + 5 * WIDTH) * w
+    nb = load(table, k + 8 * WIDTH) * a + load(table, k + 9 * WIDTH) * w
+    nb = nb + load(table, k + 11 * WIDTH) * v + load(table, k + 16 * WIDTH) * steady
+    nv = load(table, k + 12 * WIDTH) * a + load(table, k + 13 * WIDTH) * w
+    nv = nv + load(table, k + 15 * WIDTH) * v + steady
+    store(path, INSTANTS, (na + lift) * d)
+    store(path, INSTANTS + WIDTH, nw * d)
+    store(path, INSTANTS + 2 * WIDTH, nb * d + s.xs)
+    store(path, INSTANTS + 3 * WIDTH, nv * d)
+    size = magnitude(na + lift)
+    travel = s.xs * d
+    found = (nv <= 0.0) | (nb >= t.stroke - travel) | (size >= t.flapper_stop)
+    found = found | (nb >= t.backlash - TOUCH - (s.xs - s.wire) * d)
+    if not fine:
+        before_a, before_w = behind(a, na), behind(w, nw)
+        swing = 0.25 * h * most(magnitude(before_w), magnitude(nw))
+        low = least(before_a, na) - swing <= t.dry - lift
+        far = most(behind(abs(a + lift), size), size) + swing >= t.flapper_stop
         found = found | ((before_w * nw < 0.0) & (low | far))
     return found
 
 
 @packed
 def _stuck_instants(
-    c: PlantConstants, table: NDArray[np.float64], place: int, h: float, fine: bool, still: float,
-    room: float, limit: float, side: float, xf: float, wf: float, path: NDArray[np.float64],
+    t: SpoolLaw, table: NDArray[np.float64], place: int, h: float, fine: bool, still: float,
+    s: SpoolState, path: NDArray[np.float64],
 ) -> Mask:  # fmt: skip
     """As `_moving_instants` for a spool at rest, whose flapper rings about `still`, m.
 
-    The spool breaks away beyond `limit`, but not to the side on which its stop holds it; within
-    `room` nothing happens, m.
+    The spool breaks away beyond the static friction, but not to the side on which its stop holds
+    it.
     """
+    xf, wf, side = s.xf, s.wf, s.xs if abs(s.xs) >= t.stroke else 0.0
+    room = min(t.breakaway, t.flapper_stop)
     a = xf - still
     k = place * STUCK_ROWS * WIDTH
     new_xf = load(table, k) * a + load(table, k + WIDTH) * wf + still
@@ -145,60 +180,68 @@ def _stuck_instants(
     store(path, INSTANTS, new_xf)
     store(path, INSTANTS + WIDTH, new_wf)
     size = magnitude(new_xf)
-    found = ((size > limit) & (side * new_xf <= 0.0)) | (size >= c.XFM)
+    found = ((size > t.breakaway) & (side * new_xf <= 0.0)) | (size >= t.flapper_stop)
     if not fine:
         before = behind(wf, new_wf)
         swing = 0.25 * h * most(magnitude(before), magnitude(new_wf))
         far = most(behind(abs(xf), size), size) + swing > room
         found = found | ((before * new_wf < 0.0) & far)
+    store(path, INSTANTS + 2 * WIDTH, s.xs)
+    store(path, INSTANTS + 3 * WIDTH, 0.0)
     return found
 
 
 @packed
 def _clamped_instants(
-    c: PlantConstants, t: SpoolScalars, table: NDArray[np.float64], place: int, torque: float,
-    d: float, xf: float, xs: float, vs: float, path: NDArray[np.float64],
+    t: SpoolLaw, table: NDArray[np.float64], place: int, deflection: float, s: SpoolState,
+    path: NDArray[np.float64],
 ) -> Mask:  # fmt: skip
-    """As `_moving_instants` with the flapper on its stop; the spool may be at rest (d = 0)."""
+    """As `_moving_instants` with the flapper on its stop; the spool may be at rest."""
+    d, xf = float(s.direction), s.xf
     k = (place * MOVING_ROWS + 16) * WIDTH
     time, fade = load(table, k), load(table, k + WIDTH)
-    steady = (t.force * xf - t.dynamic * d) / t.damping
-    if d == 0.0:
-        steady = 0.0
-    excess = vs - steady
-    new_xs = time * steady + (1.0 - fade) * (excess * c.MS / t.damping) + xs
+    steady = steady_rate(t, xf, d) if d != 0.0 else 0.0
+    excess = s.vs - steady
+    new_xs = time * steady + (1.0 - fade) * (excess * t.mass / t.damping) + s.xs
     new_vs = fade * excess + steady
     store(path, INSTANTS, xf)
     store(path, INSTANTS + WIDTH, 0.0)
     store(path, INSTANTS + 2 * WIDTH, new_xs)
     store(path, INSTANTS + 3 * WIDTH, new_vs)
-    leaves = (torque - c.KF * xf - c.KSF * new_xs) * xf < 0.0
+    wire = play(s.wire, new_xs, t.backlash)
+    leaves = (still_flapper(t.ratio, deflection, wire) - xf) * xf < 0.0
     if d == 0.0:
-        return leaves if held(c, t, xf, xs) else new_vs <= 0.0  # all of them: it rests
-    return leaves | (new_vs * d <= 0.0) | (new_xs * d >= c.XSM)
+        return leaves if held(t, xf, s.xs) else new_vs <= 0.0  # all of them: it rests
+    return leaves | (new_vs * d <= 0.0) | (new_xs * d >= t.stroke)
 
 
 @merged
 def _event_tick(
-    c: PlantConstants,
     i: int,
-    torque: float,
     tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
     moving: NDArray[np.float64],
+    loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> None:
     """Lane `i`."""
-    force, unit = c.AS * c.GPF, tick / WHOLE
-    damping, dry = coefficients[DAMPING * LANES + i], coefficients[DRY * LANES + i]
-    limit, room = coefficients[BREAK * LANES + i], coefficients[ROOM * LANES + i]
-    t = SpoolScalars(force, damping, coefficients[DYNAMIC * LANES + i], limit, 0.0, 0.0)
-    xf, wf = state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i]
-    xs, vs = state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i]
-    direction, clamped = int(state[DIRECTION * LANES + i]), state[CLAMPED * LANES + i] != 0.0
-    from_xs, from_vs, since = xs, vs, 0
+    t, unit, deflection = (
+        spool_law_of_lane(coefficients, i),
+        tick / WHOLE,
+        state[DEFLECTION * LANES + i],
+    )
+    s = SpoolState(
+        state[FLAPPER * LANES + i],
+        state[FLAPPER_RATE * LANES + i],
+        state[SPOOL * LANES + i],
+        state[SPOOL_RATE * LANES + i],
+        state[WIRE * LANES + i],
+        int(state[DIRECTION * LANES + i]),
+        state[CLAMPED * LANES + i] != 0.0,
+    )
+    from_xs, from_vs, since = s.xs, s.vs, 0
     kinks, count = False, 0
     done, level, finest = 0, 0, len(SHIFTS) - 1
     while done < WHOLE:
@@ -207,80 +250,81 @@ def _event_tick(
             level += 1
         shift, fine = SHIFTS[level], level == finest
         whole = WIDTH - ((done >> shift) & (WIDTH - 1))
-        h = unit * (1 << shift)
-        if clamped:
-            found = _clamped_instants(
-                c, t, moving, i * len(SHIFTS) + level, torque, float(direction), xf, xs, vs, path
-            )
-        elif direction != 0:
-            base = (torque - c.KF * dry * direction) / c.KSF
-            found = _moving_instants(
-                c, moving, i * len(SHIFTS) + level, h, fine, dry, base, float(direction),
-                xf, wf, xs, vs, path,
-            )  # fmt: skip
+        h, place = unit * (1 << shift), i * len(SHIFTS) + level
+        if s.clamped:
+            found = _clamped_instants(t, moving, place, deflection, s, path)
+        elif s.direction != 0:
+            if carried(t, s.direction, s.xs, s.wire):
+                base = slide_base(t, deflection, float(s.direction))
+                found = _moving_instants(t, moving, place, h, fine, base, s, path)
+            else:
+                still = still_flapper(t.ratio, deflection, s.wire)
+                found = _loose_instants(t, loose, place, h, fine, still, s, path)
         else:
-            still = (torque - c.KSF * xs) / c.KF
-            side = xs if abs(xs) >= c.XSM else 0.0
-            found = _stuck_instants(
-                c, stuck, level, h, fine, still, room, limit, side, xf, wf, path
-            )
-            store(path, INSTANTS + 2 * WIDTH, xs)
-            store(path, INSTANTS + 3 * WIDTH, 0.0)
+            still = still_flapper(t.ratio, deflection, s.wire)
+            found = _stuck_instants(t, stuck, place, h, fine, still, s, path)
         first = first_place(found)
         event = NOTHING
         if first < whole and fine:
             o = INSTANTS + first
             new_xf, new_xs, new_vs = path[o], path[o + 2 * WIDTH], path[o + 3 * WIDTH]
-            if clamped:
-                event = clamped_event(c, t, torque, new_xf, new_xs, new_vs, direction)
+            if s.clamped:
+                wire = play(s.wire, new_xs, t.backlash)
+                event = clamped_event(t, deflection, new_xf, new_xs, new_vs, wire, s.direction)
             else:
-                event = _event(c, t, new_xf, new_xs, new_vs, direction)
+                event = _event(t, s, new_xf, new_xs, new_vs)
         steps = whole if first >= whole else first + 1 if fine else first
         for n in range(steps):
             o = INSTANTS + n
-            xf, wf, xs, vs = path[o], path[o + WIDTH], path[o + 2 * WIDTH], path[o + 3 * WIDTH]
-            end_vs = vs
+            s = SpoolState(
+                path[o],
+                path[o + WIDTH],
+                path[o + 2 * WIDTH],
+                path[o + 3 * WIDTH],
+                play(s.wire, path[o + 2 * WIDTH], t.backlash),
+                s.direction,
+                s.clamped,
+            )
+            end_vs = s.vs
             done += 1 << shift
             since += 1 << shift
             switches = event > NOTHING and n == steps - 1
             if switches:
-                xf, wf, xs, vs, direction, clamped = switch(
-                    c, t, event, xf, wf, xs, vs, direction, clamped
-                )
-                kinks = kinks or event == SPOOL_STOP or (direction != 0 and vs == 0.0)
+                s = switch(t, event, s)
+                kinks = kinks or event == SPOOL_STOP or (s.direction != 0 and s.vs == 0.0)
             at_node = done & (QUARTER - 1) == 0
             if at_node or (switches and count < MOST_PIECES - NODES):
                 o = PIECES + 4 * count
-                path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, xs, from_vs, end_vs
-                from_vs, since = vs, 0
+                path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, s.xs, from_vs, end_vs
+                from_vs, since = s.vs, 0
                 count += 1
             if at_node:
-                path[(PLACE + done // QUARTER) * LANES + i] = xs
-                path[(SLOPE + done // QUARTER) * LANES + i] = vs
+                path[(PLACE + done // QUARTER) * LANES + i] = s.xs
+                path[(SLOPE + done // QUARTER) * LANES + i] = s.vs
         level = 0 if fine or steps == whole else level + 1
     if kinks:
-        _jack_beside(c, i, from_xs, count, state, path, coefficients)
-    state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = xf, wf
-    state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = xs, vs
-    state[DIRECTION * LANES + i] = direction
-    state[CLAMPED * LANES + i] = 1.0 if clamped else 0.0
+        _jack_beside(i, from_xs, count, state, path, coefficients)
+    state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = s.xf, s.wf
+    state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = s.xs, s.vs
+    state[WIRE * LANES + i] = s.wire
+    state[DIRECTION * LANES + i] = s.direction
+    state[CLAMPED * LANES + i] = 1.0 if s.clamped else 0.0
 
 
 @inlined
-def _event(
-    c: PlantConstants, t: SpoolScalars, xf: float, xs: float, vs: float, direction: int
-) -> int:
-    """Which event has come at an instant that is past one."""
-    if direction == 0:
-        return FLAPPER_STOP if held(c, t, xf, xs) else BREAKAWAY
-    if vs * direction <= 0.0:
+def _event(t: SpoolLaw, s: SpoolState, xf: float, xs: float, vs: float) -> int:
+    """Which event has come at an instant that is past one; `s`: the state before."""
+    if s.direction == 0:
+        return FLAPPER_STOP if held(t, xf, xs) else BREAKAWAY
+    if vs * s.direction <= 0.0:
         return REVERSAL
-    return FLAPPER_STOP if abs(xf) >= c.XFM else SPOOL_STOP
+    if abs(xf) >= t.flapper_stop:
+        return FLAPPER_STOP
+    return SPOOL_STOP if abs(xs) >= t.stroke else ENGAGE
 
 
 @merged
 def _jack_beside(
-    c: PlantConstants,
     i: int,
     from_xs: float,
     count: int,
@@ -289,17 +333,12 @@ def _jack_beside(
     coefficients: NDArray[np.float64],
 ) -> None:
     """Jack of lane `i` over the tick, by `count` pieces of the spool's path."""
-    friction = coefficients[JACK_FRICTION * LANES + i]
-    place, velocity = state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i]
-    d, fresh = state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i]
+    j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
     for n in range(count):
         o = PIECES + 4 * n
         span = path[o]
-        place, velocity, d, fresh = jack_piece(
-            c, friction, span, 0.0, 1.0, from_xs, path[o + 1],
-            path[o + 2] * span, path[o + 3] * span, place, velocity, d, fresh,
-        )  # fmt: skip
+        piece = Piece(span, from_xs, path[o + 1], path[o + 2] * span, path[o + 3] * span)
+        jack = jack_piece(j, piece, 0.0, 1.0, jack)
         from_xs = path[o + 1]
-    state[JACK * LANES + i], state[JACK_VELOCITY * LANES + i] = place, velocity
-    state[JACK_DIRECTION * LANES + i], state[FRESH * LANES + i] = d, fresh
+    keep_lane_jack(jack, state, i)
     state[DONE * LANES + i] = 1.0

@@ -1,9 +1,9 @@
-"""The flight-control computer's side of bus.md, one control tick at a time, without a clock."""
+"""The flight-control computer's side of BUS-4 to BUS-13, one tick at a time, without a clock."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitReason, BitState, CommandMode
 from ehadiag.core.stored_test import StoredTest
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.converters import ChannelFault
 from ehadiag_sim.plant.simulator import Plant
 from firmware_iface.codec.encode import Encoder
 from firmware_iface.codec.live_decode import LiveDecoder
@@ -72,12 +73,14 @@ class FccCore:
         idle_telemetry: bool = True,
         start_ns: int = 0,
         bus_map: BusMap | None = None,
+        channel_faults: Sequence[ChannelFault] = (),
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL}")
         self._actuator = actuator
         self._tests = _by_number(tests, actuator)
         self._faults, self._sensors = faults, sensors
+        self._channel_faults = tuple(channel_faults)
         self._effects = effects or Effects()
         self._seed, self._serial = seed, serial
         self._demands = preconditions or Preconditions()
@@ -152,10 +155,8 @@ class FccCore:
             frames += self._encoder.command(mode, command, test_id, 0)
             frames += self._encoder.telemetry(codes.tolist(), 0)
         if (self._tick - 1) % round(self._rate / ENVIRONMENT_HZ) == 0:
-            effects = self._effects
-            frames += self._encoder.environment(
-                effects.supply_pressure, effects.return_pressure, effects.oil_temperature, 0
-            )
+            supply, drain, degc = self._plant.probed
+            frames += self._encoder.environment(supply, drain, degc, 0)
         return [_stamped(frame, self.now_ns + i * FRAME_NS) for i, frame in enumerate(frames)]
 
     def _start(self, test_id: int) -> None:
@@ -174,17 +175,18 @@ class FccCore:
             self._enter(BitState.REFUSED, test_id)
 
     def _objection(self, test_id: int) -> BitReason:
-        effects, demands = self._effects, self._demands
+        demands = self._demands
+        supply, drain, degc = self._plant.probed
         position = float(POSITION.decode(np.asarray(self._plant.codes[3:]))[0])
         checks = (
             (self._state in (BitState.ARMING, BitState.RUNNING), BitReason.ALREADY_RUNNING),
             (test_id not in self._tests, BitReason.UNKNOWN_TEST),
             (self.interlock_open, BitReason.INTERLOCK_OPEN),
             (
-                effects.supply_pressure - effects.return_pressure < demands.supply,
+                supply - drain < demands.supply,
                 BitReason.SUPPLY_PRESSURE_LOW,
             ),
-            (effects.oil_temperature < demands.oil_temperature, BitReason.OIL_TOO_COLD),
+            (degc < demands.oil_temperature, BitReason.OIL_TOO_COLD),
             (abs(position) > demands.off_centre, BitReason.NOT_CENTRED),
         )
         return next((reason for failed, reason in checks if failed), BitReason.NONE)
@@ -238,7 +240,14 @@ class FccCore:
 
     def _fresh_plant(self) -> Plant:
         seed = int(np.random.SeedSequence((self._seed, self._count)).generate_state(1)[0])
-        return Plant(self._actuator, self._faults, self._effects, self._sensors, seed)
+        return Plant(
+            self._actuator,
+            self._faults,
+            self._effects,
+            self._sensors,
+            seed,
+            channel_faults=self._channel_faults,
+        )
 
 
 def _by_number(tests: Iterable[StoredTest], actuator: Actuator) -> dict[int, StoredTest]:

@@ -1,4 +1,4 @@
-"""Numbers that the plant's kernel needs, from actuator data, faults and effects."""
+"""Coefficients of the plant's kernel, from actuator data, faults and effects."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from ehadiag_sim.plant.conditions import Effects, Faults
 __all__ = ["Coefficients", "coefficients", "relative_viscosity"]
 
 CLOGGING = 0.8
-"""Share of the first-stage flow gain that is lost at the limit of damage (model.md section 3)."""
+"""Share of the first-stage flow gain that is lost at the limit of damage (PHY-13)."""
 
 KELVIN = 273.15
 REFERENCE_DEGC = 40.0
 KNOWN_VISCOSITIES = ((40.0, 14.5), (100.0, 3.5))
-"""degC and mm²/s of MIL-PRF-83282 (model.md section 4)."""
+"""degC and mm²/s of MIL-PRF-83282 (PHY-19)."""
 WALTHER_SHIFT = 0.7
 
 
 class Coefficients(NamedTuple):
-    """Symbols of model.md, SI units, with faults and effects already in them."""
+    """Symbols of docs/reference/physics.md, SI units, with faults and effects already in them."""
 
     GM: float
     JF: float
@@ -52,48 +52,90 @@ class Coefficients(NamedTuple):
     FDJ: float
     """Dynamic jack friction, N."""
     FR: float
-    HYSTERESIS: float
-    """Half-width of the torque-motor play, A."""
+    KA: float
+    """Load spring, N/m."""
     BACKLASH: float
     """Half-width of the play between spool and feedback ball, m."""
+    VSS: float
+    """Stribeck velocity of the spool, m/s; 0: none."""
+    VSJ: float
+    """Stribeck velocity of the jack, m/s; 0: none."""
+    OIL: float
+    """Stiffness of the oil in the chambers, 2·β/V, Pa/m³; 0: a linear second stage."""
+    U: float
+    """Underlap of the orifices, 2·PSR/GP, m."""
+    TAU: float
+    """Time constant of the analogue filter on spool and pressure, s; 0: none."""
+    LAND: float
+    """Asymmetry of the lands (stranger)."""
+    NULL: float
+    """Spool position at which the lands are closed, m (stranger)."""
+    WAY: float
+    """Asymmetry of the jack's friction (stranger)."""
+    SLEEVE: float
+    """Growth of spool friction along the sleeve, 1/m (stranger)."""
 
 
-def coefficients(actuator: Actuator, faults: Faults, effects: Effects) -> Coefficients:
-    """Scale the actuator's data by faults (model.md section 3) and effects (section 4).
+def coefficients(
+    actuator: Actuator,
+    faults: Faults,
+    effects: Effects,
+    *,
+    filter_time: float = 0.0,
+    oil_temperature: float | None = None,
+) -> Coefficients:
+    """Scale the actuator's data by faults (PHY-13 to 15) and effects (PHY-16 to 39).
 
-    The first-stage pressure gain does not follow the supply: model.md names PSR only.
+    The first-stage pressure gain does not follow the supply (PHY-20). The ends of
+    the friction scales (FSS1, FDJ1) have no tolerance. `oil_temperature` (degC) stands for that of
+    the effects.
     """
-    valve, jack = actuator.servovalve, actuator.jack
-    thickness = relative_viscosity(effects.oil_temperature)
+    valve, jack, stage = actuator.servovalve, actuator.jack, actuator.second_stage
+    data, strange = effects.data, effects.strangers
+    degc = effects.oil_temperature if oil_temperature is None else oil_temperature
+    thickness = relative_viscosity(degc)
     flow_gain = valve.GQF * (1.0 - CLOGGING * faults.Kintas)
-    spool_friction = valve.FSS0 + faults.FSS * (valve.FSS1 - valve.FSS0)
-    jack_friction = jack.FDJ0 + faults.FDJ * (jack.FDJ1 - jack.FDJ0)
+    spool_new = valve.FSS0 * (1.0 + data.FSS0)
+    spool_friction = spool_new + faults.FSS * (valve.FSS1 - spool_new)
+    jack_new = jack.FDJ0 * (1.0 + data.FDJ0)
+    jack_friction = jack_new + faults.FDJ * (jack.FDJ1 - jack_new)
+    drop = effects.supply_pressure - effects.return_pressure
+    gain = valve.GP * (1.0 + data.GP)
     return Coefficients(
-        GM=valve.GM * (1.0 + effects.gain_change),
+        GM=valve.GM * (1.0 + data.GM) * (1.0 + effects.gain_change),
         JF=valve.JF,
         CF=valve.CF,
-        KSF=valve.KSF,
-        KF=valve.KF,
+        KSF=valve.KSF * (1.0 + data.KSF),
+        KF=valve.KF * (1.0 + data.KF),
         XFM=valve.XFM,
         FORCE=valve.AS * valve.GPF,
-        DAMPING=valve.AS**2 * valve.GPF / flow_gain + valve.CS * thickness,
+        DAMPING=valve.AS**2 * valve.GPF / flow_gain + valve.CS * (1.0 + data.CS) * thickness,
         MS=valve.MS,
         XSM=valve.XSM,
         FSS=spool_friction,
         FDS=0.5 * spool_friction,
-        PSR=effects.supply_pressure - effects.return_pressure,
-        GP=valve.GP,
-        GQ=valve.GQ,
+        PSR=drop,
+        GP=gain,
+        GQ=valve.GQ * (1.0 + data.GQ),
         CLK=valve.CLK / thickness,
         AJ=jack.AJ,
-        MJ=jack.MJ,
-        CJ=jack.CJ * thickness,
+        MJ=jack.MJ * (1.0 + data.MJ),
+        CJ=jack.CJ * (1.0 + data.CJ) * thickness,
         XJM=jack.XJM,
         FSJ=2.0 * jack_friction,
         FDJ=jack_friction,
-        FR=jack.FR,
-        HYSTERESIS=0.5 * effects.hysteresis * actuator.controller.IM,
+        FR=jack.FR + effects.load,
+        KA=effects.load_spring,
         BACKLASH=effects.backlash,
+        VSS=effects.spool_stribeck,
+        VSJ=effects.jack_stribeck,
+        OIL=2.0 * stage.beta / stage.volume if stage.kind == "orifice" else 0.0,
+        U=2.0 * drop / gain,
+        TAU=filter_time,
+        LAND=strange.land_asymmetry,
+        NULL=strange.land_shift,
+        WAY=strange.friction_asymmetry,
+        SLEEVE=strange.spool_friction_slope / valve.XSM,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from ehadiag.core.recording import (
 from ehadiag.core.stored_test import StoredTest
 from ehadiag_sim.fcc.controller import PositionController
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.converters import ChannelFault, Converters
 from ehadiag_sim.plant.dynamics import DEFAULT_STEP, Dynamics
 
 __all__ = [
@@ -38,7 +40,6 @@ __all__ = [
 
 COMMAND_STEP = {CommandMode.CURRENT: 0.5e-6, CommandMode.POSITION: 2e-6}
 """Resolution of commands (A, m): the computer acts on what its bus shows (`ServoCommand`)."""
-LSB = np.array([channel.lsb for channel in CHANNELS])
 
 
 class Plant:
@@ -49,7 +50,8 @@ class Plant:
 
     Raises
     ------
-    ConfigurationError: a step that is not finite or not within 1 ns … one tick.
+    ConfigurationError: a step that is not finite or not within 1 ns … one tick; sensors sampled
+        a tick early or more.
     """
 
     def __init__(
@@ -61,14 +63,22 @@ class Plant:
         seed: int = 0,
         *,
         step: float = DEFAULT_STEP,
+        channel_faults: Sequence[ChannelFault] = (),
     ) -> None:
-        self._dynamics = Dynamics(actuator, faults, effects, step)
-        self._sensors = sensors or Sensors()
-        self._offsets = np.array(self._sensors.offsets_lsb)
-        self._noise = np.random.default_rng(seed)
+        sensors, effects = sensors or Sensors(), effects or Effects()
+        self._dynamics = Dynamics(
+            actuator,
+            faults,
+            effects,
+            step,
+            filter_time=sensors.filter_time,
+            early=sensors.early,
+        )
+        self._converters = Converters(actuator, sensors, effects.strangers, seed, channel_faults)
+        self._effects, self._sensors = effects, sensors
         self._controller = PositionController(actuator.controller)
         self._current = 0.0
-        self._codes = self._digitise()
+        self._codes = self._converters.digitise(self._dynamics.seen)
 
     def tick(self, command: float, mode: CommandMode) -> NDArray[np.int64]:
         """Advance by one control tick; return the four ADC codes at its end, shape (4,).
@@ -80,7 +90,7 @@ class Plant:
         measured = float(POSITION.decode(self._codes[3:])[0])
         self._current = self._controller.current(command, mode, measured)
         self._dynamics.advance(self._current)
-        self._codes = self._digitise()
+        self._codes = self._converters.digitise(self._dynamics.seen)
         return self._codes
 
     @property
@@ -94,12 +104,14 @@ class Plant:
         plant = self._dynamics
         return self._current, plant.spool, plant.pressure, plant.position
 
-    def _digitise(self) -> NDArray[np.int64]:
-        noise = self._sensors.noise_lsb * self._noise.standard_normal(len(CHANNELS))
-        volts = np.array(self.truth) + (self._offsets + noise) * LSB
-        # One value at a time costs the real-time emulator little; the code stays Channel's own.
-        return np.concatenate(
-            [channel.encode(volts[i : i + 1]) for i, channel in enumerate(CHANNELS)]
+    @property
+    def probed(self) -> tuple[float, float, float]:
+        """Supply and return pressure (Pa), oil temperature (degC) as the probes read them."""
+        effects, sensors = self._effects, self._sensors
+        return (
+            effects.supply_pressure + sensors.supply_error,
+            effects.return_pressure,
+            self._dynamics.oil_temperature + sensors.temperature_error,
         )
 
 
@@ -113,7 +125,8 @@ class SimulatedRun:
     effects: the conditions it ran under.
     command: command of each tick at the bus's resolution, A or m, shape (ticks,).
     current, spool, pressure, position: noise-free A, m, Pa, m at the end of each tick, (ticks,).
-    codes: ADC codes of the four channels at the end of each tick, shape (4, ticks).
+    codes: ADC codes of the four channels as sampled in each tick, shape (4, ticks).
+    environment: what the probes read half-way through the test, at the bus's resolution.
     """
 
     test: StoredTest
@@ -124,6 +137,7 @@ class SimulatedRun:
     pressure: NDArray[np.float64]
     position: NDArray[np.float64]
     codes: NDArray[np.int64]
+    environment: Environment
 
     @property
     def samples(self) -> Samples:
@@ -145,8 +159,11 @@ class SimulatedRun:
             host_ns=np.arange(1, self.test.ticks + 1, dtype=np.int64) * period_ns,
         )
 
-    def recording(self, source: str) -> Recording:
-        """Return the test as an acquisition without a fault would hand it over."""
+    def recording(self, source: str, serial: int | None = None) -> Recording:
+        """Return the test as an acquisition without a fault would hand it over.
+
+        `source` names it in results, `serial` is the number of the actuator if the bus says one.
+        """
         samples = self.samples
         perfect = MessageCounts(received=samples.ticks, accepted=samples.ticks)
         counts = samples.saturated.sum(axis=1)
@@ -154,13 +171,9 @@ class SimulatedRun:
             source=source,
             samples=samples,
             test_id=self.test.id,
-            serial=None,
+            serial=serial,
             outcome=Outcome(state=BitState.COMPLETE),
-            environment=Environment(
-                supply_pressure=self.effects.supply_pressure,
-                return_pressure=self.effects.return_pressure,
-                oil_temperature=self.effects.oil_temperature,
-            ),
+            environment=self.environment,
             quality=Quality(
                 messages={"ServoTelemetry": perfect, "ServoCommand": perfect},
                 saturated={c.name: int(n) for c, n in zip(CHANNELS, counts, strict=True)},
@@ -177,10 +190,12 @@ def simulate(
     *,
     seed: int = 0,
     step: float = DEFAULT_STEP,
+    channel_faults: Sequence[ChannelFault] = (),
 ) -> SimulatedRun:
     """Run a stored test from rest; the same seed gives the same run.
 
-    `step` is the integration step in s, shortened so that a whole number makes a tick.
+    `step` is the integration step in s, shortened so that a whole number makes a tick;
+    `channel_faults` damage sensors and wires.
 
     Raises
     ------
@@ -192,13 +207,18 @@ def simulate(
             f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
         )
     effects = effects or Effects()
-    plant = Plant(actuator, faults, effects, sensors, seed, step=step)
+    plant = Plant(
+        actuator, faults, effects, sensors, seed, step=step, channel_faults=channel_faults
+    )
     command, mode = bus_command(test), _mode(test)
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
+    probed = plant.probed
     for tick, value in enumerate(command.tolist()):
         codes[:, tick] = plant.tick(value, mode)
         truth[:, tick] = plant.truth
+        if tick == test.ticks // 2:
+            probed = plant.probed
     return SimulatedRun(
         test=test,
         effects=effects,
@@ -208,6 +228,7 @@ def simulate(
         pressure=truth[2],
         position=truth[3],
         codes=codes,
+        environment=_on_the_bus(*probed),
     )
 
 
@@ -220,6 +241,15 @@ def bus_command(test: StoredTest) -> NDArray[np.float64]:
     step = COMMAND_STEP[_mode(test)]
     rounded: NDArray[np.float64] = np.rint(test.command() / step) * step
     return rounded
+
+
+def _on_the_bus(supply: float, drain: float, degc: float) -> Environment:
+    """Probes' readings as the bus carries them: 10 kPa and 0.1 K (`Environment` of the DBC)."""
+    return Environment(
+        supply_pressure=round(supply / 1e4) * 1e4,
+        return_pressure=round(drain / 1e4) * 1e4,
+        oil_temperature=round(10.0 * degc) / 10.0,
+    )
 
 
 def _mode(test: StoredTest) -> CommandMode:

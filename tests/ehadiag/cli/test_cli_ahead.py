@@ -1,4 +1,4 @@
-"""Working ahead of the end of a test: when there is nothing left to listen for."""
+"""Identification while the test runs: same digits as afterwards, and no listening beyond need."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_result import Run
+from ehadiag.assess.online import OnlineIdentification
 from places import LOGS
 
 from ehadiag.assess.acceptance import nothing_is_under_way
-from ehadiag.assess.online import OnlineIdentification
 from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.cli.deadline import Deadline
 from ehadiag.core.actuator import default_actuator

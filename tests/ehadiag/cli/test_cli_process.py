@@ -1,4 +1,4 @@
-"""The command line as processes: signals, two of them on a bus, an installation without rights."""
+"""The command line as a process: signals, two processes on a bus, a read-only installation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a command loads: each of these libraries costs every start a tenth of a second or more."""
+"""Start-up loads no heavy library that a command does not need."""
 
 from __future__ import annotations
 

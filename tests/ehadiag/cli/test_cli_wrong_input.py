@@ -1,4 +1,4 @@
-"""Wrong input: each with its exit code and one line that says what, where and how."""
+"""Wrong input gives its exit code and one line that says what, where and how to fix it."""
 
 from __future__ import annotations
 
@@ -94,6 +94,14 @@ WRONG_ACTUATORS = {
     "text for a number": (changed(ACTUATOR, "1.6e-3", '"much"'), "got `str` - at `$.jack.AJ`"),
     "infinite": (changed(ACTUATOR, "5.0e3", "inf"), "a finite number is needed at $.jack.CJ"),
     "friction falls": (changed(ACTUATOR, "3000.0", "100.0"), "jack.FDJ1 must be greater"),
+    "third kind of stage": (
+        ACTUATOR + '\n[second_stage]\nkind = "ball"\n',
+        "Invalid enum value 'ball' - at `$.second_stage.kind`",
+    ),
+    "airy oil": (
+        ACTUATOR + '\n[second_stage]\nkind = "orifice"\nbeta = 1e6\n',
+        ">= 10000000.0 - at `$.second_stage.beta`",
+    ),
     "not TOML": ("[jack\n", "not valid TOML"),
     "not text": ("\udcff", "not valid TOML"),
     "empty": ("", "missing required field"),

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from ehadiag.identify.pipeline import identify
 from identify_cases import PAPER_FAULTS, own_experiment, recorded
 
-from ehadiag.identify.pipeline import identify
 from ehadiag.identify.search.first_approximation import first_approximation, first_inputs
 from ehadiag.identify.search.solvers import PygadGa
 from ehadiag.model.parameters import FAULT_NAMES
@@ -13,7 +13,7 @@ PAPER_FIRST = {
     "open": (0.7147, 7.7791, 9.6052, 9.5992),
     "closed": (0.3005, 4.5653, 5.1306, 2.2902),
 }
-"""The paper's mean error after the first approximation, percent (model.md section 7)."""
+"""The paper's mean error after the first approximation, percent (PHY-40)."""
 ALL = [(test, number) for test in ("open", "closed") for number in range(1, 5)]
 
 

@@ -1,4 +1,4 @@
-"""The monitoring model against independent solutions of the contract's equations."""
+"""The monitoring model against independent solutions of the specified equations (PHY-4 to 9)."""
 
 import numpy as np
 import pytest
@@ -101,7 +101,7 @@ def test_without_friction_the_spool_is_the_linear_system():
 
 
 def jack_by_small_steps(constants, fdj, spool, step=0.5e-6):
-    """Second stage and jack, the contract's section 1 as it stands; the spool moves straight."""
+    """Second stage and jack, PHY-6 and PHY-7 as they stand; the spool moves straight."""
     c = constants
     dynamic = c.FDJ0 + fdj * (c.FDJ1 - c.FDJ0)
     substeps = round(TICK / step)

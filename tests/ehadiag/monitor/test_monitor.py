@@ -34,7 +34,7 @@ MATCHED = {
     "paper-closed-4.blf": (0.6, 0.6, 0.6),
     "hot-worn-closed.asc": (0.2, 0.5, 0.1),
 }
-"""Recordings of the contract and their true constants (truth.csv)."""
+"""Reference recordings (PHY-41) and their true severities (truth.csv)."""
 ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
 NAN = float("nan")
 NOTHING = Tick(NAN, NAN, NAN, NAN, NAN)

@@ -1,4 +1,4 @@
-"""A whole stored test under each fault of a harness, from its request to the verdict."""
+"""Runs a whole stored test, from request to verdict, under a harness fault."""
 
 from __future__ import annotations
 

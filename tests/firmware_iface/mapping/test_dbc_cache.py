@@ -1,4 +1,4 @@
-"""What is kept of a DBC file gives the same map, and never stands in the way."""
+"""The cache of DBC contents gives the same map as the file, and never gets in the way."""
 
 from __future__ import annotations
 

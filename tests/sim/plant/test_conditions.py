@@ -16,7 +16,7 @@ from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
         (lambda: Faults(FDJ=math.nan), "FDJ"),
         (lambda: Effects(hysteresis=2.0), "hysteresis"),
         (lambda: Effects(backlash=-1e-6), "backlash"),
-        (lambda: Effects(gain_change=-1.0), "gain_change"),
+        (lambda: Effects(gain_change=-2.1), "gain_change"),
         (lambda: Effects(oil_temperature=-100.0), "temperature"),
         (lambda: Effects(supply_pressure=0.5e6, return_pressure=0.7e6), "supply"),
         (lambda: Sensors(noise_lsb=-1.0), "noise"),

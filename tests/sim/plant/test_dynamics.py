@@ -1,4 +1,4 @@
-"""Properties that the plant must have whatever drives it."""
+"""Properties of the plant that hold for any input."""
 
 import msgspec
 import numpy as np
@@ -16,16 +16,15 @@ from ehadiag_sim.plant.kernels import (
     DXF,
     DXJ,
     DXS,
-    MOTOR,
     P12,
     STATES,
     XF,
     XJ,
     XS,
-    play,
-    step_tick,
+    advance,
     velocity_after,
 )
+from ehadiag_sim.plant.torque_motor import play
 
 ACTUATOR = default_actuator()
 COARSE = 2e-6
@@ -73,7 +72,7 @@ def test_friction_holds_a_spool_at_rest(fault, share):
     flapper = share * min(p.FSS / p.FORCE, p.XFM)
     state = np.zeros(STATES)
     state[XF] = flapper
-    step_tick(state, p, p.KF * flapper / p.GM, COARSE, 500)
+    advance(state, p, p.KF * flapper, COARSE, 500)
     assert (state[XS], state[DXS], state[DXJ]) == (0.0, 0.0, 0.0)
 
 
@@ -81,7 +80,7 @@ def test_spool_breaks_away_just_above_static_friction():
     p = coefficients(ACTUATOR, Faults(FSS=0.5), Effects())
     state = np.zeros(STATES)
     state[XF] = 1.01 * p.FSS / p.FORCE
-    step_tick(state, p, p.KF * state[XF] / p.GM, COARSE, 500)
+    advance(state, p, p.KF * state[XF], COARSE, 500)
     assert state[XS] > 0.0
 
 
@@ -114,7 +113,7 @@ def test_undriven_masses_only_lose_energy(fault, spool_speed, jack_speed):
     state[DXS], state[DXJ] = spool_speed, jack_speed
     energy = np.inf
     for _ in range(50):
-        step_tick(state, p, 0.0, COARSE, 10)
+        advance(state, p, 0.0, COARSE, 10)
         now = 0.5 * p.MS * state[DXS] ** 2 + 0.5 * p.MJ * state[DXJ] ** 2
         assert now <= energy
         energy = now
@@ -150,7 +149,7 @@ def test_hysteresis_is_as_wide_as_it_says():
     seen = []
     for current in drive:
         plant.advance(float(current))
-        seen.append(plant.state[MOTOR])
+        seen.append(plant.motor_current)
     rising, falling = np.array(seen[50:99]) - drive[50:99], np.array(seen[150:]) - drive[150:]
     np.testing.assert_allclose(rising, -0.5 * 0.05 * 10e-3, atol=1e-15)
     np.testing.assert_allclose(falling, 0.5 * 0.05 * 10e-3, atol=1e-15)
@@ -198,7 +197,7 @@ def test_jack_driven_back_cannot_exceed_the_supply(speed):
     p = coefficients(ACTUATOR, Faults(), Effects())
     state = np.zeros(STATES)
     state[DXJ] = speed
-    step_tick(state, p, 0.0, 1e-7, 1)
+    advance(state, p, 0.0, 1e-7, 1)
     assert state[P12] == p.PSR
     slowed = (p.MJ * speed + 1e-7 * (p.AJ * p.PSR + p.FDJ)) / (p.MJ + 1e-7 * p.CJ)
     assert state[DXJ] == pytest.approx(slowed, rel=1e-12)

@@ -23,7 +23,7 @@ AGREE = 0.2
 def cramer_rao(experiments: Sequence[Experiment], faults: Sequence[float]) -> NDArray[np.float64]:
     """Deviations of Kintas, FSS, FDJ at the truth, sensor offsets known to be zero, shape (3,).
 
-    Noise of the converters as in model.md section 5: 0.5 LSB rms and rounding, taken as Gaussian
+    Noise of the converters as in PHY-21 and PHY-22: 0.5 LSB rms and rounding, taken as Gaussian
     of variance 0.25 + 1/12 LSB². Ticks at which a break-away tips between both sides of a
     difference are left out: there the response has no derivative. NaN for a constant that shows
     nowhere.

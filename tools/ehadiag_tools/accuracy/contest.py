@@ -1,4 +1,4 @@
-"""Compact genetic algorithm, pygad and differential evolution on the same objective and budget."""
+"""Compares compact GA, pygad and differential evolution on the same objective and budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of merit of many identifications with known truth; all in percent of full damage."""
+"""Statistics of many identifications with known truth, in percent of full damage."""
 
 from __future__ import annotations
 

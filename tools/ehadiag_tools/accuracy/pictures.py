@@ -1,4 +1,4 @@
-"""Pictures of an identification: parity, gaps over time, objective along each constant."""
+"""Pictures of identifications: parity, residuals over time, objective along each severity."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from ehadiag.identify.refine.residual_model import CAP
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
-from ehadiag.identify.refine.residual_model import CAP
 from ehadiag.identify.search.objective import SEARCH_CAP, Objective
 from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag.model.scalar.response import respond

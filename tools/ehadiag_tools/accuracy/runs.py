@@ -1,4 +1,4 @@
-"""One identification with known truth: where its recording comes from, what came out."""
+"""One identification with known truth: its recording, its estimate, its errors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ehadiag.identify.pipeline import identify
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.channels import PRESSURE, SPOOL
@@ -16,7 +17,6 @@ from ehadiag.core.errors import InputOutputError
 from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import Experiment, build_experiment
-from ehadiag.identify.pipeline import identify
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import make_solver
 from ehadiag.model.plant import plant_constants

@@ -1,4 +1,4 @@
-"""Accuracy of the identification on tests with known truth, against what it must show.
+"""`tools/accuracy`: sweeps of identifications with known truth, compared with their targets.
 
 Modes: `sweep` (random cases of the unit cube, corners, edges and faces among them), `paper` (the
 paper's eight cases), `efficiency` (the monitoring model as its own plant, against the Cramér-Rao

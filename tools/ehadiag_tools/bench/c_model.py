@@ -1,4 +1,4 @@
-"""The monitoring model and its lanes in C (`tools/bench_c`), compiled where asked for."""
+"""The scalar and the vector model in C (`tools/bench_c`), compiled on demand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The monitoring model's scalar kernel: against C and against oracles."""
+"""Benchmark of the scalar kernel: against C and against oracles."""
 
 from __future__ import annotations
 

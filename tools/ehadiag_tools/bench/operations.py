@@ -1,4 +1,4 @@
-"""Counts the lanes' operations: runs them uncompiled, on numbers that count what is done with them.
+"""Counts the vector kernel's arithmetic by running it uncompiled on numbers that count.
 
 As a script, with NUMBA_DISABLE_JIT=1: reads a list of jobs, pickled, from stdin and prints the
 counts as JSON.

@@ -1,4 +1,4 @@
-"""How much of what one core can do the lanes' kernel does."""
+"""Share of one core's peak throughput that the vector kernel reaches."""
 
 from __future__ import annotations
 

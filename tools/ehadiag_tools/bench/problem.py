@@ -1,4 +1,4 @@
-"""The recordings that the benchmark works on."""
+"""The recordings that the benchmark identifies."""
 
 from __future__ import annotations
 

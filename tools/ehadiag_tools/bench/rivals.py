@@ -1,4 +1,4 @@
-"""The whole estimate against others' solvers on the same compiled objective.
+"""Benchmark of the whole estimate against other solvers on the same compiled objective.
 
 They get what this package would be without its method: model and objective of the whole test, but
 the whole cube to search, and neither a first approximation nor a refinement. Each is run twice:

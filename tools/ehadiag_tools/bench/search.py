@@ -1,4 +1,4 @@
-"""The genetic search against other searches: same compiled objective, same final cost.
+"""Benchmark of the genetic search against other searches, to the same final cost.
 
 All start from the first approximation with the pipeline's deviation. The compact genetic algorithm
 runs to its end; what it reaches is the goal. Each rival then runs until it is there.

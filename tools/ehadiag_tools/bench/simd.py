@@ -1,4 +1,4 @@
-"""The population's kernel: against scalar code and C, over lanes and ticks, on two processors."""
+"""Benchmark of the vector kernel: against scalar code and C, by population, on two processors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the lanes would gain and lose in single precision, by their algorithm in C."""
+"""What the vector kernel would gain and lose in single precision, measured in C."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from ehadiag.identify.refine.residual_model import FAULT_COUNT, KINK, STEP
 from numpy.typing import NDArray
 
 from ehadiag.core.channels import PRESSURE, SPOOL
-from ehadiag.identify.refine.residual_model import FAULT_COUNT, KINK, STEP
 from ehadiag.identify.search.objective import SEARCH_CAP
 from ehadiag.model.scalar.residuals import Batch
 from ehadiag.model.simd.residuals import lane_work

@@ -1,12 +1,15 @@
-"""Simulator against recordings with known faults: residuals per file and channel, in LSB."""
+"""Simulator against recordings with known faults: residuals per file and channel, in LSB.
+
+Where `truth-effects.csv` lies beside `truth.csv` the units have those effects besides; units of
+`truth.csv` that it does not name are left out.
+"""
 
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +20,17 @@ from ehadiag.core.channels import CHANNELS
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
 from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import StoredTest, resolve_test
-from ehadiag_sim.plant.conditions import Effects, Faults
+from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
 from ehadiag_sim.plant.dynamics import DEFAULT_STEP
 from ehadiag_sim.plant.simulator import bus_command
+from ehadiag_tools.simulator.recorded_units import read_rows, read_units
 from ehadiag_tools.simulator.replay import replay
+from ehadiag_tools.simulator.units import Unit
 from firmware_iface.logs.reader import read_recording
 
 __all__ = ["main"]
 
+EFFECTS = "truth-effects.csv"
 FLOOR = float(np.sqrt(0.5**2 + 1.0 / 12.0))
 """LSB rms of a perfect simulator: electrical noise and quantisation."""
 
@@ -36,6 +42,7 @@ class Truth:
     file: str
     test: str
     faults: Faults
+    unit: str = ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,6 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         actuator = load_actuator(options.actuator) if options.actuator else default_actuator()
         rows = read_truth(options.folder / "truth.csv")
+        units = {"": Unit(actuator)}
+        if (options.folder / EFFECTS).exists():
+            units = read_units(options.folder / EFFECTS, actuator)
+            rows = [row for row in rows if row.unit in units]
         print(f"Residual recording - simulator, LSB rms (largest); noise floor {FLOOR:.3f}\n")
         print("| file | samples | " + " | ".join(channel.name for channel in CHANNELS) + " |")
         print("| --- | --- |" + " --- |" * len(CHANNELS))
@@ -64,13 +75,15 @@ def main(argv: Sequence[str] | None = None) -> int:
                 raise InputOutputError(f"log {row.file}: no telemetry of a test in it")
             test = resolve_test(row.test)
             command = test.command() if options.exact_command else bus_command(test)
+            unit = units[row.unit]
             gap = residuals(
-                actuator,
+                unit.actuator,
                 recording.samples,
                 _fitting(row.file, test, recording.samples, command),
                 row.faults,
-                effects_of(recording.environment),
+                effects_of(recording.environment, unit.effects),
                 options.step * 1e-6,
+                unit.sensors,
             )
             good = np.isfinite(gap).all(axis=0)
             cells = [f"{_rms(part):.3f} ({np.abs(part).max():.1f})" for part in gap[:, good]]
@@ -82,25 +95,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def read_truth(path: Path) -> list[Truth]:
-    """Read file names, tests and fault constants.
+    """Read file names, tests and severities.
 
     Raises
     ------
     InputOutputError: no such file.
     ConfigurationError: a column is missing, a value is not a number from 0 to 1.
     """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except OSError as error:
-        raise InputOutputError(f"{path}: {error.strerror or error}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputOutputError(f"{path}: not a table of comma-separated text: {error}") from None
     found = []
-    for number, row in enumerate(rows, start=2):
+    for number, row in enumerate(read_rows(path), start=2):
         try:
             faults = Faults(*(float(row[name]) for name in ("Kintas", "FSS", "FDJ")))
-            found.append(Truth(row["file"], row["test"], faults))
+            found.append(Truth(row["file"], row["test"], faults, row.get("unit", "")))
         except KeyError as error:
             raise ConfigurationError(f"{path}: column {error} is missing") from None
         except (TypeError, ValueError, ConfigurationError) as error:
@@ -108,14 +114,19 @@ def read_truth(path: Path) -> list[Truth]:
     return found
 
 
-def effects_of(environment: Environment) -> Effects:
-    """Oil and pressures of a recording; defaults where the bus did not say."""
-    known = {
-        "oil_temperature": environment.oil_temperature,
-        "supply_pressure": environment.supply_pressure,
-        "return_pressure": environment.return_pressure,
-    }
-    return Effects(**{name: value for name, value in known.items() if value is not None})
+def effects_of(environment: Environment, effects: Effects | None = None) -> Effects:
+    """Effects under the oil and pressures of a recording; as they are where the bus did not say."""
+    default = effects or Effects()
+
+    def known(value: float | None, otherwise: float) -> float:
+        return otherwise if value is None else value
+
+    return replace(
+        default,
+        oil_temperature=known(environment.oil_temperature, default.oil_temperature),
+        supply_pressure=known(environment.supply_pressure, default.supply_pressure),
+        return_pressure=known(environment.return_pressure, default.return_pressure),
+    )
 
 
 def residuals(
@@ -125,9 +136,10 @@ def residuals(
     faults: Faults,
     effects: Effects,
     step: float,
+    sensors: Sensors | None = None,
 ) -> NDArray[np.float64]:
     """Recorded minus simulated, LSB, NaN where nothing was recorded, shape (4, ticks)."""
-    truth = replay(actuator, samples, command, faults, effects, step)
+    truth = replay(actuator, samples, command, faults, effects, step, sensors)
     seen = np.vstack([samples.current, samples.spool, samples.pressure, samples.position])
     gap: NDArray[np.float64] = (seen - truth) / np.array([[channel.lsb] for channel in CHANNELS])
     return gap

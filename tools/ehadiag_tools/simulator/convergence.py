@@ -1,4 +1,4 @@
-"""Integration step of the simulator against its error, by a stiff solver with event location.
+"""`tools/convergence`: error of the simulator against its integration step, by a stiff solver.
 
 The currents of a whole stored test (closed loop: of one simulated run) drive both.
 """
@@ -20,6 +20,7 @@ from ehadiag_sim.plant.conditions import Faults
 from ehadiag_sim.plant.dynamics import respond
 from ehadiag_sim.plant.simulator import simulate
 from ehadiag_tools.simulator.stiff_reference import StiffReference
+from ehadiag_tools.simulator.unit_convergence import unit_table
 
 __all__ = ["main"]
 
@@ -37,11 +38,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         nargs=3,
         default=(0.3, 0.6, 0.3),
         metavar=("KINTAS", "FSS", "FDJ"),
-        help="fault constants (%(default)s)",
+        help="severities (%(default)s)",
     )
     parser.add_argument("--ticks", type=int, help="only the first so many ticks")
     parser.add_argument(
         "--steps", type=float, nargs="+", default=STEPS_US, help="steps, µs (%(default)s)"
+    )
+    parser.add_argument(
+        "--units",
+        type=int,
+        default=0,
+        metavar="N",
+        help="instead of the stiff solver: N random units of either stage and friction",
     )
     options = parser.parse_args(argv)
     try:
@@ -49,6 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ConfigurationError(f"--ticks {options.ticks}: need at least 1")
         faults = Faults(*options.faults)
         for name in options.test or ("open", "closed"):
+            if options.units:
+                unit_table(resolve_test(name), options.units, options.steps, options.ticks)
+                continue
             table(name, faults, options.steps, options.ticks)
     except EhadiagError as error:
         print(f"convergence: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The simulated plant driven through the very currents of a recording.
+"""Drives the simulated plant with the currents of a recording.
 
 Free-running loops with different noise part ways, so in closed loop the control law gets the
 *recorded* (digitised) jack position. What was not recorded is told from the next current.
@@ -16,7 +16,8 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import CURRENT, POSITION
 from ehadiag.core.recording import CommandMode, Samples
 from ehadiag_sim.fcc.controller import PositionController
-from ehadiag_sim.plant.conditions import Effects, Faults
+from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.converters import Converters
 from ehadiag_sim.plant.dynamics import DEFAULT_STEP, Dynamics
 
 __all__ = ["replay"]
@@ -32,24 +33,31 @@ def replay(
     faults: Faults,
     effects: Effects,
     step: float = DEFAULT_STEP,
+    sensors: Sensors | None = None,
 ) -> NDArray[np.float64]:
-    """Noise-free current (A), spool (m), pressure (Pa), jack (m) of each tick, shape (4, ticks).
+    """Current (A), spool (m), pressure (Pa), jack (m) as read without noise, shape (4, ticks).
 
     `command` of each tick in A or m, shape (ticks,), as the control computer had it. A missing
     jack sample (also the one before the test) is the code near the simulated position whose
     current is nearest to the recorded one; without that either, the code of the simulated
-    position.
+    position. `sensors` err as they say, but for noise.
     """
-    plant = Dynamics(actuator, faults, effects, step)
+    sensors = sensors or Sensors()
+    plant = Dynamics(
+        actuator, faults, effects, step, filter_time=sensors.filter_time, early=sensors.early
+    )
+    electronics = Converters(actuator, sensors, effects.strangers, seed=0)
     law = PositionController(actuator.controller)
     truth = np.empty((4, samples.ticks))
     measured = math.nan
+    # Readings at rest: of the current by its offset alone, of the jack before the test.
+    zero, _, _, shown = electronics.read(plant.seen).tolist()
     for tick, wanted in enumerate(command.tolist()):
         if samples.mode is CommandMode.POSITION and math.isnan(measured):
-            measured = _missing(law, wanted, float(samples.current[tick]), plant.position)
-        current = law.current(wanted, samples.mode, measured)
-        plant.advance(current)
-        truth[:, tick] = current, plant.spool, plant.pressure, plant.position
+            measured = _missing(law, wanted, float(samples.current[tick]) - zero, shown)
+        plant.advance(law.current(wanted, samples.mode, measured))
+        truth[:, tick] = electronics.read(plant.seen)
+        shown = float(truth[3, tick])
         measured = float(samples.position[tick])
     return truth
 

@@ -1,0 +1,86 @@
+"""What a refinement says, as estimates with intervals and a measure of fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.refine.derivatives import CAP
+from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.result import Estimate, Fit
+from ehadiag.identify.search.first_approximation import FirstApproximation
+from ehadiag.identify.search.solvers import SearchResult
+from ehadiag.identify.uncertainty import interval95
+from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
+from ehadiag.model.parameters import FAULTS
+
+__all__ = ["estimates_of", "fit_of", "of_faults", "outliers"]
+
+NOT_SHOWN_STD = 0.1
+BOUND = 1e-6
+
+
+def of_faults(refined: Refinement, spread: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Part of a covariance that is of the severities, in the order of `FAULTS`."""
+    places = [refined.parameters.index(item) for item in FAULTS]
+    return spread[np.ix_(places, places)]
+
+
+def estimates_of(
+    first: FirstApproximation,
+    found: SearchResult,
+    refined: Refinement,
+    spread: NDArray[np.float64],
+) -> tuple[Estimate, ...]:
+    """Severities as each stage left them.
+
+    spread: covariance of all that was refined, SI.
+    """
+    values = refined.values
+    deviations = np.sqrt(np.diag(of_faults(refined, spread)))
+    out = []
+    for item, searched, std in zip(FAULTS, found.best, deviations.tolist(), strict=True):
+        value = values[item.name]
+        out.append(
+            Estimate(
+                name=item.name,
+                first=float(first.values[item.name]),
+                search=float(searched),
+                value=value,
+                std=std,
+                interval95=interval95(value, std),
+                at_bound=value <= item.lower + BOUND or value >= item.upper - BOUND,
+                shown=std < NOT_SHOWN_STD,
+            )
+        )
+    return tuple(out)
+
+
+def fit_of(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
+    """How well the optimum explains the recordings; noise and offsets are of the first one."""
+    first, values = experiments[0], refined.values
+    return Fit(
+        spool_rms=_rms(refined, SPOOL_ROW),
+        pressure_rms=_rms(refined, PRESSURE_ROW),
+        outliers=outliers(refined),
+        spool_noise=first.spool_noise,
+        pressure_noise=first.pressure_noise,
+        spool_offset=first.spool_offset + values["spool_offset"],
+        pressure_offset=first.pressure_offset + values["pressure_offset"],
+        anchored=refined.anchored,
+    )
+
+
+def outliers(refined: Refinement) -> float:
+    """Share of residuals beyond three deviations."""
+    present = refined.weighted
+    return float(np.mean(refined.residuals[present] ** 2 >= CAP)) if present.any() else 1.0
+
+
+def _rms(refined: Refinement, row: int) -> float:
+    """Rms residual of a signal, squares capped; NaN without a sample."""
+    residuals = refined.residuals[row, refined.weighted[row]]
+    return float(np.sqrt(np.mean(np.minimum(residuals**2, CAP)))) if residuals.size else np.nan

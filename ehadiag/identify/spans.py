@@ -1,0 +1,110 @@
+"""Spans of experiments laid out for the kernels: which windows count, and how they are anchored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.channels import PRESSURE, SPOOL
+from ehadiag.core.stored_test import Window
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.noise import TYPICAL_NOISE_LSB, relative_noise, rounding_noise
+from ehadiag.model.anchor import FREE_RUN, Anchor
+from ehadiag.model.batch import Batch
+from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, Unknowns
+
+__all__ = ["ANCHOR_LSB", "Spans", "judge_noise", "lay_out", "unknowns_of"]
+
+Spans = Sequence[Sequence[Window]]
+"""Of each test, s."""
+ANCHOR_GAIN = 0.3
+ANCHOR_LSB = (1.3, 6.0)
+"""Filtered and single innovations beyond which the model is put back on the spool, LSB."""
+
+
+def lay_out(
+    experiments: Sequence[Experiment],
+    windows: Sequence[Sequence[Window]] | None = None,
+    *,
+    lead: float = 0.0,
+    channels: tuple[bool, bool] = (True, True),
+    anchor_lsb: tuple[float, float] | None = None,
+) -> Batch:
+    """Lay spans of experiments one behind the other.
+
+    Parameters
+    ----------
+    windows: for each experiment the spans (s) to explain; None: all of every test.
+    lead: run-in before each span, s, without weight.
+    channels: whether spool and pressure count.
+    anchor_lsb: re-anchoring thresholds (small, large) in units of LSB-sized noise; None: free run.
+    """
+    parts: list[tuple[int, int, int, int]] = []
+    for index, experiment in enumerate(experiments):
+        spans = [(0.0, experiment.ticks * experiment.tick)] if windows is None else windows[index]
+        for start, end in spans:
+            a = round(start / experiment.tick)
+            b = min(round(end / experiment.tick), experiment.ticks)
+            first = max(0, a - round(lead / experiment.tick))
+            if b - a > 1:
+                parts.append((index, first, a, b))
+    if not parts:
+        raise ValueError("no span of any experiment is inside its recording")
+    weight, anchors, origins = [], [], []
+    for index, first, a, b in parts:
+        experiment = experiments[index]
+        inside = np.arange(first, b) >= a
+        on_spool = inside & np.isfinite(experiment.spool[first:b]) & channels[0]
+        on_pressure = inside & np.isfinite(experiment.pressure[first:b]) & channels[1]
+        weight.append(
+            np.vstack([on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise])
+        )
+        unit = experiment.spool_noise / TYPICAL_NOISE_LSB
+        anchor = FREE_RUN
+        if anchor_lsb is not None:
+            anchor = Anchor(ANCHOR_GAIN, anchor_lsb[0] * unit, anchor_lsb[1] * unit)
+        anchors.append(anchor.as_array())
+        origins.append(_origin(experiment, first))
+    begins = np.cumsum([0, *(item.ticks for item in experiments)])
+    return Batch(
+        test=np.array([index for index, _, _, _ in parts]),
+        tick=np.array([experiments[i].tick for i, _, _, _ in parts]),
+        start=np.concatenate([[0], np.cumsum([b - first for _, first, _, b in parts])]),
+        origin=np.array(origins),
+        history=np.array([first for _, first, _, _ in parts]),
+        since=np.array([begins[i] + first for i, first, _, _ in parts]),
+        current=np.concatenate([item.trace.current for item in experiments]),
+        spool=np.concatenate([experiments[i].spool[first:b] for i, first, _, b in parts]),
+        pressure=np.concatenate([experiments[i].pressure[first:b] for i, first, _, b in parts]),
+        weight=np.hstack(weight),
+        anchor=np.array(anchors),
+    )
+
+
+def _origin(experiment: Experiment, first: int) -> float:
+    """Spool position before tick `first`, m: where it rests before the test, else measured."""
+    if first == 0:
+        return experiment.origin
+    before = experiment.spool[max(0, first - 5) : first]
+    seen = before[np.isfinite(before)]
+    return float(seen[-1]) if seen.size else 0.0
+
+
+def judge_noise(experiment: Experiment, residuals: NDArray[np.float64]) -> Experiment:
+    """Weigh an experiment anew, by the noise that its residuals show, shape (SIGNALS, n)."""
+    spool, pressure = (relative_noise(row) for row in residuals)
+    return replace(
+        experiment,
+        spool_noise=max(experiment.spool_noise * spool, rounding_noise(SPOOL)),
+        pressure_noise=max(experiment.pressure_noise * pressure, rounding_noise(PRESSURE)),
+    )
+
+
+def unknowns_of(
+    experiments: Sequence[Experiment], free: Sequence[Parameter] = (*FAULTS, *OFFSETS)
+) -> Unknowns:
+    """Space of the unknowns of experiments with one actuator."""
+    return Unknowns(tuple(free), tuple(item.constants for item in experiments), {})

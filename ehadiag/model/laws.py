@@ -1,0 +1,269 @@
+"""The laws of the actuator, each written once: inlined by the scalar and the vector kernels alike.
+
+Named tuples hold what a law needs of a candidate, precombined; the functions take plain numbers or
+vectors of lanes. Symbols and requirement numbers are those of docs/reference/physics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from ehadiag.compile.kernels import inlined
+from ehadiag.compile.vector import least, magnitude, most, packed
+from ehadiag.model.plant import PlantConstants
+
+__all__ = [
+    "DriveLaw",
+    "JackLaw",
+    "SensorLaw",
+    "SpoolLaw",
+    "drive_law",
+    "excess",
+    "flapper_held",
+    "jack_law",
+    "opening",
+    "play",
+    "pressure",
+    "resistance",
+    "sampled",
+    "sensor_law",
+    "slide_base",
+    "spool_law",
+    "steady_rate",
+    "still_flapper",
+]
+
+STATIC_SHARE_SPOOL = 0.5
+"""Dynamic over static dry friction of the spool (PHY-14)."""
+STATIC_RATIO_JACK = 2.0
+"""Static over dynamic dry friction of the jack (PHY-15)."""
+
+
+class DriveLaw(NamedTuple):
+    """What the torque motor of one candidate makes of the current.
+
+    Attributes
+    ----------
+    gain: flapper deflection per current, GM / KF, m/A.
+    bias: current that the motor adds to the commanded one, A.
+    spacing: of the half-widths of the plays, A: they are spacing (i + 1/2).
+    share: of each play in the current that acts, 1 / plays.
+    """
+
+    gain: Any
+    bias: Any
+    spacing: Any
+    share: Any
+
+
+@inlined
+def drive_law(c: PlantConstants) -> DriveLaw:
+    """Precombine what the torque motor's law needs (PHY-4, PHY-29, PHY-30)."""
+    return DriveLaw(c.GM / c.KF, c.IB, c.HYS * c.IM / c.NPL, 1.0 / c.NPL)
+
+
+@packed
+def play(held: Any, value: Any, half_width: Any) -> Any:
+    """What a play of a half-width holds after its input has gone to a value (PHY-30)."""
+    return least(most(held, value - half_width), value + half_width)
+
+
+class SpoolLaw(NamedTuple):
+    """Torque motor, flapper and spool of one candidate.
+
+    Attributes
+    ----------
+    ratio: flapper deflection that the feedback wire takes back per spool travel, KSF / KF.
+    reach: its inverse, spool travel per flapper deflection.
+    force: on the spool per flapper deflection, AS GPF, N/m.
+    mass: of the spool, kg.
+    damping: viscous coefficient of the moving spool, (GPF/GQF) AS² + CS, N s/m.
+    dynamic: dry friction of the moving spool, N.
+    dry: flapper deflection that balances it, m.
+    breakaway: flapper deflection that overcomes the static friction, m.
+    flapper_stop, stroke: of flapper and spool, m.
+    backlash: half-width of the play between spool and feedback wire, m.
+    ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper beside a resting
+        spool; rate 0 where it does not ring.
+    """
+
+    ratio: float
+    reach: float
+    force: float
+    mass: float
+    damping: float
+    dynamic: float
+    dry: float
+    breakaway: float
+    flapper_stop: float
+    stroke: float
+    backlash: float
+    ring_damping: float
+    ring_rate: float
+
+
+@inlined
+def spool_law(c: PlantConstants) -> SpoolLaw:
+    """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14)."""
+    force = c.AS * c.GPF
+    ring_damping = 0.5 * c.CF / c.JF
+    square = c.KF / c.JF - ring_damping * ring_damping
+    return SpoolLaw(
+        c.KSF / c.KF,
+        c.KF / c.KSF,
+        force,
+        c.MS,
+        c.GPF / c.GQF * c.AS * c.AS + c.CS,
+        STATIC_SHARE_SPOOL * c.FSS,
+        STATIC_SHARE_SPOOL * c.FSS / force,
+        c.FSS / force,
+        c.XFM,
+        c.XSM,
+        c.BKL,
+        ring_damping,
+        math.sqrt(square) if square > 0.0 else 0.0,
+    )
+
+
+@packed
+def still_flapper(ratio: Any, deflection: Any, wire: Any) -> Any:
+    """Deflection at which the flapper rests while the feedback wire is held at `wire`, m."""
+    return deflection - ratio * wire
+
+
+@packed
+def slide_base(t: SpoolLaw, deflection: Any, direction: Any) -> Any:
+    """Spool position towards which it slides while the current lasts, m."""
+    return (deflection - t.dry * direction) * t.reach + t.backlash * direction
+
+
+@inlined
+def steady_rate(t: SpoolLaw, xf: float, direction: float) -> float:
+    """Velocity that the spool approaches with the flapper held at `xf`, m/s."""
+    return (t.force * xf - t.dynamic * direction) / t.damping
+
+
+@inlined
+def flapper_held(t: SpoolLaw, deflection: float, wire: float) -> float:
+    """Deflection of a flapper in equilibrium beside a spool that friction holds, m."""
+    xf = still_flapper(t.ratio, deflection, wire)
+    return min(max(xf, -t.breakaway), t.breakaway)
+
+
+class JackLaw(NamedTuple):
+    """Second stage and jack of one candidate.
+
+    The second stage's equation, solved for the pressure, reads P12 = (flow x - v) / e with
+    e = slope max(abs(x), corner) + leak, whether its pressure gain saturates or not (PHY-6).
+
+    Attributes
+    ----------
+    flow: no-load velocity of the jack per spool travel, GQ / AJ, 1/s.
+    slope: velocity that a pressure takes, per opening, GQ / (PSR AJ), 1/(s Pa).
+    leak: the same by leakage, CLK / AJ, m/(s Pa).
+    corner: opening at which the pressure gain saturates, PSR / GP, m.
+    area, viscosity: of the jack, m² and N s/m.
+    by_mass: reciprocal of its mass, 1/kg.
+    supply: supply minus return pressure, Pa.
+    stroke: m.
+    load: external, N.
+    friction: dry friction of the moving jack, N.
+    static: of the resting one, N.
+    """
+
+    flow: Any
+    slope: Any
+    leak: Any
+    corner: Any
+    area: Any
+    viscosity: Any
+    by_mass: Any
+    supply: Any
+    stroke: Any
+    load: Any
+    friction: Any
+    static: Any
+
+
+@inlined
+def jack_law(c: PlantConstants) -> JackLaw:
+    """Precombine what the laws of second stage and jack need (PHY-6, PHY-7, PHY-15)."""
+    return JackLaw(
+        c.GQ / c.AJ,
+        c.GQ / (c.PSR * c.AJ),
+        c.CLK / c.AJ,
+        c.PSR / c.GP,
+        c.AJ,
+        c.CJ,
+        1.0 / c.MJ,
+        c.PSR,
+        c.XJM,
+        c.FR,
+        c.FDJ,
+        STATIC_RATIO_JACK * c.FDJ,
+    )
+
+
+@packed
+def opening(j: JackLaw, x: Any) -> Any:
+    """Opening of the second stage with the spool at `x`, no less than its corner, m."""
+    return most(magnitude(x), j.corner)
+
+
+@packed
+def resistance(j: JackLaw, x: Any) -> Any:
+    """Velocity that a pressure takes from the jack with the spool at `x`, e, m/(s Pa)."""
+    return j.slope * opening(j, x) + j.leak
+
+
+@packed
+def pressure(j: JackLaw, x: Any, velocity: Any) -> Any:
+    """Differential pressure with the spool at `x` and the jack at a velocity, unlimited, Pa."""
+    return (j.flow * x - velocity) / resistance(j, x)
+
+
+@packed
+def excess(j: JackLaw, x: Any, hold: Any) -> Any:
+    """Force on the resting jack beyond `hold` (N, signed), times e, which is positive."""
+    return j.area * j.flow * x - (j.load + hold) * resistance(j, x)
+
+
+class SensorLaw(NamedTuple):
+    """How the sensors of one candidate show spool and pressure.
+
+    Attributes
+    ----------
+    spool_offset, pressure_offset: constant errors, m and Pa.
+    place_before, place, slope_before, slope: weights by which the ends of the last piece of the
+        spool's path give the spool at the instant of sampling (Hermite's cubic).
+    """
+
+    spool_offset: Any
+    pressure_offset: Any
+    place_before: Any
+    place: Any
+    slope_before: Any
+    slope: Any
+
+
+@inlined
+def sensor_law(c: PlantConstants, span: float) -> SensorLaw:
+    """Precombine what the sensors' laws need; `span`: of the path's last piece, s."""
+    u = 1.0 - min(max(c.DLY / span, 0.0), 1.0)
+    v = 1.0 - u
+    return SensorLaw(
+        c.OXS,
+        c.OPD,
+        (1.0 + 2.0 * u) * v * v,
+        u * u * (3.0 - 2.0 * u),
+        u * v * v * span,
+        -u * u * v * span,
+    )
+
+
+@packed
+def sampled(law: SensorLaw, before: Any, now: Any, slope_before: Any, slope: Any) -> Any:
+    """Spool as its sensor samples it, m, from the ends of the path's last piece (m and m/s)."""
+    place = law.place_before * before + law.place * now
+    return place + law.slope_before * slope_before + law.slope * slope

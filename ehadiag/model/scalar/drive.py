@@ -1,0 +1,31 @@
+"""Torque motor of one candidate: what its hysteresis makes of the current, tick by tick."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.kernels import inlined
+from ehadiag.model.laws import DriveLaw, play
+
+__all__ = ["deflection_held", "drive"]
+
+
+@inlined
+def drive(law: DriveLaw, held: NDArray[np.float64], current: float) -> float:
+    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-4, PHY-29, PHY-30).
+
+    held: what the plays hold, A, shape (plays,), changed in place.
+    """
+    for i in range(held.shape[0]):
+        held[i] = play(held[i], current + law.bias, law.spacing * (i + 0.5))
+    return deflection_held(law, held)
+
+
+@inlined
+def deflection_held(law: DriveLaw, held: NDArray[np.float64]) -> float:
+    """Flapper deflection by the current that acts, m."""
+    total = 0.0
+    for i in range(held.shape[0]):
+        total += held[i]
+    return law.gain * law.share * total
