@@ -235,7 +235,7 @@ def test_a_dbc_of_too_many_signals_is_refused_before_it_is_parsed() -> None:
 
 def test_a_key_without_end_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
     path = tmp_path / "deep.toml"
-    path.write_text("a" + ".a" * 400_000 + " = 1\n")
+    path.write_text("a" + ".a" * 100_000 + " = 1\n")
     with pytest.raises(ConfigurationError, match="a line with more than 50 dots"):
         load_map(path)
 
