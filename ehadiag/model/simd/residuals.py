@@ -39,7 +39,14 @@ from ehadiag.model.simd.layout import (
 from ehadiag.model.simd.spool import anchor_lanes, drive_lanes, rest_lanes, see_lanes, spool_lanes
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
 
-__all__ = ["Scratch", "block_costs", "block_residuals", "scratch_beside", "scratch_for"]
+__all__ = [
+    "Scratch",
+    "block_costs",
+    "block_residuals",
+    "levels_for",
+    "scratch_beside",
+    "scratch_for",
+]
 
 BOW = 0.008e-6
 """Distance (m) of the spool's path from its chord from which the jack takes two steps a tick, where
@@ -87,13 +94,30 @@ class Scratch(NamedTuple):
     no_residuals: NDArray[np.float64]
 
 
-def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
-    """Scratch for a batch, the jack's steps found by a run of candidates all over the space.
+def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64]:
+    """How often the jack's ticks are to be halved, by a run of candidates all over the space.
 
-    `scattered`: their constants, shape (LANES, tests, FIELDS).
+    Parameters
+    ----------
+    scattered : shape (LANES, tests, FIELDS)
+        Their constants.
+
+    Returns
+    -------
+    Shape (N,), see `Scratch.levels`.
     """
-    work = Scratch(
-        levels=np.full(len(batch.current), -1, dtype=np.int64),
+    levels = np.full(len(batch.current), -1, dtype=np.int64)
+    if batch.weight[PRESSURE_ROW].any():
+        # Without weights the jack is left out, and the spool's path is all that is looked at.
+        spool_only = batch._replace(weight=np.zeros_like(batch.weight))
+        block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(LANES))
+    return levels
+
+
+def scratch_for(levels: NDArray[np.int64]) -> Scratch:
+    """Scratch with the jack's steps; those below 0 are found by the first block that is run."""
+    return Scratch(
+        levels=levels,
         state=np.zeros(STATE_ROWS * LANES),
         path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
@@ -106,11 +130,6 @@ def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
         uncounted=np.zeros(0, dtype=np.int64),
         no_residuals=np.zeros((0, SIGNALS, 0)),
     )
-    if batch.weight[PRESSURE_ROW].any():
-        # Without weights the jack is left out, and the spool's path is all that is looked at.
-        spool_only = batch._replace(weight=np.zeros_like(batch.weight))
-        block_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
-    return work
 
 
 def scratch_beside(work: Scratch) -> Scratch:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_result import Run
+from ehadiag.assess.online import OnlineIdentification
 from places import LOGS
 
 from ehadiag.assess.acceptance import nothing_is_under_way
-from ehadiag.assess.online import OnlineIdentification
 from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import BitState, Recording

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from ehadiag.identify.pipeline import identify
 from identify_cases import PAPER_FAULTS, own_experiment, recorded
 
-from ehadiag.identify.pipeline import identify
 from ehadiag.identify.search.first_approximation import first_approximation, first_inputs
 from ehadiag.identify.search.solvers import PygadGa
 from ehadiag.model.parameters import FAULT_NAMES

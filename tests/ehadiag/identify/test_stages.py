@@ -4,14 +4,14 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from ehadiag.assess.online import OnlineIdentification
+from ehadiag.identify.pipeline import identify, run_ahead
 from identify_cases import own_experiment
 from msgspec import structs
 
-from ehadiag.assess.online import OnlineIdentification
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import Environment, Outcome, Quality, Recording, Samples
 from ehadiag.core.stored_test import resolve_test
-from ehadiag.identify.pipeline import identify, run_ahead
 from ehadiag.identify.search.stages import STAGES, Memory, first_ends_at, stage_ends_at
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_sim.plant.simulator import simulate

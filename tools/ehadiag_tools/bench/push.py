@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
-from ehadiag.identify.pipeline import identify
+from ehadiag.identify.session import identify
 from ehadiag.monitor import Monitor, Tick
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import TRUTH, experiment, recording, samples
