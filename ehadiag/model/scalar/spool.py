@@ -53,10 +53,10 @@ def spool_response(
     s = spool_rest(law, drive(gain, current_before), origin)
     count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
-        before = s.xs
+        before, first = s.xs, count
         s, count = spool_tick(tables, drive(gain, current[k]), tick, s, nodes, count)
         node_end[k] = count
-        spool[k] = sampled(nodes, count, before, constants.DLY)
+        spool[k] = sampled(nodes, first, count, before, constants.DLY)
         xs, filtered, moved = re_anchored(
             measured[k] - constants.OXS - spool[k], anchor[0], anchor[1], anchor[2],
             s.xs, filtered, law.stroke,

@@ -194,13 +194,15 @@ def spool_tick(
 
 
 @inlined
-def sampled(nodes: Matrix, end: int, before: float, lead: float) -> float:
-    """Spool position `lead` seconds before the end of a tick, within its last piece, m.
+def sampled(nodes: Matrix, first: int, end: int, before: float, lead: float) -> float:
+    """Spool position `lead` seconds before the end of a tick, m.
 
-    nodes, end: the path up to the tick's end; before: position before the path's last piece where
-    that is the first of all, m.
+    nodes, first, end: the path of the tick; before: position at its start, m.
     """
     node = end - 1
-    start = nodes[node - 1, 1] + nodes[node - 1, 4] if node > 0 else before
+    while lead > nodes[node, 0] and node > first:
+        lead -= nodes[node, 0]
+        node -= 1
+    start = nodes[node - 1, 1] if node > first else before
     w = seen_weights(lead, nodes[node, 0])
     return w[0] * start + w[1] * nodes[node, 1] + w[2] * nodes[node, 2] + w[3] * nodes[node, 3]
