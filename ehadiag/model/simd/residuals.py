@@ -163,6 +163,7 @@ def _level(path: NDArray[np.float64]) -> int:
 
 @packed
 def _hold_against(
+    end: int,
     measured: float,
     weight: float,
     cap: float,
@@ -174,7 +175,7 @@ def _hold_against(
     sums: NDArray[np.float64],
 ) -> None:
     """Weighted residual of one sample in every lane, its capped square added to the sums."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         seen = measured - load(coefficients, offset * LANES + o)
         residual = (seen - load(state, row * LANES + o)) * weight
         store(sample, o, residual)
@@ -183,6 +184,8 @@ def _hold_against(
 
 @packed
 def _jack_tick(
+    count: int,
+    end: int,
     tick: float,
     level: int,
     state: NDArray[np.float64],
@@ -191,8 +194,8 @@ def _jack_tick(
 ) -> None:
     """Jack of all lanes over a tick cut into 2^level steps."""
     for step in range(1 << level):
-        if jack_lanes(level, step, tick, state, path, coefficients):
-            jack_events(level, step, tick, state, path, coefficients)
+        if jack_lanes(end, level, step, tick, state, path, coefficients):
+            jack_events(count, level, step, tick, state, path, coefficients)
 
 
 @merged
@@ -208,7 +211,9 @@ def _block(
     moving, stuck, rows, sums, sample = work.moving, work.stuck, work.rows, work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
     weight, levels, start = batch.weight, work.levels, batch.start
-    wanted, last_candidate = out.shape[0], candidates.shape[0] - 1
+    count, wanted = candidates.shape[0], out.shape[0]
+    # Lanes that hold no candidate repeat the last one and take no events; a half of none is left.
+    end = WIDTH if count <= WIDTH else LANES
     sums[:] = 0.0
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
@@ -217,23 +222,23 @@ def _block(
         anchored = math.isfinite(small) or math.isfinite(large)
         for i in range(LANES):
             for field in range(FIELDS):
-                rows[i, field] = candidates[min(i, last_candidate), test, field]
+                rows[i, field] = candidates[min(i, count - 1), test, field]
         tabulate(rows, tick, coefficients, moving, stuck)
-        drive_lanes(batch.current_before[index], state, coefficients)
-        rest_lanes(batch.origin[index], state, coefficients)
+        drive_lanes(end, batch.current_before[index], state, coefficients)
+        rest_lanes(end, batch.origin[index], state, coefficients)
         last = start[index + 1] - 1
         while last >= start[index] and weight[PRESSURE_ROW, last] == 0.0:
             last -= 1
         for k in range(start[index], start[index + 1]):
-            drive_lanes(current[k], state, coefficients)
-            if spool_lanes(tick, state, path, coefficients):
-                event_ticks(tick, state, path, coefficients, moving, stuck)
+            drive_lanes(end, current[k], state, coefficients)
+            if spool_lanes(end, tick, state, path, coefficients):
+                event_ticks(count, tick, state, path, coefficients, moving, stuck)
             seen = math.isfinite(spool[k])
             if seen:
-                see_lanes(state, path, coefficients)
+                see_lanes(end, state, path, coefficients)
             if weight[SPOOL_ROW, k] != 0.0 and seen:
                 _hold_against(
-                    spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_OFFSET,
+                    end, spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_OFFSET,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
@@ -241,17 +246,17 @@ def _block(
             if levels[k] < 0:
                 levels[k] = _level(path)
             if k <= last:  # nothing depends on the jack but the pressure
-                _jack_tick(tick, levels[k], state, path, coefficients)
+                _jack_tick(count, end, tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(state, path, coefficients)
+                pressures(end, state, path, coefficients)
                 _hold_against(
-                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_OFFSET,
+                    end, pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_OFFSET,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
                     out[i, PRESSURE_ROW, k] = sample[i]
             if anchored and seen:
-                anchor_lanes(spool[k], gain, small, large, state, coefficients)
+                anchor_lanes(end, spool[k], gain, small, large, state, coefficients)
 
 
 @kernel
@@ -284,8 +289,7 @@ def block_costs(
 ) -> None:
     """Summed squared weighted residuals of each candidate, each square at most `cap`: out, (n,).
 
-    `candidates` has shape (n, tests, FIELDS). Blocks of LANES candidates run at once; a last block
-    that is not full takes as long as a full one.
+    `candidates` has shape (n, tests, FIELDS). Blocks of LANES candidates run at once.
     """
     _run_blocks(batch, candidates, cap, work, out, work.uncounted, work.no_residuals)
 

@@ -2,7 +2,8 @@
 
 The same equations as `ehadiag.model.scalar.spool_tick`. The spool moves by quarters of a tick,
 exactly; a lane in which an event may hide takes the whole tick alone
-(`ehadiag.model.simd.spool_events`). No lane's result depends on its neighbours.
+(`ehadiag.model.simd.spool_events`). No lane's result depends on its neighbours. `end`: the lanes
+before it are run, whole vectors.
 """
 
 from __future__ import annotations
@@ -71,24 +72,24 @@ denormal numbers, which cost a hundred times as much."""
 
 @packed
 def drive_lanes(
-    current: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int, current: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
     """Flapper deflection that the current (A) of a tick alone makes, all lanes, into the state."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         gain = load(coefficients, DRIVE_GAIN * LANES + o)
         store(state, DEFLECTION * LANES + o, drive(gain, current))
 
 
 @packed
 def rest_lanes(
-    origin: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int, origin: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
     """All lanes at rest, the spool at `origin` (m), the flapper in equilibrium if it can be.
 
     The deflection by the current is in the state; the count of re-anchorings goes on.
     """
     state[: DEFLECTION * LANES] = 0.0
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         stroke = load(coefficients, STROKE * LANES + o)
         xs = most(least(stroke * 0.0 + origin, stroke), -stroke)
         limit = load(coefficients, BREAKAWAY * LANES + o)
@@ -118,6 +119,7 @@ def _quarter(
 
 @packed
 def spool_lanes(
+    end: int,
     tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
@@ -130,7 +132,7 @@ def spool_lanes(
     """
     any_busy = False
     bow = tick / 16.0
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         xf, wf = load(state, FLAPPER * LANES + o), load(state, FLAPPER_RATE * LANES + o)
         xs, vs = load(state, SPOOL * LANES + o), load(state, SPOOL_RATE * LANES + o)
         d, clamped = load(state, DIRECTION * LANES + o), load(state, CLAMPED * LANES + o)
@@ -210,11 +212,14 @@ def spool_lanes(
 
 @packed
 def see_lanes(
-    state: NDArray[np.float64], path: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
 ) -> None:
     """Spool of all lanes as it is sampled in a tick, into the state."""
     before, now = NODES - 1, NODES
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         seen = load(coefficients, SEEN_PLACE * LANES + o) * load(path, (PLACE + now) * LANES + o)
         seen = seen + load(coefficients, SEEN_PLACE_BEFORE * LANES + o) * load(
             path, (PLACE + before) * LANES + o
@@ -230,6 +235,7 @@ def see_lanes(
 
 @packed
 def anchor_lanes(
+    end: int,
     measured: float,
     gain: float,
     small: float,
@@ -238,7 +244,7 @@ def anchor_lanes(
     coefficients: NDArray[np.float64],
 ) -> None:
     """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`)."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
         seen = load(state, SEEN * LANES + o)
         error = measured - load(coefficients, SPOOL_OFFSET * LANES + o) - seen

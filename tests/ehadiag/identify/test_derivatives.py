@@ -90,7 +90,9 @@ def test_what_is_considered_moves_the_residuals_but_is_not_estimated():
 
     free = (*FAULTS, LEAD)
     model = Derivatives(Formula(formula, free), NOISE, [Considered(LEAD, 0.15e-6)])
-    residuals, considered, anchored = model.at(np.full(len(FAULTS), 0.5))
+    beside = np.full(len(FAULTS), 0.25)
+    residuals, considered, anchored, costs = model.at(np.full(len(FAULTS), 0.5), beside)
     assert not residuals.any()
     np.testing.assert_allclose(considered[0], 0.15e-6 * shape)
+    assert costs == [0.0]
     assert (anchored, len(considered), len(model.estimated)) == (0, 1, len(FAULTS))
