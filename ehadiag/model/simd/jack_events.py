@@ -85,7 +85,10 @@ def jack_events(
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Jack of BUSY lanes, of the first `count`, over one of the 2^level steps of a tick, piece by piece of the path."""
+    """Jack of BUSY lanes, of the first `count`, over one of the 2^level steps of a tick.
+
+    Piece by piece of the spool's path.
+    """
     span, steps = tick / NODES, 1 << level
     begin, stop = step * NODES / steps, (step + 1) * NODES / steps
     first, last = int(begin), math.ceil(stop)

@@ -21,7 +21,7 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch
-from ehadiag.model.plant import FIELDS
+from ehadiag.model.plant import FIELDS, PlantConstants
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
 from ehadiag.model.simd.jack import jack_lanes, pressures
 from ehadiag.model.simd.jack_events import jack_events
@@ -33,6 +33,7 @@ from ehadiag.model.simd.layout import (
     PRESSURE,
     PRESSURE_OFFSET,
     SEEN,
+    SPOOL,
     SPOOL_OFFSET,
     STATE_ROWS,
 )
@@ -53,6 +54,7 @@ BOW = 0.008e-6
 the orifice is almost closed; elsewhere in proportion to its opening."""
 BOW_RATIO = 6.0
 """The same, of four steps."""
+LEAD = PlantConstants._fields.index("DLY")
 OPENING = 10.0e-6
 TRAVEL = 0.15
 """Travel as a share of the opening, likewise."""
@@ -223,6 +225,11 @@ def _block(
         for i in range(LANES):
             for field in range(FIELDS):
                 rows[i, field] = candidates[min(i, count - 1), test, field]
+        late = False
+        for i in range(count):
+            late = late or rows[i, LEAD] != 0.0
+        # Most candidates are read at the end of the tick, where the spool is at hand.
+        read = SEEN if late else SPOOL
         tabulate(rows, tick, coefficients, moving, stuck)
         drive_lanes(end, batch.current_before[index], state, coefficients)
         rest_lanes(end, batch.origin[index], state, coefficients)
@@ -234,11 +241,11 @@ def _block(
             if spool_lanes(end, tick, state, path, coefficients):
                 event_ticks(count, tick, state, path, coefficients, moving, stuck)
             seen = math.isfinite(spool[k])
-            if seen:
+            if seen and late:
                 see_lanes(end, state, path, coefficients)
             if weight[SPOOL_ROW, k] != 0.0 and seen:
                 _hold_against(
-                    end, spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_OFFSET,
+                    end, spool[k], weight[SPOOL_ROW, k], cap, read, SPOOL_OFFSET,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
@@ -256,7 +263,7 @@ def _block(
                 for i in range(wanted):
                     out[i, PRESSURE_ROW, k] = sample[i]
             if anchored and seen:
-                anchor_lanes(end, spool[k], gain, small, large, state, coefficients)
+                anchor_lanes(end, read, spool[k], gain, small, large, state, coefficients)
 
 
 @kernel

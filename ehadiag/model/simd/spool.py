@@ -236,6 +236,7 @@ def see_lanes(
 @packed
 def anchor_lanes(
     end: int,
+    read: int,
     measured: float,
     gain: float,
     small: float,
@@ -243,11 +244,14 @@ def anchor_lanes(
     state: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`)."""
+    """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`).
+
+    read: row of the state that has the spool as it is sampled.
+    """
     for o in range(0, end, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
-        seen = load(state, SEEN * LANES + o)
-        error = measured - load(coefficients, SPOOL_OFFSET * LANES + o) - seen
+        error = measured - load(coefficients, SPOOL_OFFSET * LANES + o)
+        error = error - load(state, read * LANES + o)
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)
