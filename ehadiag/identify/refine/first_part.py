@@ -35,6 +35,8 @@ POLISH_REACH = 6.0
 """Deviations, of each severity, over which the polish begins to draw."""
 POLISH_SPREAD = (2e-4, 2e-3)
 """Severities: out of a narrow basin, which looks well known, and not further than is shown."""
+FREE_LEVEL = 2
+"""Halvings of the jack's ticks in a model that runs free, for noise and medians."""
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
@@ -81,7 +83,8 @@ def refine_first_part(
     free, residuals = residuals_at(experiments, spans, start)
     start = {**start, **median_offsets(free, residuals)}
     experiments = _judged(experiments, until, residuals)
-    best = _refine(experiments, spans, start, free.levels)
+    levels = anchored_model(experiments, spans).levels
+    best = _refine(experiments, spans, start, levels)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [(item.spool_noise, item.pressure_noise) for item in experiments]
@@ -90,20 +93,23 @@ def refine_first_part(
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
-        best = _refine(experiments, spans, best.values, free.levels)
+        best = _refine(experiments, spans, best.values, levels)
         evaluations += best.evaluations
     if best.jagged:
-        best = _polish(experiments, spans, best, free.levels)
+        best = _polish(experiments, spans, best, levels)
         evaluations += best.evaluations
     noise = tuple((item.spool_noise, item.pressure_noise) for item in experiments)
-    return FirstPart(best, noise, free.levels, evaluations)
+    return FirstPart(best, noise, levels, evaluations)
 
 
 def residuals_at(
     experiments: Sequence[Experiment], spans: Spans | None, start: Mapping[str, float]
 ) -> tuple[SimdModel, NDArray[np.float64]]:
     """A model that runs free, and its residuals at severities by name, no offsets taken off."""
-    model = SimdModel(lay_out(experiments, spans), unknowns_of(experiments))
+    batch = lay_out(experiments, spans)
+    # For one point it takes longer to find the jack's steps than to take four in every tick.
+    levels = np.full(len(batch.current), FREE_LEVEL)
+    model = SimdModel(batch, unknowns_of(experiments), levels=levels)
     point = np.array([[start.get(item.name, 0.0) for item in model.unknowns.free]])
     return model, model.residuals(point)[0][0]
 

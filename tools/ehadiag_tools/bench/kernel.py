@@ -29,11 +29,11 @@ SECTION = "kernel"
 IN_C = "the same in C (cc -O3 -march=native, scalar)"
 WITHOUT_COMPILER = """
 import time, sys
-from ehadiag.model.scalar.response import respond
 from ehadiag.core.stored_test import resolve_test
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.scalar.response import respond
 current = resolve_test("open").command()[: int(sys.argv[1])]
-constants = damaged_unit({faults})
+constants = PlantConstants(*map(float, sys.argv[2:]))
 begin = time.thread_time()
 respond(constants, current, 1e-3)
 print(time.thread_time() - begin)
@@ -137,7 +137,7 @@ def _against_oracles(current: np.ndarray, sizes: Sizes) -> list[Figure]:
     took = cpu_median(CompiledModel(part), sizes.repeats)
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_COMPILER.format(faults=list(FAULTS)), str(len(part))],
+        [sys.executable, "-c", WITHOUT_COMPILER, str(len(part)), *map(repr, damaged_unit(FAULTS))],
         env=environment,
         capture_output=True,
         text=True,
