@@ -85,7 +85,7 @@ def objections_to_recording(
         return ["the test was aborted"]
     samples = recording.samples
     if samples is None:
-        return ["no telemetry of a test in the recording"]
+        return [*recording.quality.refused, "no telemetry of a test in the recording"]
     if test is None and recording.test_id is None:
         return ["the recording does not say which test it is of: name the test by --test"]
     if test is None:

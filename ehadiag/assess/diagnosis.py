@@ -25,7 +25,7 @@ from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
 from ehadiag.identify.session import Session
 
-__all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "not_tested"]
+__all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
 
 LEAST_SHARE = 0.75
 """Share of samples without which nothing is worked out of a running test."""
@@ -105,7 +105,7 @@ class DiagnosisSession:
 
     def feed(self, recording: Recording) -> None:
         """Work out all that the samples so far allow; nothing of what cannot carry a verdict."""
-        samples, test = recording.samples, self._test_of(recording)
+        samples, test = recording.samples, _match(recording, self._tests, self._default)
         if samples is None or samples.ticks == 0 or test is None or not self.due_s(test):
             return
         if out_of_range(recording.environment, samples, self._actuator):
@@ -121,7 +121,7 @@ class DiagnosisSession:
     ) -> Diagnosis:
         """Diagnose one actuator from one complete recording, or from several together."""
         begin = time.perf_counter()
-        matched = tuple(self._test_of(recording) for recording in recordings)
+        matched = match_tests(recordings, self._tests, self._default)
         experiments, reasons = self._experiments(recordings, matched)
         identification: Identification | None = None
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
@@ -160,12 +160,6 @@ class DiagnosisSession:
             reasons.append("the recordings are of actuators with different serial numbers")
         return experiments, reasons
 
-    def _test_of(self, recording: Recording) -> StoredTest | None:
-        """Find the test that a recording is of."""
-        if recording.test_id is None:
-            return self._default
-        return next((test for test in self._tests if test.id == recording.test_id), None)
-
 
 def diagnose(
     recordings: Sequence[Recording],
@@ -186,20 +180,44 @@ def diagnose(
 
 
 def not_tested(
-    recording: Recording, test: StoredTest, actuator: Actuator, reasons: Sequence[str]
+    recordings: Sequence[Recording],
+    tests: Sequence[StoredTest | None],
+    actuator: Actuator,
+    reasons: Sequence[str],
+    elapsed: float = 0.0,
 ) -> Diagnosis:
-    """Return the verdict NOT TESTED for a test that did not come about."""
+    """Return the verdict NOT TESTED for a test that did not come about, or was not judged.
+
+    tests: of each recording.
+    """
     return Diagnosis(
-        recordings=(recording,),
-        tests=(test,),
+        recordings=tuple(recordings),
+        tests=tuple(tests),
         actuator=actuator,
         verdict=Verdict.NOT_TESTED,
         reasons=tuple(reasons),
         identification=None,
         experiments=(),
-        notes=_notes((recording,), (test,), actuator),
-        elapsed=0.0,
+        notes=_notes(recordings, tests, actuator),
+        elapsed=elapsed,
     )
+
+
+def match_tests(
+    recordings: Sequence[Recording], tests: Iterable[StoredTest], default: StoredTest | None = None
+) -> tuple[StoredTest | None, ...]:
+    """Find the test that each recording is of; None where it is none of `tests`."""
+    known = tuple(tests)
+    return tuple(_match(recording, known, default) for recording in recordings)
+
+
+def _match(
+    recording: Recording, tests: Sequence[StoredTest], default: StoredTest | None
+) -> StoredTest | None:
+    """Find the test that a recording is of."""
+    if recording.test_id is None:
+        return default
+    return next((test for test in tests if test.id == recording.test_id), None)
 
 
 def _notes(

@@ -1,4 +1,4 @@
-"""Identifies in a thread of its own while `ehadiag bit` still runs the test."""
+"""Runs the identification in a thread while `ehadiag bit` is still running the test."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import DiagnosisSession
+    from ehadiag.cli.deadline import Deadline
     from ehadiag.core.recording import Recording
     from ehadiag.core.stored_test import StoredTest
     from firmware_iface.session.assembler import Assembler
@@ -61,8 +62,8 @@ class Ahead:
             self.whole = recording
         return self.whole is not None
 
-    def finish(self) -> None:
-        """Wait for the work under way, and for that on the newest snapshot; Ctrl-C ends the wait.
+    def finish(self, deadline: Deadline, stop: threading.Event) -> bool:
+        """Wait for the work under way, and for that on the newest snapshot; return whether it came.
 
         The newest one holds all that those before it hold.
         """
@@ -73,8 +74,9 @@ class Ahead:
         if newest is not None:
             self._work.put(newest)
         self._work.put(None)
-        while self._thread.is_alive():
+        while self._thread.is_alive() and not (deadline.passed or stop.is_set()):
             self._thread.join(POLL_S)
+        return not self._thread.is_alive()
 
     def abandon(self) -> None:
         """Leave what is not done yet; what is under way ends by itself."""

@@ -1,4 +1,4 @@
-"""What `ehadiag bit` refuses before anything is compiled, written, or moves."""
+"""Checks before `ehadiag bit` starts: options, rates and buses that could not lead to a verdict."""
 
 from __future__ import annotations
 
@@ -21,10 +21,22 @@ def refuse_beforehand(
 ) -> None:
     """Refuse what could not end in a verdict whatever the bus says.
 
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        The parsed command line.
+    test : StoredTest
+        The stored test.
+    actuator : Actuator
+        Data of the actuator.
+    bus_map : BusMap
+        The bus that will carry the test.
+
     Raises
     ------
-    ConfigurationError: options that contradict each other, different rates, a bus on which the test
-        cannot be requested.
+    ConfigurationError
+        Options that contradict each other, different rates, a bus on which the test cannot be
+        requested.
     """
     _refuse_contradictions(arguments)
     _refuse_other_rates(test, actuator, bus_map)

@@ -1,4 +1,4 @@
-"""Options for what a simulated actuator suffers from besides the three faults."""
+"""Command-line options for the effects of a simulated actuator (PHY-16 to PHY-38)."""
 
 from __future__ import annotations
 
@@ -171,12 +171,12 @@ DATA = ("GM", "KSF", "KF", "GP", "GQ", "CS", "CJ", "MJ", "FSS0", "FDJ0")
 
 
 def add_effect_options(parser: argparse.ArgumentParser) -> None:
-    """Add the effects of a real unit, how its sensors err, and what no page of the contract names.
+    """Add the effects of a real unit, how its sensors err, and what no requirement names.
 
     All are off by default.
     """
     group = parser.add_argument_group(
-        "effects of a real unit, simulated", "as in model.md sections 4 and 8; all off by default"
+        "effects of a real unit, simulated", "as in PHY-16 to 39; all off by default"
     )
     _add(group, EFFECTS)
     group.add_argument(

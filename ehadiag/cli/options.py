@@ -1,10 +1,11 @@
-"""Options that several commands share, and what they stand for."""
+"""Command-line options that several commands share, and the objects made from them."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.effects import add_effect_options
@@ -13,6 +14,7 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 
 if TYPE_CHECKING:
+    from firmware_iface.logs.budget import Budget
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.transport.interface import Transport
 
@@ -21,6 +23,7 @@ __all__ = [
     "add_bus_options",
     "add_diagnosis_options",
     "add_fault_options",
+    "add_log_options",
     "add_mapping_options",
     "has_bus",
     "known_tests",
@@ -29,10 +32,13 @@ __all__ = [
     "positive",
     "refuse_two_buses",
     "the_actuator",
+    "the_budget",
     "the_bus_map",
 ]
 
 DEFAULT_BAUD = 921600
+TIME_LIMIT_S = 600.0
+"""Some ten thousand times what a sound recording takes."""
 
 
 def add_actuator_options(parser: argparse.ArgumentParser) -> None:
@@ -52,8 +58,40 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dbc", metavar="FILE", help="DBC to use instead of the mapping's own")
 
 
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    """Add the channel of a recording, and what reading one may cost."""
+    parser.add_argument(
+        "--log-channel",
+        type=_count,
+        metavar="N",
+        help="adapter channel of the recording that is the actuator's, from 1"
+        " (default: the mapping's, else the only one)",
+    )
+    parser.add_argument(
+        "--max-frames",
+        type=_count,
+        default=20_000_000,
+        metavar="N",
+        help="frames that a recording may have (default 20000000, some three hours)",
+    )
+    parser.add_argument(
+        "--max-log-size",
+        type=positive,
+        default=4096.0,
+        metavar="MiB",
+        help="size of a recording, and of what it unpacks to (default 4096)",
+    )
+    parser.add_argument(
+        "--max-read-time",
+        type=positive,
+        default=900.0,
+        metavar="S",
+        help="time that reading one recording may take (default 900)",
+    )
+
+
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
-    """Add solver, seed, levels and output."""
+    """Add solver, seed, levels, time limit and output."""
     parser.add_argument(
         "--solver",
         choices=("cga", "pygad"),
@@ -72,14 +110,29 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.25,
         metavar="K",
-        help="DEGRADED at or above this fault constant (default 0.25)",
+        help="DEGRADED at or above this severity (default 0.25)",
     )
     parser.add_argument(
         "--limit",
         type=float,
         default=0.75,
         metavar="K",
-        help="FAULT at or above this fault constant (default 0.75)",
+        help="FAULT at or above this severity (default 0.75)",
+    )
+    parser.add_argument(
+        "--rule",
+        choices=("interval", "estimate"),
+        default="interval",
+        help="verdict by the chance that a severity is at or above a level (default), or by the"
+        " estimates alone",
+    )
+    parser.add_argument(
+        "--time-limit",
+        type=positive,
+        default=TIME_LIMIT_S,
+        metavar="S",
+        help="NOT TESTED where the identification takes longer, wall clock"
+        f" (default {TIME_LIMIT_S:g})",
     )
     parser.add_argument(
         "--json",
@@ -204,11 +257,22 @@ def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
     from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
 
-    if arguments.mapping:
-        return load_map(arguments.mapping, arguments.dbc)
-    if arguments.dbc:
+    if arguments.dbc and not arguments.mapping:
         raise ConfigurationError("--dbc: needs --mapping, which names the signals")
-    return default_map()
+    found = load_map(arguments.mapping, arguments.dbc) if arguments.mapping else default_map()
+    channel = getattr(arguments, "log_channel", None)
+    return found if channel is None else replace(found, channel=channel)
+
+
+def the_budget(arguments: argparse.Namespace) -> Budget:
+    """Return what reading a recording may cost."""
+    from firmware_iface.logs.budget import Budget  # noqa: PLC0415
+
+    return Budget(
+        frames=arguments.max_frames,
+        size=round(arguments.max_log_size * (1 << 20)),
+        seconds=arguments.max_read_time,
+    )
 
 
 def known_tests(files: list[str]) -> tuple[StoredTest, ...]:

@@ -1,45 +1,73 @@
-"""What commands print and write: results to standard output, all else to standard error."""
+"""What commands print: results to standard output, all else to standard error."""
 
 from __future__ import annotations
 
-import argparse
+import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO, cast
 
 from ehadiag.core.errors import InputOutputError
+from ehadiag.core.printable import printable, printable_lines
+from ehadiag.facade.compiling import compiling_notice
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ehadiag.assess.diagnosis import Diagnosis
-    from ehadiag.report.spent import Spent
     from firmware_iface.transport.interface import Transport
 
 __all__ = [
+    "abandon",
     "damage",
-    "load_report",
-    "make_folder",
+    "emit",
     "progress_bar",
+    "put",
+    "rendered",
     "say",
     "say_if_compiling",
-    "show",
-    "wide_console",
-    "write_report",
 ]
 
 LEAST_WIDTH = 100
 PIPE_WIDTH = 200
-IDENTIFICATION, SIMULATION = "ehadiag_identify", "ehadiag_sim"
-"""Packages of kernels, as the names of their cache files hold them."""
 
 
 def say(text: str) -> None:
-    """Print one line to standard error."""
-    print(f"ehadiag: {text}", file=sys.stderr, flush=True)
+    """Print one line to standard error; that nobody can read it is no reason to fail."""
+    try:
+        print(f"ehadiag: {printable(text)}", file=sys.stderr, flush=True)
+    except OSError:
+        abandon(sys.stderr)
+
+
+def put(text: str) -> None:
+    """Print lines of plain text to standard output.
+
+    Raises
+    ------
+    InputOutputError: it is closed, or full.
+    """
+    emit(printable_lines(text) + "\n")
+
+
+def emit(text: str) -> None:
+    """As `put`, of text that is already fit for the terminal, its last line ended."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError as error:
+        abandon(sys.stdout)
+        raise InputOutputError(f"standard output: {error.strerror or error}") from None
+
+
+def abandon(stream: TextIO) -> None:
+    """Send the rest of a stream nowhere: else what is left in it fails again at the exit."""
+    with contextlib.suppress(OSError, ValueError):  # a stream of a test has no number
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def damage(transport: Transport) -> str:
@@ -49,20 +77,34 @@ def damage(transport: Transport) -> str:
 
 def say_if_compiling(*, simulation: bool = False, identification: bool = True) -> None:
     """Tell that the first run takes longer, where what it needs is not in the cache."""
-    from ehadiag.compile.kernels import cache_folder  # noqa: PLC0415 - loads numba
-
-    needed = [SIMULATION] * simulation + [IDENTIFICATION] * identification
-    if not all(any(cache_folder().glob(f"*{kind}*.nbi")) for kind in needed):
-        say("compiling the model's kernels, once for this installation (up to half a minute)")
+    notice = compiling_notice(simulation=simulation, identification=identification)
+    if notice:
+        say(notice)
 
 
-def wide_console() -> Console:
-    """Standard output wide enough for our tables: a pipe must not cut them."""
+def rendered(draw: Callable[[Console], None]) -> str:
+    """Return what is drawn on a console like standard output's, for `emit`.
+
+    Wide enough for our tables: a pipe must not cut them. Not written by the console itself, which
+    ends the program where a pipe is closed.
+    """
     from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
 
-    console = Console(highlight=False)
-    width = max(console.width, LEAST_WIDTH) if console.is_terminal else PIPE_WIDTH
-    return Console(highlight=False, width=width)
+    there = Console()
+    width = max(there.width, LEAST_WIDTH) if there.is_terminal else PIPE_WIDTH
+    out = io.StringIO()
+    # Names of others are no markup.
+    draw(
+        Console(
+            file=out,
+            force_terminal=there.is_terminal,
+            highlight=False,
+            markup=False,
+            emoji=False,
+            width=width,
+        )
+    )
+    return out.getvalue()
 
 
 @contextmanager
@@ -79,75 +121,31 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
         TimeElapsedColumn,
     )
 
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as display:
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+    terminal = Console(file=cast("TextIO", _Forgiving(sys.stderr)))
+    with Progress(*columns, console=terminal, transient=True) as display:
         task = display.add_task("", total=1.0)
         yield lambda stage, share: display.update(task, description=stage, completed=share)
 
 
-def load_report(arguments: argparse.Namespace) -> None:
-    """Load what `show` needs: a verdict must not wait for it."""
-    if arguments.json:
-        import ehadiag.report.json_line  # noqa: PLC0415
-    else:
-        import ehadiag.report.table  # noqa: F401, PLC0415
+class _Forgiving:
+    """A terminal that may go away: a test must not end because nobody sees its progress."""
 
-        wide_console()
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.encoding = stream.encoding
 
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
 
-def show(diagnosis: Diagnosis, arguments: argparse.Namespace, spent: Spent) -> None:
-    """Print a diagnosis as JSON or as a table."""
-    if arguments.json:
-        from ehadiag.report.json_line import json_line  # noqa: PLC0415
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
 
-        print(json_line(diagnosis, spent, arguments.solver, arguments.seed), flush=True)
-    else:
-        from ehadiag.report.table import print_diagnosis  # noqa: PLC0415
+    def isatty(self) -> bool:
+        return True
 
-        print_diagnosis(diagnosis, wide_console(), spent)
-
-
-def make_folder(name: str) -> Path:
-    """Create the output folder.
-
-    Raises
-    ------
-    InputOutputError: it cannot be created.
-    """
-    folder = Path(name)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputOutputError(f"output folder {name}: {error.strerror or error}") from None
-    return folder
-
-
-def write_report(
-    diagnosis: Diagnosis, stem: Path, arguments: argparse.Namespace, spent: Spent
-) -> None:
-    """Write `stem`.json and, where a model was fitted, `stem`.png.
-
-    Raises
-    ------
-    InputOutputError: one of them cannot be written.
-    """
-    from ehadiag.report.json_line import json_line  # noqa: PLC0415
-
-    line = json_line(diagnosis, spent, arguments.solver, arguments.seed)
-    path = stem.with_name(stem.name + ".json")
-    try:
-        path.write_text(line + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputOutputError(f"result {path}: {error.strerror or error}") from None
-    written = [path]
-    if diagnosis.identification is not None:
-        from ehadiag.compile.kernels import cache_folder  # noqa: PLC0415 - loads numba
-
-        # Its own folder cannot be written without a home, which it would say at length.
-        os.environ.setdefault("MPLCONFIGDIR", str(cache_folder().parent / "matplotlib"))
-        from ehadiag.report.picture import draw_diagnosis  # noqa: PLC0415 - matplotlib is slow
-
-        picture = stem.with_name(stem.name + ".png")
-        draw_diagnosis(diagnosis, picture)
-        written.append(picture)
-    say("wrote " + ", ".join(str(item) for item in written))
+    def fileno(self) -> int:
+        return self._stream.fileno()

@@ -1,4 +1,4 @@
-"""The emulated flight-control computer, for commands that run it."""
+"""Builds and runs the emulated flight-control computer for `sim` and `bit --simulate`."""
 
 from __future__ import annotations
 
@@ -58,9 +58,17 @@ def make_core(
 def emulator_beside(core: FccCore, transport: Transport) -> Iterator[None]:
     """Run the computer on a bus in a thread of its own while the block runs.
 
+    Parameters
+    ----------
+    core : FccCore
+        The emulated computer.
+    transport : Transport
+        The bus to send and receive on.
+
     Raises
     ------
-    EhadiagError: the emulator's bus failed meanwhile.
+    EhadiagError
+        The emulator's bus failed meanwhile.
     """
     stop = threading.Event()
     failure: list[EhadiagError] = []

@@ -1,1 +1,1 @@
-"""Compilation of kernels: one decorator, a cache that cannot go stale, vector types."""
+"""Compilation of numba kernels: one decorator, a cache that cannot go stale, vector types."""

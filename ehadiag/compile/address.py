@@ -1,4 +1,4 @@
-"""Compiled code called once a tick, without what numba does for a call.
+"""Direct calls of compiled code by address, without numba's dispatcher (for the monitor's push).
 
 Its dispatcher looks at the type of every argument, and an array that is handed over becomes an
 object of numba's own while the call lasts. Back to back that is a quarter of a microsecond. A

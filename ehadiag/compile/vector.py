@@ -1,4 +1,4 @@
-"""Vectors of lanes in kernels: a number of WIDTH candidates in one variable.
+"""A numba type for SIMD vectors: one variable holds a number for each of WIDTH candidates.
 
 numba leaves it to the compiler to find vector instructions in loops, and it finds them now and
 then. Here a vector is a type: arithmetic on it is vector instructions, of whatever width the

@@ -1,4 +1,4 @@
-"""Data of an actuator: what the contract calls `actuator.toml`, validated."""
+"""Data of one actuator (controller, servovalve, jack), read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -21,87 +21,87 @@ __all__ = [
     "load_actuator",
 ]
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+# Each range is some decades about what is built, so that no product of them leaves the numbers.
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Position controller of the flight-control computer (model.md section 1)."""
+    """Position controller of the flight-control computer (PHY-2)."""
 
-    IM: Positive
+    IM: Annotated[float, msgspec.Meta(ge=1e-4, le=10)]
     """Rated current and saturation, A."""
-    GAP: NonNegative
+    GAP: Annotated[float, msgspec.Meta(ge=0, le=1e4)]
     """Proportional gain, A/m."""
-    GAI: float = 0.0
+    GAI: Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)] = 0.0
     """Integral gain, A/(m s)."""
-    GAD: float = 0.0
+    GAD: Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)] = 0.0
     """Derivative gain, A s/m."""
-    rate: Positive = 1000.0
+    rate: Annotated[float, msgspec.Meta(ge=10, le=1e5)] = 1000.0
     """Control rate, Hz."""
 
 
 class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Two-stage flapper-nozzle servovalve, SI units (model.md section 2)."""
+    """Two-stage flapper-nozzle servovalve, SI units (PHY-4 to 6, PHY-11)."""
 
-    GM: Positive
+    GM: Annotated[float, msgspec.Meta(ge=1e-4, le=1e4)]
     """Torque-motor gain, N m/A."""
-    JF: Positive
+    JF: Annotated[float, msgspec.Meta(ge=1e-9, le=1)]
     """Flapper inertia, N m/(m/s²)."""
-    CF: NonNegative
+    CF: Annotated[float, msgspec.Meta(ge=0, le=1000)]
     """Flapper damping, N m/(m/s)."""
-    KF: Positive
+    KF: Annotated[float, msgspec.Meta(ge=0.01, le=1e7)]
     """Net flapper stiffness, N m/m."""
-    KSF: Positive
+    KSF: Annotated[float, msgspec.Meta(ge=1e-3, le=1e7)]
     """Feedback-wire stiffness, N m/m."""
-    XFM: Positive
+    XFM: Annotated[float, msgspec.Meta(ge=1e-7, le=0.01)]
     """Flapper stop, m."""
-    GQF: Positive
+    GQF: Annotated[float, msgspec.Meta(ge=1e-6, le=1e4)]
     """First-stage flow gain as new, m²/s."""
-    GPF: Positive
+    GPF: Annotated[float, msgspec.Meta(ge=1e6, le=1e16)]
     """First-stage pressure gain, Pa/m."""
-    AS: Positive
+    AS: Annotated[float, msgspec.Meta(ge=1e-8, le=0.1)]
     """Spool end area, m²."""
-    MS: Positive
+    MS: Annotated[float, msgspec.Meta(ge=1e-6, le=100)]
     """Spool mass, kg."""
-    CS: NonNegative
+    CS: Annotated[float, msgspec.Meta(ge=0, le=1e5)]
     """Spool viscous coefficient at 40 °C, N s/m."""
-    XSM: Positive
+    XSM: Annotated[float, msgspec.Meta(ge=1e-6, le=0.1)]
     """Spool stop, m."""
-    FSS0: NonNegative
+    FSS0: Annotated[float, msgspec.Meta(ge=0, le=1e5)]
     """Static spool friction as new, N."""
-    FSS1: Positive
+    FSS1: Annotated[float, msgspec.Meta(ge=1e-3, le=1e5)]
     """Static spool friction at the limit of damage, N."""
-    PSR: Positive
+    PSR: Annotated[float, msgspec.Meta(ge=10000, le=2e8)]
     """Supply minus return pressure, Pa."""
-    GP: Positive
+    GP: Annotated[float, msgspec.Meta(ge=1e6, le=1e17)]
     """Pressure gain, Pa/m."""
-    GQ: Positive
+    GQ: Annotated[float, msgspec.Meta(ge=1e-6, le=1e4)]
     """Flow gain, m²/s."""
-    CLK: NonNegative
+    CLK: Annotated[float, msgspec.Meta(ge=0, le=1e-6)]
     """Leakage, m³/(s Pa)."""
 
 
 class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Jack and control surface, SI units (model.md section 2)."""
+    """Jack and control surface, SI units (PHY-7, PHY-11)."""
 
-    AJ: Positive
+    AJ: Annotated[float, msgspec.Meta(ge=1e-6, le=10)]
     """Active area, m²."""
-    MJ: Positive
+    MJ: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)]
     """Equivalent mass of jack and surface, kg."""
-    CJ: NonNegative
+    CJ: Annotated[float, msgspec.Meta(ge=0, le=1e9)]
     """Viscous coefficient at 40 °C, N s/m."""
-    XJM: Positive
+    XJM: Annotated[float, msgspec.Meta(ge=1e-4, le=10)]
     """Stop, m."""
-    FDJ0: NonNegative
+    FDJ0: Annotated[float, msgspec.Meta(ge=0, le=1e7)]
     """Dynamic friction as new, N."""
-    FDJ1: Positive
+    FDJ1: Annotated[float, msgspec.Meta(ge=1e-3, le=1e7)]
     """Dynamic friction at the limit of damage, N."""
-    FR: float = 0.0
+    FR: Annotated[float, msgspec.Meta(ge=-1e7, le=1e7)] = 0.0
     """External load, N."""
 
 
 class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How spool position becomes pressure: model.md section 1, or orifices of section 8."""
+    """How spool position becomes pressure: PHY-6, or the orifices of PHY-39."""
 
     kind: Literal["linear", "orifice"] = "linear"
     """`linear`: saturating pressure gain, stiff oil; `orifice`: two lands, compressible oil."""
@@ -114,7 +114,7 @@ class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One actuator: its name, controller, servovalve, second stage and jack."""
 
-    name: Annotated[str, msgspec.Meta(min_length=1)]
+    name: Name
     controller: Controller
     servovalve: Servovalve
     jack: Jack
@@ -124,16 +124,28 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 def load_actuator(path: Path | str) -> Actuator:
     """Read an actuator file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    Actuator
+        The actuator's data, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, a value out of its range.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, a value out of its range.
     """
     return _checked(read_toml(Path(path), Actuator, "actuator file"), f"actuator file {path}")
 
 
 def default_actuator() -> Actuator:
-    """Return the reference actuator that the package brings along."""
+    """Return the reference actuator, which comes with the package."""
     text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
     return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
 

@@ -16,11 +16,16 @@ class Channel:
 
     Attributes
     ----------
-    name: identifier used in tables, files and reports.
-    full_scale: half range, SI unit of the channel; codes cover [-full_scale, full_scale - lsb].
-    bits: converter width.
-    unit: engineering unit shown to people.
-    per_unit: SI value of one engineering unit.
+    name : str
+        Identifier used in tables, files and reports.
+    full_scale : float
+        Half range, SI unit of the channel; codes cover [-full_scale, full_scale - lsb].
+    unit : str
+        Engineering unit shown to people.
+    per_unit : float
+        SI value of one engineering unit.
+    bits : int
+        Converter width.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Errors that a user can mend, each with the exit code of the command line."""
+"""Errors that a user can fix, each with its exit code."""
 
 from __future__ import annotations
 

@@ -1,13 +1,19 @@
-"""What the acquisition hands to the diagnosis: aligned samples and how good they are."""
+"""What acquisition hands to diagnosis: samples on the tick grid, and their quality."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ehadiag.core.errors import NotTestedError
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = [
     "BitReason",
@@ -23,14 +29,14 @@ __all__ = [
 
 
 class CommandMode(IntEnum):
-    """What a command is (bus.md, `CommandMode`)."""
+    """What a command is (BUS-4, `CommandMode`)."""
 
     CURRENT = 1
     POSITION = 2
 
 
 class BitState(IntEnum):
-    """State of the built-in test (bus.md, `BitState`)."""
+    """State of the built-in test (BUS-10, `BitState`)."""
 
     IDLE = 0
     ARMING = 1
@@ -41,7 +47,7 @@ class BitState(IntEnum):
 
 
 class BitReason(IntEnum):
-    """Why the flight-control computer refused (bus.md, `BitReason`)."""
+    """Why the flight-control computer refused (BUS-11, `BitReason`)."""
 
     NONE = 0
     UNKNOWN_TEST = 1
@@ -62,15 +68,24 @@ class Samples:
 
     Attributes
     ----------
-    period_ns: length of a tick, ns.
-    current: servovalve current, A.
-    spool: spool position, m.
-    pressure: differential pressure, Pa.
-    position: jack position, m.
-    command: command, A (current mode) or m (position mode).
-    mode: what the command is.
-    saturated: shape (4, ticks), the channel's converter stood at its end.
-    host_ns: host time stamp of each telemetry row, ns; -1 where none arrived.
+    period_ns : int
+        Length of a tick, ns.
+    mode : CommandMode
+        What the command is.
+    current : NDArray[np.float64]
+        Servovalve current, A.
+    spool : NDArray[np.float64]
+        Spool position, m.
+    pressure : NDArray[np.float64]
+        Differential pressure, Pa.
+    position : NDArray[np.float64]
+        Jack position, m.
+    command : NDArray[np.float64]
+        Command, A (current mode) or m (position mode).
+    saturated : NDArray[np.bool_]
+        Shape (4, ticks), the channel's converter stood at its end.
+    host_ns : NDArray[np.int64]
+        Host time stamp of each telemetry row, ns; -1 where none arrived.
     """
 
     period_ns: int
@@ -87,6 +102,35 @@ class Samples:
     def ticks(self) -> int:
         """Number of rows."""
         return len(self.spool)
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """Start of each tick, s from the start of the test, shape (ticks,)."""
+        return np.arange(self.ticks, dtype=np.float64) * (self.period_ns * 1e-9)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the samples as a data frame, one row a tick.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Index `time`, the start of each tick in s; columns `command`, `current`, `spool`,
+            `pressure`, `position` as the arrays hold them: SI, NaN where nothing arrived.
+
+        Raises
+        ------
+        ImportError
+            pandas is not installed.
+        """
+        try:
+            import pandas  # noqa: PLC0415 - optional, and slow
+        except ImportError:
+            raise ImportError("a data frame needs pandas: pip install 'ehadiag[pandas]'") from None
+        names = ("command", "current", "spool", "pressure", "position")
+        return pandas.DataFrame(
+            {name: getattr(self, name) for name in names},
+            index=pandas.Index(self.time, name="time"),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +156,8 @@ class MessageCounts:
     """Counter gaps, and frames missing at the ends of the test."""
     repeated: int = 0
     out_of_order: int = 0
+    conflicts: int = 0
+    """Counter values that came with different payloads; all their frames are dropped, and lost."""
     crc_errors: int = 0
     length_errors: int = 0
     range_errors: int = 0
@@ -159,3 +205,31 @@ class Recording:
     outcome: Outcome
     environment: Environment
     quality: Quality
+    channel: int | None = None
+    """Adapter channel of the recording; None where it has only one or does not say."""
+    start_ns: int | None = None
+    """Host time of the test's first sample, ns since the epoch (or the log's start)."""
+
+    @property
+    def duration(self) -> float:
+        """Length of the test, s; 0 without samples."""
+        return 0.0 if self.samples is None else self.samples.ticks * self.samples.period_ns * 1e-9
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the samples as a data frame, see `Samples.to_frame`.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a tick.
+
+        Raises
+        ------
+        NotTestedError
+            There are no samples.
+        ImportError
+            pandas is not installed.
+        """
+        if self.samples is None:
+            raise NotTestedError(f"{self.source}: no telemetry of a test in it")
+        return self.samples.to_frame()

@@ -30,6 +30,12 @@ __all__ = [
 ]
 
 MAX_DURATION_S = 600.0
+MIN_TICKS, MAX_TICKS = 100, 60_000
+"""Bounds what an identification costs: a minute at 1 kHz, as long as the default bus can tell."""
+MAX_WINDOWS = 32
+"""Of each search."""
+MAX_COMMAND = 10.0
+"""A or m."""
 SAME_RATE = 1e-6
 """Relative difference up to which two rates are one."""
 LEAST_WINDOW = 10
@@ -40,6 +46,8 @@ UNITS = {"current": {"A": 1.0, "mA": 1e-3}, "position": {"m": 1.0, "mm": 1e-3}}
 
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+Value = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
+Rate = Annotated[float, msgspec.Meta(ge=10, le=1e5)]
 Window = tuple[NonNegative, NonNegative]
 """Start and end of a span of the test, s."""
 
@@ -47,7 +55,9 @@ Window = tuple[NonNegative, NonNegative]
 class Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="line"):
     """Straight lines through points (time in s, value); a time given twice is a step."""
 
-    points: Annotated[tuple[tuple[NonNegative, float], ...], msgspec.Meta(min_length=2)]
+    points: Annotated[
+        tuple[tuple[NonNegative, Value], ...], msgspec.Meta(min_length=2, max_length=10_000)
+    ]
 
     @property
     def start(self) -> float:
@@ -74,7 +84,7 @@ class Sine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="k
 
     start: NonNegative
     end: NonNegative
-    amplitude: float
+    amplitude: Value
     frequency: Positive
     """Hz."""
 
@@ -83,13 +93,16 @@ class Sine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="k
         return self.amplitude * np.sin(2.0 * np.pi * self.frequency * (time - self.start))
 
 
+Spans = Annotated[tuple[Window, ...], msgspec.Meta(min_length=1, max_length=MAX_WINDOWS)]
+
+
 class Windows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which spans of the test serve which search (s)."""
 
-    FDJ: tuple[Window, ...]
-    Kintas: tuple[Window, ...]
-    FSS: tuple[Window, ...]
-    refinement: tuple[Window, ...]
+    FDJ: Spans
+    Kintas: Spans
+    FSS: Spans
+    refinement: Spans
 
 
 class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,10 +112,10 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     id: Annotated[int, msgspec.Meta(ge=1, le=255)]
     mode: Literal["current", "position"]
     unit: str
-    rate: Positive = 1000.0
+    rate: Rate = 1000.0
     """Control rate, Hz."""
-    description: str = ""
-    segment: Annotated[tuple[Line | Sine, ...], msgspec.Meta(min_length=1)]
+    description: Annotated[str, msgspec.Meta(max_length=1000)] = ""
+    segment: Annotated[tuple[Line | Sine, ...], msgspec.Meta(min_length=1, max_length=1000)]
     windows: Windows
 
     @property
@@ -141,16 +154,28 @@ class StoredTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 def load_test(path: Path | str) -> StoredTest:
     """Read a test file.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+
+    Returns
+    -------
+    StoredTest
+        The test, checked.
+
     Raises
     ------
-    InputOutputError: the file cannot be read.
-    ConfigurationError: not TOML, a key unknown or missing, times out of order, windows outside.
+    InputOutputError
+        The file cannot be read.
+    ConfigurationError
+        Not TOML, a key unknown or missing, times out of order, windows outside.
     """
     return _checked(read_toml(Path(path), StoredTest, "test file"), f"test file {path}")
 
 
 def bundled_tests() -> dict[str, StoredTest]:
-    """Return the stored tests of the contract by name."""
+    """Return the stored tests that come with the package (PHY-25, PHY-26), by name."""
     folder = resources.files("ehadiag").joinpath("data/tests")
     tests = {}
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):
@@ -194,17 +219,32 @@ def _checked(test: StoredTest, where: str) -> StoredTest:
         at = part.end
     if test.duration > MAX_DURATION_S:
         raise ConfigurationError(f"{where}: longer than {MAX_DURATION_S:g} s")
-    if test.ticks < 100:
-        raise ConfigurationError(f"{where}: shorter than 100 ticks")
+    if not MIN_TICKS <= test.ticks <= MAX_TICKS:
+        raise ConfigurationError(
+            f"{where}: {test.ticks} ticks long, need {MIN_TICKS} to {MAX_TICKS}"
+        )
+    _check_command(test, where)
     _check_windows(test, where)
     return test
+
+
+def _check_command(test: StoredTest, where: str) -> None:
+    for index, part in enumerate(test.segment):
+        if isinstance(part, Sine) and part.frequency > test.rate / 2.0:
+            raise ConfigurationError(
+                f"{where}: segment[{index}].frequency beyond half the rate of {test.rate:g} Hz"
+            )
+    greatest = float(np.abs(test.command()).max())
+    if greatest > MAX_COMMAND:
+        si = "m" if test.closed_loop else "A"
+        raise ConfigurationError(
+            f"{where}: a command of {greatest:g} {si}, need at most {MAX_COMMAND:g} {si}"
+        )
 
 
 def _check_windows(test: StoredTest, where: str) -> None:
     for field in ("FDJ", "Kintas", "FSS", "refinement"):
         windows: tuple[Window, ...] = getattr(test.windows, field)
-        if not windows:
-            raise ConfigurationError(f"{where}: windows.{field} is empty")
         for start, end in windows:
             if not start < end <= test.duration + 1e-9:
                 raise ConfigurationError(

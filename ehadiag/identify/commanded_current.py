@@ -2,7 +2,7 @@
 
 Measured current carries the converter's noise; the commanded one is known better. In open loop it
 is the command. In closed loop the control law is repeated on the *digitised* jack position, as the
-flight-control computer saw it (bus.md: the position of the tick before feeds the control law).
+flight-control computer saw it (BUS-7: the position of the tick before feeds the control law).
 Where that sample is lost, its code follows from the measured current: one code of position is
 many codes of current.
 """

@@ -19,7 +19,7 @@ KEPT_SHARE = 0.98
 KEPT_MEAN = 0.75978
 """Mean absolute value of a standard normal variable, the largest 2 % left out."""
 TYPICAL_NOISE_LSB = float(np.sqrt(0.5**2 + 1.0 / 12.0))
-"""Noise of a 12-bit channel of the contract, LSB: thresholds in LSB are meant at this noise."""
+"""Noise of a 12-bit channel (PHY-21, PHY-22), LSB: thresholds in LSB are meant at this noise."""
 QUIET_BLOCK = 100
 """Ticks over which noise is judged."""
 QUIET_SHARE = 0.867

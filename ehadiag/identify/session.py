@@ -37,7 +37,15 @@ from ehadiag.identify.search.stages import (
     staged_search,
 )
 from ehadiag.identify.spans import lay_out
-from ehadiag.identify.textbook import Attempt, attempt, explains, first_ticks, named, rescued
+from ehadiag.identify.textbook import (
+    Attempt,
+    attempt,
+    explains,
+    first_ticks,
+    named,
+    rescued,
+    resembles,
+)
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
 
@@ -121,8 +129,9 @@ class Session:
             found = staged_search(self._stages(experiments, start), tell)
             search_s = time.perf_counter() - searched_at
             tell("refinement", 0.0)
-            best = attempt(experiments, found, self._first_part)
-            best = replace(best, evaluations=best.evaluations + found.evaluations)
+            if self.nuisances is Nuisances.NONE or resembles(experiments, found.best):
+                best = attempt(experiments, found, self._first_part)
+                best = replace(best, evaluations=best.evaluations + found.evaluations)
         if best is not None and self.nuisances is Nuisances.NONE:
             best = rescued(
                 experiments, best, self._first_part, self.solver, self.seed, tell,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import outliers
 from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.refine.first_part import FirstPart, refine_first_part, residuals_at
 from ehadiag.identify.refine.least_squares import Refinement, median_offsets
 from ehadiag.identify.refine.update import add_last_part
@@ -31,7 +32,7 @@ from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.model.parameters import FAULTS, OFFSETS
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["Attempt", "attempt", "explains", "first_ticks", "named", "rescued"]
+__all__ = ["Attempt", "attempt", "explains", "first_ticks", "named", "rescued", "resembles"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,8 @@ RESCUES = (
 """One after the other where the staged search does not explain the recording."""
 POOR_FIT = 0.01
 """Share of residuals beyond three deviations that asks for another attempt."""
+HOPELESS = 0.15
+"""Such a share after the search: 0.04 at most on a textbook's actuator, 0.29 and more on others."""
 MOST_ANCHORED = 4
 """Times that the model may be put back on the measured spool. Away from the optimum break-aways
 come at other ticks; at it the model stays on the spool in all but one of 200 tests."""
@@ -145,6 +148,18 @@ def rescued(
 def explains(refinement: Refinement) -> bool:
     """Whether the optimum explains the recording, so that there is none better to look for."""
     return outliers(refinement) <= POOR_FIT and refinement.anchored <= MOST_ANCHORED
+
+
+def resembles(experiments: Sequence[Experiment], severities: NDArray[np.float64]) -> bool:
+    """Whether a refinement from such severities may explain the recordings at all."""
+    free, residuals = residuals_at(experiments, None, named(severities))
+    offsets = median_offsets(free, residuals)
+    weighted = free.batch.weight > 0.0
+    for item in OFFSETS:
+        if item.adds_to is not None:
+            row = item.adds_to
+            residuals[row] -= offsets[item.name] * free.batch.weight[row]
+    return float(np.mean(residuals[weighted] ** 2 >= CAP)) <= HOPELESS
 
 
 def first_ticks(experiment: Experiment) -> int:

@@ -13,7 +13,7 @@ __all__ = ["ControlLaw", "ControlState", "commanded_currents", "control"]
 
 
 class ControlLaw(NamedTuple):
-    """Gains of the controller (PHY-1), see `ehadiag.core.actuator.Controller`.
+    """Gains of the controller (PHY-2), see `ehadiag.core.actuator.Controller`.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class ControlState(NamedTuple):
 def control(law: ControlLaw, state: ControlState, error: float) -> tuple[float, ControlState]:
     """Demanded current (A) for a position error (m).
 
-    Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt) (PHY-1).
+    Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt) (PHY-2).
     """
     wanted = law.GAP * error
     if state.started != 0.0:

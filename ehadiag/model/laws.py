@@ -35,9 +35,9 @@ __all__ = [
 ]
 
 STATIC_SHARE_SPOOL = 0.5
-"""Dynamic over static dry friction of the spool (PHY-11)."""
+"""Dynamic over static dry friction of the spool (PHY-14)."""
 STATIC_RATIO_JACK = 2.0
-"""Static over dynamic dry friction of the jack (PHY-12)."""
+"""Static over dynamic dry friction of the jack (PHY-15)."""
 
 
 class DriveLaw(NamedTuple):
@@ -59,13 +59,13 @@ class DriveLaw(NamedTuple):
 
 @inlined
 def drive_law(c: PlantConstants) -> DriveLaw:
-    """Precombine what the torque motor's law needs (PHY-2, PHY-30, PHY-31)."""
+    """Precombine what the torque motor's law needs (PHY-4, PHY-29, PHY-30)."""
     return DriveLaw(c.GM / c.KF, c.IB, c.HYS * c.IM / c.NPL, 1.0 / c.NPL)
 
 
 @packed
 def play(held: Any, value: Any, half_width: Any) -> Any:
-    """What a play of a half-width holds after its input has gone to a value (PHY-31)."""
+    """What a play of a half-width holds after its input has gone to a value (PHY-30)."""
     return least(most(held, value - half_width), value + half_width)
 
 
@@ -105,7 +105,7 @@ class SpoolLaw(NamedTuple):
 
 @inlined
 def spool_law(c: PlantConstants) -> SpoolLaw:
-    """Precombine what the flapper and spool laws need (PHY-2, PHY-3, PHY-11)."""
+    """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14)."""
     force = c.AS * c.GPF
     ring_damping = 0.5 * c.CF / c.JF
     square = c.KF / c.JF - ring_damping * ring_damping
@@ -155,7 +155,7 @@ class JackLaw(NamedTuple):
     """Second stage and jack of one candidate.
 
     The second stage's equation, solved for the pressure, reads P12 = (flow x - v) / e with
-    e = slope max(abs(x), corner) + leak, whether its pressure gain saturates or not (PHY-4).
+    e = slope max(abs(x), corner) + leak, whether its pressure gain saturates or not (PHY-6).
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class JackLaw(NamedTuple):
 
 @inlined
 def jack_law(c: PlantConstants) -> JackLaw:
-    """Precombine what the laws of second stage and jack need (PHY-4, PHY-5, PHY-12)."""
+    """Precombine what the laws of second stage and jack need (PHY-6, PHY-7, PHY-15)."""
     return JackLaw(
         c.GQ / c.AJ,
         c.GQ / (c.PSR * c.AJ),
@@ -248,9 +248,12 @@ class SensorLaw(NamedTuple):
 
 
 @inlined
-def sensor_law(c: PlantConstants, span: float) -> SensorLaw:
-    """Precombine what the sensors' laws need; `span`: of the path's last piece, s."""
-    u = 1.0 - min(max(c.DLY / span, 0.0), 1.0)
+def sensor_law(c: PlantConstants, lead: float, span: float) -> SensorLaw:
+    """Precombine what the sensors' laws need.
+
+    lead: of sampling before the end of a piece of the path, s; span: of the piece, s.
+    """
+    u = 1.0 - min(max(lead / span, 0.0), 1.0)
     v = 1.0 - u
     return SensorLaw(
         c.OXS,

@@ -81,7 +81,7 @@ class Parameter:
 
 
 CLOGGED = 0.8
-"""Share of the first stage's flow gain that is lost at the limit of damage (PHY-10)."""
+"""Share of the first stage's flow gain that is lost at the limit of damage (PHY-13)."""
 
 REGISTRY: tuple[Parameter, ...] = (
     Parameter(
@@ -207,7 +207,7 @@ REGISTRY: tuple[Parameter, ...] = (
         changes=lambda c, value: {"FDJ": c.FDJ + value * (c.FDJ1 - c.FDJ)},
     ),
 )
-"""All that can be estimated; the progressive faults are those of the paper (PHY-10 to PHY-12)."""
+"""All that can be estimated; the progressive faults are those of the paper (PHY-13 to PHY-15)."""
 
 FAULTS: tuple[Parameter, ...] = tuple(item for item in REGISTRY if item.kind is Kind.FAULT)
 FAULT_NAMES: tuple[str, ...] = tuple(item.name for item in FAULTS)

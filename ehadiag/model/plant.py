@@ -31,9 +31,9 @@ __all__ = [
 Value = Any
 """A number, or an array with one of each candidate, shape (n,)."""
 REFERENCE_TEMPERATURE = 40.0
-"""degC at which an actuator's viscous coefficients are given (PHY-20)."""
+"""degC at which an actuator's viscous coefficients are given (PHY-19)."""
 WALTHER_POINTS = ((40.0, 14.5), (100.0, 3.5))
-"""MIL-PRF-83282: temperature (degC), kinematic viscosity (mm²/s) (PHY-20)."""
+"""MIL-PRF-83282: temperature (degC), kinematic viscosity (mm²/s) (PHY-19)."""
 
 
 class PlantConstants(NamedTuple):
@@ -142,7 +142,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
 
     Without an environment, or for a quantity it does not state, the actuator's own data hold:
     40 degC and its `PSR`. Viscous coefficients scale with the relative viscosity, the leakage with
-    its inverse (PHY-20).
+    its inverse (PHY-19).
     """
     valve, jack = actuator.servovalve, actuator.jack
     viscosity, supply = 1.0, valve.PSR

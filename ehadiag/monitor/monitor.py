@@ -32,7 +32,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 NOISE_LSB = math.sqrt(0.5**2 + 1.0 / 12.0)
-"""Noise of a channel of the contract (bus.md), its converter's rounding included."""
+"""Noise of a channel (PHY-22), its converter's rounding included."""
 ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
 RESIDUAL_LIMIT = 4.0
 """Noise; a residual beyond counts no more: one break-away at another tick gives no alarm."""
@@ -99,7 +99,7 @@ class Monitor:
     mode: what commands are.
     hours: mean time between false alarms of the monitor as a whole, on white noise, h.
     shift: of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
-    noise: standard deviation of spool (m) and pressure (Pa), white; None: the contract's.
+    noise: standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
     offsets: constant errors of spool (m) and pressure sensor (Pa).
     anchor: how the modelled spool is kept on the measured one.
 

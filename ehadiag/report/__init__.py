@@ -1,1 +1,1 @@
-"""Verdict, machine-readable and human-readable results."""
+"""Results as a table, as JSON and as a picture."""

@@ -6,7 +6,8 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from ehadiag.model.parameters import FAULT_NAMES
+from ehadiag.core.printable import valid_text
+from ehadiag.report.faults import Fault, faults_of
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
@@ -35,8 +36,11 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
         "actuator": diagnosis.actuator.name,
         "serial": serials[0] if serials else None,
         "verdict": diagnosis.verdict.name,
-        "reasons": list(diagnosis.reasons),
-        "faults": _faults(diagnosis),
+        "reasons": [valid_text(reason) for reason in diagnosis.reasons],
+        "faults": {
+            name: _fault(fault, identified=found is not None)
+            for name, fault in faults_of(diagnosis).items()
+        },
         "fit": _fit(diagnosis),
         "quality": _quality(diagnosis),
         "solver": {
@@ -55,12 +59,12 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
             "after_test": None if spent.after_test is None else _rounded(spent.after_test),
         },
     }
-    return json.dumps(tree, allow_nan=False, ensure_ascii=False)
+    return json.dumps(_finite(tree), allow_nan=False)
 
 
 def source_name(diagnosis: Diagnosis) -> str:
-    """File or bus; several joined by ' + '."""
-    return " + ".join(recording.source for recording in diagnosis.recordings)
+    r"""File or bus; several joined by ' + '; bytes that are not UTF-8 are written as `\xff`."""
+    return " + ".join(valid_text(recording.source) for recording in diagnosis.recordings)
 
 
 def test_name(diagnosis: Diagnosis) -> str | None:
@@ -69,22 +73,18 @@ def test_name(diagnosis: Diagnosis) -> str | None:
     return "+".join(names) or None
 
 
-def _faults(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
-    if diagnosis.identification is None:
-        empty = {"first": None, "search": None, "estimate": None, "std": None, "interval95": None}
-        return {name: dict(empty, flags=[]) for name in FAULT_NAMES}
-    out = {}
-    for item in diagnosis.identification.estimates:
-        flags = ["at_bound"] * item.at_bound + ["not_shown"] * (not item.shown)
-        out[item.name] = {
-            "first": item.first,
-            "search": item.search,
-            "estimate": item.value,
-            "std": item.std,
-            "interval95": list(item.interval95),
-            "flags": flags,
-        }
-    return out
+def _fault(fault: Fault, *, identified: bool) -> dict[str, Any]:
+    if not identified:
+        empty = dict.fromkeys(("first", "search", "estimate", "std", "interval95"))
+        return {**empty, "flags": []}
+    return {
+        "first": fault.first,
+        "search": fault.search,
+        "estimate": fault.value,
+        "std": fault.std,
+        "interval95": list(fault.interval),
+        "flags": list(fault.flags),
+    }
 
 
 def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
@@ -92,8 +92,8 @@ def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
         return None
     fit = diagnosis.identification.fit
     return {
-        "spool_rms": _finite(fit.spool_rms),
-        "pressure_rms": _finite(fit.pressure_rms),
+        "spool_rms": fit.spool_rms,
+        "pressure_rms": fit.pressure_rms,
         "outliers": fit.outliers,
         "spool_noise_mm": fit.spool_noise * 1e3,
         "pressure_noise_MPa": fit.pressure_noise * 1e-6,
@@ -115,6 +115,7 @@ def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
         "frames": total("received"),
         "lost": total("lost"),
         "repeated": total("repeated"),
+        "conflicts": total("conflicts"),
         "crc_errors": total("crc_errors"),
         "out_of_order": total("out_of_order"),
         "length_errors": total("length_errors"),
@@ -122,7 +123,7 @@ def _quality(diagnosis: Diagnosis) -> dict[str, Any]:
         "foreign": sum(recording.quality.foreign for recording in diagnosis.recordings),
         "error_frames": sum(recording.quality.error_frames for recording in diagnosis.recordings),
         "saturated": saturated,
-        "notes": list(diagnosis.notes),
+        "notes": [valid_text(note) for note in diagnosis.notes],
     }
 
 
@@ -130,5 +131,10 @@ def _rounded(seconds: float) -> float:
     return round(seconds, 4)
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(node: Any) -> Any:
+    """Put null in the place of numbers that are none: JSON has no others."""
+    if isinstance(node, dict):
+        return {key: _finite(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_finite(value) for value in node]
+    return None if isinstance(node, float) and not math.isfinite(node) else node

@@ -1,9 +1,12 @@
-"""The picture of a diagnosis: measured against modelled response, and what is left over."""
+"""Draws a diagnosis: measured and modelled response, and their residuals."""
 
 from __future__ import annotations
 
+import io
+import warnings
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -11,29 +14,55 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
 from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.scalar.response import respond
+from ehadiag.report.faults import faults_of
 
-__all__ = ["draw_diagnosis"]
+__all__ = ["Picture", "diagnosis_figure", "draw_diagnosis"]
 
 MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
+DPI = 110
 
 
-def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
-    """Write a PNG: one column for each recording; current, spool, pressure and their gaps.
+class Picture(Figure):
+    """A figure that a notebook shows by itself, whether or not pyplot is loaded."""
+
+    def png(self) -> bytes:
+        """Return it as a PNG."""
+        out = io.BytesIO()
+        self.savefig(out, format="png", dpi=DPI)
+        return out.getvalue()
+
+    _repr_png_ = png
+
+
+def draw_diagnosis(diagnosis: Diagnosis) -> bytes:
+    """Return the picture of a diagnosis as a PNG.
 
     Raises
     ------
-    InputOutputError: the file cannot be written.
+    ValueError: nothing was identified.
+    """
+    with matplotlib.rc_context(matplotlib.rcParamsDefault), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # in names of others
+        return diagnosis_figure(diagnosis).png()
+
+
+def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
+    """Draw one column for each recording: current, spool, pressure, and their residuals.
+
+    Raises
+    ------
+    ValueError: nothing was identified, so there is no modelled response to draw.
     """
     found = diagnosis.identification
     if found is None:
         raise ValueError("nothing was identified, so there is no modelled response to draw")
     columns = len(diagnosis.experiments)
-    figure = Figure(figsize=(9.5 * columns, 9.0), layout="constrained")
+    figure = Picture(figsize=(9.5 * columns, 9.0), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(
         5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
@@ -41,17 +70,13 @@ def draw_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
     for column, experiment in enumerate(diagnosis.experiments):
         _draw_column([axes[column] for axes in grid], experiment, found)
     constants = ",  ".join(
-        f"{item.name} {item.value:.5f} ({item.interval95[0]:.5f} … {item.interval95[1]:.5f})"
-        for item in found.estimates
+        f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
+        for fault in faults_of(diagnosis).values()
     )
-    names = " + ".join(Path(recording.source).name for recording in diagnosis.recordings)
-    figure.suptitle(
-        f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}", fontsize=11
-    )
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+    names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
+    title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}"
+    figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
+    return figure
 
 
 def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:
@@ -61,7 +86,7 @@ def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification
     model = respond(constants, experiment.trace.current, experiment.tick)
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
-    axes[0].set_title(f"test {experiment.test.name!r}", fontsize=10)
+    axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
     _pair(axes[1], axes[2], time, experiment.spool * 1e3, model.spool * 1e3, "spool, mm", "µm", 1e3)
     _pair(
         axes[3],
@@ -103,6 +128,6 @@ def _pair(
     upper.plot(time, modelled, color=MODELLED, lw=0.8, label="modelled")
     upper.set_ylabel(label)
     lower.plot(time, (measured - modelled) * gap_scale, color=GAP, lw=0.5)
-    lower.set_ylabel(f"gap, {gap_unit}")
+    lower.set_ylabel(f"residual, {gap_unit}")
     spread = np.nanpercentile(np.abs(measured - modelled), 99.5) * gap_scale
     lower.set_ylim(-2.0 * spread, 2.0 * spread)

@@ -1,4 +1,4 @@
-"""Time spent around a diagnosis."""
+"""Times that a result reports besides the identification's own: reading, total, after the test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Spent"]
 class Spent:
     """Seconds."""
 
-    read: float
-    """Acquiring or reading the recording."""
+    read: float = 0.0
+    """Acquiring or reading the recording; 0 where it was at hand."""
     after_test: float | None = None
     """From the word that a live test is complete to the verdict."""

@@ -1,1 +1,1 @@
-"""Decoded frames onto the tick grid of a test, with counts of what was wrong."""
+"""From decoded frames to tests: each sample at the control tick in which it was taken."""

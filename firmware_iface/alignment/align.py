@@ -1,8 +1,9 @@
-"""Decoded frames onto the tick grid of each test, with the counts of what was wrong."""
+"""Builds recordings of tests from frames: samples at their ticks, losses as NaN and counted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from ehadiag.core.recording import (
     CommandMode,
     Environment,
+    Outcome,
     Quality,
     Recording,
     Samples,
@@ -17,7 +19,14 @@ from ehadiag.core.recording import (
 from firmware_iface.alignment.counts import count_frames, within
 from firmware_iface.alignment.episodes import Episode, find_episodes
 from firmware_iface.alignment.policy import judge_frames
+from firmware_iface.alignment.senders import (
+    Conflicts,
+    crowded,
+    drop_conflicts,
+    second_senders,
+)
 from firmware_iface.alignment.ticks import TickAxis, place
+from firmware_iface.codec.channel import channels_in, choose_channel
 from firmware_iface.codec.decode import DecodedTable, decode
 from firmware_iface.codec.status import read_status, resolve_turns
 from firmware_iface.mapping.bus_map import BusMap
@@ -36,7 +45,13 @@ FROZEN_LIVELY = 0.2
 
 
 def assemble(
-    table: FrameTable, bus_map: BusMap, source: str, notes: tuple[str, ...] = ()
+    table: FrameTable,
+    bus_map: BusMap,
+    source: str,
+    notes: tuple[str, ...] = (),
+    *,
+    channels: frozenset[int] | None = None,
+    unsaid_is_test: bool = True,
 ) -> tuple[Recording, ...]:
     """All tests in a frame table, at least one recording (without samples if none ran).
 
@@ -46,9 +61,17 @@ def assemble(
     bus_map: what they mean.
     source: file or bus, for reports.
     notes: facts known before decoding.
+    channels: adapter channels on which the actuator's frames came so far; None: in this table.
+    unsaid_is_test: take frames without command and status for one test.
     """
+    present = channels_in(table, bus_map) if channels is None else channels
+    channel, ambiguous = choose_channel(bus_map.channel, present)
+    if ambiguous:
+        return (_undecoded(source, notes, ambiguous),)
+    bus_map = replace(bus_map, channel=channel)
     decoded = decode(table, bus_map)
     axis = place(decoded, bus_map.tick_ns)
+    decoded, axis, conflicts = drop_conflicts(decoded, axis)
     status = read_status(decoded, axis, bus_map)
     if axis is not None and (mended := resolve_turns(axis, status)) is not axis:
         axis, status = mended, read_status(decoded, mended, bus_map)
@@ -57,11 +80,17 @@ def assemble(
         notes += ("no telemetry in the recording",)
     else:
         notes += axis.notes
-    episodes = find_episodes(decoded, axis, status, bus_map)
+    episodes = find_episodes(decoded, axis, status, bus_map, unsaid_is_test=unsaid_is_test)
     bounds = _Bounds.of(axis) if axis is not None else None
     return tuple(
-        _recording(item, decoded, bounds, bus_map, source, notes, len(table)) for item in episodes
+        _recording(item, decoded, conflicts, bounds, bus_map, source, notes, len(table))
+        for item in episodes
     )
+
+
+def _undecoded(source: str, notes: tuple[str, ...], why: str) -> Recording:
+    quality = Quality(notes=notes, refused=(why,))
+    return Recording(source, None, None, None, Outcome(), Environment(), quality)
 
 
 def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
@@ -75,6 +104,7 @@ def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
 def _recording(
     episode: Episode,
     decoded: DecodedTable,
+    conflicts: Mapping[str, Conflicts],
     bounds: _Bounds | None,
     bus_map: BusMap,
     source: str,
@@ -92,10 +122,24 @@ def _recording(
         extra = ["no test in the recording"]
     extra += _stuck_counters(decoded, bus_map, begin, end)
     counts = {
-        name: count_frames(item, axis, episode, begin, end)
+        name: count_frames(
+            item,
+            axis,
+            episode,
+            begin,
+            end,
+            conflicts[name].within(begin, end) if name in conflicts else 0,
+        )
         for name, item in decoded.messages.items()
     }
     refused, used = judge_frames(bus_map.policy, counts)
+    crowds = (crowded(item, bus_map.tick_ns, begin, end) for item in decoded.messages.values())
+    refused = (
+        *second_senders(counts, conflicts, bus_map, begin, end),
+        *filter(None, crowds),
+        *episode.refused,
+        *refused,
+    )
     quality = Quality(
         messages=counts,
         saturated=_saturated(samples),
@@ -112,7 +156,17 @@ def _recording(
         outcome=episode.outcome,
         environment=_environment(decoded, begin, end),
         quality=quality,
+        channel=bus_map.channel,
+        start_ns=_start_ns(samples),
     )
+
+
+def _start_ns(samples: Samples | None) -> int | None:
+    """Host time of row 0, told by the first row that came."""
+    if samples is None:
+        return None
+    came = np.flatnonzero(samples.host_ns >= 0)
+    return int(samples.host_ns[came[0]] - came[0] * samples.period_ns) if len(came) else None
 
 
 def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""Counts of what was wrong with the frames of a message over the span of a test."""
+"""Counts the lost, repeated, late and damaged frames of a message during a test."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ def within(rows: NDArray[np.int64], begin: int, end: int) -> int:
 
 
 def count_frames(
-    item: Decoded, axis: TickAxis | None, episode: Episode, begin: int, end: int
+    item: Decoded,
+    axis: TickAxis | None,
+    episode: Episode,
+    begin: int,
+    end: int,
+    conflicts: int = 0,
 ) -> MessageCounts:
     """Count what happened to the frames of a message.
 
@@ -29,6 +34,7 @@ def count_frames(
     axis: ticks; None without telemetry.
     episode: the test.
     begin, end: rows of the table that belong to the test.
+    conflicts: counter values among them that came with different payloads.
     """
     received = within(item.received, begin, end)
     crc_errors = within(item.crc_bad, begin, end)
@@ -58,6 +64,7 @@ def count_frames(
         lost=max(expected - accepted - crc_errors - length_errors, 0),
         repeated=len(position) - accepted,
         out_of_order=_late(position),
+        conflicts=conflicts,
         crc_errors=crc_errors,
         length_errors=length_errors,
         range_errors=range_errors,

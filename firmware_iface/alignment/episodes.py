@@ -1,4 +1,4 @@
-"""Where the tests lie in a recording: first tick, length and outcome of each."""
+"""Finds the tests in a recording: where each begins, how long it is and how it ended."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.recording import BitReason, BitState, Outcome
+from firmware_iface.alignment.consistency import SAME_START, contradictions, time_bases
 from firmware_iface.alignment.ticks import TickAxis
 from firmware_iface.codec.decode import DecodedTable
 from firmware_iface.codec.protection import OUTSIDE
@@ -16,8 +17,6 @@ from firmware_iface.mapping.bus_map import BusMap
 
 __all__ = ["Episode", "find_episodes"]
 
-SAME_START = 20
-"""Status frames whose implied first ticks lie nearer than this belong to one test."""
 BLIP = 2
 """A run of other test ids this short inside a test is corruption, not another test."""
 MAX_TICKS = 1_000_000
@@ -38,6 +37,7 @@ class Episode:
     outcome: how it ended.
     ended: row of the status frame that told of the end; None without one.
     notes: what a reader should know.
+    refused: why it is not one test on one unit.
     """
 
     first: int
@@ -47,6 +47,7 @@ class Episode:
     outcome: Outcome
     ended: int | None = None
     notes: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,25 +62,33 @@ class _Span:
 
 
 def find_episodes(
-    decoded: DecodedTable, axis: TickAxis | None, status: Status, bus_map: BusMap
+    decoded: DecodedTable,
+    axis: TickAxis | None,
+    status: Status,
+    bus_map: BusMap,
+    *,
+    unsaid_is_test: bool = True,
 ) -> tuple[Episode, ...]:
-    """Find all tests, in order of time.
+    """Find all tests, in order of time, refused ones (without ticks) among them.
 
     Command test ids bound a test exactly where its neighbours arrived; status frames tell the
-    first tick where they did not. A recording with neither is one test. Refusals that stand alone
-    are episodes without ticks.
+    first tick where they did not. Frames with neither are one test if `unsaid_is_test`.
     """
+    running = np.flatnonzero((status.state == BitState.RUNNING) & np.isfinite(status.elapsed))
+    running, second = time_bases(status, running)
     spans: list[_Span] = []
     if axis is not None:
         spans = _spans_by_id(decoded, axis, bus_map)
-        spans = _merge(spans, _spans_by_status(status, axis))
-        if not spans and _tells_nothing(decoded, status, bus_map):
+        spans = _merge(spans, _spans_by_status(status, running, axis))
+        if not spans and unsaid_is_test and _tells_nothing(decoded, status, bus_map):
             spans = [_Span(int(axis.tick.min()), int(axis.tick.max()) + 1, None)]
     found = []
     for index, span in enumerate(spans):
         limit = spans[index + 1].start if index + 1 < len(spans) else None
-        found.append(_episode(span, limit, status, axis))
-    return tuple(found) if found else _never_ran(status)
+        item = _episode(span, limit, status, axis)
+        found.append(replace(item, refused=(*item.refused, second)) if second else item)
+    found += _refusals(status, found)
+    return tuple(sorted(found, key=lambda item: item.first)) if found else (_never_ran(status),)
 
 
 def _tells_nothing(decoded: DecodedTable, status: Status, bus_map: BusMap) -> bool:
@@ -132,8 +141,7 @@ def _runs(ids: NDArray[np.int64]) -> list[tuple[int, int]]:
     return runs
 
 
-def _spans_by_status(status: Status, axis: TickAxis) -> list[_Span]:
-    running = np.flatnonzero((status.state == BitState.RUNNING) & np.isfinite(status.elapsed))
+def _spans_by_status(status: Status, running: NDArray[np.int64], axis: TickAxis) -> list[_Span]:
     if len(running) == 0:
         return []
     start = status.start[running].astype(np.int64)
@@ -220,7 +228,10 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
     if ticks > MAX_TICKS:
         notes.append(f"test cut off at {MAX_TICKS} ticks")
         ticks = MAX_TICKS
-    serials = status.serial[mine]
+    following = status.following[mine]
+    inside = mine[(following > first) & (following <= stop)]
+    refused, odd = contradictions(status, inside, final, first, stop, span.test_id)
+    serials = status.serial[inside if len(inside) else mine]
     return Episode(
         first=first,
         ticks=max(ticks, 0),
@@ -228,8 +239,18 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
         serial=_most_common(serials[serials >= 0]) if np.any(serials >= 0) else None,
         outcome=outcome,
         ended=int(status.row[final]) if final is not None and outcome.state in ENDS else None,
-        notes=tuple(notes),
+        notes=(*notes, *_on_the_end(status, outcome), *odd),
+        refused=refused,
     )
+
+
+def _on_the_end(status: Status, outcome: Outcome) -> tuple[str, ...]:
+    """Note where nothing tells how a test ended."""
+    if len(status.row) == 0:
+        return ("no status frames: nothing says how the test ended",)
+    if outcome.state is BitState.RUNNING:
+        return ("the status frame that tells of the test's end is missing",)
+    return ()
 
 
 def _status_rows(span: _Span, limit: int | None, status: Status) -> NDArray[np.int64]:
@@ -264,20 +285,31 @@ def _reason(status: Status, index: int) -> BitReason:
     return BitReason(number) if number in BitReason.__members__.values() else BitReason.NONE
 
 
-def _never_ran(status: Status) -> tuple[Episode, ...]:
-    """One episode without ticks: the last refusal, or the last state known."""
+def _refusals(status: Status, ran: list[Episode]) -> list[Episode]:
+    """Episodes without ticks: requests that were refused while no test ran."""
+    refused = status.state == BitState.REFUSED
+    begins = np.flatnonzero(refused & ~np.concatenate(([False], refused[:-1])))
+    return [
+        _without_ticks(status, int(index))
+        for index in begins
+        if not any(item.first <= status.following[index] <= item.first + item.ticks for item in ran)
+    ]
+
+
+def _never_ran(status: Status) -> Episode:
+    """One episode without ticks: the last state known."""
     known = np.flatnonzero(status.state >= 0)
     if len(known) == 0:
-        return (Episode(0, 0, None, None, Outcome(None)),)
-    refused = np.flatnonzero(status.state == BitState.REFUSED)
-    index = int(refused[-1]) if len(refused) else int(known[-1])
+        return Episode(0, 0, None, None, Outcome(None))
+    return _without_ticks(status, int(known[-1]))
+
+
+def _without_ticks(status: Status, index: int) -> Episode:
     test_id, serial = int(status.test_id[index]), int(status.serial[index])
-    return (
-        Episode(
-            first=0,
-            ticks=0,
-            test_id=test_id if test_id > 0 else None,
-            serial=serial if serial >= 0 else None,
-            outcome=Outcome(BitState(int(status.state[index])), _reason(status, index)),
-        ),
+    return Episode(
+        first=int(status.following[index]),
+        ticks=0,
+        test_id=test_id if test_id > 0 else None,
+        serial=serial if serial >= 0 else None,
+        outcome=Outcome(BitState(int(status.state[index])), _reason(status, index)),
     )

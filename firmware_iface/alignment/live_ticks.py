@@ -1,4 +1,4 @@
-"""Live telemetry and commands put together, tick by tick, as a monitor wants them.
+"""Assembles live telemetry and commands into control ticks, one by one, for the monitor.
 
 A whole test is put together afterwards, from columns, by `firmware_iface.alignment.align`.
 """
@@ -11,7 +11,8 @@ from typing import NamedTuple
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import CommandMode
 from firmware_iface.codec.decode import value_ends
-from firmware_iface.codec.live_decode import bit_pattern, checked_values
+from firmware_iface.codec.live_decode import bit_pattern, checked_values, counter_key
+from firmware_iface.codec.validity import SenderWatch
 from firmware_iface.mapping.bus_map import BusMap, MessageMap, default_map
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.transport.frames import Frame
@@ -22,6 +23,8 @@ NAN = math.nan
 KEYS = ("channels.current", "channels.spool", "channels.pressure", "channels.position")
 LATE = 16
 """Ticks by which a frame may come late; its tick has been given out as lost."""
+DOUBTFUL = 50
+"""Ticks given out as lost after a conflict: with 2 % of conflicts, the most that is borne, all."""
 SILENCE_NS = 1_000_000_000
 """After so long the counter says nothing any more: the ticks begin anew."""
 
@@ -57,6 +60,8 @@ class LiveTicks:
     ----------
     lost: ticks whose telemetry did not come, or was damaged.
     breaks: silences so long that the ticks began anew after them.
+    conflicts: counter values that came with different payloads: a second sender. The `DOUBTFUL`
+        ticks after each are given out as lost: nothing tells which sender is right.
 
     Raises
     ------
@@ -80,11 +85,21 @@ class LiveTicks:
         self._at = -1
         self._time_ns = 0
         self._held: LiveTick | None = None
+        self._watches = {
+            item.name: SenderWatch(item.modulus, bus_map.tick_ns)
+            for item in (self._telemetry, self._command)
+        }
+        self._channel = bus_map.channel or 0
+        self._doubtful = 0
         self.lost = 0
         self.breaks = 0
+        self.conflicts = 0
 
     def take(self, frame: Frame) -> list[LiveTick]:
         """Take a frame; returns the ticks that are complete now, mostly none or one."""
+        return [self._believed(tick) for tick in self._complete(frame)]
+
+    def _complete(self, frame: Frame) -> list[LiveTick]:
         for message in (self._telemetry, self._command):
             if frame.can_id == message.can_id and frame.extended == message.extended:
                 break
@@ -93,6 +108,8 @@ class LiveTicks:
         values = None if frame.error or frame.remote else checked_values(message, frame.data)
         if values is None:
             return []
+        if self._of_another(message, frame):
+            return []
         count = bit_pattern(self._counters[message.name], frame.data) % self._turn
         out: list[LiveTick] = []
         if self._value in values:
@@ -100,6 +117,27 @@ class LiveTicks:
         if KEYS[0] in values:
             self._take_telemetry(count, frame.time_ns, values, out)
         return out
+
+    def _of_another(self, message: MessageMap, frame: Frame) -> bool:
+        """Whether a frame is another channel's, or in conflict with one before."""
+        if frame.channel not in (0, self._channel):
+            if self._channel:
+                return True
+            self._channel = frame.channel
+        key = counter_key(message, self._counters[message.name], frame.data)
+        if key is None or not self._watches[message.name].take(key, frame.data, frame.time_ns):
+            return False
+        self.conflicts += 1
+        self._doubtful = DOUBTFUL
+        return True
+
+    def _believed(self, tick: LiveTick) -> LiveTick:
+        """The tick, or a lost one in its place soon after a conflict."""
+        if not self._doubtful:
+            return tick
+        self._doubtful -= 1
+        self.lost += math.isfinite(tick.spool)
+        return LiveTick(NAN, NAN, NAN, NAN, NAN)
 
     def _take_command(self, count: int, values: dict[str, float], out: list[LiveTick]) -> None:
         if self._mode_told and values.get("command.mode") not in self._modes:

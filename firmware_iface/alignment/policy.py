@@ -1,4 +1,4 @@
-"""What a mapping's policy makes of the faults of a recording's frames."""
+"""Applies the mapping's policy: which frame faults are merely counted, which refuse a verdict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control ticks of frames: by their counters, and by host time where there is none."""
+"""Assigns frames to control ticks: by their counters, or by host time where there are none."""
 
 from __future__ import annotations
 

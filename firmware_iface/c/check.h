@@ -1,4 +1,4 @@
-/* Check sums of the bus and of the serial link (bus.md). */
+/* Check sums of the bus and of the serial link (BUS-6, BUS-15). */
 #ifndef FCC_CHECK_H
 #define FCC_CHECK_H
 

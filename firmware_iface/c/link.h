@@ -1,4 +1,4 @@
-/* The serial link (bus.md): COBS(id u16, time u32 in us, payload 8 bytes, CRC-16), all little
+/* The serial link (BUS-15): COBS(id u16, time u32 in us, payload 8 bytes, CRC-16), all little
  * endian, and a zero byte. */
 #ifndef FCC_LINK_H
 #define FCC_LINK_H

@@ -1,5 +1,5 @@
-/* A minimal flight-control computer, the FCC of bus.md: it answers requests, plays stored tests and
- * sends telemetry, command, environment and status.
+/* A minimal flight-control computer (docs/reference/bus.md): it answers requests, plays stored
+ * tests and sends telemetry, command, environment and status.
  *
  * No transport, no clock, no heap: one struct of fixed size, and two calls per control tick of 1 ms:
  *

@@ -1,4 +1,4 @@
-/* The stored tests of the contract, as the computer plays them. */
+/* The stored tests PHY-25 and PHY-26, as the computer plays them. */
 #ifndef FCC_STORED_TESTS_H
 #define FCC_STORED_TESTS_H
 

@@ -1,1 +1,1 @@
-"""Frames to physical values and back, with end-to-end protection checked."""
+"""Translates between frames and physical values, and checks their end-to-end protection."""

@@ -1,14 +1,14 @@
-"""Frames in bulk to checked signal columns in SI, one set per message."""
+"""Decodes frames in bulk into SI values: one set of columns for each message."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.codec.protection import crc8_rows
+from firmware_iface.codec.validity import rows_of, sound_rows
 from firmware_iface.mapping.bus_map import BusMap, MessageMap, Role
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.transport.frames import FrameTable
@@ -28,6 +28,7 @@ class Decoded:
     received: rows of the table with its identifier, good or bad.
     crc_bad, length_bad, range_bad: rows that failed a check.
     row: rows that passed length and check sum, shape (n,), ascending.
+    data: their payloads, shape (n, width).
     time_ns: host time, shape (n,).
     counter: counter values, shape (n,); None without a counter.
     values: SI value per role, shape (n,); NaN where a multiplexed signal is absent or its value
@@ -42,11 +43,26 @@ class Decoded:
     length_bad: Rows
     range_bad: Rows
     row: Rows
+    data: NDArray[np.uint8]
     time_ns: NDArray[np.int64]
     counter: NDArray[np.int64] | None
     values: Mapping[str, NDArray[np.float64]]
     saturated: Mapping[str, NDArray[np.bool_]]
     stream: NDArray[np.int64]
+
+    def without(self, dropped: NDArray[np.bool_]) -> Decoded:
+        """The same with some of the frames that passed left out after all; shape (n,)."""
+        keep = ~dropped
+        return replace(
+            self,
+            row=self.row[keep],
+            data=self.data[keep],
+            time_ns=self.time_ns[keep],
+            counter=None if self.counter is None else self.counter[keep],
+            values={name: value[keep] for name, value in self.values.items()},
+            saturated={name: value[keep] for name, value in self.saturated.items()},
+            stream=self.stream[keep],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,18 +75,21 @@ class DecodedTable:
 
 
 def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
-    """Check and decode all frames of the mapped messages."""
-    unusable = table.error | table.remote
-    foreign = ~unusable
+    """Check and decode all frames of the mapped messages on the actuator's channel."""
+    foreign = ~(table.error | table.remote)
     messages = {}
     for message in bus_map.messages.values():
-        mine = table.can_id == message.can_id
-        mine &= table.extended == message.extended
-        mine &= ~unusable
-        foreign &= ~mine
-        keep_bad = bus_map.policy.crc == "flag"
+        mine = rows_of(table, message)
+        if bus_map.channel is not None:
+            channel = table.channel[mine]
+            mine = mine[(channel == bus_map.channel) | (channel == 0)]
+        foreign[mine] = False
         messages[message.name] = _decode_message(
-            table, np.flatnonzero(mine), message, keep_bad, bus_map.policy.range == "flag"
+            table,
+            mine,
+            message,
+            bus_map.policy.crc == "flag",
+            bus_map.policy.range == "flag",
         )
     return DecodedTable(messages, np.flatnonzero(foreign), np.flatnonzero(table.error))
 
@@ -78,17 +97,9 @@ def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
 def _decode_message(
     table: FrameTable, received: Rows, message: MessageMap, keep_bad_crc: bool, keep_range: bool
 ) -> Decoded:
-    fits = table.length[received] == message.length
-    length_bad, row = received[~fits], received[fits]
-    data = _gather(table.data, row)
-    crc_bad = row[:0]
-    if message.crc is not None and len(row):
-        at = message.crc.lead // 8
-        good = crc8_rows(message.can_id, data, at, message.length) == data[:, at]
-        if not good.all():
-            crc_bad = row[~good]
-            if not keep_bad_crc:
-                row, data = row[good], np.ascontiguousarray(data[good])
+    row, data, length_bad, crc_bad = sound_rows(
+        table, received, message, keep_bad_sums=keep_bad_crc
+    )
     values, saturated = {}, {}
     outside = np.zeros(len(row), dtype=np.bool_)
     stream = np.zeros(len(row), dtype=np.int64)
@@ -116,18 +127,13 @@ def _decode_message(
         length_bad=length_bad,
         range_bad=row[outside],
         row=row,
+        data=data,
         time_ns=table.time_ns[row],
         counter=_integers(message.counter, data),
         values=values,
         saturated=saturated,
         stream=stream,
     )
-
-
-def _gather(data: NDArray[np.uint8], row: Rows) -> NDArray[np.uint8]:
-    if data.shape[1] == 8 and data.flags.c_contiguous:
-        return data.view(np.uint64).reshape(-1)[row].view(np.uint8).reshape(-1, 8)
-    return np.ascontiguousarray(data[row])
 
 
 def _integers(signal: SignalLayout | None, data: NDArray[np.uint8]) -> NDArray[np.int64] | None:

@@ -1,4 +1,4 @@
-"""SI values to frames: what the emulated computer and the tester put on the bus."""
+"""Encodes SI values as frames, for the emulated computer and for the tester's requests."""
 
 from __future__ import annotations
 

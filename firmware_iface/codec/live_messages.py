@@ -1,4 +1,4 @@
-"""Single messages that a running test is steered by, decoded and checked, in SI."""
+"""The decoded content of a single frame: a status, a sample or a request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""End-to-end protection: check sums and counters, over whole columns at once."""
+"""End-to-end protection: the CRC, and the unlimited position that a wrapping counter means."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ INITIAL = 0xFF
 FINAL_XOR = 0xFF
 CRC_KINDS = ("crc8-j1850-id",)
 """Check sums by name. `crc8-j1850-id`: CRC-8 SAE J1850 over the low byte of the identifier, its
-next byte, and the payload without the check sum's own byte (bus.md)."""
+next byte, and the payload without the check sum's own byte (BUS-6)."""
 
 NEAR = 16
 """Counter steps up to this are taken at their word when the host's clock contradicts them."""

@@ -1,4 +1,4 @@
-"""Status frames of the built-in test as columns."""
+"""Reads the status frames of the built-in test into columns."""
 
 from __future__ import annotations
 

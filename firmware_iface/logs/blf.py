@@ -1,4 +1,4 @@
-"""BLF recordings in bulk: containers of objects into columns, without an object per frame.
+"""Reads BLF recordings in blocks, without a Python object for each frame.
 
 python-can's reader is the oracle in the tests; it makes a message of every frame, which takes
 about fifty times as long. Layouts after its source and Vector's published headers.
@@ -6,6 +6,7 @@ about fifty times as long. Layouts after its source and Vector's published heade
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -17,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.errors import InputOutputError
+from firmware_iface.logs.budget import Spending
 from firmware_iface.transport.columns import ColumnBuilder
+from firmware_iface.transport.frames import FrameTable
 
-__all__ = ["read_blf"]
+__all__ = ["BlfBlocks"]
 
 Bytes = NDArray[np.uint8]
 
@@ -35,43 +38,114 @@ START_FIELD = 14
 CLASSIC, CLASSIC_2, CONTAINER = 1, 86, 10
 ERROR_EXT, FD, FD_64 = 73, 100, 101
 STORED, DEFLATED = 0, 2
-MAX_CONTAINER = 64 << 20
-"""Bytes of a container, packed or unpacked: loggers write 128 KiB."""
+PIECE = 256 << 10
+"""Bytes that are read from a container and handed to the unpacker at once."""
 BATCH = 2 << 20
-"""Unpacked bytes that are parsed at once."""
+"""Unpacked bytes that are parsed at once: whatever a container unpacks to, no more is held."""
+MAX_OBJECT = 16 << 20
+"""Bytes of an object other than a container: an embedded text or picture, never a frame."""
+MAX_CONTAINER = 1 << 30
+"""Bytes of a container as packed: loggers write 128 KiB."""
 RUN = 16
 """Objects of one size in a row from which on they are found in one step."""
 
 
-def read_blf(path: Path, columns: ColumnBuilder) -> str:
-    """Append all frames of a file to `columns`.
+class BlfBlocks:
+    """The frames of a BLF file, one table after another.
 
-    Returns
-    -------
-    What ended the reading early, empty at the regular end.
+    Attributes
+    ----------
+    trouble: what ended the reading early; empty at the regular end.
 
     Raises
     ------
-    InputOutputError: not a BLF file, or it cannot be read.
+    InputOutputError: not a BLF file, it cannot be read, or it costs more than its budget.
     """
-    try:
-        with path.open("rb") as file:
-            start_ns = _file_header(file, path)
-            parser = _Parser(start_ns, columns)
-            pending: list[bytes] = []
-            held = 0
-            trouble = ""
-            for block, wrong in _containers(file):
-                trouble = wrong
-                pending.append(block)
-                held += len(block)
-                if held >= BATCH:
-                    parser.feed(b"".join(pending))
-                    pending, held = [], 0
-            parser.feed(b"".join(pending))
-    except OSError as error:
-        raise InputOutputError(f"log {path}: {error.strerror or error}") from None
-    return trouble or parser.trouble
+
+    def __init__(self, path: Path, spending: Spending) -> None:
+        self._path = path
+        self._spending = spending
+        self.trouble = ""
+
+    def __iter__(self) -> Iterator[FrameTable]:
+        try:
+            with self._path.open("rb") as file:
+                parser = _Parser(_file_header(file, self._path))
+                for block in self._batches(file):
+                    table = parser.feed(block)
+                    self._spending.add_frames(len(table))
+                    if len(table):
+                        yield table
+                    if parser.trouble:
+                        break
+        except OSError as error:
+            raise InputOutputError(f"log {self._path}: {error.strerror or error}") from None
+        self.trouble = self.trouble or parser.trouble
+
+    def _batches(self, file: BinaryIO) -> Iterator[bytes]:
+        """Unpacked content in pieces of about `BATCH` bytes; sets `trouble` where it ends early."""
+        pending: list[bytes] = []
+        held = 0
+        for piece in self._unpacked(file):
+            self._spending.add_bytes(len(piece))
+            pending.append(piece)
+            held += len(piece)
+            if held >= BATCH:
+                yield b"".join(pending)
+                pending, held = [], 0
+        yield b"".join(pending)
+
+    def _unpacked(self, file: BinaryIO) -> Iterator[bytes]:
+        while header := file.read(OBJECT_HEADER.size):
+            if len(header) < OBJECT_HEADER.size:
+                self.trouble = "the log breaks off"
+                return
+            signature, _, _, size, kind = OBJECT_HEADER.unpack(header)
+            if signature != b"LOBJ" or not OBJECT_HEADER.size <= size <= MAX_CONTAINER:
+                self.trouble = "the log is damaged"
+                return
+            self._spending.look_at_clock()
+            if kind == CONTAINER:
+                yield from self._container(file, size - OBJECT_HEADER.size)
+            else:
+                file.seek(size - OBJECT_HEADER.size, os.SEEK_CUR)
+            if self.trouble:
+                return
+            file.seek(size % 4, os.SEEK_CUR)
+
+    def _container(self, file: BinaryIO, size: int) -> Iterator[bytes]:
+        header = file.read(min(CONTAINER_HEADER.size, size))
+        if len(header) < CONTAINER_HEADER.size:
+            self.trouble = "the log breaks off"
+            return
+        method, _ = CONTAINER_HEADER.unpack(header)
+        if method not in (STORED, DEFLATED):
+            self.trouble = f"the log is packed in an unknown way ({method})"
+            return
+        unpacker = zlib.decompressobj() if method == DEFLATED else None
+        left = size - len(header)
+        while left > 0:
+            packed = file.read(min(left, PIECE))
+            if not packed:
+                self.trouble = "the log breaks off"
+                return
+            left -= len(packed)
+            yield from (packed,) if unpacker is None else self._inflated(unpacker, packed)
+            if self.trouble:
+                return
+        if unpacker is not None and not unpacker.eof:
+            self.trouble = "the log breaks off"
+
+    def _inflated(self, unpacker: zlib._Decompress, packed: bytes) -> Iterator[bytes]:
+        """What a piece unpacks to, never more than `PIECE` at a time: it may be a thousandfold."""
+        while packed and not unpacker.eof:
+            try:
+                data = unpacker.decompress(packed, PIECE)
+            except zlib.error:
+                self.trouble = "the log is damaged"
+                return
+            yield data
+            packed = unpacker.unconsumed_tail
 
 
 def _file_header(file: BinaryIO, path: Path) -> int:
@@ -88,62 +162,25 @@ def _file_header(file: BinaryIO, path: Path) -> int:
     return int(start.timestamp()) * 1_000_000_000 + milli * 1_000_000
 
 
-def _containers(file: BinaryIO) -> Iterator[tuple[bytes, str]]:
-    """Unpacked content of each container, and what is wrong with it (then it is the last)."""
-    while header := file.read(OBJECT_HEADER.size):
-        if len(header) < OBJECT_HEADER.size:
-            yield b"", "the log breaks off"
-            return
-        signature, _, _, size, kind = OBJECT_HEADER.unpack(header)
-        if signature != b"LOBJ" or not OBJECT_HEADER.size <= size <= MAX_CONTAINER:
-            yield b"", "the log is damaged"
-            return
-        body = file.read(size - OBJECT_HEADER.size)
-        cut = len(body) < size - OBJECT_HEADER.size
-        file.read(size % 4)
-        if kind == CONTAINER:
-            data, trouble = _unpack(body)
-            yield data, "the log breaks off" if cut else trouble
-            if cut or trouble:
-                return
-
-
-def _unpack(body: bytes) -> tuple[bytes, str]:
-    if len(body) < CONTAINER_HEADER.size:
-        return b"", "the log breaks off"
-    method, _ = CONTAINER_HEADER.unpack_from(body)
-    packed = body[CONTAINER_HEADER.size :]
-    if method == STORED:
-        return packed, ""
-    if method != DEFLATED:
-        return b"", f"the log is packed in an unknown way ({method})"
-    unpacker = zlib.decompressobj()
-    try:
-        data = unpacker.decompress(packed, MAX_CONTAINER)
-    except zlib.error:
-        return b"", "the log is damaged"
-    return data, "" if unpacker.eof else "the log breaks off"
-
-
 class _Parser:
     """Objects of the joined containers into columns; an object may span two of them."""
 
-    def __init__(self, start_ns: int, columns: ColumnBuilder) -> None:
+    def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
-        self._columns = columns
+        self._columns = ColumnBuilder()
         self._tail = b""
         self.trouble = ""
 
-    def feed(self, block: bytes) -> None:
+    def feed(self, block: bytes) -> FrameTable:
         """Parse a further block; keeps the last, incomplete object."""
-        if self.trouble or not block:
-            return
+        self._columns = ColumnBuilder()
         text = self._tail + block
         data = np.frombuffer(text, dtype=np.uint8)
         places, kinds, consumed = self._walk(text, data)
         self._tail = text[consumed:]
         if len(places):
             self._append(data, places, kinds)
+        return self._columns.table()
 
     def _walk(self, text: bytes, data: Bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
         """Positions and kinds of all whole objects, and the bytes used."""
@@ -160,7 +197,7 @@ class _Parser:
                     break
                 at = found
                 continue
-            if size < OBJECT_HEADER.size or size > MAX_CONTAINER:
+            if size < OBJECT_HEADER.size or size > MAX_OBJECT:
                 self.trouble = "the log is damaged"
                 break
             if at + size > end:
@@ -209,6 +246,7 @@ class _Parser:
             extended=can_id >> 31 == 1,
             remote=remote,
             sent=(flags & 1).astype(np.bool_),
+            channel=_u16(data, body).astype(np.uint16),
         )
 
     def _special(self, data: Bytes, place: int, kind: int) -> None:
@@ -219,16 +257,18 @@ class _Parser:
         whole = data[body : place + size].tobytes()
         time_ns = int(self._times(data, np.array([place]))[0])
         if kind == ERROR_EXT:
-            self._columns.add(time_ns, 0, b"", error=True)
+            channel = int.from_bytes(whole[:2], "little")
+            self._columns.add(time_ns, 0, b"", error=True, channel=channel)
             return
         try:
             if kind == FD:
-                _, flags, _, can_id, _, _, fd_flags, valid = FD_MESSAGE.unpack_from(whole)
+                channel, flags, _, can_id, _, _, fd_flags, valid = FD_MESSAGE.unpack_from(whole)
                 payload = whole[FD_MESSAGE.size :][: min(valid, 64)]
                 remote, sent, fd = bool(flags & 0x80), bool(flags & 1), bool(fd_flags & 1)
             else:
                 fields = FD_MESSAGE_64.unpack_from(whole)
-                valid, can_id, fd_flags, direction = fields[2], fields[4], fields[6], fields[12]
+                channel, valid, can_id, fd_flags = fields[0], fields[2], fields[4], fields[6]
+                direction = fields[12]
                 stop = fields[13] - (body - place) if fields[13] else len(whole)
                 payload = whole[FD_MESSAGE_64.size : max(stop, 0)][: min(valid, 64)]
                 payload = payload.ljust(min(valid, 64), b"\0")
@@ -244,6 +284,7 @@ class _Parser:
             fd=fd,
             remote=remote,
             sent=sent,
+            channel=channel,
         )
 
     def _times(self, data: Bytes, places: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -257,13 +298,21 @@ class _Parser:
 
 def _run(data: Bytes, at: int, size: int) -> int:
     """Objects of that size that follow one another from `at` on, at least 1."""
-    count = (len(data) - at) // size
-    if count < RUN or size > 256:
+    most = (len(data) - at) // size
+    if most < RUN or size > 256:
         return 1
-    rows = data[at : at + count * size].reshape(count, size)
-    same = rows[:, :4].copy().view("<u4").reshape(-1) == SIGNATURE
-    same &= rows[:, 8:12].copy().view("<u4").reshape(-1) == size
-    return count if same.all() else max(int(np.argmin(same)), 1)
+    found, probe = 0, RUN
+    # In growing steps: objects of changing size must not cost a look at all that follow.
+    while found < most:
+        count = min(probe, most - found)
+        begin = at + found * size
+        rows = data[begin : begin + count * size].reshape(count, size)
+        same = rows[:, :4].copy().view("<u4").reshape(-1) == SIGNATURE
+        same &= rows[:, 8:12].copy().view("<u4").reshape(-1) == size
+        if not same.all():
+            return max(found + int(np.argmin(same)), 1)
+        found, probe = found + count, 4 * probe
+    return found
 
 
 def _rows(data: Bytes, places: NDArray[np.int64], width: int) -> Bytes:

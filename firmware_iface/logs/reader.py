@@ -1,207 +1,147 @@
-"""Recordings on disk (BLF, ASC, CSV, TRC, MF4): into columns of frames, and into tests."""
+"""Reads the tests of a log: all of them, or the one to be diagnosed."""
 
 from __future__ import annotations
 
-import gc
-import logging
-import math
-import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import InputOutputError
 from ehadiag.core.recording import BitState, Recording
-from firmware_iface.alignment.align import assemble
-from firmware_iface.logs.asc_lines import open_asc, open_text
-from firmware_iface.logs.blf import read_blf
+from firmware_iface.alignment.windows import recordings_of
+from firmware_iface.logs.blocks import SUFFIXES, LogReader
+from firmware_iface.logs.budget import Budget
 from firmware_iface.mapping.bus_map import BusMap, default_map
-from firmware_iface.transport.columns import ColumnBuilder
-from firmware_iface.transport.frames import MAX_PAYLOAD, FrameTable
+from firmware_iface.transport.frames import FrameTable, concatenate
 
-if TYPE_CHECKING:
-    from can import Message
+__all__ = [
+    "SUFFIXES",
+    "choose",
+    "describe",
+    "iterate_recordings",
+    "read_frames",
+    "read_recording",
+    "read_recordings",
+]
 
-__all__ = ["SUFFIXES", "read_frames", "read_recording", "read_recordings"]
-
-SUFFIXES = (".blf", ".asc", ".csv", ".trc", ".mf4")
-MAX_LOG_BYTES = 2 << 30
-"""Largest log that is read: some ten hours of this bus."""
-MAX_FRAMES = 100_000_000
+MOST_NAMED = 3
+"""Tests passed over that are told one by one."""
 
 
-def read_recordings(path: Path | str, bus_map: BusMap | None = None) -> tuple[Recording, ...]:
-    """Read all tests in a log, in order of time; a log without one gives one empty recording.
+def iterate_recordings(
+    path: Path | str, bus_map: BusMap | None = None, budget: Budget | None = None
+) -> Iterator[Recording]:
+    """Read a log and give its tests in order of time, each as soon as it is complete.
+
+    Memory is that of the longest test, whatever the length of the log. A log without a test gives
+    one recording without samples.
 
     Raises
     ------
-    InputOutputError: the file is missing, unreadable, or not what its suffix says.
+    InputOutputError: the file is missing, unreadable, not what its suffix says, or beyond its
+        budget.
     ConfigurationError: unknown kind of log.
     """
-    table, notes = read_frames_noted(path)
-    return assemble(table, bus_map or default_map(), str(path), notes)
+    budget = budget or Budget()
+    reader = LogReader(path, budget)
+    for recording in recordings_of(reader, bus_map or default_map(), str(path), budget.held):
+        yield _with_notes(recording, reader.notes)
 
 
-def read_recording(path: Path | str, bus_map: BusMap | None = None) -> Recording:
+def read_recordings(
+    path: Path | str, bus_map: BusMap | None = None, budget: Budget | None = None
+) -> tuple[Recording, ...]:
+    """Read all tests in a log, in order of time; see `iterate_recordings`."""
+    return tuple(iterate_recordings(path, bus_map, budget))
+
+
+def read_recording(
+    path: Path | str, bus_map: BusMap | None = None, budget: Budget | None = None
+) -> Recording:
     """Read the last complete test of a log; the last one begun if none was completed.
 
+    Its notes say what was passed over. Where tests lie on several adapter channels and none was
+    chosen, it is refused.
+    """
+    return choose(iterate_recordings(path, bus_map, budget))
+
+
+def choose(recordings: Iterable[Recording]) -> Recording:
+    """Return the last complete test, or the last with samples, or the last.
+
+    Its notes name the other tests. Only the best so far is held.
+
     Raises
     ------
-    InputOutputError: the file is missing, unreadable, or not what its suffix says.
-    ConfigurationError: unknown kind of log.
+    ValueError: no recording at all.
     """
-    return choose(read_recordings(path, bus_map))
+    best: Recording | None = None
+    place, count = 0, 0
+    others: list[str] = []
+    channels: set[int] = set()
+    for count, item in enumerate(recordings, start=1):
+        others.append(describe(item, count))
+        if item.samples is not None and item.channel:
+            channels.add(item.channel)
+        if best is None or _worth(item) >= _worth(best):
+            best, place = item, count
+    if best is None:
+        raise ValueError("no recording to choose from")
+    del others[place - 1]
+    notes = tuple(f"passed over: {item}" for item in others[-MOST_NAMED:])
+    if len(others) > MOST_NAMED:
+        notes = (f"{len(others) - MOST_NAMED} earlier tests of the recording passed over", *notes)
+    best = _with_notes(best, notes)
+    return _refused(best, sorted(channels)) if len(channels) > 1 else best
 
 
-def choose(recordings: tuple[Recording, ...]) -> Recording:
-    """Return the last complete test, or the last with samples, or the last."""
-    for wanted in (_complete, _sampled):
-        found = [item for item in recordings if wanted(item)]
-        if found:
-            return found[-1]
-    return recordings[-1]
+def _worth(item: Recording) -> int:
+    if item.samples is None:
+        return 0
+    return 2 if item.outcome.state is BitState.COMPLETE else 1
 
 
-def _complete(item: Recording) -> bool:
-    return item.samples is not None and item.outcome.state is BitState.COMPLETE
+def _with_notes(item: Recording, notes: tuple[str, ...]) -> Recording:
+    if not notes:
+        return item
+    return replace(item, quality=replace(item.quality, notes=(*item.quality.notes, *notes)))
 
 
-def _sampled(item: Recording) -> bool:
-    return item.samples is not None
+def _refused(item: Recording, channels: Sequence[int]) -> Recording:
+    listed = ", ".join(map(str, channels))
+    why = f"tests on the adapter channels {listed}: choose the actuator's by --log-channel"
+    return replace(item, quality=replace(item.quality, refused=(*item.quality.refused, why)))
 
 
-def read_frames(path: Path | str) -> FrameTable:
-    """Read all frames of a log; a log that breaks off is read up to the break."""
-    return read_frames_noted(path)[0]
+def describe(item: Recording, number: int) -> str:
+    """A test of a log in one clause: number, length, outcome, serial number, channel."""
+    state = item.outcome.state
+    how = "how it ended is not said" if state is None else state.name.lower().replace("_", " ")
+    if state is BitState.RUNNING:
+        how = "without the word of its end"
+    test = "unnamed" if item.test_id is None else str(item.test_id)
+    length = "" if item.samples is None else f", {item.duration:.3f} s"
+    serial = "" if item.serial is None else f", serial {item.serial}"
+    channel = f", channel {item.channel}" if item.channel else ""
+    return f"test {test} (no. {number} of the recording{length}{serial}{channel}): {how}"
 
 
-def read_frames_noted(path: Path | str) -> tuple[FrameTable, tuple[str, ...]]:
-    """Read all frames of a log, with notes on the reading."""
-    path = Path(path)
-    try:
-        if not path.is_file():
+def read_frames(path: Path | str, budget: Budget | None = None) -> FrameTable:
+    """Read all frames of a log at once; a log that breaks off is read up to the break.
+
+    Raises
+    ------
+    InputOutputError, ConfigurationError: see `LogReader`; also where there are more frames than
+        the budget allows to hold at once.
+    """
+    budget = budget or Budget()
+    tables: list[FrameTable] = []
+    count = 0
+    for table in LogReader(path, budget):
+        tables.append(table)
+        count += len(table)
+        if count > budget.held:
             raise InputOutputError(
-                f"log {path}: {'not a file' if path.exists() else 'no such file'}"
+                f"log {path}: more than {budget.held} frames, too many to hold at once; cut it"
             )
-        size = path.stat().st_size
-        with path.open("rb"):
-            pass
-    except OSError as error:
-        raise InputOutputError(f"log {path}: {error.strerror or error}") from None
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ConfigurationError(
-            f"log {path}: unknown kind {suffix or 'without a suffix'}; known: {', '.join(SUFFIXES)}"
-        )
-    if size > MAX_LOG_BYTES:
-        raise InputOutputError(f"log {path}: larger than {MAX_LOG_BYTES >> 20} MiB; split it")
-    if size == 0:
-        raise InputOutputError(f"log {path}: the file is empty")
-    return _collect(path, suffix)
-
-
-def _collect(path: Path, suffix: str) -> tuple[FrameTable, tuple[str, ...]]:
-    columns = ColumnBuilder()
-    notes: tuple[str, ...] = ()
-    with _Complaints() as complaints:
-        trouble = read_blf(path, columns) if suffix == ".blf" else _read_text(path, suffix, columns)
-    if len(columns) == 0:
-        reason = f" ({trouble})" if trouble else ""
-        raise InputOutputError(f"log {path}: no frames in it{reason}")
-    if complaints.count:
-        notes += (f"{complaints.count} lines of the log could not be read",)
-    if trouble:
-        notes += (f"{trouble} after {len(columns)} frames; the rest is lost",)
-    return columns.table(), notes
-
-
-class _Complaints(logging.Handler):
-    """Counts what python-can's readers skip with no more than a line in its own log.
-
-    And keeps quiet the destructor of asammdf, which fails where its constructor failed.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.count = 0
-        self._hook = sys.unraisablehook
-
-    def emit(self, _: logging.LogRecord) -> None:
-        """Count a complaint."""
-        self.count += 1
-
-    def __enter__(self) -> Self:
-        logging.getLogger("can").addHandler(self)
-        sys.unraisablehook = self._tell
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        logging.getLogger("can").removeHandler(self)
-        sys.unraisablehook = self._hook
-
-    def _tell(self, what: Any) -> None:
-        if not getattr(what.object, "__module__", "").startswith("asammdf."):
-            self._hook(what)
-
-
-def _read_text(path: Path, suffix: str, columns: ColumnBuilder) -> str:
-    """Read the other kinds through python-can."""
-    if suffix == ".asc":
-        # A date in a language that python-can does not know fails the file: time then starts at 0.
-        try:
-            return _read_with(path, suffix, columns, dated=True)
-        except InputOutputError:
-            return _read_with(path, suffix, columns, dated=False)
-    return _read_with(path, suffix, columns, dated=True)
-
-
-def _read_with(path: Path, suffix: str, columns: ColumnBuilder, *, dated: bool) -> str:
-    reader: Any = None
-    failed = ""
-    try:
-        reader = _reader(path, suffix, dated)
-        for message in reader:
-            _add(message, columns)
-            if len(columns) > MAX_FRAMES:
-                raise InputOutputError(f"log {path}: more than {MAX_FRAMES} frames; split it")
-    except InputOutputError:
-        raise
-    except Exception as error:  # the readers raise whatever a bad file leads them to
-        failed = " ".join(str(error).split())[:160] or type(error).__name__
-    finally:
-        if reader is not None:
-            reader.stop()
-    if failed and suffix == ".mf4":
-        gc.collect()  # or the destructor is heard of later
-    if failed and len(columns) == 0:
-        raise InputOutputError(f"log {path}: not a readable {suffix[1:].upper()} log: {failed}")
-    return "the log breaks off or is damaged" if failed else ""
-
-
-def _reader(path: Path, suffix: str, dated: bool) -> Any:
-    import can  # noqa: PLC0415 - slow to import
-
-    if suffix == ".asc":
-        return can.ASCReader(open_asc(path), relative_timestamp=not dated)
-    kinds: dict[str, Any] = {".csv": can.CSVReader, ".trc": can.TRCReader}
-    if suffix in kinds:
-        return kinds[suffix](open_text(path))
-    try:
-        return can.MF4Reader(str(path))
-    except NotImplementedError:
-        raise InputOutputError(
-            f"log {path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"
-        ) from None
-
-
-def _add(message: Message, columns: ColumnBuilder) -> None:
-    whole = math.floor(message.timestamp)
-    columns.add(
-        whole * 1_000_000_000 + round((message.timestamp - whole) * 1e9),
-        message.arbitration_id & 0xFFFFFFFF,
-        bytes(message.data[:MAX_PAYLOAD]),
-        extended=message.is_extended_id,
-        fd=message.is_fd,
-        error=message.is_error_frame,
-        remote=message.is_remote_frame,
-        sent=not message.is_rx,
-    )
+    return concatenate(tables)

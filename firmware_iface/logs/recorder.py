@@ -1,4 +1,4 @@
-"""Raw frames to disk, before anything is decoded."""
+"""Records raw frames to disk as they arrive, before anything is decoded."""
 
 from __future__ import annotations
 
@@ -38,7 +38,10 @@ class Recorder:
     InputOutputError: the file exists, or cannot be written, now or later.
     """
 
-    def __init__(self, path: Path | str, *, max_bytes: int | None = None) -> None:
+    def __init__(
+        self, path: Path | str, *, max_bytes: int | None = None, channel: int | None = None
+    ) -> None:
+        """`channel` is the adapter channel to write for frames of a bus that has only one."""
         self._first = Path(path)
         self._suffix = self._first.suffix.lower()
         if self._suffix not in SUFFIXES:
@@ -50,6 +53,7 @@ class Recorder:
                 f"recording {path}: files of {max_bytes} bytes, need at least {SMALLEST_FILE}"
             )
         self._max_bytes = max_bytes
+        self._channel = channel or 0
         self._lock = threading.RLock()
         self._paths: list[Path] = []
         self._frames = 0
@@ -89,7 +93,11 @@ class Recorder:
             if self._suffix == ".trc" and (frame.error or frame.remote or frame.fd):
                 self._skipped += 1
                 return
-            self._writer.on_message_received(message_of(frame))
+            message = message_of(frame)
+            if number := frame.channel or self._channel:
+                # python-can counts channels from 0, and its MF4 writer as they are in the file.
+                message.channel = number if self._suffix == ".mf4" else number - 1
+            self._writer.on_message_received(message)
             self._frames += 1
             self._dirty = True
             # The first one at once: it gives a BLF header its start time.

@@ -1,16 +1,23 @@
-"""Logs as a source of frames, and back onto a bus."""
+"""Plays logs: as a source of frames, or onto a bus."""
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 
-from ehadiag.core.errors import ConfigurationError
+import numpy as np
+
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+from firmware_iface.logs.blocks import LogReader
+from firmware_iface.logs.budget import Budget
 from firmware_iface.transport.frames import Frame, FrameTable
 from firmware_iface.transport.interface import Transport
 
-__all__ = ["ReplayTransport", "play"]
+__all__ = ["ReplayTransport", "StoredLog", "play"]
 
 BLOCK = 4096
 """Rows turned into frames at a time."""
@@ -21,7 +28,7 @@ STEP = 0.05
 def _frames(table: FrameTable) -> Iterator[Frame]:
     for start in range(0, len(table), BLOCK):
         rows = slice(start, start + BLOCK)
-        for time_ns, can_id, length, data, extended, fd, error, remote, sent in zip(
+        for time_ns, can_id, length, data, extended, fd, error, remote, sent, channel in zip(
             table.time_ns[rows].tolist(),
             table.can_id[rows].tolist(),
             table.length[rows].tolist(),
@@ -31,10 +38,11 @@ def _frames(table: FrameTable) -> Iterator[Frame]:
             table.error[rows].tolist(),
             table.remote[rows].tolist(),
             table.sent[rows].tolist(),
+            table.channel[rows].tolist(),
             strict=True,
         ):
             payload = data[:length].tobytes()
-            yield Frame(time_ns, can_id, payload, extended, fd, error, remote, sent)
+            yield Frame(time_ns, can_id, payload, extended, fd, error, remote, sent, channel)
 
 
 class ReplayTransport(Transport):
@@ -97,8 +105,51 @@ class ReplayTransport(Transport):
         self._next = None
 
 
+class StoredLog:
+    """The frames of a log on one adapter channel, as often as they are asked for.
+
+    Attributes
+    ----------
+    frames: how many there are.
+
+    Raises
+    ------
+    InputOutputError: the log cannot be read, or has no frame on that channel.
+    ConfigurationError: several channels and none chosen: on one bus they would be two senders.
+    """
+
+    def __init__(self, path: Path | str, channel: int | None, budget: Budget | None = None) -> None:
+        self._path, self._budget = path, budget
+        self._channel = channel
+        counts: Counter[int] = Counter()
+        for table in LogReader(path, budget):
+            numbers, count = np.unique(table.channel, return_counts=True)
+            counts.update(dict(zip(numbers.tolist(), count.tolist(), strict=True)))
+        named = sorted(set(counts) - {0})
+        if channel is None and len(named) > 1:
+            listed = ", ".join(map(str, named))
+            raise ConfigurationError(
+                f"log {path}: frames of the adapter channels {listed}: choose one by --log-channel"
+            )
+        if channel is not None and named and channel not in named:
+            listed = ", ".join(map(str, named))
+            raise InputOutputError(
+                f"log {path}: no frame on adapter channel {channel}, only on {listed}"
+            )
+        self.frames = sum(counts.values())
+        if channel is not None:
+            self.frames = counts[channel] + counts[0]
+
+    def __iter__(self) -> Iterator[FrameTable]:
+        for table in LogReader(self._path, self._budget):
+            if self._channel is None:
+                yield table
+            else:
+                yield table.rows((table.channel == self._channel) | (table.channel == 0))
+
+
 def play(
-    table: FrameTable,
+    log: FrameTable | Iterable[FrameTable],
     transport: Transport,
     *,
     speed: float | None = 1.0,
@@ -122,7 +173,8 @@ def play(
     started = time.monotonic()
     first_ns: int | None = None
     sent = 0
-    for frame in _frames(table):
+    tables = (log,) if isinstance(log, FrameTable) else log
+    for frame in itertools.chain.from_iterable(map(_frames, tables)):
         if frame.error:
             continue
         first_ns = frame.time_ns if first_ns is None else first_ns

@@ -1,4 +1,4 @@
-"""python-can's log writers, opened so that a killed process leaves a readable file.
+"""Opens python-can's log writers so that a killed process leaves a readable file.
 
 Imported only where a recording is written: python-can takes half a second to import.
 """
@@ -11,6 +11,7 @@ from typing import Any
 import can
 
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.folder import create_file
 
 __all__ = ["FlushingBlfWriter", "open_writer"]
 
@@ -46,16 +47,22 @@ def open_writer(path: Path) -> Any:
     OSError: the file exists or cannot be created.
     """
     suffix = path.suffix.lower()
+    descriptor = create_file(path)
+
+    def begin(mode: Any, **text: Any) -> Any:
+        return open(path, mode, FILE_BUFFER, opener=lambda *_: descriptor, **text)
+
     if suffix == ".mf4":
-        path.open("xb").close()
+        file = begin("w+b")
         try:
-            return can.MF4Writer(path)
+            return can.MF4Writer(file)
         except (ImportError, NotImplementedError):
+            file.close()
             path.unlink()
             raise ConfigurationError(
                 f"recording {path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"
             ) from None
     if suffix == ".blf":
-        return FlushingBlfWriter(path.open("xb", buffering=FILE_BUFFER))
+        return FlushingBlfWriter(begin("wb"))
     kinds: dict[str, Any] = {".asc": can.ASCWriter, ".csv": can.CSVWriter, ".trc": can.TRCWriter}
-    return kinds[suffix](path.open("x", buffering=FILE_BUFFER, encoding="utf-8", newline=""))
+    return kinds[suffix](begin("w", encoding="utf-8", newline=""))

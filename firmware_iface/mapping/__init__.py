@@ -1,1 +1,1 @@
-"""Which messages and signals of a DBC play which role: mapping file, DBC, units."""
+"""Maps the messages and signals of a DBC to the roles that they play here."""

@@ -1,15 +1,15 @@
-"""A mapping resolved against its DBC: what decoder and encoder work from."""
+"""Resolves a mapping file against its DBC into what decoder and encoder work from."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitState, CommandMode
+from ehadiag.core.small_file import read_small_file
 from ehadiag.core.toml_file import decode_toml, read_toml
 from firmware_iface.mapping.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, recall_dbc
 from firmware_iface.mapping.file import MappingFile, Policy, Protection, SignalRef
@@ -21,6 +21,9 @@ __all__ = ["BusMap", "MessageMap", "Role", "default_map", "load_map"]
 
 MAX_MULTIPLEXERS = 8
 """Multiplexers of multiplexers."""
+
+SMALLEST, LARGEST = 1e-12, 1e12
+"""Magnitudes of scales that a physical quantity can have; beyond them arithmetic overflows."""
 
 DIMENSIONS: dict[str, dict[str, str | None]] = {
     "channels": {
@@ -79,6 +82,11 @@ class MessageMap:
         """Counts per turn of the counter."""
         return 1 << self.counter.length if self.counter else 0
 
+    @property
+    def measures(self) -> bool:
+        """Whether it brings a measured channel."""
+        return any(role.name.startswith("channels.") for role in self.roles)
+
 
 @dataclass(frozen=True, slots=True)
 class BusMap:
@@ -92,6 +100,8 @@ class BusMap:
     states: Mapping[int, BitState]
     requests: Mapping[str, int]
     policy: Policy
+    channel: int | None = None
+    """Adapter channel of a recording that is the actuator's, from 1; None: the only one."""
 
     def find(self, role: str) -> tuple[MessageMap, Role] | None:
         """Message and signal of a role (`command.mode`); None if the mapping leaves it out."""
@@ -103,7 +113,7 @@ class BusMap:
 
 
 def default_map() -> BusMap:
-    """Return the contract's own bus (`data/eha_fcc.dbc`)."""
+    """Return the default bus (BUS-2, `data/eha_fcc.dbc`)."""
     folder = resources.files("firmware_iface").joinpath("data")
     where = "bundled mapping eha_fcc.toml"
     tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)
@@ -128,11 +138,7 @@ def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
                 f"mapping file {path}: dbc must be a path in the mapping's folder, not {tree.dbc!r}"
             )
         dbc = path.parent / inside
-    try:
-        with Path(dbc).open("rb") as file:
-            text = file.read(MAX_DBC_BYTES + 1)
-    except OSError as error:
-        raise InputOutputError(f"DBC file {dbc}: {error.strerror or error}") from None
+    text = read_small_file(Path(dbc), MAX_DBC_BYTES, "DBC file")
     return resolve(tree, recall_dbc(text, str(dbc)), f"mapping file {path}", str(dbc))
 
 
@@ -174,6 +180,7 @@ def resolve(
         states=states,
         requests={str(key): value for key, value in tree.request.codes.items()},
         policy=tree.policy,
+        channel=tree.channel,
     )
 
 
@@ -206,8 +213,10 @@ def _role(
     if dimension is not None:
         text = ref.unit if ref.unit is not None else signal.unit
         gain, bias = si_factor(text, dimension, f"{at} ({ref.message}.{ref.signal})")
-    if ref.scale == 0.0:
-        raise ConfigurationError(f"{at}: scale must not be zero")
+    if not SMALLEST <= abs(ref.scale) <= LARGEST or abs(ref.offset) > LARGEST:
+        raise ConfigurationError(
+            f"{at}: scale must lie within {SMALLEST:g} … {LARGEST:g}, offset within ±{LARGEST:g}"
+        )
     return Role(name, signal, gain * ref.scale, gain * ref.offset + bias)
 
 
@@ -223,9 +232,10 @@ def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 
     scale, offset = signal.scale, signal.offset
     if scale is None or offset is None or not 1 <= signal.length <= 64:
         raise ConfigurationError(f"{at}: signal {signal.name!r} is not a plain number")
-    if scale == 0 or not math.isfinite(scale) or not math.isfinite(offset):
+    if not SMALLEST <= abs(scale) <= LARGEST or not abs(offset) <= LARGEST:
         raise ConfigurationError(
-            f"{at}: the DBC gives signal {signal.name!r} a scale of zero or a number without end"
+            f"{at}: the DBC gives signal {signal.name!r} a scale outside {SMALLEST:g} …"
+            f" {LARGEST:g}, or an offset beyond"
         )
     if depth > MAX_MULTIPLEXERS:
         raise ConfigurationError(f"{at}: the multiplexers of {message.name!r} go in a circle")

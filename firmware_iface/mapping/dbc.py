@@ -1,4 +1,4 @@
-"""A DBC file as plain data: read by cantools, remembered in the user's cache.
+"""Reads a DBC file with cantools, and keeps the result in the user's cache.
 
 cantools takes a quarter of a second to load (it loads python-can, and that whatever reads MF4), so
 what it found in a file is kept, as JSON under a hash of the file's bytes.
@@ -7,25 +7,31 @@ what it found in a file is kept, as JSON under a hash of the file's bytes.
 from __future__ import annotations
 
 import hashlib
-import os
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import version
 from itertools import islice
-from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 
-from ehadiag.core.cache_folder import private_folder
+from ehadiag.core.cache_folder import private_folder, tell
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.folder import Folder
 
 __all__ = ["MAX_DBC_BYTES", "DbcMessage", "DbcSignal", "parse_dbc", "recall_dbc"]
 
-MAX_DBC_BYTES = 8 << 20
+MAX_DBC_BYTES = 2 << 20
 MAX_KEPT_BYTES = 32 << 20
 MAX_KEPT = 16
 """Files in the cache; the oldest goes."""
+MAX_SIGNALS = 10_000
+MAX_MESSAGE_SIGNALS = 1000
+"""Of all messages, and of one."""
+MESSAGE = re.compile(rb"\bBO_\s")
+SIGNAL = re.compile(rb"\bSG_\s+\w+(?:\s+\w+)?\s*:")
+PLACE = re.compile(r"at line (\d+), column (\d+)")
 FORM = 1
 """Raised with each change of what is kept."""
 
@@ -66,16 +72,18 @@ DECODER = msgspec.json.Decoder(Dbc)
 
 def recall_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
     """`parse_dbc`, from the cache if the same bytes were read before."""
-    folder = private_folder("dbc") if len(text) <= MAX_DBC_BYTES else None
+    if len(text) > MAX_DBC_BYTES:
+        return parse_dbc(text, name)  # which refuses it
+    folder = private_folder("dbc")
     if folder is None:
         return parse_dbc(text, name)
-    key = hashlib.sha256(f"{FORM} {version('cantools')} ".encode() + text).hexdigest()
-    path = folder / f"{key}.json"
-    kept = _read(path)
-    if kept is None:
-        kept = parse_dbc(text, name)
-        _keep(kept, path)
-    return kept
+    with folder:
+        key = hashlib.sha256(f"{FORM} {version('cantools')} ".encode() + text).hexdigest()
+        kept = _read(folder, f"{key}.json")
+        if kept is None:
+            kept = parse_dbc(text, name)
+            _keep(kept, folder, f"{key}.json")
+        return kept
 
 
 def parse_dbc(text: bytes, name: str) -> Dbc:
@@ -85,8 +93,7 @@ def parse_dbc(text: bytes, name: str) -> Dbc:
     ------
     ConfigurationError: not a DBC, or too large.
     """
-    if len(text) > MAX_DBC_BYTES:
-        raise ConfigurationError(f"DBC file {name}: larger than {MAX_DBC_BYTES} bytes")
+    _check_budget(text, name)
     import cantools.database  # noqa: PLC0415 - slow to import
     from cantools.database.can.database import Database  # noqa: PLC0415
 
@@ -102,8 +109,38 @@ def parse_dbc(text: bytes, name: str) -> Dbc:
     except ConfigurationError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ConfigurationError(f"DBC file {name}: not a valid DBC: {reason}") from None
+        raise ConfigurationError(f"DBC file {name}: not a valid DBC{_reason(error)}") from None
+
+
+def _check_budget(text: bytes, name: str) -> None:
+    """Refuse what would take its parser longer than anybody waits.
+
+    Multiplexed signals cost the square of their number in a message.
+    """
+    if len(text) > MAX_DBC_BYTES:
+        raise ConfigurationError(f"DBC file {name}: larger than {MAX_DBC_BYTES} bytes")
+    total = 0
+    for message in MESSAGE.split(text):
+        signals = len(SIGNAL.findall(message))
+        total += signals
+        if signals > MAX_MESSAGE_SIGNALS:
+            raise ConfigurationError(
+                f"DBC file {name}: a message of more than {MAX_MESSAGE_SIGNALS} signals"
+            )
+    if total > MAX_SIGNALS:
+        raise ConfigurationError(
+            f"DBC file {name}: more than {MAX_SIGNALS} signals; keep the messages that are mapped"
+        )
+
+
+def _reason(error: Exception) -> str:
+    """Why a DBC is none, without quoting a line of it: a link may lead to any file."""
+    text = str(error)
+    if place := PLACE.search(text):
+        return f": invalid syntax at line {place[1]}, column {place[2]}"
+    if type(error).__module__.startswith("cantools."):
+        return f": {' '.join(text.split())[:200]}"  # it was a DBC, and names its messages
+    return ""
 
 
 def plain_message(message: Any) -> DbcMessage:
@@ -142,25 +179,27 @@ def _number(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def _read(path: Path) -> Dbc | None:
+def _read(folder: Folder, name: str) -> Dbc | None:
     """Return what is kept; None if there is nothing, or nothing that can be read."""
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_KEPT_BYTES)
-        return DECODER.decode(content)
+        return DECODER.decode(folder.read(name, MAX_KEPT_BYTES))
+    except FileNotFoundError:
+        return None
     except (OSError, msgspec.DecodeError, RecursionError):
+        tell(f"cache folder {folder.path}: what was kept of a DBC is damaged; read again")
         return None
 
 
-def _keep(found: Dbc, path: Path) -> None:
+def _keep(found: Dbc, folder: Folder, name: str) -> None:
     """Write to the cache if that is possible, and gives the same when it is read."""
     content = msgspec.json.encode(found)
-    draft = path.with_suffix(f".{os.getpid()}")
-    with suppress(OSError, msgspec.DecodeError):
+    with suppress(msgspec.DecodeError):
         if len(content) >= MAX_KEPT_BYTES or DECODER.decode(content) != found:
             return
-        draft.write_bytes(content)
-        draft.replace(path)
-        by_age = sorted(path.parent.iterdir(), key=lambda item: item.stat().st_mtime, reverse=True)
-        for old in islice(by_age, MAX_KEPT, None):
-            old.unlink()
+        try:
+            folder.write(name, content, synced=False)
+            by_age = sorted(folder.names(), key=folder.changed_at, reverse=True)
+            for old in islice(by_age, MAX_KEPT, None):
+                folder.remove(old)
+        except OSError as error:
+            tell(f"cache folder {folder.path}: {error.strerror or error}; the DBC is not kept")

@@ -1,4 +1,4 @@
-"""The mapping file: which messages and signals of a DBC play which role here.
+"""The schema of a mapping file: which signal of which message plays which role.
 
 Untrusted input: every key is known, sizes are limited, and nothing in it is executed.
 """
@@ -138,6 +138,8 @@ class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Path of the DBC, in or below the mapping's own folder."""
     tick_ms: Annotated[float, msgspec.Meta(ge=0.05, le=1000)] = 1.0
     """Control period."""
+    channel: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None
+    """Adapter channel of a recording that is the actuator's."""
     channels: ChannelSignals
     command: CommandSignals = CommandSignals()
     environment: EnvironmentSignals = EnvironmentSignals()

@@ -1,4 +1,4 @@
-"""Where a signal lies in a payload, and its bulk extraction from many frames at once."""
+"""Locates a signal in a payload and extracts it from many frames at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unit texts of a DBC and what they are in SI."""
+"""Converts the unit texts of a DBC to SI."""
 
 from __future__ import annotations
 

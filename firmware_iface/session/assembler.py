@@ -1,4 +1,4 @@
-"""Live frames into the same recordings as from a log: collected, then decoded on one path."""
+"""Collects live frames and turns them into recordings, decoded as those of a log are."""
 
 from __future__ import annotations
 
@@ -51,6 +51,7 @@ class Assembler:
             error=frame.error,
             remote=frame.remote,
             sent=frame.sent,
+            channel=frame.channel,
         )
 
     def extend(self, frames: Iterable[Frame]) -> None:

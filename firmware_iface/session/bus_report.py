@@ -1,14 +1,16 @@
-"""What a bus or a log carries for us: what maps, what is missing, rates, gaps, range use."""
+"""Reports what a bus carries: which messages map, what is missing, rates, pauses, range use."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.alignment.senders import drop_conflicts, too_many
 from firmware_iface.alignment.ticks import TickAxis, place
+from firmware_iface.codec.channel import channels_in, choose_channel
 from firmware_iface.codec.decode import Decoded, decode
 from firmware_iface.mapping.bus_map import DIMENSIONS, BusMap, MessageMap
 from firmware_iface.transport.frames import FrameTable
@@ -31,8 +33,9 @@ class MessageReport:
     roles: what it carries for us.
     received, crc_errors, length_errors, range_errors: frames.
     lost: frames that the counter says are missing; None without a counter.
+    conflicts: counter values that came with different payloads.
     rate: frames per second, 0 with fewer than two.
-    longest_gap: between two frames, s.
+    longest_pause: between two frames, s.
     jitter: standard deviation of the time between frames, s.
     counter, crc: whether the mapping has them.
     """
@@ -46,8 +49,9 @@ class MessageReport:
     length_errors: int
     range_errors: int
     lost: int | None
+    conflicts: int
     rate: float
-    longest_gap: float
+    longest_pause: float
     jitter: float
     counter: bool
     crc: bool
@@ -95,9 +99,15 @@ class BusReport:
 
 def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
     """Report on some seconds of a bus."""
-    decoded = decode(table, bus_map)
+    channel, ambiguous = choose_channel(bus_map.channel, channels_in(table, bus_map))
+    decoded = decode(table, replace(bus_map, channel=channel))
+    received = decoded.messages
     axis = place(decoded, bus_map.tick_ns)
-    messages = tuple(_message(item, table) for item in decoded.messages.values())
+    decoded, axis, conflicts = drop_conflicts(decoded, axis)
+    messages = tuple(
+        _message(received[name], table, conflicts[name].count if name in conflicts else 0)
+        for name in decoded.messages
+    )
     ranges = tuple(use for item in decoded.messages.values() for use in _ranges(item, table))
     span = int(table.time_ns.max() - table.time_ns.min()) if len(table) else 0
     return BusReport(
@@ -108,12 +118,12 @@ def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
         ranges=ranges,
         foreign=_foreign(table, decoded.foreign),
         delay=_delay(decoded.messages, axis),
-        problems=_problems(messages, len(table)),
+        problems=((ambiguous,) if ambiguous else ()) + _problems(messages, len(table)),
         remarks=(*_pauses(messages), *_unsaid(decoded.messages, len(table))),
     )
 
 
-def _message(item: Decoded, table: FrameTable) -> MessageReport:
+def _message(item: Decoded, table: FrameTable, conflicts: int) -> MessageReport:
     message = item.message
     stamps = np.sort(table.time_ns[item.received])
     steps = np.diff(stamps) * 1e-9
@@ -128,8 +138,9 @@ def _message(item: Decoded, table: FrameTable) -> MessageReport:
         length_errors=len(item.length_bad),
         range_errors=len(item.range_bad),
         lost=_lost(item),
+        conflicts=conflicts,
         rate=len(steps) / span if span > 0 else 0.0,
-        longest_gap=float(steps.max()) if len(steps) else 0.0,
+        longest_pause=float(steps.max()) if len(steps) else 0.0,
         jitter=float(steps.std()) if len(steps) else 0.0,
         counter=message.counter is not None,
         crc=message.crc is not None,
@@ -221,6 +232,11 @@ def _problems(messages: tuple[MessageReport, ...], frames: int) -> tuple[str, ..
             )
         if item.range_errors:
             problems.append(f"{item.name}: {item.range_errors} frames with values out of range")
+        if too_many(item.conflicts, good):
+            problems.append(
+                f"{item.name}: {item.conflicts} counter values with different payloads: a second"
+                " sender"
+            )
         if item.lost:
             problems.append(f"{item.name}: {item.lost} frames lost")
     return tuple(problems)
@@ -229,10 +245,10 @@ def _problems(messages: tuple[MessageReport, ...], frames: int) -> tuple[str, ..
 def _pauses(messages: tuple[MessageReport, ...]) -> tuple[str, ...]:
     """Silences too long for a test; a counter that turns meanwhile does not tell of them."""
     return tuple(
-        f"{item.name}: nothing for {item.longest_gap:.3g} s; within a test a diagnosis bears"
+        f"{item.name}: nothing for {item.longest_pause:.3g} s; within a test a diagnosis bears"
         f" {LONGEST_GAP_S:g} s"
         for item in messages
-        if item.longest_gap > LONGEST_GAP_S
+        if item.longest_pause > LONGEST_GAP_S
         and any(role.startswith("channels.") for role in item.roles)
     )
 
@@ -261,16 +277,16 @@ def render(report: BusReport) -> str:
     lines = [
         f"{report.frames} frames in {report.duration:.2f} s, {report.errors} error frames",
         "",
-        f"{'message':<24}{'id':>11}{'frames':>8}{'1/s':>9}{'gap ms':>9}{'lost':>6}{'crc':>5}"
-        f"{'len':>5}{'range':>6}",
+        f"{'message':<24}{'id':>11}{'frames':>8}{'1/s':>9}{'pause ms':>10}"
+        f"{'lost':>6}{'conf':>6}{'crc':>5}{'len':>5}{'range':>6}",
     ]
     for item in report.messages:
         lost = "-" if item.lost is None else str(item.lost)
         check = str(item.crc_errors) if item.crc else "-"
         lines.append(
             f"{item.name:<24}{item.can_id:>#11x}{item.received:>8}{item.rate:>9.1f}"
-            f"{1e3 * item.longest_gap:>9.2f}{lost:>6}{check:>5}{item.length_errors:>5}"
-            f"{item.range_errors:>6}"
+            f"{1e3 * item.longest_pause:>10.2f}{lost:>6}{item.conflicts:>6}{check:>5}"
+            f"{item.length_errors:>5}{item.range_errors:>6}"
         )
     if report.ranges:
         lines += ["", f"{'channel':<12}{'codes seen':>16}{'of':>8}{'use':>7}{'at end':>8}"]

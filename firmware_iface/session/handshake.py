@@ -1,4 +1,4 @@
-"""Requesting a built-in test: the handshake as a state machine, without bus, threads or clock.
+"""The handshake that requests a test, as a state machine without bus, threads or clock.
 
     SETTLING -> REQUESTED -> ARMING -> RUNNING -> TRAILING -> DONE
                      \\_________\\_________\\-> ABORTING -> DONE
@@ -34,6 +34,10 @@ REASONS = {
     BitReason.INTERLOCK_OPEN: "interlock open",
 }
 ACTIVE = (BitState.ARMING, BitState.RUNNING)
+TWICE = 2
+"""Times a status must contradict those before: one damaged frame does it once."""
+BACK_S = 0.1
+"""s by which the elapsed time of late status frames goes back."""
 FRESH_S = 0.1
 """A listener that comes later to a test waits for the next one: it has missed the start."""
 
@@ -122,6 +126,9 @@ class Handshake:
     _aborted_at: int = field(init=False, default=0)
     _before: BitStatus | None = field(init=False, default=None)
     _status: BitStatus | None = field(init=False, default=None)
+    _serial: int | None = field(init=False, default=None)
+    _other_serial: int = field(init=False, default=0)
+    _went_back: int = field(init=False, default=0)
     _why: str = field(init=False, default="")
     _watch: Watch = field(init=False)
 
@@ -163,14 +170,16 @@ class Handshake:
                 actions = [Action.ABORT]
         return actions
 
-    def excuse(self, gap_ns: int) -> None:
+    def excuse(self, pause_ns: int) -> None:
         """Take out a time in which the reader itself did not run: what came then still waits."""
-        self._since += gap_ns
-        self._heard += gap_ns
-        self._watch.excuse(gap_ns)
+        self._since += pause_ns
+        self._heard += pause_ns
+        self._watch.excuse(pause_ns)
 
     def on_status(self, now: int, status: BitStatus) -> list[Action]:
         """Take a valid status message."""
+        if second := self._second_status(status):
+            return self.on_second_sender(now, second)
         match self.phase:
             case Phase.SETTLING:
                 self._before = status
@@ -210,6 +219,39 @@ class Handshake:
             case Phase.ARMING | Phase.RUNNING:
                 return self._abort(why, now)
         return []
+
+    def on_second_sender(self, now: int, why: str) -> list[Action]:
+        """Hear that somebody else sends as the computer does: nothing it says can be trusted."""
+        match self.phase:
+            case Phase.REQUESTED | Phase.ARMING | Phase.RUNNING:
+                return self._abort(why, now)
+            case Phase.SETTLING | Phase.TRAILING:
+                return self._end(why)
+        return []
+
+    def _second_status(self, status: BitStatus) -> str:
+        """What a status tells of a second computer on the bus; empty for nothing."""
+        before = self._status
+        if before is None or self.phase not in (Phase.ARMING, Phase.RUNNING, Phase.TRAILING):
+            return ""
+        self._serial = before.serial if self._serial is None else self._serial
+        if None not in (self._serial, status.serial) and status.serial != self._serial:
+            self._other_serial += 1
+            if self._other_serial >= TWICE:
+                return (
+                    f"status of two actuators, serial {self._serial} and {status.serial}: a second"
+                    " sender on the bus"
+                )
+        both_run = before.state is BitState.RUNNING is status.state
+        if both_run and status.elapsed < before.elapsed - BACK_S:
+            self._went_back += 1
+            if self._went_back >= TWICE:
+                back = before.elapsed - status.elapsed
+                return (
+                    f"the status goes back by {back:.2f} s again and again: two time bases, a"
+                    " second sender on the bus"
+                )
+        return ""
 
     def all_there(self) -> None:
         """Listen no longer for frames still under way: there are none."""

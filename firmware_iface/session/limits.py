@@ -1,4 +1,4 @@
-"""Channels that are watched while a test runs: limits, and that they keep coming."""
+"""Watches channels while a test runs: that they stay within limits, and keep coming."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ class Watch:
         self._beyond = {name: 0 for name, _ in self.limits.watched()}
         self._heard = dict.fromkeys(self._beyond, now)
 
-    def excuse(self, gap_ns: int) -> None:
+    def excuse(self, pause_ns: int) -> None:
         """Take out a time in which the reader itself did not run."""
         for name in self._heard:
-            self._heard[name] += gap_ns
+            self._heard[name] += pause_ns
 
     def on_sample(self, now: int, sample: Sample) -> str:
         """Take a sample; return why the test must end, empty if it need not."""

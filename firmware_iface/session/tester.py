@@ -191,6 +191,8 @@ class _Session:
         if frame.sent:
             return
         content = self._decoder.decode(frame)
+        if self._decoder.second_sender:
+            self._act(self._machine.on_second_sender(now, self._decoder.second_sender))
         match content:
             case BitStatus():
                 if content.serial is not None:

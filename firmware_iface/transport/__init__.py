@@ -1,1 +1,1 @@
-"""Buses as frame sources and sinks: CAN adapters, serial link, receive thread."""
+"""Buses as sources and sinks of frames: CAN adapters, serial link, receive thread."""

@@ -1,4 +1,4 @@
-"""Opening every python-can interface by its name, with errors that say how to mend."""
+"""Opens any python-can interface by its name, with errors that say what to do."""
 
 from __future__ import annotations
 

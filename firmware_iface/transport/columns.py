@@ -1,4 +1,4 @@
-"""Columns of frames that grow: by the frame or by the block, about 30 bytes a frame."""
+"""Growing columns of frames, filled one frame or one block at a time."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class ColumnBuilder:
         self._id = array("I")
         self._flags = bytearray()
         self._length = bytearray()
+        self._channel = array("H")
         self._data = bytearray()
         self._width = 8
 
@@ -44,6 +45,7 @@ class ColumnBuilder:
         error: bool = False,
         remote: bool = False,
         sent: bool = False,
+        channel: int = 0,
     ) -> None:
         """Append one frame."""
         size = len(data)
@@ -52,6 +54,7 @@ class ColumnBuilder:
         self._time.append(time_ns)
         self._id.append(can_id)
         self._length.append(size)
+        self._channel.append(channel)
         self._flags.append(extended | fd << 1 | error << 2 | remote << 3 | sent << 4)
         self._data += data
         if size < self._width:
@@ -67,6 +70,7 @@ class ColumnBuilder:
         extended: Flags,
         remote: Flags,
         sent: Flags,
+        channel: NDArray[np.uint16],
     ) -> None:
         """Append a block of classic data and remote frames; data of shape (n, 8)."""
         self._time.frombytes(np.ascontiguousarray(time_ns, dtype=np.int64).tobytes())
@@ -74,6 +78,7 @@ class ColumnBuilder:
         flags = extended * np.uint8(EXTENDED) | remote * np.uint8(REMOTE) | sent * np.uint8(SENT)
         self._flags += flags.astype(np.uint8).tobytes()
         self._length += length.astype(np.uint8).tobytes()
+        self._channel.frombytes(np.ascontiguousarray(channel, dtype=np.uint16).tobytes())
         if self._width > 8:
             wide = np.zeros((len(data), self._width), dtype=np.uint8)
             wide[:, :8] = data
@@ -101,4 +106,5 @@ class ColumnBuilder:
             error=(flags & ERROR).astype(np.bool_),
             remote=(flags & REMOTE).astype(np.bool_),
             sent=(flags & SENT).astype(np.bool_),
+            channel=np.array(self._channel, dtype=np.uint16),
         )

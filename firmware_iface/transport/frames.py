@@ -1,17 +1,19 @@
-"""Frames as they come from a bus or a recording: one at a time, and in bulk as columns."""
+"""The types for frames: a single one, and many as columns."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_PAYLOAD", "Frame", "FrameTable", "concatenate"]
+__all__ = ["MAX_CHANNEL", "MAX_PAYLOAD", "Frame", "FrameTable", "concatenate"]
 
 MAX_PAYLOAD = 64
 """Bytes of the longest payload (CAN FD)."""
+MAX_CHANNEL = 0xFFFF
+"""Largest number of an adapter channel that is told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,8 @@ class Frame:
     error: error frame; identifier and payload then carry no message.
     remote: remote request; carries no payload.
     sent: transmitted by this program (own echo), not received.
+    channel: adapter channel as loggers count them, from 1; 0 where the source has only one or does
+        not say.
     """
 
     time_ns: int
@@ -38,6 +42,7 @@ class Frame:
     error: bool = False
     remote: bool = False
     sent: bool = False
+    channel: int = 0
 
     def __post_init__(self) -> None:
         limit = 0x1FFFFFFF if self.extended else 0x7FF
@@ -58,6 +63,7 @@ class FrameTable:
     length: uint8, payload bytes, shape (n,).
     data: uint8, shape (n, width), zero beyond `length`; width 8, or 64 where a frame is longer.
     extended, fd, error, remote, sent: bool, shape (n,).
+    channel: uint16, adapter channel of each frame, 0 where it is not said, shape (n,).
     """
 
     time_ns: NDArray[np.int64]
@@ -69,9 +75,14 @@ class FrameTable:
     error: NDArray[np.bool_]
     remote: NDArray[np.bool_]
     sent: NDArray[np.bool_]
+    channel: NDArray[np.uint16]
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def rows(self, chosen: slice | NDArray[np.bool_]) -> FrameTable:
+        """Some of the rows, in the same order."""
+        return FrameTable(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
 
     @classmethod
     def from_frames(cls, frames: Iterable[Frame]) -> FrameTable:
@@ -89,11 +100,14 @@ class FrameTable:
             error=np.array([row.error for row in rows], dtype=np.bool_),
             remote=np.array([row.remote for row in rows], dtype=np.bool_),
             sent=np.array([row.sent for row in rows], dtype=np.bool_),
+            channel=np.array([row.channel for row in rows], dtype=np.uint16),
         )
 
 
 def concatenate(tables: Sequence[FrameTable]) -> FrameTable:
     """Join tables in the order given; payloads as wide as the widest."""
+    if len(tables) == 1:
+        return tables[0]
     width = max(table.data.shape[1] for table in tables)
     wide = []
     for table in tables:
@@ -110,4 +124,5 @@ def concatenate(tables: Sequence[FrameTable]) -> FrameTable:
         error=np.concatenate([table.error for table in tables]),
         remote=np.concatenate([table.remote for table in tables]),
         sent=np.concatenate([table.sent for table in tables]),
+        channel=np.concatenate([table.channel for table in tables]),
     )

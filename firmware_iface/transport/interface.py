@@ -1,4 +1,4 @@
-"""The seam between a bus and everything that reads from it or sends on it."""
+"""What every bus, serial link and log implements to be a source, or a sink, of frames."""
 
 from __future__ import annotations
 

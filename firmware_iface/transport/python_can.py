@@ -1,4 +1,4 @@
-"""Every python-can interface, by its name, as a transport."""
+"""Makes every python-can interface a transport."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from firmware_iface.transport.adapters import BusOptions, one_line, open_bus
-from firmware_iface.transport.frames import Frame
+from firmware_iface.transport.frames import MAX_CHANNEL, Frame
 from firmware_iface.transport.interface import Transport
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ class PythonCanTransport(Transport):
         self._dropped = 0
         self._unsent = 0
         self._next_try = 0.0
+        self._channels: dict[str, int] = {}
 
     @property
     def unsent(self) -> int:
@@ -110,11 +111,25 @@ class PythonCanTransport(Transport):
             self._look_for_drops()
         if message is None:
             return None
-        frame = frame_of(message)
+        frame = frame_of(message, self._channel(message.channel))
         of_kernel = self._options.interface in SOCKETCAN_ERRORS
         if frame.error and frame.can_id & BUS_OFF and of_kernel:
             raise self._fail("bus off; check wiring and bit rate, then restart the interface")
         return frame
+
+    def _channel(self, said: object) -> int:
+        """Number of a frame's adapter channel: the driver's, or by name in order of appearance.
+
+        0 where the bus was opened on the one channel that it was named by.
+        """
+        if self._options.interface in ECHOES:  # there the sender says what it likes
+            return 0
+        if isinstance(said, int):
+            several = "," in str(self._options.channel or "")
+            return min(max(said + 1, 0), MAX_CHANNEL) if several else 0
+        if not said or self._options.channel != "":
+            return 0
+        return self._channels.setdefault(str(said), len(self._channels) % MAX_CHANNEL + 1)
 
     def _read(self, timeout: float) -> can.Message | None:
         """Read from python-can; its SLCAN waits a millisecond also where it shall not wait."""
@@ -219,7 +234,7 @@ class _EchoFilter:
             return True
 
 
-def frame_of(message: can.Message) -> Frame:
+def frame_of(message: can.Message, channel: int = 0) -> Frame:
     """Turn a python-can message into a frame.
 
     Times are rounded to whole microseconds: python-can's float seconds carry no more, and only so
@@ -235,11 +250,12 @@ def frame_of(message: can.Message) -> Frame:
         fd=message.is_fd,
         error=message.is_error_frame,
         remote=message.is_remote_frame,
+        channel=channel,
     )
 
 
 def message_of(frame: Frame) -> can.Message:
-    """Turn a frame into a python-can message."""
+    """Turn a frame into a python-can message, without its channel: a bus has one."""
     import can  # noqa: PLC0415 - costs half a second
 
     return can.Message(

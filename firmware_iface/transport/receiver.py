@@ -1,4 +1,4 @@
-"""The receive thread: takes frames off a transport as they come, into a bounded queue."""
+"""The receive thread: takes frames off a transport as they arrive, into a bounded queue."""
 
 from __future__ import annotations
 

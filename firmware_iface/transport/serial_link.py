@@ -1,7 +1,7 @@
 """The project's serial link: frames in COBS packets with a CRC-16, over any pyserial URL.
 
 A packet is `COBS(id u16 LE, time u32 LE in µs, payload 8 bytes, CRC-16/CCITT-FALSE u16 LE over all
-before it)` and a zero byte (bus.md). The framer finds its way back after any damage at the next
+before it)` and a zero byte (BUS-15). The framer finds its way back after any damage at the next
 zero byte and counts what it had to drop.
 """
 

@@ -1,4 +1,4 @@
-"""Made-up tests on the default bus with a known truth, and the faults done to them."""
+"""Synthetic tests on the default bus with known truth, and damage done to their frames."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def play(
     end: BitState = BitState.COMPLETE,
     serial: int = 77,
 ) -> list[Frame]:
-    """Frames of idle ticks, a test, idle ticks, as bus.md tells."""
+    """Frames of idle ticks, a test, idle ticks, at the rates of BUS-4."""
     ticks = len(truth.codes)
     frames: list[Frame] = []
     for tick in range(-idle_before, ticks + idle_after):

@@ -1,4 +1,4 @@
-"""Two ends of a line for live tests: a cable of pseudo-terminals, and the computer on a bus."""
+"""Both ends of a line for live tests: a pair of pseudo-terminals, and the computer on a bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reference actuator with other data."""
+"""Variants of the reference actuator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where this repository and its reference recordings are."""
+"""Paths of the repository and of its test data."""
 
 from __future__ import annotations
 

@@ -79,8 +79,8 @@ def test_a_recording_is_what_the_unit_gives():
         item, TESTS["closed"], seed=5, step=1e-5, oil_temperature=70.0, supply_pressure=19e6
     )
     off = item.sensors
-    assert hot.environment.oil_temperature == pytest.approx(70.0 + off.temperature_error)
-    assert hot.environment.supply_pressure == pytest.approx(19e6 + off.supply_error)
+    assert hot.environment.oil_temperature == pytest.approx(70.0 + off.temperature_error, abs=0.051)
+    assert hot.environment.supply_pressure == pytest.approx(19e6 + off.supply_error, abs=5.1e3)
 
 
 @pytest.mark.parametrize("test", ["open", "closed"])

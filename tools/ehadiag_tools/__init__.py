@@ -1,1 +1,1 @@
-"""Command-line tools of the developers: tables, sweeps, benchmarks, figures."""
+"""Developers' tools: the paper's tables, accuracy sweeps, benchmarks, soaks."""

@@ -16,7 +16,7 @@ import atheris
 import numpy as np
 from atheris.version_dependent import CMP_OP_SHIFT_AMOUNT
 
-NAMES = ("frames", "serial", "logs", "mappings")
+NAMES = ("frames", "windows", "serial", "logs", "mappings")
 SEEN = ("firmware_iface", "ehadiag", "cantools", "textparser", "tomllib", "can")
 """Packages whose branches guide the search."""
 AGAIN = "EHADIAG_FUZZ_TARGET"

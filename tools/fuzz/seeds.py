@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -14,20 +15,29 @@ from firmware_iface.logs.recorder import Recorder
 from firmware_iface.transport.frames import Frame
 from firmware_iface.transport.serial_link import packet_of
 
+TELEMETRY = 0x110
 
-def _bus(ticks: int) -> list[Frame]:
+
+def _bus(ticks: int, serial: int = 7, codes: int = 2048) -> list[Frame]:
     """A short test as the computer sends it."""
     encoder = Encoder()
     frames: list[Frame] = []
     for tick in range(ticks):
         now = tick * 1_000_000
         if tick % 20 == 0:
-            frames += encoder.status(2, 0, 1, tick / 1000, 7, now)
+            frames += encoder.status(2, 0, 1, tick / 1000, serial, now)
         frames += encoder.command(1, 1e-6 * tick, 1, now + 130_000)
-        frames += encoder.telemetry((2048 + tick, 2048, 2000, 2050), now + 260_000)
+        frames += encoder.telemetry((codes + tick, 2048, 2000, 2050), now + 260_000)
     frames += encoder.environment(20.7e6, 0.7e6, 40.0, ticks * 1_000_000)
-    frames += encoder.status(3, 0, 1, ticks / 1000, 7, ticks * 1_000_000 + 130_000)
+    frames += encoder.status(3, 0, 1, ticks / 1000, serial, ticks * 1_000_000 + 130_000)
     return frames
+
+
+def _many_signals(count: int) -> bytes:
+    """A message of many multiplexed signals."""
+    rows = [f' SG_ S{n} m{n} : 16|8@1+ (1,0) [0|255] "" A' for n in range(count)]
+    head = 'VERSION ""\nBU_: A\nBO_ 1 M: 8 A\n SG_ X M : 0|16@1+ (1,0) [0|0] "" A\n'
+    return (head + "\n".join(rows) + "\n").encode()
 
 
 def _records(frames: list[Frame]) -> bytes:
@@ -35,7 +45,8 @@ def _records(frames: list[Frame]) -> bytes:
     out, last = b"", 0
     for frame in frames:
         step = (frame.time_ns - last) // 1000
-        out += RECORD.pack(SEALED, places[frame.can_id], step, 8, frame.data)
+        choice = places[frame.can_id] | frame.channel << 6
+        out += RECORD.pack(SEALED, choice, step, 8, frame.data)
         last = frame.time_ns
     return out
 
@@ -53,10 +64,25 @@ def main() -> None:
     """Write the files."""
     root = Path(sys.argv[1])
     frames = _bus(12)
+    second = _bus(12, serial=8, codes=1000)
+    both = sorted(frames + second, key=lambda frame: frame.time_ns)
+    shifted = [replace(frame, channel=2) for frame in second]
+    long = [replace(f, time_ns=f.time_ns + k * 12_000_000) for k in range(5) for f in frames]
     data = resources.files("firmware_iface").joinpath("data")
     inputs = {
         "frames/test": _records(frames),
         "frames/one": _records(frames[1:2]),
+        "frames/two-senders": _records(both),
+        "frames/two-channels": _records(frames + shifted),
+        "frames/standing-counter": _records([frames[2]] * 3 + second[2:6]),
+        "windows/long": _records(long),
+        "windows/two-senders": _records(both),
+        "windows/no-status": _records([f for f in long if f.can_id == TELEMETRY]),
+        "mappings/many-signals": b"\1" + _many_signals(40),
+        "mappings/deep-key": b"\0" + b"a" + b".a" * 40 + b" = 1",
+        "mappings/not-a-dbc": b"\1root:x:0:0:root:/root:/bin/sh\n",
+        "mappings/huge-scale": b"\1"
+        + data.joinpath("eha_fcc.dbc").read_bytes().replace(b"(0.0005,", b"(1e308,"),
         "serial/packets": b"".join(packet_of(frame) for frame in frames[:6]),
         "serial/torn": packet_of(frames[0])[5:] + packet_of(frames[1]),
         "mappings/mapping": b"\0" + data.joinpath("eha_fcc.toml").read_bytes(),
@@ -65,6 +91,9 @@ def main() -> None:
     for number, suffix in enumerate(KINDS):
         if suffix.startswith("."):
             inputs[f"logs/{suffix[1:]}"] = bytes((number,)) + _log(suffix, frames)
+            inputs[f"logs/two-channels-{suffix[1:]}"] = bytes((number,)) + _log(
+                suffix, frames + shifted
+            )
     for name, content in inputs.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)

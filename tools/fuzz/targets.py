@@ -25,12 +25,14 @@ from ehadiag.core.recording import CommandMode
 from ehadiag.core.toml_file import decode_toml
 from firmware_iface.alignment.align import assemble
 from firmware_iface.alignment.live_ticks import LiveTicks
-from firmware_iface.codec.decode import DecodedTable, decode
+from firmware_iface.alignment.windows import recordings_of
+from firmware_iface.codec.decode import Decoded, DecodedTable, decode
 from firmware_iface.codec.live_decode import CHANNELS, LiveDecoder
 from firmware_iface.codec.live_messages import BitStatus, Request, Sample
 from firmware_iface.codec.protection import crc8
+from firmware_iface.codec.validity import intact
 from firmware_iface.logs.blf import CONTAINER_HEADER, FILE_HEADER, OBJECT_HEADER
-from firmware_iface.logs.reader import read_frames, read_recordings
+from firmware_iface.logs.reader import choose, read_frames, read_recordings
 from firmware_iface.mapping import bus_map as busmap
 from firmware_iface.mapping.bus_map import BusMap, default_map
 from firmware_iface.mapping.dbc import parse_dbc
@@ -44,7 +46,8 @@ SHARE = 16
 """While fuzzing, inputs for one that goes all the way to recordings."""
 
 RECORD = struct.Struct("<BBhB8s")
-"""One frame of the target `frames`: flags, choice of identifier, time step, length, payload."""
+"""One frame of the target `frames`: flags, choice of identifier (its two highest bits: the adapter
+channel), time step, length, payload."""
 SEALED, EXTENDED, ERROR, REMOTE, SLOW = 1, 2, 4, 8, 16
 IDENTIFIERS = (0x110, 0x111, 0x120, 0x200, 0x201, 0x110, 0x111, 0x7FF)
 KINDS = (".blf", ".asc", ".csv", ".trc", "container")
@@ -73,22 +76,35 @@ def _frames(share: int) -> Callable[[bytes], None]:
         given = [len(live.take(frame)) for frame in frames]
         if max(given, default=0) > MOST_TICKS:
             raise AssertionError("one frame completes more ticks than a turn of the counter has")
-        samples = sum(type(answer) is Sample for answer in answers)
+        samples = sum(_is_telemetry(frame, bus) for frame in frames)
         if not live.lost <= sum(given) <= live.lost + samples:
             raise AssertionError("ticks were made up or kept back")
         if frames and _chosen(data, share):
             table = FrameTable.from_frames(frames)
-            _compare(answers, decode(table, bus), bus)
+            _compare(answers, decode(table, bus), bus, len(set(table.channel.tolist()) - {0}) > 1)
             with contextlib.suppress(EhadiagError):
                 assemble(table, bus, "fuzz")
 
     return check
 
 
+def _is_telemetry(frame: Frame, bus: BusMap) -> bool:
+    """Whether a frame could complete a tick."""
+    message = next(item for item in bus.messages.values() if item.measures)
+    mine = (frame.can_id, frame.extended) == (message.can_id, message.extended)
+    return mine and not frame.error and not frame.remote and intact(message, frame.data)
+
+
 def _compare(
-    answers: list[BitStatus | Sample | Request | None], decoded: DecodedTable, bus: BusMap
+    answers: list[BitStatus | Sample | Request | None],
+    decoded: DecodedTable,
+    bus: BusMap,
+    several_channels: bool,
 ) -> None:
-    """One frame at a time and in columns, the same frames are good and say the same."""
+    """One frame at a time and in columns, the same frames are good and say the same.
+
+    But what is in conflict, or of another channel than the first, only the columns still have.
+    """
     roles = {Sample: "channels.spool", Request: "request.code", BitStatus: "status.state"}
     for kind, role in roles.items():
         found = bus.find(role)
@@ -98,14 +114,29 @@ def _compare(
         rows = item.row
         if kind is BitStatus:
             rows = rows[np.isin(item.values[role], list(bus.states))]
-        if rows.tolist() != [row for row, answer in enumerate(answers) if type(answer) is kind]:
+        live_rows = [row for row, answer in enumerate(answers) if type(answer) is kind]
+        if not set(live_rows) <= set(rows.tolist()):
             raise AssertionError(f"{found[0].name}: the decoders accept different frames")
+        for row in set(rows.tolist()) - set(live_rows):
+            if not several_channels and not _in_conflict(item, row):
+                raise AssertionError(f"{found[0].name}: a sound frame was left out")
     messages = decoded.messages.values()
     for name, key in CHANNELS.items():
         live = [getattr(answer, key) for answer in answers if isinstance(answer, Sample)]
-        column = next(item.values[name] for item in messages if name in item.values)
+        item = next(item for item in messages if name in item.values)
+        taken = [type(answers[row]) is Sample for row in item.row.tolist()]
+        column = item.values[name][np.array(taken, dtype=np.bool_)]
         if not np.allclose(live, column, rtol=1e-12, atol=0.0):
             raise AssertionError(f"{name}: the decoders disagree")
+
+
+def _in_conflict(item: Decoded, row: int) -> bool:
+    """Whether a frame has the counter of an earlier one with another payload."""
+    if item.counter is None:
+        return False
+    place = int(np.searchsorted(item.row, row))
+    used = item.counter[:place] == item.counter[place]
+    return bool((item.data[:place][used] != item.data[place]).any())
 
 
 def _frames_of(data: bytes) -> list[Frame]:
@@ -129,9 +160,32 @@ def _frames_of(data: bytes) -> list[Frame]:
                 fd=len(payload) > 8,
                 error=bool(flags & ERROR),
                 remote=bool(flags & REMOTE),
+                channel=choice >> 6,
             )
         )
     return frames
+
+
+def _windows(_: int) -> Callable[[bytes], None]:
+    """The same frames in windows as small as can be: none larger than allowed, none without end."""
+    bus = default_map()
+
+    def check(data: bytes) -> None:
+        frames = _frames_of(data)
+        if not frames:
+            return
+        held = 20 + data[0]
+        tables = [FrameTable.from_frames(frames[at : at + 10]) for at in range(0, len(frames), 10)]
+        found = list(recordings_of(tables, bus, "fuzz", held, least=20))
+        if not found:
+            raise AssertionError("no recording at all")
+        if any(item.quality.total("received") > min(len(frames), held + 10) for item in found):
+            raise AssertionError("a test has more frames than a window")
+        best = choose(found)
+        if best.samples is None and any(item.samples is not None for item in found):
+            raise AssertionError("a test was passed over for nothing")
+
+    return check
 
 
 def _serial(_: int) -> Callable[[bytes], None]:
@@ -213,6 +267,7 @@ def _mappings(_: int) -> Callable[[bytes], None]:
 
 TARGETS: Mapping[str, Callable[[int], Callable[[bytes], None]]] = {
     "frames": _frames,
+    "windows": _windows,
     "serial": _serial,
     "logs": _logs,
     "mappings": _mappings,

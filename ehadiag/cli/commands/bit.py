@@ -4,36 +4,17 @@ from __future__ import annotations
 
 import argparse
 import time
-from contextlib import ExitStack
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
-from ehadiag.cli.ahead import working_ahead
+from ehadiag.cli.acquire import STOPPED, acquire
 from ehadiag.cli.beforehand import refuse_beforehand
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import (
-    load_report,
-    make_folder,
-    progress_bar,
-    say,
-    say_if_compiling,
-    show,
-    write_report,
-)
-from ehadiag.core.actuator import Actuator
-from ehadiag.core.recording import Environment, Outcome, Quality, Recording
-from ehadiag.core.stored_test import StoredTest, resolve_test
+from ehadiag.cli.output import progress_bar, say_if_compiling
+from ehadiag.cli.results import Results, make_folder
+from ehadiag.core.errors import NotTestedError
+from ehadiag.core.stored_test import resolve_test
 from ehadiag.report.spent import Spent
-
-if TYPE_CHECKING:
-    from ehadiag.assess.diagnosis import DiagnosisSession
-    from firmware_iface.logs.recorder import Recorder
-    from firmware_iface.mapping.bus_map import BusMap
-    from firmware_iface.session.tester import Progress
-    from firmware_iface.transport.interface import Transport
 
 __all__ = ["add_parser", "run"]
 
@@ -103,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the test and print the verdict."""
     actuator = options.the_actuator(arguments)
     test = resolve_test(arguments.test)
-    levels = Levels(arguments.advisory, arguments.limit)
+    levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
     bus_map = options.the_bus_map(arguments)
     refuse_beforehand(arguments, test, actuator, bus_map)
     folder = make_folder(arguments.out)
@@ -117,7 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Before the test: a verdict must not wait for the compiler.
     warm_up(actuator, test)
-    load_report(arguments)
+    results = Results(arguments, folder)
+    results.load()
     begin = time.perf_counter()
     session = DiagnosisSession(
         actuator,
@@ -127,142 +109,22 @@ def run(arguments: argparse.Namespace) -> int:
         solver=make_solver(arguments.solver),
         seed=arguments.seed,
     )
-    recording, why, stem, ended_at = _acquire(arguments, actuator, test, bus_map, folder, session)
+    with stop_on_signals() as stop:
+        heard = acquire(arguments, actuator, test, bus_map, folder.path, session, stop)
     read_s = time.perf_counter() - begin
+    recordings, why = [heard.recording], heard.why
+    try:
+        if stop.is_set() and not why:
+            raise KeyboardInterrupt
+        if not why:
+            with progress_bar() as progress:
+                result = session.finish(recordings, heard.deadline.watch(progress))
+    except KeyboardInterrupt:
+        why = STOPPED
+    except NotTestedError as error:
+        why = str(error)
     if why:
-        result = not_tested(recording, test, actuator, [why])
-    else:
-        with progress_bar() as progress:
-            result = session.finish([recording], progress)
-    timing = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
-    show(result, arguments, timing)
-    write_report(result, stem, arguments, timing)
-    return int(result.verdict)
-
-
-def _acquire(
-    arguments: argparse.Namespace,
-    actuator: Actuator,
-    test: StoredTest,
-    bus_map: BusMap,
-    folder: Path,
-    session: DiagnosisSession,
-) -> tuple[Recording, str, Path, float | None]:
-    """Run the test on the bus.
-
-    Returns the recording, why it is not one, the files' stem, and when the test was complete.
-    """
-    from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
-    from firmware_iface.session.limits import Limits  # noqa: PLC0415
-    from firmware_iface.session.tester import run_test  # noqa: PLC0415
-
-    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-    path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
-    assembler = Assembler(str(path), bus_map)
-    with working_ahead(session, assembler, test) as ahead:
-        with ExitStack() as stack:
-            ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
-            stop = stack.enter_context(stop_on_signals())
-            say(f"test {test.name!r} on {ours.name}, recording to {path}")
-            display = stack.enter_context(progress_bar())
-
-            def tell(progress: Progress) -> None:
-                ahead.watch(progress)
-                display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
-
-            began = time.monotonic()
-            outcome = run_test(
-                ours,
-                test_id=test.id,
-                duration=test.duration,
-                transmit=not arguments.listen,
-                recorder=recorder,
-                bus_map=bus_map,
-                limits=Limits(
-                    position=_scaled(arguments.max_position, 1e-3),
-                    pressure=_scaled(arguments.max_pressure, 1e6),
-                    current=_scaled(arguments.max_current, 1e-3),
-                ),
-                on_frame=assembler.add,
-                stop=stop,
-                progress=tell,
-                all_there=ahead.all_there,
-            )
-            listened = time.monotonic() - began
-        if ahead.whole is not None:
-            recording = ahead.whole
-        else:
-            recording = assembler.recording() if len(assembler) else _empty(path, outcome.outcome)
-        if recording.serial is None:
-            recording = replace(recording, serial=outcome.serial)
-        if outcome.degraded:
-            say(outcome.degraded)
-        why = outcome.why
-        if outcome.complete:
-            ahead.finish()
-        else:
-            ahead.abandon()
-            why += _what_was_heard(recording, ours.name, listened)
-    stem = path.with_suffix("") if not arguments.record else folder / path.stem
-    return recording, why, stem, ahead.ended_at
-
-
-def _connect(
-    arguments: argparse.Namespace,
-    actuator: Actuator,
-    test: StoredTest,
-    bus_map: BusMap,
-    path: Path,
-    stack: ExitStack,
-) -> tuple[Transport, Recorder]:
-    """Open the bus and the recording; begin the emulated computer if it was asked for."""
-    from firmware_iface.logs.recorder import Recorder  # noqa: PLC0415 - loads python-can
-
-    if not arguments.simulate:
-        ours = options.open_transport(arguments, transmit=not arguments.listen)
-        return stack.enter_context(ours), Recorder(path)
-    from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415 - loads numba
-    from ehadiag_sim.fcc.emulator import EmulatorTransport  # noqa: PLC0415
-
-    core = make_core(arguments, actuator, [test], bus_map)
-    if arguments.fast:
-        return stack.enter_context(EmulatorTransport(core)), Recorder(path)
-    if not options.has_bus(arguments):
-        arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
-    theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
-    ours = stack.enter_context(options.open_transport(arguments, transmit=True))
-    recorder = Recorder(path)
-    stack.enter_context(emulator_beside(core, theirs))
-    return ours, recorder
-
-
-def _what_was_heard(recording: Recording, bus: str, listened: float) -> str:
-    """Add to a failure what would else have to be guessed: a silent bus, or a foreign one."""
-    quality = recording.quality
-    if quality.total("received"):
-        return ""
-    if not quality.foreign:
-        return f"; {bus} was silent for {listened:.1f} s"
-    return (
-        f"; {quality.foreign} frames heard on {bus} in {listened:.1f} s, none that the mapping "
-        "knows: see ehadiag check-bus"
-    )
-
-
-def _unused(folder: Path, test: str, stamp: str) -> Path:
-    """Return a file name for the recording that does not exist yet."""
-    number = 1
-    while True:
-        suffix = f"-{number}" if number > 1 else ""
-        path = folder / f"{stamp}-{Path(test).name}{suffix}.blf"
-        if not path.exists():
-            return path
-        number += 1
-
-
-def _empty(path: Path, outcome: Outcome) -> Recording:
-    return Recording(str(path), None, None, None, outcome, Environment(), Quality())
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
+        result = not_tested(recordings, [test], actuator, [why])
+    ended_at = heard.ended_at
+    spent = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
+    return results.deliver(result, spent, heard.name)

@@ -1,4 +1,4 @@
-"""`ehadiag check-bus`: listens, and reports what of a bus can be used."""
+"""`ehadiag check-bus`: listens, and reports which signals of a bus are usable."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import progress_bar
+from ehadiag.cli.output import progress_bar, put
 
 __all__ = ["add_parser", "run"]
 
@@ -34,6 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="how long to listen (default 3)",
     )
     options.add_mapping_options(parser)
+    options.add_log_options(parser)
     options.add_bus_options(parser)
     parser.set_defaults(run=run)
 
@@ -49,8 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     from firmware_iface.transport.receiver import Receiver  # noqa: PLC0415
 
     if arguments.log is not None:
-        table = read_frames(arguments.log)
-        print(f"log {arguments.log}")
+        table = read_frames(arguments.log, options.the_budget(arguments))
+        put(f"log {arguments.log}")
     else:
         with (
             options.open_transport(arguments, transmit=False) as transport,
@@ -67,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
                 display("listening", (time.monotonic() - begin) / arguments.duration)
             listened = time.monotonic() - begin
         table = collected.table()
-        print(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
+        put(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
     report = report_bus(table, bus_map)
-    print(render(report))
+    put(render(report))
     return NOT_USABLE if report.problems else 0

@@ -1,22 +1,25 @@
-"""`ehadiag diagnose`: recordings in, verdicts out."""
+"""`ehadiag diagnose`: diagnoses recordings."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
-from ehadiag.cli.output import make_folder, progress_bar, say, say_if_compiling, show, write_report
-from ehadiag.core.errors import EhadiagError
+from ehadiag.cli.deadline import Deadline
+from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
+from ehadiag.cli.output import progress_bar, say, say_if_compiling
+from ehadiag.cli.results import Results, make_folder
+from ehadiag.core.errors import EhadiagError, NotTestedError
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
+    from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.core.recording import Recording
 
 __all__ = ["add_parser", "run"]
@@ -26,7 +29,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command."""
     parser = subparsers.add_parser(
         "diagnose",
-        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4)",
+        help="diagnose recordings (BLF, ASC, CSV, TRC, MF4, candump; .gz)",
         description="Diagnose actuators from recordings of their bus.",
         allow_abbrev=False,
     )
@@ -50,21 +53,31 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="the logs are of one actuator: one estimate from all of them",
     )
     parser.add_argument("--all", action="store_true", help="every test in a log, not its last one")
+    parser.add_argument(
+        "--list", action="store_true", help="list the tests that each log holds, diagnose none"
+    )
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
+    options.add_log_options(parser)
     options.add_diagnosis_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose each log; return the worst exit code."""
+    if arguments.list:
+        return _list(arguments)
     # What is wrong with the options is said before anything slow is loaded.
     diagnosis = _Diagnosis(arguments)
     codes = [0]
     together: list[Recording] = []
     spent = 0.0
     for log in arguments.logs:
+        if diagnosis.stopped:
+            say(f"stopped by the user: log {log} is not diagnosed")
+            codes.append(NotTestedError.exit_code)
+            continue
         begin = time.perf_counter()
         try:
             found = diagnosis.read(log)
@@ -84,7 +97,25 @@ def run(arguments: argparse.Namespace) -> int:
         say("no joint estimate: not all of the logs could be read")
     elif arguments.joint:
         codes.append(diagnosis.finish(together, spent, "joint"))
+    keep_signals()
     return max(codes)
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    """Print what the logs hold."""
+    from ehadiag.cli.listing import print_list  # noqa: PLC0415
+    from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
+
+    bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
+    code = 0
+    for log in arguments.logs:
+        try:
+            found = iterate_recordings(log, bus_map, budget)
+            print_list(log, found, as_json=arguments.json)
+        except EhadiagError as error:
+            say(str(error))
+            code = max(code, error.exit_code)
+    return code
 
 
 class _Diagnosis:
@@ -96,26 +127,56 @@ class _Diagnosis:
         self._tests = options.known_tests(arguments.test)
         only = arguments.test[0] if len(arguments.test) == 1 else None
         self._default = resolve_test(only) if only else None
-        self._levels = Levels(arguments.advisory, arguments.limit)
+        self._levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
         self._bus_map = options.the_bus_map(arguments)
-        self._folder = make_folder(arguments.out) if arguments.out else None
-        self._names: set[str] = set()
+        self._budget = options.the_budget(arguments)
+        self._results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
+        self.stopped = False
+        """Whether a signal came: nothing further is diagnosed."""
         say_if_compiling()
 
     def read(self, log: str) -> list[Recording]:
         """Read what is to be diagnosed of one log."""
-        from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - loads cantools
+        from firmware_iface.logs.reader import (  # noqa: PLC0415 - loads cantools
+            read_recording,
+            read_recordings,
+        )
 
-        found = read_recordings(log, self._bus_map)
-        return list(found) if self._arguments.all else [choose(found)]
+        interrupt_on_signals()
+        if self._arguments.all:
+            return list(read_recordings(log, self._bus_map, self._budget))
+        return [read_recording(log, self._bus_map, self._budget)]
 
     def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
-        """Diagnose, print and write one result; return its exit code."""
+        """Diagnose, write and print one result; return its exit code."""
+        from ehadiag.assess.diagnosis import match_tests, not_tested  # noqa: PLC0415 - loads numba
+
+        begin = time.perf_counter()
+        try:
+            interrupt_on_signals()
+            if self.stopped:
+                raise KeyboardInterrupt
+            result = self._diagnose(recordings)
+        except KeyboardInterrupt:
+            self.stopped, why = True, "stopped by the user"
+        except NotTestedError as error:
+            why = str(error)
+        else:
+            why = ""
+        if why:
+            tests = match_tests(recordings, self._tests, self._default)
+            elapsed = time.perf_counter() - begin
+            result = not_tested(recordings, tests, self._actuator, [why], elapsed)
+        code = self._results.deliver(result, Spent(read_s), name)
+        self.stopped = self.stopped or self._results.stopped
+        return code
+
+    def _diagnose(self, recordings: Sequence[Recording]) -> Diagnosis:
         from ehadiag.assess.diagnosis import diagnose  # noqa: PLC0415 - loads numba
         from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
 
         with progress_bar() as progress:
-            result = diagnose(
+            return diagnose(
                 recordings,
                 self._actuator,
                 self._tests,
@@ -123,16 +184,5 @@ class _Diagnosis:
                 levels=self._levels,
                 solver=make_solver(self._arguments.solver),
                 seed=self._arguments.seed,
-                progress=progress,
+                progress=Deadline(self._arguments.time_limit).watch(progress),
             )
-        show(result, self._arguments, Spent(read_s))
-        if self._folder is not None:
-            write_report(result, self._folder / self._unused(name), self._arguments, Spent(read_s))
-        return int(result.verdict)
-
-    def _unused(self, name: str) -> str:
-        """Return a name that no other log of this call has: folders may hold equal file names."""
-        candidates = (name if n == 1 else f"{name}-{n}" for n in itertools.count(1))
-        free = next(item for item in candidates if item not in self._names)
-        self._names.add(free)
-        return free

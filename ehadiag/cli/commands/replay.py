@@ -27,6 +27,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="X",
         help="times its own rhythm (default 1); 0: as fast as the bus takes it",
     )
+    options.add_log_options(parser)
     options.add_bus_options(parser)
     parser.set_defaults(run=run)
 
@@ -34,23 +35,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Play the log."""
     options.need_one_bus(arguments)
-    from firmware_iface.logs.reader import read_frames  # noqa: PLC0415 - loads python-can
-    from firmware_iface.logs.replay import play  # noqa: PLC0415
+    from firmware_iface.logs.replay import StoredLog, play  # noqa: PLC0415 - loads python-can
 
-    table = read_frames(arguments.log)
+    # Read once beforehand: what is wrong with it must be said before anything is sent.
+    log = StoredLog(arguments.log, arguments.log_channel, options.the_budget(arguments))
     with (
         options.open_transport(arguments, transmit=True) as transport,
         stop_on_signals() as stop,
         progress_bar() as display,
     ):
         sent = play(
-            table,
+            log,
             transport,
             speed=arguments.speed or None,
             stop=stop,
-            progress=lambda done: display("replay", done / max(len(table), 1)),
+            progress=lambda done: display("replay", done / max(log.frames, 1)),
         )
-    say(f"played {sent} of {len(table)} frames on {transport.name}{damage(transport)}")
+    say(f"played {sent} of {log.frames} frames on {transport.name}{damage(transport)}")
     return 0
 
 

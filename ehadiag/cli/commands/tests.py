@@ -6,7 +6,7 @@ import argparse
 import csv
 import sys
 
-from ehadiag.cli.output import wide_console
+from ehadiag.cli.output import emit, rendered
 from ehadiag.core.stored_test import UNITS, bundled_tests, resolve_test
 
 __all__ = ["add_parser", "run"]
@@ -48,5 +48,5 @@ def run(arguments: argparse.Namespace) -> int:
             f"{test.rate:g} Hz",
             test.description,
         )
-    wide_console().print(table)
+    emit(rendered(lambda console: console.print(table)))
     return 0

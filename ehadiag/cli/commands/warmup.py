@@ -7,6 +7,7 @@ import time
 
 from ehadiag.cli.output import say, say_if_compiling
 from ehadiag.core.actuator import default_actuator
+from ehadiag.core.errors import InputOutputError
 from ehadiag.core.recording import CommandMode
 from ehadiag.core.stored_test import bundled_tests
 
@@ -29,7 +30,7 @@ def run(_arguments: argparse.Namespace) -> int:
     """Compile."""
     say_if_compiling(simulation=True)
     begin = time.perf_counter()
-    from ehadiag.compile.kernels import cache_folder  # noqa: PLC0415
+    from ehadiag.compile.kernel_cache import cache_folder  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415 - loads numba
     from ehadiag.monitor import Monitor  # noqa: PLC0415
     from ehadiag_sim.plant.simulator import Plant  # noqa: PLC0415
@@ -40,5 +41,10 @@ def run(_arguments: argparse.Namespace) -> int:
     Monitor(default_actuator(), (0.0, 0.0, 0.0))
     Plant(default_actuator()).tick(0.0, CommandMode.CURRENT)
     default_map()  # keeps what it finds in the DBC
-    say(f"kernels ready in {cache_folder()} after {time.perf_counter() - begin:.1f} s")
+    folder = cache_folder()
+    took = f"{time.perf_counter() - begin:.1f} s"
+    if folder is None:
+        say(f"kernels compiled in {took}, and kept nowhere")
+        return InputOutputError.exit_code
+    say(f"kernels ready in {folder.path} after {took}")
     return 0

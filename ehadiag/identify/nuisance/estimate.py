@@ -86,11 +86,13 @@ def estimate(
         The same seed gives the same answer.
     """
     known = known or {}
-    model = _derivatives(experiments, free, ())
+    coarse = _free_running(experiments, free)
+    model = _scaled(coarse, experiments)
     first, information = belief_of(model, known), information_of(model, known)
     found = search(model, first, information, is_noise, alias=ALIAS, budget=budget, seed=seed)
     judged = _judged(experiments, found.residuals)
-    fine = _derivatives(judged, free, considered)
+    held = [item.parameter for item in considered]
+    fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
     belief = _last_look(fine, model, found, known, seed)
     refined = _described(fine, belief, settled=found.explained, seed=seed)
     return Estimated(
@@ -104,12 +106,19 @@ def estimate(
     )
 
 
-def _derivatives(
-    experiments: Sequence[Experiment], free: Sequence[Parameter], considered: Sequence[Considered]
+def _free_running(
+    experiments: Sequence[Experiment],
+    parameters: Sequence[Parameter],
+    levels: NDArray[np.int64] | None = None,
+) -> SimdModel:
+    """Model of whole tests; `levels`: of one of the same tests, if there was one."""
+    return SimdModel(lay_out(experiments), unknowns_of(experiments, parameters), levels=levels)
+
+
+def _scaled(
+    model: SimdModel, experiments: Sequence[Experiment], considered: Sequence[Considered] = ()
 ) -> Derivatives:
-    """Whole tests, the model running free, in coordinates scaled by the noise."""
-    parameters = (*free, *(item.parameter for item in considered))
-    model = SimdModel(lay_out(experiments), unknowns_of(experiments, parameters))
+    """Coordinates scaled by the noise."""
     noise = (experiments[0].spool_noise, experiments[0].pressure_noise)
     return Derivatives(model, noise, considered)
 
@@ -137,7 +146,7 @@ def _last_look(
 def _described(model: Derivatives, belief: Belief, *, settled: bool, seed: int) -> Refinement:
     """Put together what is known at the optimum."""
     linear = linearised(model, belief, np.random.default_rng(seed))
-    residuals, considered, anchored = model.at(belief.x)
+    residuals, considered, anchored, _ = model.at(belief.x)
     weighted = model.model.batch.weight > 0.0
     used = (linear.scatter < CLEAR) & (residuals**2 < CAP) & weighted
     return Refinement(

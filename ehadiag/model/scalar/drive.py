@@ -13,7 +13,7 @@ __all__ = ["deflection_held", "drive"]
 
 @inlined
 def drive(law: DriveLaw, held: NDArray[np.float64], current: float) -> float:
-    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-2, PHY-30, PHY-31).
+    """Flapper deflection (m) that the torque of a current (A) alone makes (PHY-4, PHY-29, PHY-30).
 
     held: what the plays hold, A, shape (plays,), changed in place.
     """

@@ -1,1 +1,1 @@
-"""Harness faults: what a damaged bus does to frames."""
+"""Simulated damage: to the harness of a bus, and to the frames on it."""

@@ -1,4 +1,4 @@
-"""A bus seen through a damaged harness."""
+"""A transport that damages the frames of another one as a faulty harness would."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Broken hardware by name: kinds of damage that the three progressive faults are not.
+"""Named kinds of broken hardware, besides the three progressive faults.
 
 A diagnosis must not take any of them for a healthy actuator, nor for one of the three faults.
 Seeded: the same generator gives the same sizes.

@@ -1,4 +1,4 @@
-"""Faults of a harness, one kind at a time: what becomes of each frame.
+"""Kinds of harness damage (loss, delay, bit flips, ...), each a rule for single frames.
 
 Seeded, so that a run can be repeated. Each fault turns one frame into none, one or several.
 """

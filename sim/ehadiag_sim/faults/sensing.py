@@ -1,4 +1,4 @@
-"""Broken sensors and wires, one kind at a time: what becomes of the four readings of a tick.
+"""Broken sensors and wires: what each kind does to the four readings of a tick.
 
 They strike before conversion, so that the control law works on what they leave of the jack
 position. Each keeps its own past; a plant takes copies, so that every test begins afresh.

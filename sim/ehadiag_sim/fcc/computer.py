@@ -1,4 +1,4 @@
-"""The flight-control computer's side of bus.md, one control tick at a time, without a clock."""
+"""The flight-control computer's side of BUS-4 to BUS-13, one tick at a time, without a clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control law of the flight-control computer (model.md section 1)."""
+"""Control law of the flight-control computer (PHY-2, PHY-3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated computer on a bus: in real time, or as fast as the bus takes its frames."""
+"""Runs the emulated computer on a bus, in real time or as fast as the bus takes its frames."""
 
 from __future__ import annotations
 

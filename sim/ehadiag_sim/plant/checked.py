@@ -1,4 +1,4 @@
-"""Numbers with a range: fields of a data class that say where they lie, and the check of them."""
+"""Data-class fields with a range, and the check of it."""
 
 from __future__ import annotations
 

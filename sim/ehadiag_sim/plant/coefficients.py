@@ -1,4 +1,4 @@
-"""Numbers that the plant's kernel needs, from actuator data, faults and effects."""
+"""Coefficients of the plant's kernel, from actuator data, faults and effects."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from ehadiag_sim.plant.conditions import Effects, Faults
 __all__ = ["Coefficients", "coefficients", "relative_viscosity"]
 
 CLOGGING = 0.8
-"""Share of the first-stage flow gain that is lost at the limit of damage (model.md section 3)."""
+"""Share of the first-stage flow gain that is lost at the limit of damage (PHY-13)."""
 
 KELVIN = 273.15
 REFERENCE_DEGC = 40.0
 KNOWN_VISCOSITIES = ((40.0, 14.5), (100.0, 3.5))
-"""degC and mm²/s of MIL-PRF-83282 (model.md section 4)."""
+"""degC and mm²/s of MIL-PRF-83282 (PHY-19)."""
 WALTHER_SHIFT = 0.7
 
 
 class Coefficients(NamedTuple):
-    """Symbols of model.md, SI units, with faults and effects already in them."""
+    """Symbols of docs/reference/physics.md, SI units, with faults and effects already in them."""
 
     GM: float
     JF: float
@@ -84,9 +84,9 @@ def coefficients(
     filter_time: float = 0.0,
     oil_temperature: float | None = None,
 ) -> Coefficients:
-    """Scale the actuator's data by faults (model.md section 3) and effects (sections 4 and 8).
+    """Scale the actuator's data by faults (PHY-13 to 15) and effects (PHY-16 to 39).
 
-    The first-stage pressure gain does not follow the supply: model.md names PSR only. The ends of
+    The first-stage pressure gain does not follow the supply (PHY-20). The ends of
     the friction scales (FSS1, FDJ1) have no tolerance. `oil_temperature` (degC) stands for that of
     the effects.
     """

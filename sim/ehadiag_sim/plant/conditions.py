@@ -1,4 +1,4 @@
-"""What a simulated actuator suffers from: faults, effects, and how its sensors err."""
+"""State of a simulated actuator: its faults, its effects, and the errors of its sensors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHANNEL_COUNT = 4
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """The three progressive faults (model.md section 3), each 0 (as new) … 1 (limit of damage).
+    """The three progressive faults (PHY-12 to 15), each 0 (as new) … 1 (limit of damage).
 
     Raises
     ------
@@ -35,7 +35,7 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class DataErrors:
-    """By what share the unit's data differ from its actuator file (model.md section 8).
+    """By what share the unit's data differ from its actuator file (PHY-37).
 
     Each -0.5 … 1; 0.05 means 5 % more than the file says.
 
@@ -61,7 +61,7 @@ class DataErrors:
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """What the three faults leave out (model.md sections 4 and 8).
+    """What the three faults leave out (PHY-16 to 39).
 
     Raises
     ------
@@ -95,7 +95,7 @@ class Effects:
     data: DataErrors = field(default_factory=DataErrors)
     """By what the unit's data differ from the actuator file."""
     strangers: Strangers = field(default_factory=Strangers)
-    """What the contract does not name."""
+    """Effects that no requirement names."""
 
     def __post_init__(self) -> None:
         check_ranges(self, "effect")
@@ -108,7 +108,7 @@ class Effects:
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """How converters and probes err (model.md sections 5 and 8); offsets in LSB of each channel.
+    """How converters and probes err (PHY-21, 22, 33 to 38); offsets in LSB of each channel.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Sensors and converters: from what the electronics see to the codes on the bus."""
+"""Sensors and analogue-to-digital converters of the simulated plant."""
 
 from __future__ import annotations
 

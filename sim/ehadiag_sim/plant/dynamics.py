@@ -1,4 +1,4 @@
-"""The plant alone: servovalve current in, spool, pressure and jack position out; no noise."""
+"""The plant without sensors: servovalve current in, noise-free response out."""
 
 from __future__ import annotations
 

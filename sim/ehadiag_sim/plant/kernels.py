@@ -2,7 +2,7 @@
 
 Each sub-step takes flapper, spool, pressure and jack in the order of the chain. Forces that grow
 with a mass's own velocity are implicit (the hydraulic ones have time constants of microseconds),
-the rest is explicit; dry friction follows Borello's algorithm (model.md section 1).
+the rest is explicit; dry friction follows Borello's algorithm (PHY-8).
 """
 
 from __future__ import annotations
@@ -78,13 +78,13 @@ def velocity_after(
 
 @kernel
 def stribeck(static: float, dynamic: float, speed: float, scale: float) -> float:
-    """Friction of a mass that moves, N: FD + (FS - FD)·exp(-|v|/vS) (model.md section 8)."""
+    """Friction of a mass that moves, N: FD + (FS - FD)·exp(-|v|/vS) (PHY-31)."""
     return dynamic + (static - dynamic) * math.exp(-abs(speed) / scale)
 
 
 @kernel
 def orifice_flow(opening: float, share: float, underlap: float, gain: float) -> float:
-    """Flow through two lands into the chambers, m³/s (model.md section 8).
+    """Flow through two lands into the chambers, m³/s (PHY-39).
 
     `opening` is the spool's position against the lands in m, `share` P12/PSR, `gain` GQ.
     """

@@ -126,7 +126,7 @@ class SimulatedRun:
     command: command of each tick at the bus's resolution, A or m, shape (ticks,).
     current, spool, pressure, position: noise-free A, m, Pa, m at the end of each tick, (ticks,).
     codes: ADC codes of the four channels as sampled in each tick, shape (4, ticks).
-    environment: what the probes read half-way through the test.
+    environment: what the probes read half-way through the test, at the bus's resolution.
     """
 
     test: StoredTest
@@ -213,12 +213,12 @@ def simulate(
     command, mode = bus_command(test), _mode(test)
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
-    environment = Environment(*plant.probed)
+    probed = plant.probed
     for tick, value in enumerate(command.tolist()):
         codes[:, tick] = plant.tick(value, mode)
         truth[:, tick] = plant.truth
         if tick == test.ticks // 2:
-            environment = Environment(*plant.probed)
+            probed = plant.probed
     return SimulatedRun(
         test=test,
         effects=effects,
@@ -228,7 +228,7 @@ def simulate(
         pressure=truth[2],
         position=truth[3],
         codes=codes,
-        environment=environment,
+        environment=_on_the_bus(*probed),
     )
 
 
@@ -241,6 +241,15 @@ def bus_command(test: StoredTest) -> NDArray[np.float64]:
     step = COMMAND_STEP[_mode(test)]
     rounded: NDArray[np.float64] = np.rint(test.command() / step) * step
     return rounded
+
+
+def _on_the_bus(supply: float, drain: float, degc: float) -> Environment:
+    """Probes' readings as the bus carries them: 10 kPa and 0.1 K (`Environment` of the DBC)."""
+    return Environment(
+        supply_pressure=round(supply / 1e4) * 1e4,
+        return_pressure=round(drain / 1e4) * 1e4,
+        oil_temperature=round(10.0 * degc) / 10.0,
+    )
 
 
 def _mode(test: StoredTest) -> CommandMode:

@@ -1,4 +1,4 @@
-"""Effects that no page of the contract names, to try an identification on what it does not know."""
+"""Effects that no requirement names, to try the identification on the unknown."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Strangers"]
 
 @dataclass(frozen=True, slots=True)
 class Strangers:
-    """What a bench may hold and model.md does not: unknown to the identification, all 0 = none.
+    """What a bench may show and no requirement names: unknown to the identification, all 0 = none.
 
     Raises
     ------

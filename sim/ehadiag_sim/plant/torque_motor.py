@@ -1,4 +1,4 @@
-"""Torque motor: from the current that the computer holds to the torque on the flapper."""
+"""Torque motor: from controller current to flapper torque, with bias, hysteresis and gain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def play(held: float, value: float, half_width: float) -> float:
 
 
 class TorqueMotor:
-    """Null bias, hysteresis and gain of one torque motor (model.md sections 4 and 8).
+    """Null bias, hysteresis and gain of one torque motor (PHY-16, 17, 29, 30).
 
     Hysteresis is the mean of n plays (Prandtl-Ishlinskii) with half-widths
     `r_i = hyst·IM·(i + 0.5)/n`; for n = 1 the play of section 4, of half-width hyst·IM/2.

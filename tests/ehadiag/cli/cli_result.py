@@ -1,4 +1,4 @@
-"""What a run of the command line gave, and where its tests find things."""
+"""Result of a command-line run: exit code, output, error line, JSON objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line in this process: exit code, standard output, standard error."""
+"""A fixture that runs the command line in this process."""
 
 from __future__ import annotations
 

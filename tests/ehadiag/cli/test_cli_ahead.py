@@ -1,4 +1,4 @@
-"""Working ahead of the end of a test: when there is nothing left to listen for."""
+"""Identification while the test runs: same digits as afterwards, and no listening beyond need."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from cli_result import Run
 from places import LOGS
 
 from ehadiag.assess.acceptance import nothing_is_under_way
-from ehadiag.assess.online import OnlineIdentification
+from ehadiag.assess.diagnosis import DiagnosisSession
 from ehadiag.cli.ahead import Ahead, working_ahead
+from ehadiag.cli.deadline import Deadline
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import BitState, Recording
-from ehadiag.core.stored_test import resolve_test
+from ehadiag.core.stored_test import StoredTest, resolve_test
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.session.assembler import Assembler
 from firmware_iface.session.handshake import Phase
@@ -47,36 +48,41 @@ def heard(
 
 
 def test_stages_run_when_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
-    online = OnlineIdentification(TEST, default_actuator())
-    due = len(online.due_s)
+    session = a_session()
+    due = len(session.due_s(TEST))
     taken = threading.Semaphore(0)
-    work = online.take
+    work = session.feed
 
     def take(recording: Recording) -> None:
         work(recording)
         taken.release()
 
-    monkeypatch.setattr(online, "take", take)
-    with working_ahead(online, heard("paper-open-1.blf"), TEST) as ahead:
+    monkeypatch.setattr(session, "feed", take)
+    with working_ahead(session, heard("paper-open-1.blf"), TEST) as ahead:
         for tenth in range(54):
             ahead.watch(Progress(Phase.RUNNING, tenth / 10.0, TEST.duration, 0, None))
         assert all(taken.acquire(timeout=60.0) for _ in range(due))
-        ahead.finish()
+        assert ahead.finish(Deadline(60.0), threading.Event())
     assert due == 4
-    assert len(online.memory) == 5, "first approximation, three stages of search, refinement"
-    assert online.memory.reused == 3 * 5, "the log has all of them at the first of four instants"
+    # First approximation, three stages of search, refinement.
+    assert session.reused == 3 * 5, "the log has all of them at the first of four instants"
+
+
+def a_session() -> DiagnosisSession:
+    return DiagnosisSession(default_actuator(), (TEST,))
 
 
 class Blocked:
-    """An identification that is at its first snapshot until it may go on."""
-
-    due_s = (0.1, 0.2, 0.3, 0.4)
+    """A session that is at its first snapshot until it may go on."""
 
     def __init__(self) -> None:
         self.begun, self.go_on = threading.Event(), threading.Event()
         self.taken: list[int] = []
 
-    def take(self, number: int) -> None:
+    def due_s(self, _test: StoredTest) -> tuple[float, ...]:
+        return (0.1, 0.2, 0.3, 0.4)
+
+    def feed(self, number: int) -> None:
         self.taken.append(number)
         self.begun.set()
         assert self.go_on.wait(60.0)
@@ -96,27 +102,27 @@ class Numbered:
         return table
 
 
-def watched(ahead: Ahead, online: Blocked) -> None:
+def watched(ahead: Ahead, session: Blocked) -> None:
     """Let every snapshot fall due; the first one is at work then, the others wait."""
-    for at in online.due_s:
+    for at in session.due_s(TEST):
         ahead.watch(Progress(Phase.RUNNING, at + 0.05, 1.0, 0, None))
-        assert online.begun.wait(60.0)
+        assert session.begun.wait(60.0)
 
 
 def test_the_end_does_not_wait_for_stale_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
-    online: Any = Blocked()
+    session: Any = Blocked()
     assembler: Any = Numbered()
-    with working_ahead(online, assembler, TEST) as ahead:
-        watched(ahead, online)
+    with working_ahead(session, assembler, TEST) as ahead:
+        watched(ahead, session)
         join = ahead._thread.join
 
         def waiting(timeout: float | None = None) -> None:
-            online.go_on.set()
+            session.go_on.set()
             join(timeout)
 
         monkeypatch.setattr(ahead._thread, "join", waiting)
         ahead.finish()
-    assert online.taken == [1, 4]
+    assert session.taken == [1, 4]
 
 
 def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
@@ -124,7 +130,7 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
 ) -> None:
     told: list[str] = []
 
-    def interrupted(_: Ahead) -> None:
+    def interrupted(*_: object) -> bool:
         told.append("finish")
         raise KeyboardInterrupt
 
@@ -135,15 +141,28 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
     leave = Ahead.abandon
     monkeypatch.setattr(Ahead, "finish", interrupted)
     monkeypatch.setattr(Ahead, "abandon", abandon)
-    result = run("bit", "--simulate", "--fast", "--test", "open", "--record", "a.blf")
-    assert (result.code, told) == (130, ["finish", "abandon"])
+    result = run("bit", "--simulate", "--fast", "--json", "--test", "open", "--record", "a.blf")
+    assert (result.code, told) == (30, ["finish", "abandon"])
+    assert result.objects[0]["reasons"] == ["stopped by the user"]
+
+
+def test_the_wait_for_what_runs_ahead_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    online: Any = Blocked()
+    assembler: Any = Numbered()
+    with working_ahead(online, assembler, TEST) as ahead:
+        watched(ahead, online)
+        assert not ahead.finish(Deadline(0.01), threading.Event())
+        stop = threading.Event()
+        stop.set()
+        assert not ahead.finish(Deadline(60.0), stop)
+        ahead.abandon()
+    online.go_on.set()
 
 
 def test_a_test_that_is_all_there_needs_no_more_listening() -> None:
-    online = OnlineIdentification(TEST, default_actuator())
-    with working_ahead(online, heard("paper-open-1.blf"), TEST) as ahead:
+    with working_ahead(a_session(), heard("paper-open-1.blf"), TEST) as ahead:
         assert ahead.all_there()
-        ahead.finish()
+        assert ahead.finish(Deadline(60.0), threading.Event())
     assert ahead.whole is not None
     assert ahead.whole.outcome.state is BitState.COMPLETE
     assert ahead.ended_at is not None
@@ -151,9 +170,8 @@ def test_a_test_that_is_all_there_needs_no_more_listening() -> None:
 
 @pytest.mark.parametrize(("without", "before"), [(1, 0), (1, 49), (40, 0)])
 def test_frames_that_are_missing_may_be_under_way(without: int, before: int) -> None:
-    online = OnlineIdentification(TEST, default_actuator())
     log = heard("paper-open-1.blf", without=without, before=before)
-    with working_ahead(online, log, TEST) as ahead:
+    with working_ahead(a_session(), log, TEST) as ahead:
         assert not ahead.all_there()
         ahead.abandon()
     assert ahead.whole is None

@@ -1,4 +1,4 @@
-"""`ehadiag bit` and what it needs of a bus: verdicts, refusals, silence, other testers."""
+"""`ehadiag bit` on a bus: verdicts, refusals, silence, other testers."""
 
 from __future__ import annotations
 

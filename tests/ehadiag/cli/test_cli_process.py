@@ -1,11 +1,10 @@
-"""The command line as processes: signals, two of them on a bus, an installation without rights."""
+"""The command line as a process: signals, two processes on a bus, a read-only installation."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import textwrap
@@ -15,9 +14,7 @@ import pytest
 from cli_result import COMMAND, REPOSITORY
 from places import LOGS
 
-from ehadiag.compile.kernels import cache_folder
-from ehadiag.core.recording import BitState
-from firmware_iface.logs.reader import read_recording
+from ehadiag.compile.kernel_cache import cache_folder
 
 LOOPNET = REPOSITORY / "tools" / "loopnet.sh"
 NO_NAMESPACE = 125
@@ -76,55 +73,6 @@ def test_two_processes_on_multicast(
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_aborts_the_test_and_leaves_a_readable_recording(
-    number: signal.Signals, tmp_path: Path, environment: dict[str, str]
-) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "bit", "--test", "open", "--simulate", "--json", "--record", "cut.blf"],
-        cwd=tmp_path,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stderr is not None
-        while "recording to" not in process.stderr.readline():
-            assert process.poll() is None
-        recording = tmp_path / "cut.blf"
-        # Some hundred frames on disk: the test has been requested and is on its way.
-        while recording.stat().st_size < 4000:
-            assert process.poll() is None
-        process.send_signal(number)
-        output, errors = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 30, errors
-    assert "Traceback" not in errors
-    found = json.loads(output)
-    assert found["verdict"] == "NOT_TESTED"
-    assert found["reasons"] == ["stopped by the user"]
-    assert read_recording(recording).outcome.state is BitState.ABORTED
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_sim_ends_on_a_signal(number: signal.Signals, environment: dict[str, str]) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "sim", "-i", "virtual"], env=environment, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stderr is not None
-        assert "Ctrl-C stops it" in process.stderr.readline()
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 0
-    (line,) = errors.splitlines()
-    assert line.startswith("ehadiag: stopped after ")
-
-
 def test_reader_that_goes_away_ends_it_without_a_traceback(environment: dict[str, str]) -> None:
     done = subprocess.run(
         ["sh", "-c", '"$@" | head -1', "pipe", *COMMAND, "tests", "--csv", "open"],
@@ -150,11 +98,16 @@ def installed_copy(folder: Path) -> Path:
 
 
 def without_home(
-    site: Path, temporary: Path, arguments: list[str], environment: dict[str, str]
+    site: Path,
+    temporary: Path,
+    arguments: list[str],
+    environment: dict[str, str],
+    cache: dict[str, str],
 ) -> subprocess.CompletedProcess[str]:
     gone = ("HOME", "XDG_CACHE_HOME", "EHADIAG_CACHE_DIR", "NUMBA_CACHE_DIR", "MPLCONFIGDIR")
     kept = {key: value for key, value in environment.items() if key not in gone}
     kept |= {"PYTHONPATH": str(site), "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
+    kept |= cache
     # As root the lack of rights hinders nobody, so what was written is looked at afterwards.
     code = textwrap.dedent(f"""
         import sys, ehadiag
@@ -181,20 +134,24 @@ def test_read_only_installation_without_home(
     temporary.mkdir()
     installed_copy(site)
     before = sorted(site.rglob("*"))
+    kept = temporary / "kept"
     if warm:
         ours = cache_folder()
-        shutil.copytree(ours, temporary / f"ehadiag-{os.getuid()}" / ours.name)
+        assert ours is not None
+        shutil.copytree(ours.path, kept / ours.path.name)
+    cache = {"EHADIAG_CACHE_DIR": str(kept)} if warm else {}
     log = str(LOGS / "healthy-open.blf")
     arguments = ["diagnose", "--json", "--out", "reports", log]
-    done = without_home(site, temporary, arguments, environment)
+    done = without_home(site, temporary, arguments, environment, cache)
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if "font cache" not in line]
-    assert [line.partition(":")[0] for line in said] == ["ehadiag"] * (1 if warm else 2)
+    assert [line.partition(":")[0] for line in said] == ["ehadiag"] * (1 if warm else 3)
     assert json.loads(done.stdout)["verdict"] == "HEALTHY"
     assert sorted(site.rglob("*")) == before
-    told = "compiling the model's kernels, once for this installation" in done.stderr
+    told = "compiling the model's kernels, in memory, at each start" in done.stderr
     assert told is not warm
-    assert any((temporary / f"ehadiag-{os.getuid()}").glob("kernels-*/*.nbi"))
+    there = {path.name for path in temporary.iterdir()}
+    assert there == {"reports", *(["kept"] if warm else [])}
 
 
 def in_shell(

@@ -1,4 +1,4 @@
-"""The quick starts, typed word for word: each `sh` block of the page in its terminal."""
+"""The quick starts, typed word for word, each `sh` block in its terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording lacks: said beside the verdict, or as the reason why there is none."""
+"""What a recording lacks is noted beside the verdict, or is the reason for NOT TESTED."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What commands print and write: JSON as promised, tables whole, exit codes, seeds."""
+"""Output of the commands: JSON schema, tables, exit codes, seeds."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_csv_is_the_command_of_the_test(run: Run) -> None:
     assert head == "time_s,command_mA"
     values = {float(time): float(value) for time, value in (row.split(",") for row in rows)}
     assert len(values) == 5500
-    # model.md section 6; the tick of a step still has the earlier value.
+    # PHY-25 and PHY-26; the tick of a step still has the earlier value.
     expected = {0.1: 0.0, 0.45: 0.75, 0.7: 1.5, 1.2: 0.0, 1.7: -1.5, 2.4: 0.0, 2.401: 10.0}
     expected |= {2.5: 10.0, 2.501: -10.0, 2.7: -10.0, 2.75: 10.0, 3.0: 0.0, 4.51: 8.0}
     assert {time: values[time] for time in expected} == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""When there is a verdict, and which: every reason for NOT TESTED, and the levels."""
+"""Verdicts: every reason for NOT TESTED, and the two levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory had by its address, and compiled code that is called at once."""
+"""Direct calls of compiled code by address give what normal calls give."""
 
 import numba
 import numpy as np

@@ -1,4 +1,4 @@
-"""The sums' design against tables and against white noise."""
+"""Design of the CUSUM against published tables and against white noise."""
 
 import numpy as np
 import pytest

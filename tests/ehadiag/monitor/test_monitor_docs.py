@@ -1,4 +1,4 @@
-"""The how-to's examples run and print what the page says."""
+"""The examples of the monitor's page run and print what the page says."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""The monitor in the receive thread of a bus: every tick reaches it, and it follows."""
+"""The monitor in a receive thread gets every tick, in order."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Frames with every fault of a harness onto the tick grid: nothing invented, everything counted."""
+"""Alignment of damaged frame streams: nothing invented, everything counted."""
 
 from __future__ import annotations
 
@@ -213,12 +213,15 @@ def test_duplicated_last_frame(frames, bus_map, truth):
     assert (counts(recording).repeated, counts(recording).lost) == (1, 0)
 
 
-def test_of_two_frames_with_one_counter_the_first_counts(frames, bus_map, truth, encoder):
+def test_two_payloads_with_one_counter_are_both_dropped(frames, bus_map, truth, encoder):
     place = next(i for i, f in enumerate(frames) if f.can_id == TELEMETRY and tick_of(f) == 100)
     (other,) = encoder.telemetry((1, 1, 1, 1), frames[place].time_ns + 1000, 13 + 100)
     recording = one([*frames[: place + 1], other, *frames[place + 1 :]], bus_map)
     assert_truthful(recording.samples, truth)
-    assert counts(recording).repeated == 1
+    assert np.isnan(recording.samples.spool[100])
+    assert (counts(recording).conflicts, counts(recording).lost) == (1, 1)
+    assert counts(recording).repeated == 0
+    assert recording.quality.refused == ()
 
 
 def test_swapped_frames_are_put_in_order(frames, bus_map, truth):

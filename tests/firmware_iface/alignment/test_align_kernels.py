@@ -1,4 +1,4 @@
-"""Kernels behind the tick grid, one at a time: what whole recordings do not tell apart."""
+"""Kernels of the alignment, one at a time, at their limits."""
 
 from __future__ import annotations
 

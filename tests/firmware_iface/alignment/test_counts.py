@@ -1,4 +1,4 @@
-"""Counts at their exact boundaries."""
+"""Counts of lost, repeated and late frames, at their exact limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Single frames become ticks: each once, in order, whatever the bus loses, repeats or swaps."""
+"""Live assembly of ticks: each once, in order, whatever the bus loses, repeats or swaps."""
 
 import dataclasses
 import math

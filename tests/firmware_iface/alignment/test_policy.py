@@ -1,4 +1,4 @@
-"""What a policy makes of counts alone: what is refused, what is noted, and in which words."""
+"""Policies: which counts refuse a recording, which are noted, and the wording."""
 
 from __future__ import annotations
 

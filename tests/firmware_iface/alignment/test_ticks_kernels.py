@@ -1,4 +1,4 @@
-"""Kernels behind the control ticks, one at a time: what whole recordings do not tell apart."""
+"""Kernels that place frames on ticks, one at a time, at their limits."""
 
 from __future__ import annotations
 

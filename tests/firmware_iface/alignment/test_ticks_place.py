@@ -1,4 +1,4 @@
-"""Which message the tick axis comes from, and how the other messages find their place on it."""
+"""Which message defines the ticks, and how the other messages are placed on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node in C in step with the Python emulator: every frame but the samples must be the same."""
+"""The C computer in step with the Python emulator: the same frames, but for the samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames out: byte for byte the reference recording's, and readable by cantools."""
+"""Encoding of frames, byte for byte as in the reference recordings and as cantools reads them."""
 
 from __future__ import annotations
 

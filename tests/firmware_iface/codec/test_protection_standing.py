@@ -1,4 +1,4 @@
-"""Counters that stand still, and short runs of frames that come much too late."""
+"""Counters that stand still, and runs of frames that arrive much too late."""
 
 from __future__ import annotations
 

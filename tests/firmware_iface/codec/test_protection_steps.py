@@ -1,4 +1,4 @@
-"""Steps from frame to frame at their exact limits, and the host clock's own steps."""
+"""Counter steps at their exact limits, and steps of the host clock."""
 
 from __future__ import annotations
 

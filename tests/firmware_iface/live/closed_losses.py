@@ -1,4 +1,4 @@
-"""What lost frames cost the closed-loop test: prints the rows of the table in the docs.
+"""Measures what lost frames cost the closed-loop test; prints rows for the page on bus faults.
 
 python tests/firmware_iface/live/closed_losses.py 20
 
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from fault_cases import Case, run
 
-from ehadiag.assess import acceptance as fitness
-from ehadiag.assess import diagnosis
+from ehadiag.assess import acceptance, diagnosis
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import Recording
@@ -49,7 +48,7 @@ def lossy(frames: list[Frame], share: float, rng: np.random.Generator) -> list[F
 
 
 def holed(frames: list[Frame], count: int, length: int, rng: np.random.Generator) -> list[Frame]:
-    """Frames with holes of some ms anywhere in the test."""
+    """Frames with dropouts of some ms anywhere in the test."""
     begun = next(item.time_ns for item in frames if item.can_id == COMMAND and item.data[5])
     first = rng.integers(300, 5400 - length, count)
     gone = {tick for item in first.tolist() for tick in range(item, item + length)}
@@ -93,11 +92,11 @@ def row(name: str, outcomes: list[Outcome]) -> str:
     )
 
 
-LIMIT = fitness.MOST_GUESSED
+LIMIT = acceptance.MOST_GUESSED
 
 
 def main(seeds: int) -> None:
-    fitness.MOST_GUESSED = 1.0
+    acceptance.MOST_GUESSED = 1.0
     found: dict[str, list[Outcome]] = {}
     for seed in range(seeds):
         truth = PAPER[seed % len(PAPER)]
@@ -112,7 +111,7 @@ def main(seeds: int) -> None:
         for count, length in HOLES:
             rng = np.random.default_rng((seed, count, length))
             frames = holed(clean.frames, count, length, rng)
-            name = f"{count} hole{'s' * (count > 1)} of {length} ms"
+            name = f"{count} dropout{'s' * (count > 1)} of {length} ms"
             found.setdefault(name, []).append(compared(frames, sound, truth))
     for name, outcomes in found.items():
         print(row(name, outcomes))

@@ -1,4 +1,4 @@
-"""Faults of a harness and what becomes of a test under each; also prints the table of the docs.
+"""Harness faults with the outcome stated for each; prints docs/reference/bus-faults.md.
 
 python tests/firmware_iface/live/fault_cases.py > docs/reference/bus-faults.md
 """
@@ -307,7 +307,7 @@ def concluded(case: Case) -> str:
 
 
 CLOSED_LOSSES = """\
-| lost | runs | guessed | fit lets pass | off whole | off truth | beyond 1.5 % |
+| lost | runs | interpolated | accepted | from whole | from truth | beyond 1.5 % |
 | --- | --- | --- | --- | --- | --- | --- |
 | 1 % | 20 | 0.0 % | 20 | 0.8 | 1.8 | 0 |
 | 2 % | 20 | 0.0 … 0.1 % | 20 | 0.5 | 1.8 | 0 |
@@ -316,14 +316,22 @@ CLOSED_LOSSES = """\
 | 12 % | 28 | 1.1 … 1.8 % | 25 | 2.1 | 2.7 | some |
 | 15 % | 28 | 1.8 … 2.8 % | 23 | 21.3 | 20.5 | 28 |
 | 20 % | 20 | 3.4 … 4.4 % | 15 | 9.6 | 10.4 | 20 |
-| a hole of 50 ms | 12 | 0.9 % | 12 | 0.5 | 1.8 | 0 |
-| a hole of 100 ms | 28 | 0.9 % | 25 | 1.7 | 3.1 | 0 |
-| a hole of 200 ms | 28 | 0.9 % | 24 | 0.9 | 2.2 | 0 |
-| 20 holes of 5 ms | 28 | 1.4 … 1.5 % | 26 | 1.8 | 2.3 | 0 |
-| 40 holes of 5 ms | 28 | 2.8 … 2.9 % | 26 | 3.8 | 4.9 | 28 |
-| 10 holes of 20 ms | 16 | 3.2 … 3.5 % | 16 | 11.1 | 11.9 | 16 |
+| a dropout of 50 ms | 12 | 0.9 % | 12 | 0.5 | 1.8 | 0 |
+| a dropout of 100 ms | 28 | 0.9 % | 25 | 1.7 | 3.1 | 0 |
+| a dropout of 200 ms | 28 | 0.9 % | 24 | 0.9 | 2.2 | 0 |
+| 20 dropouts of 5 ms | 28 | 1.4 … 1.5 % | 26 | 1.8 | 2.3 | 0 |
+| 40 dropouts of 5 ms | 28 | 2.8 … 2.9 % | 26 | 3.8 | 4.9 | 28 |
+| 10 dropouts of 20 ms | 16 | 3.2 … 3.5 % | 16 | 11.1 | 11.9 | 16 |
 """
 """Measured by closed_losses.py."""
+
+
+SECOND_SENDER = """
+## What a second sender does to a test
+
+Its frames are dropped and counted as conflicts, or the answer is NOT TESTED and names it:
+[a second sender](second-sender.md).
+"""
 
 
 def table() -> str:
@@ -334,16 +342,16 @@ def table() -> str:
     logs = "".join(f"| {item.name} | {item.stated} |\n" for item in LOG_CASES)
     return f"""# What a damaged harness does to a test
 
-Each fault is injected between an emulated computer and the tester
+Each fault is injected between the emulated computer and the tester
 (`tests/firmware_iface/live/fault_cases.py`, from which these tables are printed by
 `python tests/firmware_iface/live/fault_cases.py`).
 
-*Handshake and samples*: a test of 0.4 s, each line checked by `test_live_faults.py`. The samples
-are those of the sound bus to the last bit: none is ever made up.
+*Handshake and samples*: a test of 0.4 s, each line checked by `test_live_faults.py`. Every
+sample that arrives equals that of the sound bus to the last bit; none is ever invented.
 
 *Diagnosis*: the whole stored test `open` from its request to the verdict, each line checked by
-`test_live_diagnosis.py`; faults that strike once strike amidst the steps that show the filter.
-Same: the verdict of the sound bus, and each estimate within twice its stated error (95 %
+`test_live_diagnosis.py`; a fault that occurs once occurs during the steps, which show the filter.
+“Same” means the verdict of the sound bus, and each estimate within twice its stated error (95 %
 interval) of that of the sound bus.
 
 | fault | handshake and samples | diagnosis |
@@ -354,18 +362,19 @@ interval) of that of the sound bus.
 Losses of 1, 5 and 10 %, late frames, a pause of 0.1 s and damaged frames with a valid CRC give
 the outcomes above in closed loop too. There the servovalve current is rebuilt from the jack
 positions that the control law worked on. A lost position follows exactly from the current
-measured in the next tick. Where that is lost too, the position can only be bridged over, and the
-noise of that one sample, which the control law turned into current, is not known; the stated
-error leaves it out.
+measured in the next tick. Where that is lost too, the position can only be interpolated; the
+noise of that sample, which the control law turned into current, remains unknown and is not part
+of the stated error.
 
 {CLOSED_LOSSES}
-*Guessed* are the ticks whose position was bridged over, of a hole at most 50. *Off* is the
-largest distance of an estimate, in stated standard deviations, from that of the whole recording
-and from the truth, among the runs that the fit let pass. With 20 % lost and the positions put
-back, no estimate was more than 1.1 off: it is the bridging. Hence **a closed-loop recording with
-more than 1.5 % of its positions guessed is NOT TESTED** (last column), and so is every controller
-with an integral or derivative part that lost more than 1.5 % of its positions: there each lost
-one is bridged over.
+*Interpolated* is the share of ticks whose position was interpolated, at most 50 in one dropout;
+*accepted* are the runs whose fit is accepted. *From whole* and *from truth* are the largest
+distances of an accepted estimate, in stated standard deviations, from that of the whole recording
+and from the truth. With 20 % lost and the positions restored, no estimate was more than 1.1
+deviations off, so interpolation is the cause. Hence **a closed-loop recording with more than
+1.5 % of its positions interpolated is NOT TESTED** (last column). So is every recording from a
+controller with an integral or derivative part that lost more than 1.5 % of its positions: there
+each lost position is interpolated.
 
 ## What a damaged log does to a diagnosis
 
@@ -374,7 +383,7 @@ The recording of the same test, damaged, and read as `ehadiag diagnose` reads it
 
 | log | diagnosis |
 | --- | --- |
-{logs}"""
+{logs}{SECOND_SENDER}"""
 
 
 if __name__ == "__main__":

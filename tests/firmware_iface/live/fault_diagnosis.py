@@ -1,4 +1,4 @@
-"""A whole stored test under each fault of a harness, from its request to the verdict."""
+"""Runs a whole stored test, from request to verdict, under a harness fault."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Diagnoser:
         """Run a case from request to verdict."""
         came = run(case, test=self.test, at=STRIKE)
         if not came.outcome.complete:
-            why = not_tested(came.recording, self.test, default_actuator(), [came.outcome.why])
+            why = not_tested([came.recording], [self.test], default_actuator(), [came.outcome.why])
             return Judged(came, why)
         return Judged(came, self.diagnose(came.recording))
 

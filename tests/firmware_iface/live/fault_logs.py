@@ -1,4 +1,4 @@
-"""Logs of a whole stored test, damaged: what becomes of the diagnosis."""
+"""Damaged logs of a whole stored test, with the outcome stated for each."""
 
 from __future__ import annotations
 
@@ -109,12 +109,12 @@ def endless(frames: list[Frame], begun: float, _: Path) -> Recording:
 
 
 LOG_CASES = (
-    LogCase("half a log (BLF cut off)", half, "samples are missing"),
-    LogCase("last 0.2 s missing, word of completion too", without(END - 0.2, 99.0)),
+    LogCase("half a log (BLF truncated)", half, "samples are missing"),
+    LogCase("last 0.2 s missing, and with it the status of completion", without(END - 0.2, 99.0)),
     LogCase("last 0.3 s missing", without(END - 0.3, 99.0), "no spool sample for 0.3"),
     LogCase("first 0.2 s missing", without(-99.0, 0.2)),
-    LogCase("0.2 s missing amidst the steps", without(2.45, 2.65)),
-    LogCase("0.3 s missing amidst the steps", without(2.45, 2.75), "no spool sample for 0.3"),
+    LogCase("0.2 s missing during the steps", without(2.45, 2.65)),
+    LogCase("0.3 s missing during the steps", without(2.45, 2.75), "no spool sample for 0.3"),
     LogCase("an endless log, the test at its end", endless),
     LogCase("a flood of foreign frames, then the test", after_noise),
     LogCase("the test, then a flood of foreign frames", before_noise, "no telemetry"),

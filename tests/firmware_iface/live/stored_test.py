@@ -1,4 +1,4 @@
-"""The frames of one whole stored test, for transports to carry, and what must come of them."""
+"""The frames of one whole stored test, for transport tests to carry."""
 
 from __future__ import annotations
 

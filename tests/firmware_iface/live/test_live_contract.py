@@ -1,4 +1,4 @@
-"""One contract, run on every transport: what `Transport` promises, its readers may rely on."""
+"""What `Transport` promises, tested on every transport."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ CLOSED = (
     "pause of 0.1 s, frames lost",
     "bit flips with a valid CRC, 1 %",
 )
-QUICK_LOGS = ("last 0.2 s missing, word of completion too", "last 0.3 s missing")
+QUICK_LOGS = ("last 0.2 s missing, and with it the status of completion", "last 0.3 s missing")
 
 
 @pytest.fixture(scope="module")

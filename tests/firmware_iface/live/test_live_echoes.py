@@ -1,4 +1,4 @@
-"""Interfaces that hand a sender its own frames: they must not be taken for somebody else's."""
+"""A sender's own frames that an interface echoes are not taken for somebody else's."""
 
 from __future__ import annotations
 

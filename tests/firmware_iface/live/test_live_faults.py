@@ -1,4 +1,4 @@
-"""Every fault of a harness gives its stated outcome, and no sample is ever made up."""
+"""Every harness fault has its stated outcome, and no sample is invented."""
 
 from __future__ import annotations
 

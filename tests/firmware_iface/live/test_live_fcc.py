@@ -1,4 +1,4 @@
-"""The emulated computer: its answers, its rates, its check sums, its refusals, its aborts."""
+"""The emulated computer: answers, rates, check sums, refusals, aborts."""
 
 from __future__ import annotations
 

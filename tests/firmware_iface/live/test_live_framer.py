@@ -1,4 +1,4 @@
-"""The serial link's framer: byte streams in any shape, whole or damaged."""
+"""Framing of the serial link on byte streams of any shape, whole or damaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The handshake's state machine, fed by hand: every way a request can end."""
+"""State machine of the handshake: every way a request can end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The receive thread: order, overflow, faults that reach the reader, a clean stop."""
+"""Receive thread: order, overflow, errors that reach the reader, a clean stop."""
 
 from __future__ import annotations
 

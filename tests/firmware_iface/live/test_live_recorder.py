@@ -1,4 +1,4 @@
-"""The recorder: what is on disk, also after a kill, and what it refuses."""
+"""Recorder: what is on disk, also after a kill, and what it refuses."""
 
 from __future__ import annotations
 

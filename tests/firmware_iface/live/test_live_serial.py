@@ -1,4 +1,4 @@
-"""The serial link on ports of all kinds: one that nobody reads, network ports, pyserial URLs."""
+"""The serial link on all kinds of ports: unread ones, network ports, pyserial URLs."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
-"""Logs of every kind and every defect, in one line or read as far as they go."""
+"""Logs of every format and defect: read as far as they go, or refused in one line."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import gc
+import gzip
 import sys
 from dataclasses import fields, replace
 
@@ -95,7 +96,7 @@ def test_counts_of_the_lossy_recording():
 
 
 @pytest.mark.filterwarnings("default")  # asammdf's own
-@pytest.mark.parametrize("suffix", [".blf", ".asc", ".csv", ".trc", ".mf4"])
+@pytest.mark.parametrize("suffix", [".blf", ".asc", ".csv", ".trc", ".mf4", ".log"])
 def test_one_recording_in_every_format(tmp_path, encoder, suffix):
     if suffix == ".mf4":
         pytest.importorskip("asammdf", reason="MF4 needs the extra ehadiag[mf4]")
@@ -233,7 +234,7 @@ def test_missing_file(tmp_path, name):
     assert name in one_line(error)
 
 
-@pytest.mark.parametrize("name", ["log.txt", "log", "log.blf.gz"])
+@pytest.mark.parametrize("name", ["log.txt", "log", "log.txt.gz", "log.gz"])
 def test_unknown_suffix(tmp_path, name):
     (tmp_path / name).write_text("x")
     with pytest.raises(ConfigurationError, match="unknown kind") as error:
@@ -241,7 +242,7 @@ def test_unknown_suffix(tmp_path, name):
     assert ".blf" in one_line(error)
 
 
-@pytest.mark.parametrize("suffix", [".blf", ".asc", ".csv", ".trc"])
+@pytest.mark.parametrize("suffix", [".blf", ".asc", ".csv", ".trc", ".log", ".blf.gz", ".log.gz"])
 @pytest.mark.parametrize("content", [b"", b"hello, world\n", b"\0" * 300, b"LOGG", b"\xff\xfe"])
 def test_not_a_log(tmp_path, suffix, content):
     path = tmp_path / f"text{suffix}"
@@ -297,12 +298,14 @@ def test_assembler_forgets_the_oldest(encoder):
 
 BLF_SEED = (LOGS / "paper-open-1.blf").read_bytes()[:6000]
 ASC_SEED = (LOGS / "hot-worn-closed.asc").read_bytes()[:1500]
+CANDUMP_SEED = b"(1700000000.000001) can0 110#0102030405060708\n(1.5) can0 00000111##1FF R\n" * 9
+PACKED_SEED = gzip.compress(CANDUMP_SEED)
 
 
 @settings(max_examples=150, suppress_health_check=list(HealthCheck))
-@given(st.data(), st.sampled_from([".blf", ".asc", ".csv", ".trc"]))
+@given(st.data(), st.sampled_from([".blf", ".asc", ".csv", ".trc", ".log", ".log.gz"]))
 def test_no_bytes_crash_the_reader(tmp_path, data, suffix):
-    seed = BLF_SEED if suffix == ".blf" else ASC_SEED
+    seed = {".blf": BLF_SEED, ".log": CANDUMP_SEED, ".log.gz": PACKED_SEED}.get(suffix, ASC_SEED)
     content = bytearray(data.draw(st.sampled_from([b"", seed])))
     for _ in range(data.draw(st.integers(0, 6))):
         at = data.draw(st.integers(0, len(content)))

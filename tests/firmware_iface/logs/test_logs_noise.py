@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from ehadiag.core.errors import InputOutputError
-from firmware_iface.logs.reader import read_frames, read_frames_noted
+from firmware_iface.logs.blocks import LogReader
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.transport.frames import Frame
 
@@ -57,6 +58,6 @@ def test_lines_that_cannot_be_read_are_counted(tmp_path: Path) -> None:
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     lines[-3] = "    18        17.0 DT 0zzz Rx 8 damaged\n"
     path.write_text("".join(lines), encoding="utf-8")
-    table, notes = read_frames_noted(path)
-    assert len(table) == 19
-    assert notes == ("1 lines of the log could not be read",)
+    reader = LogReader(path)
+    assert sum(map(len, reader)) == 19
+    assert reader.notes == ("1 lines of the log could not be read",)

@@ -1,4 +1,4 @@
-"""What is kept of a DBC file gives the same map, and never stands in the way."""
+"""The cache of DBC contents gives the same map as the file, and never gets in the way."""
 
 from __future__ import annotations
 
@@ -70,12 +70,15 @@ def test_another_cantools_is_another_entry(folder: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     "damage", [b"", b"{", b"[]", b'{"M": {"name": 1}}', b"\xff\xfe", b"[" * 100_000]
 )
-def test_a_damaged_entry_is_read_from_the_file(folder: Path, damage: bytes) -> None:
+def test_a_damaged_entry_is_read_from_the_file(
+    folder: Path, damage: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     first = recall_dbc(TEXT, "a")
     (entry,) = folder.iterdir()
     entry.write_bytes(damage)
     assert recall_dbc(TEXT, "a") == first
     assert entry.read_bytes() != damage
+    assert caplog.text.count("\n") == 1
 
 
 def test_without_a_folder_it_parses(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,13 +87,27 @@ def test_without_a_folder_it_parses(folder: Path, monkeypatch: pytest.MonkeyPatc
     assert not folder.exists()
 
 
-def test_what_cannot_be_written_is_not_kept(folder: Path) -> None:
+def test_what_cannot_be_written_is_not_kept(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     first = recall_dbc(TEXT, "a")
     (entry,) = folder.iterdir()
     entry.unlink()
-    entry.with_suffix(f".{os.getpid()}").mkdir()
+    entry.mkdir()
     assert recall_dbc(TEXT, "a") == first
-    assert not entry.exists()
+    assert [item.name for item in folder.iterdir()] == [entry.name]
+    assert "the DBC is not kept" in caplog.text
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+def test_a_planted_link_is_neither_read_nor_followed(folder: Path) -> None:
+    first = recall_dbc(TEXT, "a")
+    (entry,) = folder.iterdir()
+    elsewhere = folder.parent / "elsewhere"
+    elsewhere.write_bytes(b"{}")
+    entry.unlink()
+    entry.symlink_to(elsewhere)
+    assert recall_dbc(TEXT, "a") == first
+    assert elsewhere.read_bytes() == b"{}"
+    assert not entry.is_symlink()
 
 
 def test_numbers_without_end_are_not_kept(folder: Path) -> None:

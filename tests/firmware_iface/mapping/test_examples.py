@@ -1,4 +1,4 @@
-"""Other people's buses: the worked examples of the documentation, fed by cantools."""
+"""The example mappings of the documentation, fed by cantools."""
 
 from __future__ import annotations
 

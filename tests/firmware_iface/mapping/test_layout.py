@@ -1,4 +1,4 @@
-"""Bulk extraction and packing against cantools, over random layouts."""
+"""Extraction and packing of signals against cantools, over random layouts."""
 
 from __future__ import annotations
 

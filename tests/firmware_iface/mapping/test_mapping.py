@@ -1,4 +1,4 @@
-"""Mappings and DBCs from strangers: checked, explained in one line, never trusted."""
+"""Untrusted mappings and DBC files are checked, and refused in one line."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_mapping_names_no_file_outside_its_folder(folder, path):
         ('"Environment"', '"Weather"', "no message 'Weather'"),
         ('signal = "DiffPressure"', 'signal = "JackPosition"', "unit 'mm' is no pressure"),
         ('signal = "ServoCurrent"', 'signal = "TelemetryCounter"', "gives no unit; add unit"),
-        ('signal = "ServoCurrent"', 'signal = "ServoCurrent", scale = 0.0', "must not be zero"),
+        ('signal = "ServoCurrent"', 'signal = "ServoCurrent", scale = 0.0', "scale must lie"),
         ('signal = "ServoCurrent"', 'signal = "ServoCurrent", scale = nan', "finite"),
         ('signal = "ServoCurrent"', 'signal = "ServoCurrent", unit = "kg"', "unit 'kg' is no"),
         ('signal = "ServoCurrent"', 'signal = "ServoCurrent", sign = 1', "sign"),
@@ -115,7 +115,7 @@ def test_wrong_mapping(folder, old, new, match):
         ("BO_ 288 Environment", "BO_ 272 Environment", "share an identifier"),
         ("BO_ 272 ServoTelemetry: 8", "BO_ 272 ServoTelemetry: 80", "longer than a CAN FD"),
         ("36|12@1+", "36|40@1+", "DBC"),
-        ("24|12@1+ (0.01220703125,-25)", "24|12@1+ (0,-25)", "scale of zero"),
+        ("24|12@1+ (0.01220703125,-25)", "24|12@1+ (0,-25)", "a scale outside"),
     ],
 )
 def test_wrong_dbc(folder, old, new, match):

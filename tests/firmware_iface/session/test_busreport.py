@@ -1,4 +1,4 @@
-"""What check-bus says of a bus."""
+"""The report of check-bus."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from bus_synth import COMMAND, START, TELEMETRY, TICK, flip, make_truth, play, tick_of
 
-from ehadiag.assess import acceptance as fitness
+from ehadiag.assess import acceptance
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.session.bus_report import LONGEST_GAP_S, render, report_bus
 from firmware_iface.transport.frames import Frame, FrameTable
@@ -25,7 +25,7 @@ def test_reference_recording(bus_map, logs):
     assert messages["ServoTelemetry"].rate == pytest.approx(1000.0, rel=1e-3)
     assert messages["Environment"].rate == pytest.approx(10.0, rel=1e-2)
     assert messages["ServoTelemetry"].lost == 0
-    assert messages["ServoTelemetry"].longest_gap < 1.2e-3
+    assert messages["ServoTelemetry"].longest_pause < 1.2e-3
     assert messages["ServoTelemetry"].roles == (
         "channels.current",
         "channels.spool",
@@ -79,7 +79,7 @@ def test_gap_and_saturation(encoder, bus_map):
     truth.codes[50:53, 3] = 4095
     frames = [f for f in play(encoder, truth) if not 100 <= tick_of(f) < 130]
     report = report_bus(FrameTable.from_frames(frames), bus_map)
-    assert by_name(report)["ServoTelemetry"].longest_gap == pytest.approx(31e-3)
+    assert by_name(report)["ServoTelemetry"].longest_pause == pytest.approx(31e-3)
     assert by_name(report)["ServoTelemetry"].lost == 30
     assert report.ranges[3].saturated == 3
     assert report.ranges[3].highest_code == 4095
@@ -99,7 +99,7 @@ def test_a_pause_in_which_the_counter_turns_is_told(encoder, bus_map):
 
 
 def test_the_pause_that_is_borne_is_the_diagnosis_own():
-    assert LONGEST_GAP_S == fitness.LONGEST_GAP_S
+    assert LONGEST_GAP_S == acceptance.LONGEST_GAP_S
 
 
 def test_a_mapping_without_a_command_is_told(encoder, bus_map):

@@ -1,4 +1,4 @@
-"""Watched channels, fed by hand: when a limit ends a test, when silence does, and what is said."""
+"""Watched limits: when a value or a silence ends a test, and the wording."""
 
 from __future__ import annotations
 

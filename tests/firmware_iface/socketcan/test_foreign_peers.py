@@ -1,4 +1,4 @@
-"""Programs of other authors on the same bus: can-utils, python-can's tools, the kernel's SLCAN."""
+"""Foreign programs on the same bus: can-utils, python-can's tools, the kernel's SLCAN."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Any mix of faults: no sample is ever invented or moved, and the counts add up."""
+"""Any mix of harness faults: no sample is invented or moved, and the counts add up."""
 
 from __future__ import annotations
 

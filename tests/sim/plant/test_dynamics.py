@@ -1,4 +1,4 @@
-"""Properties that the plant must have whatever drives it."""
+"""Properties of the plant that hold for any input."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""The effects of real units against the independent stiff solver, one by one and together."""
+"""The effects of real units against the stiff solver, one by one and together."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""The tool that drives the simulator with a recording's own currents, and its two launchers."""
+"""compare_logs: the simulator, driven by a recording's currents, reproduces the recording."""
 
 import dataclasses
 
@@ -94,6 +94,20 @@ def test_convergence_prints_a_table(capsys):
     assert convergence.main(["--test", "open", "--ticks", "450", "--steps", "8", "4"]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     assert [row.split("|")[1].strip() for row in rows] == ["step, µs", "---", "8", "4"]
+
+
+@pytest.mark.slow
+def test_convergence_of_units_falls_with_the_step(capsys):
+    words = "--units 1 --test open --ticks 500 --steps 16 2"
+    assert convergence.main(words.split()) == 0
+    stages = ("| linear |", "| orifice |")
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line.split("|") for line in lines if line.startswith(stages)]
+    cells = [([part.strip() for part in row[1:4]], float(row[4].split()[0])) for row in rows]
+    kinds = [(a, b) for a in ("linear", "orifice") for b in ("Coulomb", "Stribeck")]
+    assert [cell[0] for cell in cells] == [[*kind, step] for kind in kinds for step in ("16", "2")]
+    for coarse, fine in zip(cells[::2], cells[1::2], strict=True):
+        assert fine[1] < 0.3 * coarse[1]
 
 
 @pytest.mark.parametrize(

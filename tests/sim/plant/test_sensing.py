@@ -1,4 +1,4 @@
-"""Filters, sampling instant, gains, probes: what the converters make of the plant."""
+"""Sensor filters, sampling instant, gains and probes of the simulated plant."""
 
 import msgspec
 import numpy as np
@@ -108,7 +108,7 @@ def test_probes_err_but_the_oil_is_what_it_is():
         ACTUATOR,
         TESTS["open"],
         effects=Effects(oil_temperature=60.0),
-        sensors=Sensors(temperature_error=-2.0, supply_error=0.1e6),
+        sensors=Sensors(temperature_error=-2.04, supply_error=0.104e6),
         step=COARSE,
     )
     np.testing.assert_array_equal(right.codes, wrong.codes)

@@ -1,4 +1,4 @@
-"""Kernels against the independent stiff solver with event location."""
+"""The plant's kernels against an independent stiff solver with event location."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Null bias, hysteresis and gain of the torque motor: a Prandtl-Ishlinskii operator it is."""
+"""Torque motor: null bias, gain, and hysteresis as a Prandtl-Ishlinskii operator."""
 
 import itertools
 

@@ -17,7 +17,7 @@ SPECIAL_EVERY = 4
 
 @dataclass(frozen=True, slots=True)
 class PaperCase:
-    """One case of the paper's Tables 1 and 2 (model.md section 7); errors in percent."""
+    """One case of the paper's Tables 1 and 2 (PHY-40); errors in percent."""
 
     test: str
     number: int

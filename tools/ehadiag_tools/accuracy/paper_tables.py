@@ -1,4 +1,4 @@
-"""The paper's Table 1 (open loop) and Table 2 (closed loop) beside ours, and pictures.
+"""`tools/paper_tables`: the paper's Tables 1 and 2 beside this project's results, and pictures.
 
 From simulated tests (12-bit converters, 0.5 LSB noise, several noise seeds), or from a folder of
 recordings with their truth.csv. The paper states neither noise nor quantisation.

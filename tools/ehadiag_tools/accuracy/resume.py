@@ -1,4 +1,4 @@
-"""Many independent runs on all cores, with progress; what is done is kept and not done again."""
+"""Runs many independent jobs on all cores, and resumes where an interrupted run stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Accuracy of the identification on tests with known truth, against what it must show.
+"""`tools/accuracy`: sweeps of identifications with known truth, compared with their targets.
 
 Modes: `sweep` (random cases of the unit cube, corners, edges and faces among them), `paper` (the
 paper's eight cases), `efficiency` (the monitoring model as its own plant, against the Cramér-Rao
@@ -273,10 +273,10 @@ def _print_worst(records: Sequence[dict[str, Any]], count: int = 5) -> None:
     for index in np.argsort(-np.abs(error).max(axis=1))[:count]:
         record = records[index]
         truth = ", ".join(f"{x:.4f}" for x in record["faults"])
-        gaps = ", ".join(f"{x:+.4f}" for x in error[index])
+        off = ", ".join(f"{x:+.4f}" for x in error[index])
         std = ", ".join(f"{100.0 * x:.4f}" for x in record["std"])
         print(
-            f"| {record['noise_seed']} | {truth} | {gaps} | {std} "
+            f"| {record['noise_seed']} | {truth} | {off} | {std} "
             f"| {100.0 * record['outliers']:.2f} |"
         )
     print(flush=True)

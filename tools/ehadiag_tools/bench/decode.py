@@ -88,6 +88,7 @@ def tiled(table: FrameTable, frames: int) -> FrameTable:
         error=table.error[row],
         remote=table.remote[row],
         sent=table.sent[row],
+        channel=table.channel[row],
     )
 
 

@@ -1,11 +1,11 @@
-"""From samples to an estimate with its interval, warm: wall and CPU time by stage."""
+"""Benchmark of one estimate: from samples to interval, wall and CPU time by stage."""
 
 from __future__ import annotations
 
 import statistics
 import time
 
-from ehadiag.identify.pipeline import identify
+from ehadiag.identify.session import identify
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import LOG, TRUTH, experiment
 from ehadiag_tools.bench.rivals import rivals

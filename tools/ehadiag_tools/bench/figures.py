@@ -1,4 +1,4 @@
-"""What the sections of the benchmark share: sizes, figures, clocks."""
+"""Sizes, figures and clocks that the benchmark's sections share."""
 
 from __future__ import annotations
 

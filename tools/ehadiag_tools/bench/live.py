@@ -1,4 +1,4 @@
-"""From the end of a live test to its verdict: two processes, a serial line between them."""
+"""Benchmark of the live verdict: two processes on a serial line, from the last frame on."""
 
 from __future__ import annotations
 

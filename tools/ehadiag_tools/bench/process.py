@@ -1,4 +1,4 @@
-"""`ehadiag diagnose` as a whole process: kernels cached, and the first run ever."""
+"""Benchmark of `ehadiag diagnose` as a process: with cached kernels, and the first run ever."""
 
 from __future__ import annotations
 

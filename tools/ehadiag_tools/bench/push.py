@@ -1,4 +1,4 @@
-"""Latency of the streaming monitor's push, alone and beside a diagnosis."""
+"""Benchmark of the monitor's push: latency alone and beside a diagnosis."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
-from ehadiag.identify.pipeline import identify
+from ehadiag.identify.session import identify
 from ehadiag.monitor import Monitor, Tick
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import TRUTH, experiment, recording, samples

@@ -1,4 +1,4 @@
-"""Speed of the project against others doing the same, within one run: one table.
+"""`tools/bench`: speed of the project and its alternatives, measured in one run, as one table.
 
 Times are medians of CPU time of the thread or process, so that a machine shared with others still
 compares; wall time where it says so. Only ratios of one run count.

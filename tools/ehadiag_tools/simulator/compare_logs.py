@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def read_truth(path: Path) -> list[Truth]:
-    """Read file names, tests and fault constants.
+    """Read file names, tests and severities.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Integration step of the simulator against its error, by a stiff solver with event location.
+"""`tools/convergence`: error of the simulator against its integration step, by a stiff solver.
 
 The currents of a whole stored test (closed loop: of one simulated run) drive both.
 """
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         nargs=3,
         default=(0.3, 0.6, 0.3),
         metavar=("KINTAS", "FSS", "FDJ"),
-        help="fault constants (%(default)s)",
+        help="severities (%(default)s)",
     )
     parser.add_argument("--ticks", type=int, help="only the first so many ticks")
     parser.add_argument(
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=int,
         default=0,
         metavar="N",
-        help="instead of the stiff solver: N random units of either second stage",
+        help="instead of the stiff solver: N random units of either stage and friction",
     )
     options = parser.parse_args(argv)
     try:
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         faults = Faults(*options.faults)
         for name in options.test or ("open", "closed"):
             if options.units:
-                unit_table(resolve_test(name), options.units, options.steps)
+                unit_table(resolve_test(name), options.units, options.steps, options.ticks)
                 continue
             table(name, faults, options.steps, options.ticks)
     except EhadiagError as error:

@@ -1,4 +1,4 @@
-"""Effects of units that an independent simulator recorded, from the table beside the recordings."""
+"""Reads the effects of recorded units from the table beside the recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated plant driven through the very currents of a recording.
+"""Drives the simulated plant with the currents of a recording.
 
 Free-running loops with different noise part ways, so in closed loop the control law gets the
 *recorded* (digitised) jack position. What was not recorded is told from the next current.

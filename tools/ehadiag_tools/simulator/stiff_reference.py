@@ -1,6 +1,6 @@
-"""Slow, readable reference of the plant: a stiff solver with event location and a mode automaton.
+"""Slow, readable reference of the plant: a stiff solver with event location.
 
-Written from model.md sections 1 to 4 and 8 alone; it shares no code with the kernels. Friction
+Written from PHY-1 to 20 and PHY-28 to 39 alone; it shares no code with the kernels. Friction
 and stops are modes; the instants of sticking, breaking away and striking a stop are roots that
 scipy locates. Between them the equations are smooth but for the corners of the saturations and of
 the play at the feedback ball.

@@ -1,6 +1,6 @@
-"""Units as a bench has them: actuators drawn at random, and their recordings.
+"""Random units (actuators with faults and effects) and their simulated recordings.
 
-A unit keeps its effects over its life (model.md section 8); its faults, the oil and the noise are
+A unit keeps its effects over its life (PHY-28 to 39); its faults, the oil and the noise are
 those of a recording:
 
     unit = random_unit(np.random.default_rng(7), data=True)
@@ -60,7 +60,7 @@ def random_unit(
     strangers: bool = False,
     serial: int | None = None,
 ) -> Unit:
-    """Draw a unit, each effect evenly within its usual size (model.md section 8).
+    """Draw a unit, each effect evenly within its usual size (PHY-28 to 39).
 
     Always: offsets ±1 % of range, gain ±5 %, null bias ±2 % of rated current, hysteresis 0 to 4 %
     by one play, backlash 0 to 5 µm. Each group has a stream of its own: switching one on does not

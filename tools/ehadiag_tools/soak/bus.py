@@ -1,4 +1,4 @@
-"""Minutes on a loaded bus: frames lost, memory, and how old a sample is when its reader has it.
+"""`tools/soak`: minutes on a loaded bus; frames lost, memory, age of samples at the reader.
 
 Two more processes send: telemetry and command at 1 kHz, and frames of other devices until the bus
 is as full as asked. The reader is that of the product: receive thread, recorder, bounded queue.

@@ -1,4 +1,4 @@
-"""What a soaked bus carries: telemetry and command at 1 kHz, and frames of other devices.
+"""Senders of a soak: telemetry and command at 1 kHz, and frames of other devices.
 
 Every payload begins with the time of sending, so that its reader knows its age: 48 bits of
 microseconds on the machine's monotonic clock, which all processes share.
@@ -43,7 +43,7 @@ def sent_at_us(data: bytes) -> int:
 
 
 def send_own(options: BusOptions, stop: Event, sent: Synchronized[int]) -> None:
-    """Send telemetry and command, with the contract's counter and check sum, every tick."""
+    """Send telemetry and command every tick, with counter (BUS-5) and check sum (BUS-6)."""
     headers = [(item, struct.pack("<H", item)) for item in (COMMAND, TELEMETRY)]
     tick = 0
     with PythonCanTransport(options, transmit=True) as bus:

@@ -1,4 +1,4 @@
-"""The monitor in the receive thread of a live bus, with diagnoses running beside it.
+"""Soak of the monitor in the receive thread of a live bus, with diagnoses beside it.
 
 One more process is the flight-control computer: the detailed simulator in closed loop, telemetry
 and command at 1 kHz. This one is the product: its receive thread decodes the frames, puts them
@@ -25,7 +25,7 @@ from ehadiag.core.actuator import default_actuator
 from ehadiag.core.errors import BusLostError, ConfigurationError
 from ehadiag.core.recording import CommandMode
 from ehadiag.core.stored_test import resolve_test
-from ehadiag.identify.pipeline import identify
+from ehadiag.identify.session import identify
 from ehadiag.monitor import Monitor
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_sim.plant.simulator import Plant

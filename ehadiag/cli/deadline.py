@@ -1,0 +1,45 @@
+"""The time limit of an identification (`--time-limit`), and the wait that it bounds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from ehadiag.core.errors import NotTestedError
+
+__all__ = ["Deadline"]
+
+
+class Deadline:
+    """A number of seconds, wall clock, from now on.
+
+    The identification tells its progress between its stages and generations; it ends there.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._end = time.monotonic() + seconds
+
+    @property
+    def passed(self) -> bool:
+        """Whether the time is over."""
+        return time.monotonic() >= self._end
+
+    def watch(self, progress: Callable[[str, float], None]) -> Callable[[str, float], None]:
+        """Return a progress report that ends what reports to it when the time is over.
+
+        Raises (the report)
+        -------------------
+        NotTestedError: the time is over.
+        """
+
+        def tell(stage: str, share: float) -> None:
+            if self.passed:
+                raise NotTestedError(self.reason(stage))
+            progress(stage, share)
+
+        return tell
+
+    def reason(self, stage: str) -> str:
+        """Say why there is no estimate."""
+        return f"no estimate within {self._seconds:g} s: given up in the {stage} (see --time-limit)"

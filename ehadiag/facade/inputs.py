@@ -1,0 +1,68 @@
+"""What files, names and objects that a caller gives stand for: actuator, tests, mapping."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, TypeAlias
+
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+
+if TYPE_CHECKING:
+    from firmware_iface.mapping.bus_map import BusMap
+
+__all__ = ["PathLike", "the_actuator", "the_bus_map", "the_test", "the_tests"]
+
+PathLike: TypeAlias = str | os.PathLike[str]
+
+
+def the_actuator(given: Actuator | PathLike | None) -> Actuator:
+    """Return the actuator itself, or that of a file (`load_actuator`); None: the reference."""
+    if given is None:
+        return default_actuator()
+    return given if isinstance(given, Actuator) else load_actuator(os.fspath(given))
+
+
+def the_test(given: StoredTest | PathLike) -> StoredTest:
+    """Return the test itself, the stored one of that name, or that of a file (`resolve_test`)."""
+    return given if isinstance(given, StoredTest) else resolve_test(os.fspath(given))
+
+
+def the_tests(given: Iterable[StoredTest | PathLike]) -> tuple[StoredTest, ...]:
+    """Return the stored tests and the given ones; of one number the one given last."""
+    tests = {test.id: test for test in bundled_tests().values()}
+    for item in given:
+        test = the_test(item)
+        tests[test.id] = test
+    return tuple(tests.values())
+
+
+def the_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusMap:
+    """Return the meaning of the bus's frames (`load_map`); None: of the computer's own bus.
+
+    Parameters
+    ----------
+    mapping : BusMap | PathLike | None
+        The meaning itself, or a mapping file.
+    dbc : PathLike | None
+        DBC to use instead of the mapping file's own.
+
+    Returns
+    -------
+    BusMap
+        What each signal is.
+
+    Raises
+    ------
+    ConfigurationError
+        A DBC without a mapping file that names its signals.
+    """
+    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
+
+    if isinstance(mapping, str | os.PathLike):
+        return load_map(os.fspath(mapping), None if dbc is None else os.fspath(dbc))
+    if dbc is not None:
+        raise ConfigurationError("dbc: needs a mapping file, which names the signals")
+    return default_map() if mapping is None else mapping
