@@ -70,19 +70,21 @@ def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> 
     points = np.repeat(belief.x[None, :], 2 * pairs, axis=0)
     points[:, curved] += np.vstack([shares, -shares]) @ belief.root.T
     points[:, curved] = _mirrored(points[:, curved], model.lower[curved], model.upper[curved])
+    x = points.mean(axis=0)
     runs = model.many(points)
-    x, residuals = points.mean(axis=0), runs.mean(axis=0)
-    flat = (runs - residuals).reshape(len(runs), -1)
-    # In units of the spread, so that the regression is well conditioned.
+    shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+    # Offsets in units of the spread, so that the regression is well conditioned.
     inverse = np.linalg.inv(belief.root)
     offsets = (points - x)[:, curved] @ inverse.T
-    slopes = np.linalg.pinv(offsets, rcond=1e-6) @ flat
-    left = flat - offsets @ slopes
-    freedom = max(len(points) - 1 - count, 1)
-    scatter = np.einsum("ij,ij->j", left, left) / freedom
+    basis, triangle = np.linalg.qr(np.column_stack([np.ones(len(points)), offsets]))
+    along = basis.T @ flat
+    left = np.einsum("ij,ij->j", flat, flat) - np.einsum("ij,ij->j", along, along)
+    scatter = np.maximum(left, 0.0) / max(len(points) - 1 - count, 1)
+    slopes = inverse.T @ np.linalg.pinv(triangle[1:, 1:], rcond=1e-6)
     jacobian = model.additive_slopes()
-    jacobian[curved] = (inverse.T @ slopes).reshape(count, *residuals.shape)
-    return Linearised(x, residuals, jacobian, scatter.reshape(residuals.shape))
+    jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
+    mean = (along[0] * basis[0, 0]).reshape(shape)
+    return Linearised(x, mean, jacobian, scatter.reshape(shape))
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:
