@@ -141,8 +141,7 @@ class Session:
         if best is not None and (self.nuisances is Nuisances.NONE or explains(best.refined)):
             spent = Timing(searched_at - begin, search_s, 0.0)
             return self._textbook(first, best, spent, begin)
-        tell("nuisances", 0.0)
-        return self._with_nuisances(experiments, first, best, searched_at - begin, begin)
+        return self._with_nuisances(experiments, first, best, searched_at - begin, begin, tell)
 
     def _textbook(
         self, first: FirstApproximation, best: Attempt, spent: Timing, begin: float
@@ -169,11 +168,19 @@ class Session:
         before: Attempt | None,
         first_s: float,
         begin: float,
+        tell: Progress,
     ) -> Identification:
         """Free the nuisances too."""
         searched_at = time.perf_counter()
         free = (*FAULTS, *OFFSETS, *nuisances_of(REGISTRY))
-        done = estimate(experiments, free, considered=CONSIDERED, seed=self.seed)
+        tell("nuisances", 0.0)
+        done = estimate(
+            experiments,
+            free,
+            considered=CONSIDERED,
+            seed=self.seed,
+            tell=lambda share: tell("nuisances", share),
+        )
         values = done.refined.values
         found = SearchResult(
             best=np.array([values[item.name] for item in FAULTS]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.parameters import Parameter
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["BUDGET", "Estimated", "estimate"]
+__all__ = ["BUDGET", "Estimated", "estimate", "spread_of_optima"]
 
 BUDGET = 1600
 """Runs of the model after which no further start is made."""
@@ -68,6 +68,7 @@ def estimate(
     considered: Sequence[Considered] = (),
     budget: int = BUDGET,
     seed: int = 0,
+    tell: Callable[[float], None] | None = None,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
 
@@ -84,12 +85,16 @@ def estimate(
         See `BUDGET`.
     seed : int
         The same seed gives the same answer.
+    tell : callable, optional
+        Called from time to time with the share of the budget that is spent.
     """
     known = known or {}
     coarse = _free_running(experiments, free)
     model = _scaled(coarse, experiments)
     first, information = belief_of(model, known), information_of(model, known)
-    found = search(model, first, information, is_noise, alias=ALIAS, budget=budget, seed=seed)
+    found = search(
+        model, first, information, is_noise, alias=ALIAS, budget=budget, seed=seed, tell=tell
+    )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
@@ -98,7 +103,7 @@ def estimate(
     return Estimated(
         refined=refined,
         experiments=judged,
-        covariance=_of_other_optima(found, model.scale),
+        covariance=spread_of_optima(found, model.scale),
         explained=is_noise(refined.residuals),
         excess=excess(refined.residuals),
         starts=found.starts,
@@ -166,7 +171,7 @@ def _described(model: Derivatives, belief: Belief, *, settled: bool, seed: int) 
     )
 
 
-def _of_other_optima(found: Found, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+def spread_of_optima(found: Found, scale: NDArray[np.float64]) -> NDArray[np.float64]:
     """Covariance of the optima that the starts ended in, about the best, SI, shape (k, k).
 
     Each has the weight of its likelihood, exp(-cost / 2), costs in units of what the best one

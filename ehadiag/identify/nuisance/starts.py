@@ -82,6 +82,7 @@ def search(
     alias: str = "",
     budget: int = 1600,
     seed: int = 0,
+    tell: Callable[[float], None] | None = None,
 ) -> Found:
     """Search until the residuals are explained, or the budget is spent.
 
@@ -98,6 +99,8 @@ def search(
         Name of a parameter that passes for a sensor's constant error.
     budget : int
         Runs of the model after which no further start is made.
+    tell : callable, optional
+        Called after each start with the share of the budget that is spent.
     """
     until = model.evaluations + budget
     best: Found | None = None
@@ -114,6 +117,8 @@ def search(
         places.append(Place(belief.x, cost))
         if best is None or cost < best.cost:
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
+        if tell is not None:
+            tell(min(1.0 - (until - model.evaluations) / budget, 1.0))
     return replace(best, places=tuple(places))
 
 
