@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import identification
 from ehadiag.identify.experiment import Experiment, share_offsets
-from ehadiag.identify.nuisance.estimate import estimate
+from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.refine.first_part import (
     CONSIDERED,
@@ -21,6 +21,7 @@ from ehadiag.identify.refine.first_part import (
     first_spans,
     refine_first_part,
 )
+from ehadiag.identify.refine.least_squares import Refinement
 from ehadiag.identify.result import Identification, Timing
 from ehadiag.identify.search.first_approximation import FirstApproximation
 from ehadiag.identify.search.solvers import CompactGa, SearchResult, Solver
@@ -104,7 +105,7 @@ class Session:
         best = self._first(experiments)[1]
         for result in itertools.islice(self._stages(experiments, best), ready):
             best = result.best
-        if ready == len(STAGES):
+        if ready == len(STAGES) and resembles(experiments, best):
             self._first_part(experiments, best)
 
     def finish(
@@ -123,85 +124,91 @@ class Session:
         experiments = share_offsets(experiments)
         first, start = self._first(experiments)
         searched_at = time.perf_counter()
+        found = staged_search(self._stages(experiments, start), tell)
+        search_s = time.perf_counter() - searched_at
+        tell("refinement", 0.0)
+        alone = self.nuisances is Nuisances.NONE
+        near = resembles(experiments, found.best)
         best: Attempt | None = None
-        search_s = 0.0
-        if self.nuisances is not Nuisances.ALL:
-            found = staged_search(self._stages(experiments, start), tell)
-            search_s = time.perf_counter() - searched_at
-            tell("refinement", 0.0)
-            if self.nuisances is Nuisances.NONE or resembles(experiments, found.best):
-                best = attempt(experiments, found, self._first_part)
-                best = replace(best, evaluations=best.evaluations + found.evaluations)
-        if best is not None and self.nuisances is Nuisances.NONE:
+        if alone or (near and self.nuisances is Nuisances.AUTO):
+            best = attempt(experiments, found, self._first_part)
+            best = replace(best, evaluations=best.evaluations + found.evaluations)
+        if best is not None and alone:
             best = rescued(
                 experiments, best, self._first_part, self.solver, self.seed, tell,
                 time.perf_counter,
             )  # fmt: skip
             search_s += best.search_s
-        if best is not None and (self.nuisances is Nuisances.NONE or explains(best.refined)):
-            spent = Timing(searched_at - begin, search_s, 0.0)
-            return self._textbook(first, best, spent, begin)
-        return self._with_nuisances(experiments, first, best, searched_at - begin, begin, tell)
-
-    def _textbook(
-        self, first: FirstApproximation, best: Attempt, spent: Timing, begin: float
-    ) -> Identification:
-        """Put together what three severities alone explain."""
-        spread = covariance(best.refined)
-        return identification(
-            first,
-            best.found,
-            best.refined,
-            spread,
-            best.experiments,
-            solver=self.solver.name,
-            seed=self.seed,
-            evaluations=first.evaluations + best.evaluations,
-            attempts=best.count,
-            timing=replace(spent, refine=time.perf_counter() - begin - spent.first - spent.search),
-        )
-
-    def _with_nuisances(
-        self,
-        experiments: Sequence[Experiment],
-        first: FirstApproximation,
-        before: Attempt | None,
-        first_s: float,
-        begin: float,
-        tell: Progress,
-    ) -> Identification:
-        """Free the nuisances too."""
-        searched_at = time.perf_counter()
-        free = (*FAULTS, *OFFSETS, *nuisances_of(REGISTRY))
-        tell("nuisances", 0.0)
-        done = estimate(
-            experiments,
-            free,
-            considered=CONSIDERED,
-            seed=self.seed,
-            tell=lambda share: tell("nuisances", share),
-        )
+        refine_at = time.perf_counter()
+        timing = Timing(searched_at - begin, search_s, refine_at - searched_at - search_s)
+        evaluations = first.evaluations + (best.evaluations if best else found.evaluations)
+        if best is not None and (alone or explains(best.refined)):
+            return self._said(
+                first,
+                best.found,
+                best.refined,
+                covariance(best.refined),
+                best.experiments,
+                evaluations,
+                best.count,
+                timing,
+            )
+        hint = best.refined.values if best else named(found.best)
+        done = self._freed(experiments, hint, near, tell)
         values = done.refined.values
-        found = SearchResult(
-            best=np.array([values[item.name] for item in FAULTS]),
-            cost=done.refined.cost,
-            evaluations=done.evaluations,
-            generations=0,
-            history=np.zeros(0),
-        )
-        evaluations = first.evaluations + done.evaluations + (before.evaluations if before else 0)
-        now = time.perf_counter()
-        return identification(
+        severities = np.array([values[item.name] for item in FAULTS])
+        return self._said(
             first,
-            found,
+            replace(found, best=severities, cost=done.refined.cost),
             done.refined,
             covariance(done.refined) + done.covariance,
             done.experiments,
+            evaluations + done.evaluations,
+            done.starts + (1 if best else 0),
+            replace(timing, refine=timing.refine + time.perf_counter() - refine_at),
+        )
+
+    def _freed(
+        self,
+        experiments: Sequence[Experiment],
+        hint: Mapping[str, float],
+        near: bool,
+        tell: Progress,
+    ) -> Estimated:
+        """Estimate with all nuisances free."""
+        tell("nuisances", 0.0)
+        return estimate(
+            experiments,
+            (*FAULTS, *OFFSETS, *nuisances_of(REGISTRY)),
+            considered=CONSIDERED,
+            hint=hint,
+            near=near,
+            seed=self.seed,
+            tell=lambda share: tell("nuisances", share),
+        )
+
+    def _said(
+        self,
+        first: FirstApproximation,
+        found: SearchResult,
+        refined: Refinement,
+        spread: NDArray[np.float64],
+        experiments: Sequence[Experiment],
+        evaluations: int,
+        attempts: int,
+        timing: Timing,
+    ) -> Identification:
+        return identification(
+            first,
+            found,
+            refined,
+            spread,
+            experiments,
             solver=self.solver.name,
             seed=self.seed,
             evaluations=evaluations,
-            attempts=done.starts + (1 if before else 0),
-            timing=Timing(first_s, now - searched_at, searched_at - begin - first_s),
+            attempts=attempts,
+            timing=timing,
         )
 
     def _first(

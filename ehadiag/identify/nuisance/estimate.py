@@ -12,7 +12,7 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.explained import excess, is_noise
 from ehadiag.identify.nuisance.linearisation import Belief, linearised
 from ehadiag.identify.nuisance.posterior import sharpen
-from ehadiag.identify.nuisance.prior import ALIAS, Known, belief_of, information_of
+from ehadiag.identify.nuisance.prior import ALIAS, Known, belief_of, beside, information_of
 from ehadiag.identify.nuisance.starts import Found, robust_cost, search
 from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives, capped
 from ehadiag.identify.refine.least_squares import Refinement
@@ -66,6 +66,8 @@ def estimate(
     *,
     known: Mapping[str, Known] | None = None,
     considered: Sequence[Considered] = (),
+    hint: Mapping[str, float] | None = None,
+    near: bool = False,
     budget: int = BUDGET,
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
@@ -81,6 +83,10 @@ def estimate(
         What is known of some of them beforehand, by name.
     considered : sequence of Considered
         What is held, with a tolerance that counts in the interval.
+    hint : mapping, optional
+        Values by name (0 where not named) beside which the optimum may lie.
+    near : bool
+        Whether to try the hint before all else.
     budget : int
         See `BUDGET`.
     seed : int
@@ -92,8 +98,19 @@ def estimate(
     coarse = _free_running(experiments, free)
     model = _scaled(coarse, experiments)
     first, information = belief_of(model, known), information_of(model, known)
+    hints = [first]
+    if hint is not None:
+        hints.insert(0 if near else 1, beside(model, first, hint))
     found = search(
-        model, first, information, is_noise, alias=ALIAS, budget=budget, seed=seed, tell=tell
+        model,
+        first,
+        information,
+        is_noise,
+        hints=hints,
+        alias=ALIAS,
+        budget=budget,
+        seed=seed,
+        tell=tell,
     )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]

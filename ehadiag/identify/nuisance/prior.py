@@ -9,12 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ehadiag.identify.nuisance.linearisation import Belief
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.model.parameters import Kind, Parameter
 
-__all__ = ["ALIAS", "Known", "belief_of", "information_of", "nuisances_of"]
+__all__ = ["ALIAS", "Known", "belief_of", "beside", "information_of", "nuisances_of"]
 
 ALIAS = "null_bias"
 """What a constant error of the spool's sensor passes for: only the pressure tells them apart, and
@@ -24,6 +25,8 @@ CENTRE, SPREAD = 0.5, 0.4
 """Of a nuisance that is never negative: mean and deviation, in units of its scale."""
 SPREAD_BOTH_WAYS = 0.5
 """Deviation of one that may have either sign."""
+NEARBY = 0.1
+"""Spread about a hint, in spreads of what is believed without one."""
 LEFT_OUT = frozenset({"sampling_lead"})
 """Nuisances that `--nuisances` does not free: no unit of section 8's basic set has them, and what
 is not known of them is considered in the interval."""
@@ -61,7 +64,13 @@ def belief_of(model: Derivatives, known: Mapping[str, Known]) -> Belief:
     return Belief(x, np.diag((spread / model.scale)[model.curved]))
 
 
-def information_of(model: Derivatives, known: Mapping[str, Known]) -> np.ndarray:
+def beside(model: Derivatives, belief: Belief, values: Mapping[str, float]) -> Belief:
+    """Belief about values by name, 0 where not named: narrower than `belief`."""
+    x = np.array([values.get(item.name, 0.0) for item in model.estimated]) / model.scale
+    return Belief(np.clip(x, model.lower, model.upper), NEARBY * belief.root)
+
+
+def information_of(model: Derivatives, known: Mapping[str, Known]) -> NDArray[np.float64]:
     """Reciprocal variance of each coordinate: of what is known, and a little of the usual sizes.
 
     The latter keeps finite what no recording shows, shape (k,).

@@ -6,7 +6,7 @@ tenth of the first spread mostly finds the way on, else a start of its own does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,10 +75,11 @@ def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def search(
     model: Derivatives,
-    first: Belief,
+    known: Belief,
     information: NDArray[np.float64],
     explains: Callable[[NDArray[np.float64]], bool],
     *,
+    hints: Sequence[Belief] = (),
     alias: str = "",
     budget: int = 1600,
     seed: int = 0,
@@ -88,13 +89,15 @@ def search(
 
     Parameters
     ----------
-    first : Belief
-        Of the first start and every fresh one.
+    known : Belief
+        Before the recordings: a fresh start begins there.
     information : shape (k,)
         See `sharpen`.
     explains : callable
         Of residuals, shape (SIGNALS, N): whether there is nothing better to look for
         (a search that has not come to rest goes on all the same).
+    hints : sequence of Belief
+        Where the first starts begin; one that is `known` itself is a fresh one.
     alias : str
         Name of a parameter that passes for a sensor's constant error.
     budget : int
@@ -106,12 +109,14 @@ def search(
     best: Found | None = None
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
-        begin = first
-        if best is not None and len(places) % FRESH_EVERY != 0:
-            x = _past_alias(model, best, alias)
-            begin = Belief(x, AGAIN * first.root)
+        if len(places) < len(hints):
+            begin = hints[len(places)]
+        elif best is None or (len(places) - len(hints)) % FRESH_EVERY != 0:
+            begin = known
+        else:
+            begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
         rng = np.random.default_rng([seed, len(places)])
-        belief, settled = sharpen(model, first, begin, information, rng)
+        belief, settled = sharpen(model, known, begin, information, rng)
         residuals = model.many(belief.x[None, :])[0]
         cost = float(robust_cost(residuals))
         places.append(Place(belief.x, cost))
