@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ehadiag.identify.estimates import identification
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.nuisance.explained import excess
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.refine.first_part import (
     CONSIDERED,
@@ -51,6 +52,11 @@ from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
 
 __all__ = ["Nuisances", "Session", "identify"]
+
+
+LASTING = 1.2
+"""Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
+1.15 at most in 80 recordings of units without any."""
 
 
 class Nuisances(Enum):
@@ -142,7 +148,7 @@ class Session:
         refine_at = time.perf_counter()
         timing = Timing(searched_at - begin, search_s, refine_at - searched_at - search_s)
         evaluations = first.evaluations + (best.evaluations if best else found.evaluations)
-        if best is not None and (alone or explains(best.refined)):
+        if best is not None and (alone or (explains(best.refined) and _is_all(best.refined))):
             return self._said(
                 first,
                 best.found,
@@ -154,7 +160,7 @@ class Session:
                 timing,
             )
         hint = best.refined.values if best else named(found.best)
-        done = self._freed(experiments, hint, near, tell)
+        done = self._freed(experiments, hint if near else None, tell)
         values = done.refined.values
         severities = np.array([values[item.name] for item in FAULTS])
         return self._said(
@@ -171,8 +177,7 @@ class Session:
     def _freed(
         self,
         experiments: Sequence[Experiment],
-        hint: Mapping[str, float],
-        near: bool,
+        hint: Mapping[str, float] | None,
         tell: Progress,
     ) -> Estimated:
         """Estimate with all nuisances free."""
@@ -182,7 +187,6 @@ class Session:
             (*FAULTS, *OFFSETS, *nuisances_of(REGISTRY)),
             considered=CONSIDERED,
             hint=hint,
-            near=near,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
         )
@@ -247,6 +251,11 @@ def identify(
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
     return Session(solver, seed, nuisances).finish(experiments, progress)
+
+
+def _is_all(refinement: Refinement) -> bool:
+    """Whether nothing that lasts is left, of which small nuisances would be the cause."""
+    return excess(refinement.residuals) <= LASTING
 
 
 def _stages_ready(experiment: Experiment) -> int:

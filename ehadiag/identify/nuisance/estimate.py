@@ -12,7 +12,14 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.explained import excess, is_noise
 from ehadiag.identify.nuisance.linearisation import Belief, linearised
 from ehadiag.identify.nuisance.posterior import sharpen
-from ehadiag.identify.nuisance.prior import ALIAS, Known, belief_of, beside, information_of
+from ehadiag.identify.nuisance.prior import (
+    ALIAS,
+    Known,
+    belief_of,
+    beside,
+    information_of,
+    small_effects,
+)
 from ehadiag.identify.nuisance.starts import Found, robust_cost, search
 from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives, capped
 from ehadiag.identify.refine.least_squares import Refinement
@@ -67,7 +74,6 @@ def estimate(
     known: Mapping[str, Known] | None = None,
     considered: Sequence[Considered] = (),
     hint: Mapping[str, float] | None = None,
-    near: bool = False,
     budget: int = BUDGET,
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
@@ -84,9 +90,7 @@ def estimate(
     considered : sequence of Considered
         What is held, with a tolerance that counts in the interval.
     hint : mapping, optional
-        Values by name (0 where not named) beside which the optimum may lie.
-    near : bool
-        Whether to try the hint before all else.
+        Values by name (0 where not named) beside which the optimum probably lies.
     budget : int
         See `BUDGET`.
     seed : int
@@ -98,15 +102,15 @@ def estimate(
     coarse = _free_running(experiments, free)
     model = _scaled(coarse, experiments)
     first, information = belief_of(model, known), information_of(model, known)
-    hints = [first]
+    origins = [first, small_effects(model, first)]
     if hint is not None:
-        hints.insert(0 if near else 1, beside(model, first, hint))
+        origins = [beside(model, first, hint), *origins[::-1]]
     found = search(
         model,
         first,
         information,
+        origins,
         is_noise,
-        hints=hints,
         alias=ALIAS,
         budget=budget,
         seed=seed,

@@ -15,7 +15,15 @@ from ehadiag.identify.nuisance.linearisation import Belief
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.model.parameters import Kind, Parameter
 
-__all__ = ["ALIAS", "Known", "belief_of", "beside", "information_of", "nuisances_of"]
+__all__ = [
+    "ALIAS",
+    "Known",
+    "belief_of",
+    "beside",
+    "information_of",
+    "nuisances_of",
+    "small_effects",
+]
 
 ALIAS = "null_bias"
 """What a constant error of the spool's sensor passes for: only the pressure tells them apart, and
@@ -27,6 +35,8 @@ SPREAD_BOTH_WAYS = 0.5
 """Deviation of one that may have either sign."""
 NEARBY = 0.1
 """Spread about a hint, in spreads of what is believed without one."""
+SMALL = 0.2
+"""Spread of nuisances about 0, likewise."""
 LEFT_OUT = frozenset({"sampling_lead"})
 """Nuisances that `--nuisances` does not free: no unit of section 8's basic set has them, and what
 is not known of them is considered in the interval."""
@@ -68,6 +78,18 @@ def beside(model: Derivatives, belief: Belief, values: Mapping[str, float]) -> B
     """Belief about values by name, 0 where not named: narrower than `belief`."""
     x = np.array([values.get(item.name, 0.0) for item in model.estimated]) / model.scale
     return Belief(np.clip(x, model.lower, model.upper), NEARBY * belief.root)
+
+
+def small_effects(model: Derivatives, belief: Belief) -> Belief:
+    """Belief of an actuator that is nearly the textbook's: nuisances about 0, severities anywhere.
+
+    With hardly any hysteresis the noise of closed loop keeps the spool breaking away, and a search
+    from the usual sizes ends where hysteresis that is not there smoothes that.
+    """
+    faults = np.array([item.kind is Kind.FAULT for item in model.estimated])
+    x = np.where(faults, belief.x, 0.0)
+    shares = np.where(faults, 1.0, SMALL)[model.curved]
+    return Belief(np.clip(x, model.lower, model.upper), belief.root * shares[:, None])
 
 
 def information_of(model: Derivatives, known: Mapping[str, Known]) -> NDArray[np.float64]:

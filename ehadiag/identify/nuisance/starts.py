@@ -20,8 +20,6 @@ __all__ = ["Found", "Place", "robust_cost", "search"]
 
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
-FRESH_EVERY = 2
-"""Every so many starts begin anew."""
 ALIAS_SPAN = 1.25
 """Half-width over which a parameter is moved against what it passes for, in units of its scale."""
 
@@ -77,9 +75,9 @@ def search(
     model: Derivatives,
     known: Belief,
     information: NDArray[np.float64],
+    origins: Sequence[Belief],
     explains: Callable[[NDArray[np.float64]], bool],
     *,
-    hints: Sequence[Belief] = (),
     alias: str = "",
     budget: int = 1600,
     seed: int = 0,
@@ -90,14 +88,14 @@ def search(
     Parameters
     ----------
     known : Belief
-        Before the recordings: a fresh start begins there.
+        Before the recordings.
     information : shape (k,)
         See `sharpen`.
+    origins : sequence of Belief
+        Where every other start begins, in turn; those between begin beside the best so far.
     explains : callable
         Of residuals, shape (SIGNALS, N): whether there is nothing better to look for
         (a search that has not come to rest goes on all the same).
-    hints : sequence of Belief
-        Where the first starts begin; one that is `known` itself is a fresh one.
     alias : str
         Name of a parameter that passes for a sensor's constant error.
     budget : int
@@ -109,10 +107,9 @@ def search(
     best: Found | None = None
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
-        if len(places) < len(hints):
-            begin = hints[len(places)]
-        elif best is None or (len(places) - len(hints)) % FRESH_EVERY != 0:
-            begin = known
+        turn, beside = divmod(len(places), 2)
+        if best is None or not beside:
+            begin = origins[turn % len(origins)]
         else:
             begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
         rng = np.random.default_rng([seed, len(places)])

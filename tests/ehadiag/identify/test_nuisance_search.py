@@ -105,7 +105,7 @@ def curved(truth, seed=3):
 def searched(problem, begin, width=0.4):
     first = Belief(np.array([*begin, 0.0]), width * np.eye(3))
     information = np.array([1.0, 1.0, 1.0, 0.0])
-    return search(problem, first, information, is_noise, seed=1)
+    return search(problem, first, information, [first], is_noise, seed=1)
 
 
 def test_it_finds_the_optimum_of_a_bent_valley():
@@ -131,10 +131,12 @@ def test_what_nothing_explains_ends_with_the_budget():
     wave = 30.0 * np.sin(np.arange(SAMPLES) / 5.0)
     problem = Problem(lambda p: curved((0.8, 0.5, 0.7))(p) + wave)
     told = []
+    first = Belief(np.array([0.5, 0.5, 0.5, 0.0]), 0.4 * np.eye(3))
     found = search(
         problem,
-        Belief(np.array([0.5, 0.5, 0.5, 0.0]), 0.4 * np.eye(3)),
+        first,
         np.zeros(4),
+        [first],
         is_noise,
         budget=600,
         tell=told.append,
