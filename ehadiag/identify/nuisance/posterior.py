@@ -20,7 +20,7 @@ __all__ = ["TAIL", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
-MOST_ROUNDS = 30
+MOST_ROUNDS = 18
 LEAST_RATIO = 0.5
 """By which the belief may become narrower in a round, in any direction."""
 WIDTH = 2.0
