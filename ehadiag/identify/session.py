@@ -43,7 +43,7 @@ from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["Session", "identify"]
+__all__ = ["Session", "first_ticks", "identify"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ class Session:
         self, experiments: Sequence[Experiment], start: NDArray[np.float64]
     ) -> FirstPart:
         """Refinement on the first parts of the tests, from memory if the inputs are the same."""
-        until = [_first_ticks(item) for item in experiments]
+        until = [first_ticks(item) for item in experiments]
         free = lay_out(experiments, first_spans(experiments, until))
         base = [np.array(item.constants) for item in experiments]
         return self._memory.recall(
@@ -190,7 +190,7 @@ class Session:
 
     def _attempt(self, experiments: Sequence[Experiment], found: SearchResult) -> _Attempt:
         """Refine the optimum of a search."""
-        until = [_first_ticks(item) for item in experiments]
+        until = [first_ticks(item) for item in experiments]
         first = self._first_part(experiments, found.best)
         judged = first.judged(experiments)
         best = add_last_part(judged, until, first)
@@ -229,7 +229,7 @@ def _stages_ready(experiment: Experiment) -> int:
     return sum(seconds >= stage_ends_at(test, stage) for stage in range(len(STAGES)))
 
 
-def _first_ticks(experiment: Experiment) -> int:
+def first_ticks(experiment: Experiment) -> int:
     """Ticks that some stage before has seen the end of: windows of the test, in any order."""
     test = experiment.test
     seconds = max(first_ends_at(test), stage_ends_at(test, len(STAGES) - 1))

@@ -248,9 +248,12 @@ class SensorLaw(NamedTuple):
 
 
 @inlined
-def sensor_law(c: PlantConstants, span: float) -> SensorLaw:
-    """Precombine what the sensors' laws need; `span`: of the path's last piece, s."""
-    u = 1.0 - min(max(c.DLY / span, 0.0), 1.0)
+def sensor_law(c: PlantConstants, lead: float, span: float) -> SensorLaw:
+    """Precombine what the sensors' laws need.
+
+    lead: of sampling before the end of a piece of the path, s; span: of the piece, s.
+    """
+    u = 1.0 - min(max(lead / span, 0.0), 1.0)
     v = 1.0 - u
     return SensorLaw(
         c.OXS,

@@ -10,8 +10,9 @@ from ehadiag.core.channels import CHANNELS, PRESSURE, SPOOL
 from ehadiag.core.recording import CommandMode, Environment, Samples
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.model.plant import plant_constants
+from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag.model.scalar.response import respond
+from ehadiag_tools.damaged import damaged_unit
 from firmware_iface.logs.reader import read_recording
 
 PAPER_FAULTS = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))
@@ -30,7 +31,7 @@ def own_samples(faults, *, seed=0, noise_lsb=0.5, offsets_lsb=(0.0, 0.0)):
     """Open-loop test with the monitoring model as the plant: nothing is mismatched."""
     test = resolve_test("open")
     current = test.command()
-    truth = respond(plant_constants(default_actuator()), np.array(faults), current, 1e-3)
+    truth = respond(damaged_unit(faults), current, 1e-3)
     rng = np.random.default_rng(seed)
     clean = (current, truth.spool, truth.pressure, truth.position)
     offsets = (0.0, *offsets_lsb, 0.0)
@@ -54,6 +55,11 @@ def own_samples(faults, *, seed=0, noise_lsb=0.5, offsets_lsb=(0.0, 0.0)):
 def own_experiment(faults, **options):
     samples = own_samples(faults, **options)
     return build_experiment(samples, Environment(), resolve_test("open"), default_actuator())
+
+
+def named(faults):
+    """Severities by name."""
+    return dict(zip(FAULT_NAMES, faults, strict=True))
 
 
 NOISE = (SPOOL.lsb * np.sqrt(0.5**2 + 1 / 12), PRESSURE.lsb * np.sqrt(0.5**2 + 1 / 12))

@@ -1,6 +1,5 @@
-/* Second stage and jack as in ehadiag/model/simd/jack.py and lanestops.py, one candidate at a time.
- *
- * What does not change within a recording is in Fixed: the lanes divide once for a whole block.
+/* Second stage and jack as in ehadiag/model/jack.py, one candidate at a time; what does not change
+ * within a recording is in Fixed.
  */
 #include "plant.h"
 
@@ -18,7 +17,8 @@ static const real A31 = (16.0 - ROOT) / 36.0, A32 = (16.0 + ROOT) / 36.0, A33 = 
 
 typedef struct {
     Plant c;
-    real tick, ring_damping, ring_time, by_KSF, by_KF, by_MJ, corner, scale, flow;
+    Scalars t;
+    real tick, by_KSF, by_KF, by_MJ, corner, scale, flow;
 } Fixed;
 
 typedef struct {
@@ -38,6 +38,12 @@ static inline real greater(real a, real b) { return a > b ? a : b; }
 static inline real divide(const Plant *c, real width)
 {
     return c->GQ * width + c->PSR * c->CLK;
+}
+
+static inline Fixed fixed_of(const Plant *c, real tick)
+{
+    return (Fixed){*c, spool_law(c), tick, 1.0 / c->KSF, 1.0 / c->KF, 1.0 / c->MJ, c->PSR / c->GP,
+                   1.0 / (c->PSR * c->AJ), c->GQ / c->AJ};
 }
 
 static inline real last_velocity(const Fixed *f, real h, real load, real velocity, real x1,
@@ -123,10 +129,10 @@ static real stop_share(const Fixed *f, const Piece *p, real load, real velocity,
 }
 
 /* Jack over the shares begin ... stop of a piece; it may stop and start there. */
-static void jack_piece(const Fixed *f, real friction, const Piece *p, real begin, real stop,
-                       Jack *j)
+static void jack_piece(const Fixed *f, const Piece *p, real begin, real stop, Jack *j)
 {
     const Plant *c = &f->c;
+    real friction = c->FDJ;
     if (j->d == 0.0) {
         real up = excess(f, p, 2.0 * friction, stop), down = excess(f, p, -2.0 * friction, stop);
         if (up <= 0.0 && 0.0 <= down) {
@@ -171,7 +177,8 @@ static void jack_piece(const Fixed *f, real friction, const Piece *p, real begin
                     at_high = value;
                     at_low *= 0.5;
                 }
-                if (high - low < SHORTEST || fabs(value) < 1e-9 * fabs(hold))
+                real width = greater(fabs(piece_place(p, q)), f->corner);
+                if (high - low < SHORTEST || fabs(value) < 1e-6 * fabs(hold) * divide(c, width))
                     break;
             }
             j->velocity = 0.0;
@@ -205,15 +212,14 @@ static void jack_piece(const Fixed *f, real friction, const Piece *p, real begin
 }
 
 /* A step with a start or a stop, piece by piece of the path. */
-static void jack_events(const Fixed *f, real friction, int level, int step, const Path path,
-                        Jack *j)
+static void jack_events(const Fixed *f, int level, int step, const Path path, Jack *j)
 {
     int steps = 1 << level;
     real span = f->tick / NODES;
     real begin = (real)step * NODES / steps, stop = (real)(step + 1) * NODES / steps;
     for (int n = (int)begin, last = (int)ceil(stop); n < last; n++) {
         Piece p = {span, path[0][n], path[0][n + 1], span * path[1][n], span * path[1][n + 1]};
-        jack_piece(f, friction, &p, greater(begin - n, 0.0), lesser(stop - n, 1.0), j);
+        jack_piece(f, &p, greater(begin - n, 0.0), lesser(stop - n, 1.0), j);
     }
 }
 
@@ -224,17 +230,18 @@ static inline real stage_place(const Path path, const real *stage, real tick)
            + tick * (stage[3] * path[1][n] + stage[4] * path[1][n + 1]);
 }
 
-/* One of the 2^level steps of a tick; stages: see lanejack.STAGES. */
-static inline void jack_step(const Fixed *f, real friction, int level, int step,
-                             const real (*stages)[5], const Path path, Jack *j)
+/* One of the 2^level steps of a tick; stages: see ehadiag.model.simd.jack.STAGES. */
+static inline void jack_step(const Fixed *f, int level, int step, const real (*stages)[5],
+                             const Path path, Jack *j)
 {
     const Plant *c = &f->c;
+    real friction = c->FDJ;
     real x3 = stage_place(path, stages[2], f->tick), w3 = greater(fabs(x3), f->corner);
     if (j->d == 0.0) {
         real hold = divide(c, w3), push = c->AJ * c->PSR * c->GQ * x3 - c->FR * hold;
         int blocked = fabs(j->place) >= c->XJM && j->place * push > 0.0;
         if (fabs(push) > 2.0 * friction * hold && !blocked)
-            jack_events(f, friction, level, step, path, j);
+            jack_events(f, level, step, path, j);
         return;
     }
     real x1 = stage_place(path, stages[0], f->tick), w1 = greater(fabs(x1), f->corner);
@@ -253,5 +260,5 @@ static inline void jack_step(const Fixed *f, real friction, int level, int step,
             return;
         }
     }
-    jack_events(f, friction, level, step, path, j);
+    jack_events(f, level, step, path, j);
 }

@@ -9,19 +9,10 @@
 enum { GRID = WHOLE >> 3, HALVINGS = 3, ORDER = 8 };
 
 typedef struct {
-    Scalars t;
-    real dry, room, friction;
+    real dry, room, ring_time, seen[4];
     real quarter[16], rest[4];
     real moving[GRID + 1][16], stuck[GRID + 1][4];
 } Tables;
-
-static Fixed fixed_of(const Plant *c, real tick)
-{
-    real damping = 0.5 * c->CF / c->JF, square = c->KF / c->JF - damping * damping;
-    return (Fixed){*c, tick, damping, square > 0.0 ? 1.0 / sqrt(square) : 1e30,
-                   1.0 / c->KSF, 1.0 / c->KF, 1.0 / c->MJ, c->PSR / c->GP,
-                   1.0 / (c->PSR * c->AJ), c->GQ / c->AJ};
-}
 
 /* Matrices are found in double in any case: a float holds no step of a microsecond. */
 static inline void product(const double *a, const double *b, double *out, int n, double scale)
@@ -70,7 +61,6 @@ static inline void powers(const double *rates, int n, double tick, double *out)
         product(out + (j - 1) * n * n, out + n * n, out + j * n * n, n, 1.0);
 }
 
-/* What depends on the recording alone: steps of a spool at rest. */
 static void tabulate_rest(const Fixed *f, Tables *m)
 {
     const Plant *c = &f->c;
@@ -86,16 +76,14 @@ static void tabulate_rest(const Fixed *f, Tables *m)
     keep(rest, m->rest, 4);
 }
 
-static void tabulate(const Fixed *f, const real *candidate, Tables *m)
+static void tabulate(const Fixed *f, Tables *m)
 {
     const Plant *c = &f->c;
-    double force = (double)c->AS * c->GPF, flow_gain = c->GQF * (1.0 - 0.8 * candidate[0]);
-    double damping = c->GPF / flow_gain * c->AS * c->AS + c->CS;
-    double fixed = c->FSS0 + candidate[1] * (c->FSS1 - c->FSS0);
-    m->t = (Scalars){force, damping, 0.5 * fixed, fixed / force, 0.0, 0.0};
-    m->dry = 0.5 * fixed / force;
-    m->room = lesser(m->t.breakaway, c->XFM);
-    m->friction = c->FDJ0 + candidate[2] * (c->FDJ1 - c->FDJ0);
+    double force = (double)c->AS * c->GPF, damping = (double)c->GPF / c->GQF * c->AS * c->AS + c->CS;
+    m->dry = 0.5 * c->FSS / force;
+    m->room = lesser(f->t.breakaway, c->XFM);
+    m->ring_time = f->t.ring_rate > 0.0 ? 1.0 / f->t.ring_rate : 1e30;
+    seen_weights(c->DLY, f->tick / NODES, m->seen);
     double rates[16] = {0.0, 1.0, 0.0, 0.0,
                         -(double)c->KF / c->JF, -(double)c->CF / c->JF, -(double)c->KSF / c->JF, 0.0,
                         0.0, 0.0, 0.0, 1.0,
@@ -105,4 +93,5 @@ static void tabulate(const Fixed *f, const real *candidate, Tables *m)
     keep(&moving[0][0], &m->moving[0][0], (GRID + 1) * 16);
     product(moving[GRID], moving[GRID], quarter, 4, 1.0);
     keep(quarter, m->quarter, 16);
+    tabulate_rest(f, m);
 }

@@ -23,7 +23,7 @@ static const real LEAST_DEPTH = sizeof(real) == sizeof(double) ? -1e-14 : -1e-11
 static int event_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Path path, Jack *jack)
 {
     const Plant *c = &f->c;
-    const Scalars *t = &m->t;
+    const Scalars *t = &f->t;
     real pieces[MOST_PIECES][4], unit = f->tick / WHOLE;
     real from_xs = s->xs, from_vs = s->vs;
     int done = 0, single = 0, since = 0, kinks = 0, count = 0;
@@ -114,7 +114,7 @@ static int event_tick(const Fixed *f, const Tables *m, real torque, Spool *s, Pa
     for (int n = 0; kinks && n < count; n++) {
         real span = pieces[n][0];
         Piece p = {span, from_xs, pieces[n][1], pieces[n][2] * span, pieces[n][3] * span};
-        jack_piece(f, m->friction, &p, 0.0, 1.0, jack);
+        jack_piece(f, &p, 0.0, 1.0, jack);
         from_xs = p.x1;
     }
     return kinks;
@@ -130,7 +130,7 @@ static inline int plain_tick(const Fixed *f, const Tables *m, real torque, Spool
         return 0;
     if (s->direction == 0) {
         real still = (torque - c->KSF * s->xs) * f->by_KF, room = m->room - fabs(still);
-        real a = s->xf - still, b = (s->wf + f->ring_damping * a) * f->ring_time, wf = s->wf;
+        real a = s->xf - still, b = (s->wf + f->t.ring_damping * a) * m->ring_time, wf = s->wf;
         if (room <= 0.0 || a * a + b * b >= room * room)
             return 0;
         s->xf = still + m->rest[0] * a + m->rest[1] * wf;
@@ -172,31 +172,30 @@ static inline int plain_tick(const Fixed *f, const Tables *m, real torque, Spool
     return 1;
 }
 
-/* Summed squared weighted gap of each candidate, each square at most `cap`.
+/* Summed squared weighted residual of each candidate, each square at most `cap`.
  *
- * Arguments as the fields of ehadiag.model.scalar.residuals.Batch, the levels of LaneWork and STAGES;
- * gaps: (n, 2, ticks), or null. All of type real but the costs.
+ * Arguments as the fields of ehadiag.model.batch.Batch, the levels of SimdModel and STAGES;
+ * candidates: (n, tests); residuals: (n, 2, ticks), or null. All of type real but the costs.
  */
-void eha_lane_costs(const Plant *constants, const real *ticks, const int64_t *start,
+void eha_lane_costs(const int64_t *test, const real *ticks, const int64_t *start,
                     const real *origin, const real *current_before, const real *current,
                     const real *spool, const real *pressure, const real *weight,
                     const real (*anchor)[3], const int64_t *levels,
-                    const real (*stages)[16][3][5], long spans, real cap, long n,
-                    const real (*candidates)[5], double *costs, real *gaps)
+                    const real (*stages)[16][3][5], long spans, real cap, long n, long tests,
+                    const Plant *candidates, double *costs, real *residuals)
 {
     Tables m;
     int64_t all = start[spans];
     for (long i = 0; i < n; i++)
         costs[i] = 0.0;
     for (long index = 0; index < spans; index++) {
-        const Plant *c = constants + index;
-        const Fixed f = fixed_of(c, ticks[index]);
         real gain = anchor[index][0], small = anchor[index][1], large = anchor[index][2];
         int anchored = isfinite(small) || isfinite(large);
-        tabulate_rest(&f, &m);
         for (long i = 0; i < n; i++) {
-            tabulate(&f, candidates[i], &m);
-            real held_xf = m.t.breakaway, filtered = 0.0;
+            const Plant *c = candidates + i * tests + test[index];
+            const Fixed f = fixed_of(c, ticks[index]);
+            tabulate(&f, &m);
+            real held_xf = f.t.breakaway, filtered = 0.0;
             double sum = 0.0;
             Spool s = {0};
             Jack jack = {0};
@@ -208,28 +207,30 @@ void eha_lane_costs(const Plant *constants, const real *ticks, const int64_t *st
                 real torque = c->GM * current[k];
                 int done = !plain_tick(&f, &m, torque, &s, path)
                            && event_tick(&f, &m, torque, &s, path, &jack);
-                real seen = spool[k] - candidates[i][3];
-                if (weight[k] != 0.0 && isfinite(seen)) {
-                    real gap = (seen - s.xs) * weight[k];
-                    sum += lesser(gap * gap, cap);
-                    if (gaps != NULL)
-                        gaps[2 * i * all + k] = gap;
+                real error = spool[k] - c->OXS
+                             - (m.seen[0] * path[0][NODES - 1] + m.seen[1] * path[0][NODES]
+                                + m.seen[2] * path[1][NODES - 1] + m.seen[3] * path[1][NODES]);
+                if (weight[k] != 0.0 && isfinite(error)) {
+                    real residual = error * weight[k];
+                    sum += lesser(residual * residual, cap);
+                    if (residuals != NULL)
+                        residuals[2 * i * all + k] = residual;
                 }
                 int level = (int)levels[k];
                 for (int step = 0; !done && step < 1 << level; step++)
-                    jack_step(&f, m.friction, level, step, stages[level][step], path, &jack);
+                    jack_step(&f, level, step, stages[level][step], path, &jack);
                 if (weight[all + k] != 0.0 && isfinite(pressure[k])) {
                     real x = path[0][NODES];
                     real p12 = c->PSR * (c->GQ * x - c->AJ * jack.velocity)
                                  / divide(c, greater(fabs(x), f.corner));
                     p12 = greater(lesser(p12, c->PSR), -c->PSR);
-                    real gap = (pressure[k] - candidates[i][4] - p12) * weight[all + k];
-                    sum += lesser(gap * gap, cap);
-                    if (gaps != NULL)
-                        gaps[(2 * i + 1) * all + k] = gap;
+                    real residual = (pressure[k] - c->OPD - p12) * weight[all + k];
+                    sum += lesser(residual * residual, cap);
+                    if (residuals != NULL)
+                        residuals[(2 * i + 1) * all + k] = residual;
                 }
-                if (anchored && isfinite(seen)) {
-                    real error = seen - s.xs, move = 0.0;
+                if (anchored && isfinite(error)) {
+                    real move = 0.0;
                     filtered += gain * (error - filtered);
                     if (fabs(error) > large)
                         move = error;

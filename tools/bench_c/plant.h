@@ -1,5 +1,5 @@
-/* Constants of the plant, and what ends a step of flapper and spool (ehadiag/model/scalar/spool_events.py);
- * for all the models here. */
+/* Constants of the plant, what the spool's law needs of them (ehadiag/model/laws.py), and what ends a
+ * step of flapper and spool (ehadiag/model/spool_events.py); for all the models here. */
 #include <tgmath.h>
 
 /* Type of the numbers: with -DREAL=float constants have to be of single precision too. */
@@ -13,11 +13,10 @@ enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELE
 
 /* In the order of ehadiag.model.plant.PlantConstants. */
 typedef struct {
-    real GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS0, FSS1, PSR, GP, GQ, CLK;
-    real AJ, MJ, CJ, XJM, FDJ0, FDJ1, FR;
+    real GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS, FSS1, PSR, GP, GQ, CLK;
+    real AJ, MJ, CJ, XJM, FDJ, FDJ1, FR, OXS, OPD, DLY;
 } Plant;
 
-/* In the order of ehadiag.model.scalar.transition.SpoolScalars. */
 typedef struct {
     real force, damping, dynamic, breakaway, ring_damping, ring_rate;
 } Scalars;
@@ -26,6 +25,24 @@ typedef struct {
     real xf, wf, xs, vs;
     int direction, clamped;
 } Spool;
+
+static Scalars spool_law(const Plant *c)
+{
+    double force = (double)c->AS * c->GPF, damping = (double)c->GPF / c->GQF * c->AS * c->AS + c->CS;
+    double ring = 0.5 * (double)c->CF / c->JF, square = (double)c->KF / c->JF - ring * ring;
+    return (Scalars){force, damping, 0.5 * (double)c->FSS, c->FSS / force,
+                     ring, square > 0.0 ? sqrt(square) : 0.0};
+}
+
+/* Weights by which the ends of a path's last piece give the spool as it is sampled. */
+static void seen_weights(real lead, real span, real w[4])
+{
+    real share = lead / span, u = 1.0 - (share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share), v = 1.0 - u;
+    w[0] = (1.0 + 2.0 * u) * v * v;
+    w[1] = u * u * (3.0 - 2.0 * u);
+    w[2] = u * v * v * span;
+    w[3] = -u * u * v * span;
+}
 
 static int held(const Plant *c, const Scalars *t, real xf, real xs)
 {

@@ -27,17 +27,18 @@ typedef struct {
 /* Numbers in a block. */
 int eha_block(void) { return BLOCK; }
 
-static void prepare(const Fixed *f, const real (*candidates)[5], Coefficients *q)
+/* The first candidate's constants stand for all where no fault changes them. */
+static void prepare(real tick, const Plant *candidates, long tests, Coefficients *q)
 {
     static _Thread_local Tables m;
-    tabulate_rest(f, &m);
     for (int i = 0; i < BLOCK; i++) {
-        tabulate(f, candidates[i], &m);
+        const Fixed f = fixed_of(candidates + i * tests, tick);
+        tabulate(&f, &m);
         q->dry[i] = m.dry;
-        q->breakaway[i] = m.t.breakaway;
-        q->friction[i] = m.friction;
-        q->spool_offset[i] = candidates[i][3];
-        q->pressure_offset[i] = candidates[i][4];
+        q->breakaway[i] = f.t.breakaway;
+        q->friction[i] = f.c.FDJ;
+        q->spool_offset[i] = f.c.OXS;
+        q->pressure_offset[i] = f.c.OPD;
         for (int e = 0; e < 4; e++)
             q->rest[e][i] = m.rest[e];
         for (int e = 0; e < 16; e++)
@@ -114,15 +115,15 @@ static void jack_block(const Fixed *f, real h, const real (*stages)[5], const Co
     }
 }
 
-static void spool_gaps(real measured, real weight, real cap, const Coefficients *q, State *s)
+static void spool_residuals(real measured, real weight, real cap, const Coefficients *q, State *s)
 {
     for (int i = 0; i < BLOCK; i++) {
-        real gap = (measured - q->spool_offset[i] - s->xs[i]) * weight;
-        s->sum[i] += lesser(gap * gap, cap);
+        real residual = (measured - q->spool_offset[i] - s->xs[i]) * weight;
+        s->sum[i] += lesser(residual * residual, cap);
     }
 }
 
-static void pressure_gaps(const Fixed *f, real measured, real weight, real cap,
+static void pressure_residuals(const Fixed *f, real measured, real weight, real cap,
                           const Coefficients *q, State *s)
 {
     const Plant *c = &f->c;
@@ -130,40 +131,40 @@ static void pressure_gaps(const Fixed *f, real measured, real weight, real cap,
         real x = s->places[NODES][i];
         real p12 = c->PSR * (c->GQ * x - c->AJ * s->velocity[i])
                    / divide(c, greater(fabs(x), f->corner));
-        real gap = (measured - q->pressure_offset[i] - lesser(greater(p12, -c->PSR), c->PSR)) * weight;
-        s->sum[i] += lesser(gap * gap, cap);
+        real left = measured - q->pressure_offset[i] - lesser(greater(p12, -c->PSR), c->PSR);
+        s->sum[i] += lesser(left * weight * (left * weight), cap);
     }
 }
 
-/* Summed squared weighted gap of each of a block of candidates, each square at most `cap`.
+/* Summed squared weighted residual of each of a block of candidates, each square at most `cap`.
  *
  * Arguments as of eha_lane_costs, without origin, current_before and anchor: a recording begins at
- * zero, and the spool is not re-anchored. One block of candidates, no gaps. Samples with a weight
- * have to be finite.
+ * zero, and the spool is not re-anchored. One block of candidates, no residuals. Samples with a
+ * weight have to be finite.
  */
-void eha_unlocated_costs(const Plant *constants, const real *ticks, const int64_t *start,
+void eha_unlocated_costs(const int64_t *test, const real *ticks, const int64_t *start,
                          const real *current, const real *spool, const real *pressure,
                          const real *weight, const int64_t *levels,
-                         const real (*stages)[16][3][5], long spans, real cap,
-                         const real (*candidates)[5], double *costs)
+                         const real (*stages)[16][3][5], long spans, real cap, long tests,
+                         const Plant *candidates, double *costs)
 {
     int64_t all = start[spans];
     State s;
     Coefficients q;
     memset(&s, 0, sizeof s);
     for (long index = 0; index < spans; index++) {
-        const Fixed f = fixed_of(constants + index, ticks[index]);
-        prepare(&f, candidates, &q);
+        const Fixed f = fixed_of(candidates + test[index], ticks[index]);
+        prepare(ticks[index], candidates + test[index], tests, &q);
         memset(&s, 0, offsetof(State, sum));
         for (int64_t k = start[index]; k < start[index + 1]; k++) {
             int level = (int)levels[k];
             spool_block(&f, f.c.GM * current[k], &q, &s);
             if (weight[k] != 0.0)
-                spool_gaps(spool[k], weight[k], cap, &q, &s);
+                spool_residuals(spool[k], weight[k], cap, &q, &s);
             for (int step = 0; step < 1 << level; step++)
                 jack_block(&f, f.tick / (1 << level), stages[level][step], &q, &s);
             if (weight[all + k] != 0.0)
-                pressure_gaps(&f, pressure[k], weight[all + k], cap, &q, &s);
+                pressure_residuals(&f, pressure[k], weight[all + k], cap, &q, &s);
         }
     }
     for (int i = 0; i < BLOCK; i++)

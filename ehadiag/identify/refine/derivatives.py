@@ -117,7 +117,9 @@ class Derivatives:
         """Weighted residuals of points, shape (n, SIGNALS, N) for points of shape (n, k)."""
         return self.model.residuals(self._values(points))[0]
 
-    def at(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    def at(
+        self, x: NDArray[np.float64], *others: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], int, list[float]]:
         """Residuals at a point, what the considered parameters do there, how often anchored.
 
         Returns
@@ -126,13 +128,18 @@ class Derivatives:
         considered : shape (c, SIGNALS, N)
             Change of the residuals by a standard deviation of each considered parameter.
         anchored : int
+        costs : list of float
+            Of other points, run in the same block.
         """
-        points = np.repeat(self._values(x[None, :]), 1 + len(self.considered), axis=0)
+        points = self._values(np.vstack([x, *[x] * len(self.considered), *others]))
+        changed = slice(1, 1 + len(self.considered))
         for j, item in enumerate(self.considered):
             points[1 + j, len(x) + j] = item.std
         runs, anchored = self.model.residuals(points)
-        changes = runs[1:] - runs[0]
-        return runs[0], np.where(np.abs(changes) < JUMP, changes, 0.0), int(anchored[0])
+        changes = runs[changed] - runs[0]
+        considered = np.where(np.abs(changes) < JUMP, changes, 0.0)
+        costs = [capped(run) for run in runs[changed.stop :]]
+        return runs[0], considered, int(anchored[0]), costs
 
     def slopes(self, centres: Sequence[NDArray[np.float64]]) -> list[Slope]:
         """Residuals and derivatives at several points, all runs of the model together."""

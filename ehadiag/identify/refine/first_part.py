@@ -20,13 +20,23 @@ from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unkn
 from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["FirstPart", "anchored_derivatives", "first_spans", "refine_first_part", "residuals_at"]
+__all__ = [
+    "FirstPart",
+    "anchored_derivatives",
+    "anchored_model",
+    "derivatives_of",
+    "first_spans",
+    "refine_first_part",
+    "residuals_at",
+]
 
 POLISH = CompactGa(budget=800, virtual_population=70.0, tolerance=1e-7)
 POLISH_REACH = 6.0
 """Deviations, of each severity, over which the polish begins to draw."""
 POLISH_SPREAD = (2e-4, 2e-3)
 """Severities: out of a narrow basin, which looks well known, and not further than is shown."""
+FREE_LEVEL = 2
+"""Halvings of the jack's ticks in a model that runs free, for noise and medians."""
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
@@ -43,12 +53,15 @@ class FirstPart:
     refined : Refinement
     noise : tuple
         Of spool (m) and pressure (Pa) of each test, as the residuals show it.
+    levels : shape (N,)
+        How a model of these spans cuts its ticks (`ehadiag.model.simd.model.SimdModel`).
     evaluations : int
         Runs of the model, all told.
     """
 
     refined: Refinement
     noise: tuple[tuple[float, float], ...]
+    levels: NDArray[np.int64]
     evaluations: int
 
     def judged(self, experiments: Sequence[Experiment]) -> list[Experiment]:
@@ -70,7 +83,8 @@ def refine_first_part(
     free, residuals = residuals_at(experiments, spans, start)
     start = {**start, **median_offsets(free, residuals)}
     experiments = _judged(experiments, until, residuals)
-    best = _refine(experiments, spans, start)
+    levels = anchored_model(experiments, spans).levels
+    best = _refine(experiments, spans, start, levels)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [(item.spool_noise, item.pressure_noise) for item in experiments]
@@ -79,32 +93,38 @@ def refine_first_part(
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
-        best = _refine(experiments, spans, best.values)
+        best = _refine(experiments, spans, best.values, levels)
         evaluations += best.evaluations
     if best.jagged:
-        best = _polish(experiments, spans, best)
+        best = _polish(experiments, spans, best, levels)
         evaluations += best.evaluations
     noise = tuple((item.spool_noise, item.pressure_noise) for item in experiments)
-    return FirstPart(best, noise, evaluations)
+    return FirstPart(best, noise, levels, evaluations)
 
 
 def residuals_at(
     experiments: Sequence[Experiment], spans: Spans | None, start: Mapping[str, float]
 ) -> tuple[SimdModel, NDArray[np.float64]]:
     """A model that runs free, and its residuals at severities by name, no offsets taken off."""
-    model = SimdModel(lay_out(experiments, spans), unknowns_of(experiments))
+    batch = lay_out(experiments, spans)
+    # For one point it takes longer to find the jack's steps than to take four in every tick.
+    levels = np.full(len(batch.current), FREE_LEVEL)
+    model = SimdModel(batch, unknowns_of(experiments), levels=levels)
     point = np.array([[start.get(item.name, 0.0) for item in model.unknowns.free]])
     return model, model.residuals(point)[0][0]
 
 
-def _polish(experiments: Sequence[Experiment], spans: Spans, best: Refinement) -> Refinement:
+def _polish(
+    experiments: Sequence[Experiment], spans: Spans, best: Refinement, levels: NDArray[np.int64]
+) -> Refinement:
     """Search the neighbourhood where steps in the cost may have held up the descent.
 
     The seed is fixed: the answer depends on the recording, not on the search before.
     """
     offsets = {item.name: best.values[item.name] for item in OFFSETS}
     unknowns = unknowns_of(experiments, FAULTS).holding(offsets)
-    model = SimdModel(lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB), unknowns)
+    batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
+    model = SimdModel(batch, unknowns, levels=levels)
     objective = Objective(model, cap=CAP)
     searched = [k for k, item in enumerate(best.parameters) if item in FAULTS]
     start = best.x[searched] * best.scale[searched]
@@ -114,26 +134,51 @@ def _polish(experiments: Sequence[Experiment], spans: Spans, best: Refinement) -
     found = POLISH.minimise(objective, start, spread, seed=0)
     chosen = found.best if found.cost < at_start else start
     severities = {item.name: float(value) for item, value in zip(FAULTS, chosen, strict=True)}
-    derivatives = anchored_derivatives(experiments, spans)
+    derivatives = anchored_derivatives(experiments, spans, levels=levels)
     other = describe(derivatives, {**offsets, **severities}, converged=best.converged)
     return replace(other, evaluations=other.evaluations + found.evaluations)
 
 
 def _refine(
-    experiments: Sequence[Experiment], spans: Spans, start: Mapping[str, float]
+    experiments: Sequence[Experiment],
+    spans: Spans,
+    start: Mapping[str, float],
+    levels: NDArray[np.int64],
 ) -> Refinement:
-    return refine(anchored_derivatives(experiments, spans), start)
+    return refine(anchored_derivatives(experiments, spans, levels=levels), start)
 
 
 def anchored_derivatives(
-    experiments: Sequence[Experiment], spans: Spans | None = None, lead: float = 0.0
+    experiments: Sequence[Experiment],
+    spans: Spans | None = None,
+    levels: NDArray[np.int64] | None = None,
 ) -> Derivatives:
     """Spans of the tests, re-anchored on the spool, in coordinates scaled by the noise."""
+    return derivatives_of(anchored_model(experiments, spans, levels=levels), experiments)
+
+
+def derivatives_of(model: SimdModel, experiments: Sequence[Experiment]) -> Derivatives:
+    """A model of `anchored_model`, in coordinates scaled by the noise."""
+    return Derivatives(
+        model, (experiments[0].spool_noise, experiments[0].pressure_noise), CONSIDERED
+    )
+
+
+def anchored_model(
+    experiments: Sequence[Experiment],
+    spans: Spans | None = None,
+    *,
+    lead: float = 0.0,
+    levels: NDArray[np.int64] | None = None,
+) -> SimdModel:
+    """Model of spans of the tests, re-anchored on the spool.
+
+    `levels`: of a model of the same spans, if there was one.
+    """
     batch = lay_out(experiments, spans, lead=lead, anchor_lsb=ANCHOR_LSB)
     considered = [item.parameter for item in CONSIDERED]
-    model = SimdModel(batch, unknowns_of(experiments, (*FAULTS, *OFFSETS, *considered)))
-    noise = (experiments[0].spool_noise, experiments[0].pressure_noise)
-    return Derivatives(model, noise, CONSIDERED)
+    unknowns = unknowns_of(experiments, (*FAULTS, *OFFSETS, *considered))
+    return SimdModel(batch, unknowns, levels=levels)
 
 
 def first_spans(experiments: Sequence[Experiment], until: Sequence[int]) -> Spans:

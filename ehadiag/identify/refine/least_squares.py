@@ -152,7 +152,7 @@ def _described(
     model: Derivatives, x: NDArray[np.float64], slope: Slope, *, converged: bool, jagged: bool
 ) -> Refinement:
     """Put together what is known at x; `slope` is that of a point so near that it holds there."""
-    residuals, considered, anchored = model.at(x)
+    residuals, considered, anchored, _ = model.at(x)
     weighted = model.model.batch.weight > 0.0
     used = slope.smooth & (residuals**2 < CAP) & weighted
     return Refinement(

@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import CAP, Derivatives, Slope, capped
-from ehadiag.identify.refine.first_part import FirstPart, anchored_derivatives
+from ehadiag.identify.refine.first_part import (
+    FirstPart,
+    anchored_derivatives,
+    anchored_model,
+    derivatives_of,
+)
 from ehadiag.identify.refine.least_squares import Refinement
 from ehadiag.identify.search.stages import LEAD_S
 
@@ -42,29 +47,33 @@ def add_last_part(
     until : sequence of int
         Ticks of the first part of each test.
     """
-    whole = anchored_derivatives(experiments)
-    first = first_part.refined
+    first, rows = first_part.refined, _Rows.of(experiments, until)
+    levels = np.full(sum(item.ticks for item in experiments), -1, dtype=np.int64)
+    levels[rows.first] = first_part.levels
+    if len(rows.last):
+        last = anchored_model(experiments, rows.spans, lead=LEAD_S)
+        levels[rows.last] = last.levels[rows.counted]
+    whole = anchored_derivatives(experiments, levels=levels)
     x = first.x * first.scale / whole.scale
-    rows = _Rows.of(experiments, until)
     weight = whole.model.batch.weight
     jacobian = np.zeros((len(x), *weight.shape))
     used = np.zeros(weight.shape, dtype=np.bool_)
     jacobian[:, :, rows.first], used[:, rows.first] = first.jacobian, first.used
+    others: list[NDArray[np.float64]] = []
     evaluations = 0
     if len(rows.last):
-        model = anchored_derivatives(experiments, rows.spans, LEAD_S)
+        model = derivatives_of(last, experiments)
         slope = model.trusted_slope(x)
-        taken = slope.used & (model.model.batch.weight > 0.0)
+        taken = slope.used & (last.batch.weight > 0.0)
         moved = _stepped(x, first, slope, taken, model)
         step = first.jacobian[:, first.used].T @ (moved - x)
         if step @ step > FARTHEST**2:
             return None
         jacobian[:, :, rows.last] = slope.jacobian[:, :, rows.counted]
         used[:, rows.last] = taken[:, rows.counted]
-        before = capped(whole.many(x[None, :])[0])
-        evaluations, x = model.evaluations, moved
-    residuals, considered, anchored = whole.at(x)
-    if len(rows.last) and capped(residuals) > before + WORSE:
+        evaluations, others, x = model.evaluations, [x], moved
+    residuals, considered, anchored, before = whole.at(x, *others)
+    if before and capped(residuals) > before[0] + WORSE:
         return None
     used &= residuals**2 < CAP
     return replace(

@@ -58,10 +58,10 @@ def spool_response(
     s = spool_rest(law, deflection_held(motor, held), origin)
     count, anchored, filtered = 0, 0, 0.0
     for k in range(current.shape[0]):
-        before = s.xs
+        before, first = s.xs, count
         s, count = spool_tick(tables, drive(motor, held, current[k]), tick, s, nodes, count)
         node_end[k] = count
-        spool[k] = sampled_path(constants, nodes, count, before)
+        spool[k] = sampled_path(constants, nodes, first, count, before)
         xs, filtered, moved = re_anchored(
             measured[k] - constants.OXS - spool[k], anchor[0], anchor[1], anchor[2],
             s.xs, filtered, law.stroke,

@@ -224,13 +224,15 @@ def spool_tick(
 
 
 @inlined
-def sampled_path(c: PlantConstants, nodes: Matrix, end: int, before: float) -> float:
-    """Spool as its sensor samples it in a tick, m, from the path's last piece.
+def sampled_path(c: PlantConstants, nodes: Matrix, first: int, end: int, before: float) -> float:
+    """Spool as its sensor samples it in a tick, m, so long before its end as the constants say.
 
-    nodes, end: the path up to the tick's end; before: position before the path's last piece where
-    that is the first of all, m.
+    nodes, first, end: the path of the tick; before: position at its start, m.
     """
-    last = end - 1
-    start = nodes[last - 1, 1] + nodes[last - 1, 4] if last > 0 else before
-    law = sensor_law(c, nodes[last, 0])
-    return sampled(law, start, nodes[last, 1], nodes[last, 2], nodes[last, 3])
+    lead, node = c.DLY, end - 1
+    while lead > nodes[node, 0] and node > first:
+        lead -= nodes[node, 0]
+        node -= 1
+    start = nodes[node - 1, 1] if node > first else before
+    law = sensor_law(c, lead, nodes[node, 0])
+    return sampled(law, start, nodes[node, 1], nodes[node, 2], nodes[node, 3])

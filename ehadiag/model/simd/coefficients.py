@@ -130,7 +130,7 @@ def _laws(c: PlantConstants, tick: float, i: int, out: NDArray[np.float64]) -> S
     keep_drive_law(out, i, drive_law(c))
     keep_spool_law(out, i, t)
     keep_jack_law(out, i, jack_law(c))
-    keep_sensor_law(out, i, sensor_law(c, tick / NODES))
+    keep_sensor_law(out, i, sensor_law(c, c.DLY, tick / NODES))
     out[ROOM * LANES + i] = min(t.breakaway, t.flapper_stop)
     # A flapper that does not ring is never taken to rest: slower, not wrong.
     out[RING_TIME * LANES + i] = 1.0 / t.ring_rate if t.ring_rate > 0.0 else NEVER

@@ -86,6 +86,7 @@ def _place(path: NDArray[np.float64], o: int, k: int, tick: float) -> Vector:
 
 @packed
 def jack_lanes(
+    end: int,
     level: int,
     step: int,
     tick: float,
@@ -93,14 +94,14 @@ def jack_lanes(
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> bool:
-    """Jack of all lanes over one of the 2^level steps of a tick.
+    """Jack of the lanes before `end` over one of the 2^level steps of a tick.
 
     Lanes with an event are marked BUSY and left as they were; returns whether there are any.
     """
     any_busy = False
     h = tick / (1 << level)
     k = ((level << MOST_HALVINGS) + step) * 15
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         j = jack_laws(coefficients, o)
         place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
         d = load(state, JACK_DIRECTION * LANES + o)
@@ -144,10 +145,13 @@ def jack_lanes(
 
 @packed
 def pressures(
-    state: NDArray[np.float64], path: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
 ) -> None:
     """Differential pressure of all lanes at the end of a tick, into the state."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         j = jack_laws(coefficients, o)
         x = load(path, (PLACE + NODES) * LANES + o)
         p12 = pressure(j, x, load(state, JACK_VELOCITY * LANES + o))

@@ -46,6 +46,7 @@ def keep_lane_jack(jack: JackState, state: NDArray[np.float64], i: int) -> None:
 
 @bare_kernel
 def jack_events(
+    count: int,
     level: int,
     step: int,
     tick: float,
@@ -53,11 +54,14 @@ def jack_events(
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Jack of BUSY lanes over one of the 2^level steps of a tick, piece by piece of the path."""
+    """Jack of BUSY lanes, of the first `count`, over one of the 2^level steps of a tick.
+
+    Piece by piece of the spool's path.
+    """
     span, steps = tick / NODES, 1 << level
     begin, stop = step * NODES / steps, (step + 1) * NODES / steps
     first, last = int(begin), math.ceil(stop)
-    for i in range(LANES):
+    for i in range(count):
         if state[BUSY * LANES + i] == 0.0:
             continue
         j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)

@@ -16,6 +16,7 @@ from ehadiag.model.simd.residuals import (
     Scratch,
     block_costs,
     block_residuals,
+    levels_for,
     scratch_beside,
     scratch_for,
 )
@@ -35,14 +36,32 @@ class SimdModel:
 
     Residuals of more than one block are computed on several processors, with the same digits on
     any number of them; costs on one.
+
+    Parameters
+    ----------
+    threads : int, optional
+        At most so many; as many as there are processors unless given.
+    levels : shape (N,), optional
+        `levels` of a model of the same spans, else they are found anew.
     """
 
-    def __init__(self, batch: Batch, unknowns: Unknowns, *, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        batch: Batch,
+        unknowns: Unknowns,
+        *,
+        threads: int | None = None,
+        levels: NDArray[np.int64] | None = None,
+    ) -> None:
         self.batch = batch
         self.unknowns = unknowns
         self.evaluations = 0
         self._threads = processors() if threads is None else threads
-        self._work = scratch_for(batch, unknowns.candidates(_scattered(unknowns)))
+        if levels is None:
+            levels = levels_for(batch, unknowns.candidates(_scattered(unknowns)))
+        self.levels: NDArray[np.int64] = levels
+        """How the jack's ticks are cut; to find that takes half as long as to run a block."""
+        self._work = scratch_for(levels)
 
     def residuals(
         self, points: NDArray[np.float64]

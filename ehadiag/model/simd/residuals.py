@@ -33,6 +33,7 @@ from ehadiag.model.simd.layout import (
     PLAYS,
     PRESSURE,
     SEEN,
+    SPOOL,
     STATE_ROWS,
     sensor_laws,
 )
@@ -46,7 +47,14 @@ from ehadiag.model.simd.spool import (
 )
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
 
-__all__ = ["Scratch", "block_costs", "block_residuals", "scratch_beside", "scratch_for"]
+__all__ = [
+    "Scratch",
+    "block_costs",
+    "block_residuals",
+    "levels_for",
+    "scratch_beside",
+    "scratch_for",
+]
 
 BOW = 0.008e-6
 """Distance (m) of the spool's path from its chord from which the jack takes two steps a tick, where
@@ -95,13 +103,30 @@ class Scratch(NamedTuple):
     no_residuals: NDArray[np.float64]
 
 
-def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
-    """Scratch for a batch, the jack's steps found by a run of candidates all over the space.
+def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64]:
+    """How often the jack's ticks are to be halved, by a run of candidates all over the space.
 
-    `scattered`: their constants, shape (LANES, tests, FIELDS).
+    Parameters
+    ----------
+    scattered : shape (LANES, tests, FIELDS)
+        Their constants.
+
+    Returns
+    -------
+    Shape (N,), see `Scratch.levels`.
     """
-    work = Scratch(
-        levels=np.full(batch.weight.shape[1], -1, dtype=np.int64),
+    levels = np.full(batch.weight.shape[1], -1, dtype=np.int64)
+    if batch.weight[PRESSURE_ROW].any():
+        # Without weights the jack is left out, and the spool's path is all that is looked at.
+        spool_only = batch._replace(weight=np.zeros_like(batch.weight))
+        block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(LANES))
+    return levels
+
+
+def scratch_for(levels: NDArray[np.int64]) -> Scratch:
+    """Scratch with the jack's steps; those below 0 are found by the first block that is run."""
+    return Scratch(
+        levels=levels,
         state=np.zeros(STATE_ROWS * LANES),
         path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
         coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
@@ -115,11 +140,6 @@ def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
         uncounted=np.zeros(0, dtype=np.int64),
         no_residuals=np.zeros((0, SIGNALS, 0)),
     )
-    if batch.weight[PRESSURE_ROW].any():
-        # Without weights the jack is left out, and the spool's path is all that is looked at.
-        spool_only = batch._replace(weight=np.zeros_like(batch.weight))
-        block_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
-    return work
 
 
 def scratch_beside(work: Scratch) -> Scratch:
@@ -153,7 +173,7 @@ def _level(path: NDArray[np.float64]) -> int:
 
 @packed
 def _hold_against(
-    measured: float, weight: float, cap: float, row: int, signal: int,
+    end: int, measured: float, weight: float, cap: float, row: int, signal: int,
     state: NDArray[np.float64], coefficients: NDArray[np.float64],
     sample: NDArray[np.float64], sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
@@ -161,7 +181,7 @@ def _hold_against(
 
     row: of the state; signal: row of the residuals.
     """
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         law = sensor_laws(coefficients, o)
         offset = law.spool_offset if signal == SPOOL_ROW else law.pressure_offset
         residual = (measured - offset - load(state, row * LANES + o)) * weight
@@ -171,6 +191,8 @@ def _hold_against(
 
 @packed
 def _jack_tick(
+    count: int,
+    end: int,
     tick: float,
     level: int,
     state: NDArray[np.float64],
@@ -179,8 +201,8 @@ def _jack_tick(
 ) -> None:
     """Jack of all lanes over a tick cut into 2^level steps."""
     for step in range(1 << level):
-        if jack_lanes(level, step, tick, state, path, coefficients):
-            jack_events(level, step, tick, state, path, coefficients)
+        if jack_lanes(end, level, step, tick, state, path, coefficients):
+            jack_events(count, level, step, tick, state, path, coefficients)
 
 
 @merged
@@ -197,7 +219,9 @@ def _block(
     sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
     weight, levels, start = batch.weight, work.levels, batch.start
-    wanted, last_candidate = out.shape[0], candidates.shape[0] - 1
+    count, wanted = candidates.shape[0], out.shape[0]
+    # Lanes that hold no candidate repeat the last one and take no events; a half of none is left.
+    end = WIDTH if count <= WIDTH else LANES
     sums[:] = 0.0
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
@@ -206,27 +230,32 @@ def _block(
         anchored = math.isfinite(small) or math.isfinite(large)
         for i in range(LANES):
             for field in range(FIELDS):
-                rows[i, field] = candidates[min(i, last_candidate), test, field]
+                rows[i, field] = candidates[min(i, count - 1), test, field]
+        late = False
+        for i in range(count):
+            late = late or plant_of(rows[i]).DLY != 0.0
+        # Most candidates are read at the end of the tick, where the spool is at hand.
+        read = SEEN if late else SPOOL
         backlash = tabulate(rows, tick, coefficients, moving, loose, stuck)
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
         state[PLAYS * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
-            drive_lanes(current[k], plays, state, coefficients)
-        deflect_lanes(plays, state, coefficients)
-        rest_lanes(batch.origin[index], state, coefficients)
+            drive_lanes(end, current[k], plays, state, coefficients)
+        deflect_lanes(end, plays, state, coefficients)
+        rest_lanes(end, batch.origin[index], state, coefficients)
         last = start[index + 1] - 1
         while last >= start[index] and weight[PRESSURE_ROW, last] == 0.0:
             last -= 1
         for k in range(start[index], start[index + 1]):
-            drive_lanes(current[since + k - start[index]], plays, state, coefficients)
-            if spool_lanes(tick, backlash, state, path, coefficients):
-                event_ticks(tick, state, path, coefficients, moving, loose, stuck)
+            drive_lanes(end, current[since + k - start[index]], plays, state, coefficients)
+            if spool_lanes(end, tick, backlash, state, path, coefficients):
+                event_ticks(count, tick, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
-            if seen:
-                see_lanes(state, path, coefficients)
+            if seen and late:
+                see_lanes(end, state, path, coefficients)
             if weight[SPOOL_ROW, k] != 0.0 and seen:
                 _hold_against(
-                    spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_ROW,
+                    end, spool[k], weight[SPOOL_ROW, k], cap, read, SPOOL_ROW,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
@@ -234,17 +263,17 @@ def _block(
             if levels[k] < 0:
                 levels[k] = _level(path)
             if k <= last:  # nothing depends on the jack but the pressure
-                _jack_tick(tick, levels[k], state, path, coefficients)
+                _jack_tick(count, end, tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(state, path, coefficients)
+                pressures(end, state, path, coefficients)
                 _hold_against(
-                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_ROW,
+                    end, pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_ROW,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
                     out[i, PRESSURE_ROW, k] = sample[i]
             if anchored and seen:
-                anchor_lanes(spool[k], gain, small, large, state, coefficients)
+                anchor_lanes(end, read, spool[k], gain, small, large, state, coefficients)
 
 
 @kernel
@@ -277,8 +306,7 @@ def block_costs(
 ) -> None:
     """Summed squared weighted residuals of each candidate, each square at most `cap`: out, (n,).
 
-    `candidates` has shape (n, tests, FIELDS). Blocks of LANES candidates run at once; a last block
-    that is not full takes as long as a full one.
+    `candidates` has shape (n, tests, FIELDS). Blocks of LANES candidates run at once.
     """
     _run_blocks(batch, candidates, cap, work, out, work.uncounted, work.no_residuals)
 

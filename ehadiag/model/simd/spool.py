@@ -2,7 +2,8 @@
 
 The same equations as `ehadiag.model.scalar.spool_tick`. The spool moves by quarters of a tick,
 exactly; a lane in which an event may hide takes the whole tick alone
-(`ehadiag.model.simd.spool_events`). No lane's result depends on its neighbours.
+(`ehadiag.model.simd.spool_events`). No lane's result depends on its neighbours. `end`: the lanes
+before it are run, whole vectors.
 """
 
 from __future__ import annotations
@@ -65,10 +66,14 @@ denormal numbers, which cost a hundred times as much."""
 
 @packed
 def drive_lanes(
-    current: float, plays: int, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int,
+    current: float,
+    plays: int,
+    state: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
 ) -> None:
     """Flapper deflection that the current (A) of a tick alone makes, all lanes, into the state."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         law = drive_laws(coefficients, o)
         value = law.bias + current
         total = value * 0.0
@@ -82,10 +87,10 @@ def drive_lanes(
 
 @packed
 def deflect_lanes(
-    plays: int, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int, plays: int, state: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
     """Flapper deflection by what the plays hold, all lanes, into the state."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         law = drive_laws(coefficients, o)
         total = law.bias * 0.0
         for i in range(plays):
@@ -95,14 +100,14 @@ def deflect_lanes(
 
 @packed
 def rest_lanes(
-    origin: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int, origin: float, state: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> None:
     """All lanes at rest, the spool at `origin` (m), the flapper in equilibrium if it can be.
 
     The deflection by the current is in the state; the count of re-anchorings goes on.
     """
     state[: DEFLECTION * LANES] = 0.0
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         t = spool_laws(coefficients, o)
         xs = most(least(t.stroke * 0.0 + origin, t.stroke), -t.stroke)
         still = still_flapper(t.ratio, load(state, DEFLECTION * LANES + o), xs)
@@ -145,6 +150,7 @@ def _loose_quarter(
 
 @packed
 def spool_lanes(
+    end: int,
     tick: float,
     backlash: bool,
     state: NDArray[np.float64],
@@ -158,7 +164,7 @@ def spool_lanes(
     """
     any_busy = False
     bow = tick / 16.0
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         xf, wf = load(state, FLAPPER * LANES + o), load(state, FLAPPER_RATE * LANES + o)
         xs, vs = load(state, SPOOL * LANES + o), load(state, SPOOL_RATE * LANES + o)
         d, clamped = load(state, DIRECTION * LANES + o), load(state, CLAMPED * LANES + o)
@@ -270,10 +276,13 @@ def spool_lanes(
 
 @packed
 def see_lanes(
-    state: NDArray[np.float64], path: NDArray[np.float64], coefficients: NDArray[np.float64]
+    end: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
 ) -> None:
     """Spool of all lanes as it is sampled in a tick, into the state."""
-    for o in range(0, LANES, WIDTH):
+    for o in range(0, end, WIDTH):
         seen = sampled(
             sensor_laws(coefficients, o),
             load(path, (PLACE + NODES - 1) * LANES + o),
@@ -286,6 +295,8 @@ def see_lanes(
 
 @packed
 def anchor_lanes(
+    end: int,
+    read: int,
     measured: float,
     gain: float,
     small: float,
@@ -293,11 +304,14 @@ def anchor_lanes(
     state: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`)."""
-    for o in range(0, LANES, WIDTH):
+    """Re-anchor the spool of all lanes at the end of a tick (`ehadiag.model.anchor.Anchor`).
+
+    read: row of the state that has the spool as it is sampled.
+    """
+    for o in range(0, end, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
         offset = sensor_laws(coefficients, o).spool_offset
-        error = measured - offset - load(state, SEEN * LANES + o)
+        error = measured - offset - load(state, read * LANES + o)
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)

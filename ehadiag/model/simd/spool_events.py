@@ -76,6 +76,7 @@ SCRATCH_SIZE = 4 * MOST_PIECES + 4 * WIDTH
 
 @bare_kernel
 def event_ticks(
+    count: int,
     tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
@@ -84,8 +85,11 @@ def event_ticks(
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> None:
-    """Flapper and spool of BUSY lanes over a tick with events, located to tick / 2^FINEST."""
-    for i in range(LANES):
+    """Flapper and spool of BUSY lanes, of the first `count`, over a tick with events.
+
+    Events are located to tick / 2^FINEST.
+    """
+    for i in range(count):
         if state[BUSY * LANES + i] != 0.0:
             _event_tick(i, tick, state, path, coefficients, moving, loose, stuck)
 

@@ -84,7 +84,7 @@ def test_open_loop_current_is_the_command():
     trace = commanded_current(samples, test, data)
     assert trace.rebuilt
     np.testing.assert_array_equal(trace.current, played)
-    assert trace.command_gap == pytest.approx(0.3 * 10e-3, rel=1e-9)
+    assert trace.command_deviation == pytest.approx(0.3 * 10e-3, rel=1e-9)
 
 
 def test_proportional_law_is_rebuilt_exactly():
@@ -92,7 +92,7 @@ def test_proportional_law_is_rebuilt_exactly():
     trace = commanded_current(samples, TEST, controller())
     assert trace.rebuilt
     np.testing.assert_allclose(trace.current, truth, atol=EXACT)
-    assert 0.5 < trace.gap_lsb < 0.65
+    assert 0.5 < trace.residual_lsb < 0.65
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.001, 0.2))
@@ -142,7 +142,7 @@ def test_another_control_law_is_noticed():
     samples, _ = closed_loop(controller())
     trace = commanded_current(samples, TEST, controller(GAP=0.5 * controller().GAP))
     assert not trace.rebuilt
-    assert trace.gap_lsb > 20.0
+    assert trace.residual_lsb > 20.0
 
 
 def test_without_command_frames_the_stored_command_serves():
@@ -153,4 +153,4 @@ def test_without_command_frames_the_stored_command_serves():
     assert trace.rebuilt
     # The stored command is exact, the played one rounded to 2 µm.
     assert np.abs(trace.current - truth)[1:].max() < controller().GAP * 1.01e-6
-    assert trace.command_gap == 0.0
+    assert trace.command_deviation == 0.0

@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from identify_cases import recorded
 
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.identify.experiment import make_batch
-from ehadiag.identify.search.compact_ga import compact_ga, state_bytes
+from ehadiag.identify.search import compact_ga
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import CompactGa, PygadGa, make_solver
+from ehadiag.identify.spans import lay_out, unknowns_of
+from ehadiag.model.parameters import FAULTS
+from ehadiag.model.simd.model import SimdModel
 
 TRUTH = np.array([0.6, 0.6, 0.3])
 START = TRUTH + np.array([0.01, -0.01, 0.01])
@@ -17,7 +21,8 @@ START = TRUTH + np.array([0.01, -0.01, 0.01])
 @pytest.fixture
 def objective():
     experiment = recorded("paper-open-3.blf", "open")
-    return Objective(make_batch([experiment], [experiment.test.windows.refinement], lead=0.1))
+    batch = lay_out([experiment], [experiment.test.windows.refinement], lead=0.1)
+    return Objective(SimdModel(batch, unknowns_of([experiment], FAULTS)))
 
 
 @pytest.mark.parametrize("solver", [CompactGa(budget=400), PygadGa(budget=400)])
@@ -37,8 +42,8 @@ def test_the_best_never_gets_worse_and_is_what_it_says(objective, solver):
     found = solver.minimise(objective, START, 0.02, 1)
     assert objective.evaluations - before == found.evaluations <= 800
     assert (np.diff(found.history) <= 0.0).all()
-    assert found.cost == found.history[-1] == objective(found.best)[0]
-    assert found.cost <= objective(START)[0]
+    assert found.cost == found.history[-1] == objective(found.best[None])[0]
+    assert found.cost <= objective(START[None])[0]
     assert ((found.best >= 0.0) & (found.best <= 1.0)).all()
 
 
@@ -66,31 +71,69 @@ def test_an_interrupt_stops_the_search(objective):
         solver.minimise(objective, START, 0.02, 0, stop)
 
 
-def run_compact(objective, control, history):
-    return compact_ga(
-        objective.batch, objective.work, np.zeros(2), 25.0, START,
-        np.full(3, 0.02), 40.0, 8, 400, 1e-5, 1, control, history,
-    )  # fmt: skip
+def test_the_search_is_its_three_steps(objective):
+    """A generation at a time, by hand: the digits of the solver, which holds nothing else."""
+    solver = CompactGa(budget=320)
+    state = compact_ga.start(START, np.full(3, 0.02), 4)
+    population = np.empty((solver.samples, 3))
+    for generation in range(20):
+        compact_ga.draw(state, population)
+        if generation == 0:
+            population[0] = START
+        costs = objective(population)
+        compact_ga.learn(state, population, costs, solver.virtual_population, solver.tolerance)
+    found = solver.minimise(objective, START, 0.02, 4)
+    np.testing.assert_array_equal(found.best, state.elite)
+    assert (found.cost, found.generations, found.evaluations) == (state.best[0], 20, 320)
 
 
-def test_a_set_flag_stops_before_the_first_generation(objective):
-    history = np.full(51, np.nan)
-    best, cost, used, generations = run_compact(objective, np.array([1, 0]), history)
-    assert (used, generations) == (0, 0)
-    np.testing.assert_array_equal(best, START)
-    assert cost == np.inf
-    assert np.isnan(history).all()
+def test_other_bounds_scale_the_search():
+    """Genes are shares of the bounds: a bowl found between 0 and 1 is found between -40 and 60."""
+
+    class Bowl(Objective):
+        evaluations = 0
+
+        def __init__(self, lower, upper):
+            self.lower, self.upper = np.full(4, lower), np.full(4, upper)
+
+        def __call__(self, population):
+            shares = (population - self.lower) / (self.upper - self.lower)
+            return ((shares - 0.3) ** 2).sum(axis=1)
+
+    unit, wide = Bowl(0.0, 1.0), Bowl(-40.0, 60.0)
+    here = CompactGa(budget=4000).minimise(unit, np.full(4, 0.5), 0.1, 0)
+    there = CompactGa(budget=4000).minimise(wide, np.full(4, 10.0), 10.0, 0)
+    np.testing.assert_allclose(here.best, 0.3, atol=1e-3)
+    np.testing.assert_allclose(there.best, -40.0 + 100.0 * here.best, atol=1e-6)
 
 
-def test_the_counter_follows_the_evaluations(objective):
-    control = np.zeros(2, dtype=np.int64)
-    _, _, used, generations = run_compact(objective, control, np.empty(51))
-    assert control[1] == used == 8 * generations
+def test_a_budget_below_a_generation_leaves_the_start(objective):
+    found = CompactGa(budget=15).minimise(objective, START, 0.02, 1)
+    assert (found.evaluations, found.generations) == (0, 0)
+    np.testing.assert_allclose(found.best, START)
+    assert found.cost == np.inf
+
+
+@given(st.integers(0, 2**63), st.integers(1, 6), st.integers(1, 20))
+def test_draws_stay_inside_and_the_elite_never_gets_worse(seed, genes, samples):
+    rng = np.random.default_rng(seed % 1000)
+    state = compact_ga.start(rng.random(genes), rng.random(genes), seed)
+    population = np.empty((samples, genes))
+    best = np.inf
+    for _ in range(5):
+        compact_ga.draw(state, population)
+        assert ((population >= 0.0) & (population <= 1.0)).all()
+        costs = rng.random(samples)
+        compact_ga.learn(state, population, costs, 40.0, 1e-6)
+        best = min(best, costs.min())
+        assert state.best[0] == best
+        assert ((state.mean >= 0.0) & (state.mean <= 1.0)).all()
+        assert (state.spread > 0.0).all()
 
 
 def test_memory_is_that_of_the_genes():
-    assert state_bytes(3) <= 128
-    assert state_bytes(6) - state_bytes(3) == 3 * 24
+    assert compact_ga.state_bytes(3) <= 128
+    assert compact_ga.state_bytes(6) - compact_ga.state_bytes(3) == 3 * 24
 
 
 def test_an_unknown_solver_is_refused():

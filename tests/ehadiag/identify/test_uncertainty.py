@@ -1,41 +1,58 @@
 """Stated deviations against what happens, on linear problems whose answer is known."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from identify_cases import NOISE, own_experiment
 
-from ehadiag.identify.experiment import make_batch
-from ehadiag.identify.refine.least_squares import refine
-from ehadiag.identify.uncertainty import covariance, interval95, normal_matrix
+from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.uncertainty import DISCREPANCY_STD, covariance, interval95
+from ehadiag.model.batch import SIGNALS
+from ehadiag.model.parameters import FAULTS, OFFSETS
 
 N = 400
 TRUTH = np.array([0.4, 0.5, 0.6])
 
 
-@cache
-def template():
-    """Any refinement: only its figures are replaced."""
-    faults = np.array([0.3, 0.6, 0.3])
-    return refine(make_batch([own_experiment(faults)]), faults, np.zeros(2), NOISE)
+PARAMETERS = (*FAULTS, *OFFSETS)
+K = len(PARAMETERS)
+SCALE = np.array([item.scale for item in PARAMETERS])
 
 
 def linear_problem(seed, noise):
-    """Least squares on gaps = noise - J (x - truth), shape (5, 2, N) as the refinement's."""
-    jacobian = np.random.default_rng(seed).standard_normal((5, 2, N))
-    jacobian[:3] *= 40.0
-    rows = jacobian.reshape(5, -1)
+    """Least squares on residuals = noise - J (x - truth), in units of the scales."""
+    jacobian = np.random.default_rng(seed).standard_normal((K, SIGNALS, N))
+    jacobian[: len(FAULTS)] *= 40.0
+    rows = jacobian.reshape(K, -1)
     step = np.linalg.solve(rows @ rows.T, rows @ noise.ravel())
-    gaps = (noise.ravel() - step @ rows).reshape(2, N)
-    used = np.ones((2, N), dtype=np.bool_)
-    return replace(
-        template(), values=TRUTH + step[:3], offsets=step[3:], gaps=gaps, jacobian=jacobian,
-        spool_rate=np.zeros(N), used=used, weighted=used,
-    )  # fmt: skip
+    residuals = (noise.ravel() - step @ rows).reshape(SIGNALS, N)
+    used = np.ones((SIGNALS, N), dtype=np.bool_)
+    return Refinement(
+        parameters=PARAMETERS,
+        x=np.concatenate([TRUTH, np.zeros(len(OFFSETS))]) + step,
+        scale=SCALE,
+        cost=float((residuals**2).sum()),
+        residuals=residuals,
+        jacobian=jacobian,
+        considered=np.zeros((0, SIGNALS, N)),
+        used=used,
+        weighted=used,
+        evaluations=0,
+        converged=True,
+        jagged=False,
+        anchored=0,
+    )
+
+
+def severities(fit):
+    return fit.x[: len(FAULTS)]
+
+
+def deviations(fit):
+    """Of the severities."""
+    return np.sqrt(np.diag(covariance(fit)))[: len(FAULTS)]
 
 
 def white(rng):
@@ -55,15 +72,14 @@ def test_intervals_of_a_linear_problem_hold_the_truth(noise):
     held = []
     for trial in range(300):
         fit = linear_problem(trial, noise(rng))
-        std = np.sqrt(np.diag(covariance(fit)))
-        for value, s, truth in zip(fit.values, std, TRUTH, strict=True):
+        for value, s, truth in zip(severities(fit), deviations(fit), TRUTH, strict=True):
             low, high = interval95(value, s)
             held.append(low <= truth <= high)
     assert 0.93 <= np.mean(held) <= 0.99
 
 
-def test_correlated_gaps_widen_what_correlates_with_them():
-    """A constant that acts slowly is less sure when the gaps move slowly."""
+def test_correlated_residuals_widen_what_correlates_with_them():
+    """A severity that acts slowly is less sure when the residuals move slowly."""
     rng = np.random.default_rng(2)
     slow = 40.0 * np.sin(2 * np.pi * np.arange(N) / 200.0)
     errors, stds = [], []
@@ -71,9 +87,9 @@ def test_correlated_gaps_widen_what_correlates_with_them():
         noise = correlated(rng)
         fit = linear_problem(trial, noise)
         fit.jacobian[0] = slow
-        rows = fit.jacobian.reshape(5, -1)
+        rows = fit.jacobian.reshape(K, -1)
         step = np.linalg.solve(rows @ rows.T, rows @ noise.ravel())
-        fit.gaps[:] = (noise.ravel() - step @ rows).reshape(2, N)
+        fit.residuals[:] = (noise.ravel() - step @ rows).reshape(SIGNALS, N)
         errors.append(step[0])
         stds.append(np.sqrt(covariance(fit)[0, 0]))
     real = np.std(errors)
@@ -84,7 +100,7 @@ def test_correlated_gaps_widen_what_correlates_with_them():
 
 def test_deviations_are_those_of_the_curvature_when_all_is_well():
     fit = linear_problem(0, white(np.random.default_rng(3)))
-    curved = np.sqrt(np.diag(np.linalg.inv(normal_matrix(fit)))[:3])
+    curved = np.sqrt(np.diag(np.linalg.inv(fit.normal))) * fit.scale
     stated = np.sqrt(np.diag(covariance(fit)))
     assert (stated >= 0.999 * curved).all()
     assert (stated < 1.5 * curved).all()
@@ -101,9 +117,27 @@ def test_rows_left_out_carry_nothing():
 def test_what_the_test_does_not_show_is_uniform():
     fit = linear_problem(0, white(np.random.default_rng(5)))
     fit.jacobian[2] = 0.0
-    std = np.sqrt(np.diag(covariance(fit)))
+    std = deviations(fit)
     assert std[2] == pytest.approx(1.0 / np.sqrt(12.0), rel=0.02)
     assert (std[:2] < 0.01).all()
+
+
+def test_what_is_considered_moves_the_estimate_in_proportion():
+    """A deviation of it shifts the residuals, and least squares by what answers that shift."""
+    fit = linear_problem(0, white(np.random.default_rng(6)))
+    shift = np.array([2e-3, -1e-3, 5e-4, 0.0, 0.0])
+    moving = replace(fit, considered=np.tensordot(shift, fit.jacobian, axes=1)[None])
+    added = covariance(moving) - covariance(fit)
+    added /= np.outer(fit.scale, fit.scale)
+    np.testing.assert_allclose(added, np.outer(shift, shift), rtol=0.01, atol=1e-9)
+
+
+def test_no_estimate_is_surer_than_both_sides_integration():
+    fit = linear_problem(0, 1e-6 * white(np.random.default_rng(7)))
+    fit.jacobian[:] *= 1e6
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(covariance(fit))), DISCREPANCY_STD * fit.scale, rtol=1e-3
+    )
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))

@@ -7,9 +7,9 @@ from scipy.linalg import expm
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
-from ehadiag.model.plant import plant_constants
 from ehadiag.model.scalar.jack import jack_response
 from ehadiag.model.scalar.response import respond
+from ehadiag_tools.damaged import damaged_unit
 from ehadiag_tools.simulator.stiff_reference import StiffReference
 
 TICK = 1e-3
@@ -18,15 +18,14 @@ CORNERS = [(0, 0, 0), (1, 1, 1), (0, 1, 0), (1, 0, 1), (0.3, 0.6, 0.3), (0.9, 0.
 
 
 def model(actuator, faults, current):
-    constants = plant_constants(actuator)
-    answer = respond(constants, np.array(faults, dtype=float), current, TICK)
+    answer = respond(damaged_unit(faults, actuator), current, TICK)
     return np.vstack([answer.spool, answer.pressure, answer.position])
 
 
-def gaps(actuator, faults, current):
+def differences(actuator, faults, current):
     reference = StiffReference(actuator, *faults)
-    gap = (model(actuator, faults, current) - reference.respond(current)) / LSB
-    return np.sqrt((gap**2).mean(axis=1)), np.abs(gap).max(axis=1), reference
+    off = (model(actuator, faults, current) - reference.respond(current)) / LSB
+    return np.sqrt((off**2).mean(axis=1)), np.abs(off).max(axis=1), reference
 
 
 @pytest.mark.parametrize("faults", CORNERS)
@@ -34,7 +33,7 @@ def test_stick_slip_follows_the_stiff_solver(faults):
     """Two tones; the spool and the jack stick and break away again and again."""
     time = np.arange(100) * TICK
     current = 1.5e-3 * (np.sin(2 * np.pi * 7 * time) + np.sin(2 * np.pi * 43 * time))
-    rms, _, reference = gaps(default_actuator(), faults, current)
+    rms, _, reference = differences(default_actuator(), faults, current)
     assert reference.slides[1] >= 5
     assert rms[0] < 0.02
     assert rms[1] < 0.4
@@ -46,7 +45,7 @@ def test_full_steps_follow_the_stiff_solver(faults):
     """Rated current back and forth: flapper on its stops, second stage saturated."""
     current = np.zeros(90)
     current[1:] = 10e-3 * np.sign(np.sin(2 * np.pi * 20 * np.arange(89) * TICK + 0.1))
-    rms, largest, reference = gaps(default_actuator(), faults, current)
+    rms, largest, reference = differences(default_actuator(), faults, current)
     assert reference.slides[0] >= 3  # the flapper left its stops
     assert rms[0] < 0.05
     assert largest[0] < 0.5
@@ -63,7 +62,7 @@ def test_stops_of_the_spool_follow_the_stiff_solver(faults):
     current[1:] = 10e-3 * np.sign(np.sin(2 * np.pi * 20 * np.arange(59) * TICK + 0.1))
     answer = model(actuator, faults, current)
     assert np.abs(answer[0]).max() == actuator.servovalve.XSM
-    rms, _, _ = gaps(actuator, faults, current)
+    rms, _, _ = differences(actuator, faults, current)
     assert rms[0] < 0.05
 
 
@@ -73,7 +72,7 @@ def test_a_load_moves_the_jack_to_its_stop():
     current[1:] = 2e-3 * np.sign(np.sin(2 * np.pi * 15 * np.arange(79) * TICK + 0.1))
     answer = model(actuator, (0.2, 0.2, 0.2), current)
     assert np.abs(answer[2]).max() == 0.2e-3
-    rms, _, reference = gaps(actuator, (0.2, 0.2, 0.2), current)
+    rms, _, reference = differences(actuator, (0.2, 0.2, 0.2), current)
     assert reference.slides[2] >= 2
     assert rms[2] < 0.05
 
@@ -100,10 +99,9 @@ def test_without_friction_the_spool_is_the_linear_system():
     np.testing.assert_allclose(answer[0], exact, atol=1e-3 * SPOOL.lsb)
 
 
-def jack_by_small_steps(constants, fdj, spool, step=0.5e-6):
-    """Second stage and jack, PHY-6 and PHY-7 as they stand; the spool moves straight."""
-    c = constants
-    dynamic = c.FDJ0 + fdj * (c.FDJ1 - c.FDJ0)
+def jack_by_small_steps(constants, spool, step=0.5e-6):
+    """Second stage and jack, the contract's section 1 as it stands; the spool moves straight."""
+    c, dynamic = constants, constants.FDJ
     substeps = round(TICK / step)
     velocity = place = before = 0.0
     out = []
@@ -133,13 +131,13 @@ def jack_by_small_steps(constants, fdj, spool, step=0.5e-6):
 @pytest.mark.parametrize("fdj", [0.0, 0.4, 1.0])
 def test_jack_alone_follows_small_steps(fdj):
     """A given straight-lined spool path through the middle, saturated at both ends."""
-    constants = plant_constants(default_actuator())
+    constants = damaged_unit((0.0, 0.0, fdj))
     spool = 60e-6 * np.sin(2 * np.pi * 20 * np.arange(1, 61) * TICK)
     before = np.concatenate([[0.0], spool[:-1]])
     rate = (spool - before) / TICK
     nodes = np.column_stack([np.full(60, TICK), spool, rate, rate, np.zeros(60)])
     pressure, position = np.empty(60), np.empty(60)
-    jack_response(constants, fdj, 0.0, nodes, np.arange(1, 61), pressure, position)
-    truth = jack_by_small_steps(constants, fdj, spool)
+    jack_response(constants, 0.0, nodes, np.arange(1, 61), pressure, position)
+    truth = jack_by_small_steps(constants, spool)
     assert np.sqrt(np.mean((pressure - truth[0]) ** 2)) < 0.3 * PRESSURE.lsb
     np.testing.assert_allclose(position, truth[1], atol=0.03 * POSITION.lsb)

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.channels import SPOOL
+from ehadiag.model.anchor import Anchor
 from ehadiag.model.plant import plant_constants
-from ehadiag.model.scalar.response import Anchor, respond
+from ehadiag.model.scalar.response import respond
+from ehadiag_tools.damaged import damaged_unit
 
 TICK = 1e-3
 CONSTANTS = plant_constants(default_actuator())
@@ -23,7 +25,7 @@ currents = levels.map(lambda parts: np.concatenate([np.full(n, level) for level,
 
 
 def run(faults, current, **options):
-    return respond(CONSTANTS, np.asarray(faults, dtype=float), current, TICK, **options)
+    return respond(damaged_unit(faults), current, TICK, **options)
 
 
 @given(faults_of, currents)

@@ -6,22 +6,22 @@ import sys
 
 import numpy as np
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.model.plant import plant_constants
+from ehadiag.model.anchor import Anchor
 from ehadiag.model.scalar.response import respond
+from ehadiag_tools.damaged import damaged_unit
 
 SCRIPT = """
 import sys
 import numba, numpy as np
-from ehadiag.core.actuator import default_actuator
-from ehadiag.model.plant import plant_constants
+from ehadiag.model.anchor import Anchor
 from ehadiag.model.scalar.response import respond
+from ehadiag.model.plant import PlantConstants
 
 assert numba.config.DISABLE_JIT
 current, measured = np.loadtxt(sys.stdin)
-from ehadiag.model.scalar.response import Anchor
-answer = respond(plant_constants(default_actuator()), np.array([0.3, 0.6, 0.3]), current, 1e-3,
-                 measured=measured, anchor=Anchor(0.3, 3e-7, 1.5e-6))
+constants = PlantConstants(*map(float, sys.argv[1:]))
+anchor = Anchor(0.3, 3e-7, 1.5e-6)
+answer = respond(constants, current, 1e-3, measured=measured, anchor=anchor)
 for row in (answer.spool, answer.pressure, answer.position, [answer.anchored]):
     print(*[float(x).hex() for x in row])
 """
@@ -29,18 +29,16 @@ for row in (answer.spool, answer.pressure, answer.position, [answer.anchored]):
 
 def test_plain_python_gives_the_compiled_answer():
     """Steps, slow motion and a sample that re-anchors, over 60 ticks."""
-    from ehadiag.model.scalar.response import Anchor
-
     current = np.concatenate([np.zeros(2), np.full(8, 8e-3), 1.5e-3 * np.sin(np.arange(50) * 0.4)])
-    constants, faults = plant_constants(default_actuator()), np.array([0.3, 0.6, 0.3])
-    measured = respond(constants, faults, current, 1e-3).spool + 0.1e-6
+    constants = damaged_unit([0.3, 0.6, 0.3])
+    measured = respond(constants, current, 1e-3).spool + 0.1e-6
     measured[30:] += 3e-6
     compiled = respond(
-        constants, faults, current, 1e-3, measured=measured, anchor=Anchor(0.3, 3e-7, 1.5e-6)
+        constants, current, 1e-3, measured=measured, anchor=Anchor(0.3, 3e-7, 1.5e-6)
     )
     text = "\n".join(" ".join(f"{x:.17g}" for x in row) for row in (current, measured))
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
+        [sys.executable, "-c", SCRIPT, *map(repr, constants)],
         input=text,
         capture_output=True,
         text=True,

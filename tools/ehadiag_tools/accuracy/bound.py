@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 
 from ehadiag.core.channels import PRESSURE, SPOOL
 from ehadiag.identify.experiment import Experiment
+from ehadiag.model.batch import SIGNALS
+from ehadiag.model.parameters import FAULTS
 from ehadiag.model.scalar.response import respond
 from ehadiag_sim.plant.conditions import Sensors
+from ehadiag_tools.damaged import damaged
 
 __all__ = ["cramer_rao", "information"]
 
@@ -21,15 +24,15 @@ AGREE = 0.2
 
 
 def cramer_rao(experiments: Sequence[Experiment], faults: Sequence[float]) -> NDArray[np.float64]:
-    """Deviations of Kintas, FSS, FDJ at the truth, sensor offsets known to be zero, shape (3,).
+    """Deviations of all severities at the truth, sensor offsets known to be zero, shape (k,).
 
     Noise of the converters as in PHY-21 and PHY-22: 0.5 LSB rms and rounding, taken as Gaussian
     of variance 0.25 + 1/12 LSB². Ticks at which a break-away tips between both sides of a
-    difference are left out: there the response has no derivative. NaN for a constant that shows
+    difference are left out: there the response has no derivative. NaN for a severity that shows
     nowhere.
     """
-    total = sum((information(item, faults) for item in experiments), np.zeros((3, 3)))
-    out = np.full(3, np.nan)
+    total = sum((information(item, faults) for item in experiments), np.zeros((len(FAULTS),) * 2))
+    out = np.full(len(FAULTS), np.nan)
     shown = np.diag(total) > 0.0
     inverse = np.linalg.inv(total[np.ix_(shown, shown)])
     out[shown] = np.sqrt(np.diag(inverse))
@@ -37,7 +40,7 @@ def cramer_rao(experiments: Sequence[Experiment], faults: Sequence[float]) -> ND
 
 
 def information(experiment: Experiment, faults: Sequence[float]) -> NDArray[np.float64]:
-    """Fisher information of one test, shape (3, 3)."""
+    """Fisher information of one test, shape (k, k)."""
     truth = np.asarray(faults, dtype=np.float64)
     wide, narrow = (_derivatives(experiment, truth, step) for step in STEPS)
     scale = np.sqrt(np.mean(narrow**2, axis=2, keepdims=True))
@@ -50,15 +53,16 @@ def information(experiment: Experiment, faults: Sequence[float]) -> NDArray[np.f
 def _derivatives(
     experiment: Experiment, truth: NDArray[np.float64], step: float
 ) -> NDArray[np.float64]:
-    """Derivatives of spool and pressure in units of their noise, shape (3, 2, n)."""
+    """Derivatives of spool and pressure in units of their noise, shape (k, SIGNALS, n)."""
     noise = np.sqrt(Sensors().noise_lsb ** 2 + 1.0 / 12.0) * np.array([SPOOL.lsb, PRESSURE.lsb])
-    out = np.empty((3, 2, experiment.ticks))
-    for j in range(3):
+    out = np.empty((len(FAULTS), SIGNALS, experiment.ticks))
+    for j in range(len(FAULTS)):
         sides = []
         for sign in (1.0, -1.0):
             x = truth.copy()
             x[j] = min(max(x[j] + sign * step, 0.0), 1.0)
-            answer = respond(experiment.constants, x, experiment.trace.current, experiment.tick)
+            constants = damaged(experiment.constants, x)
+            answer = respond(constants, experiment.trace.current, experiment.tick)
             sides.append((x[j], np.vstack([answer.spool, answer.pressure])))
         (high, above), (low, below) = sides
         out[j] = (above - below) / (high - low) / noise[:, None]

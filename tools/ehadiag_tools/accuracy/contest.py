@@ -10,18 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
-from ehadiag.identify.experiment import make_batch
 from ehadiag.identify.search.first_approximation import first_approximation, first_inputs
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import CompactGa, PygadGa
 from ehadiag.identify.search.stages import DEVIATION, LEAD_S
+from ehadiag.identify.spans import lay_out, unknowns_of
+from ehadiag.model.parameters import FAULTS
+from ehadiag.model.simd.model import SimdModel
 from ehadiag_tools.accuracy.runs import Run, experiments_of
 
 __all__ = ["RIVALS", "contest", "print_contest"]
 
 RIVALS = ("cga", "pygad", "scipy DE")
 POPULATION = 24
-"""Of differential evolution: eight for each constant."""
+"""Of differential evolution: eight for each severity."""
 WORSE = 1e-6
 """Relative difference of the objective from which it counts as worse."""
 
@@ -29,9 +31,11 @@ WORSE = 1e-6
 def contest(run: Run) -> dict[str, Any]:
     """Search with each solver from the same first approximation, deviation, seed and budget."""
     experiments = experiments_of(run)
-    start = np.array(first_approximation(first_inputs(experiments)).values)
+    first = first_approximation(first_inputs(experiments)).values
+    start = np.array([first[item.name] for item in FAULTS])
     windows = [experiment.test.windows.refinement for experiment in experiments]
-    objective = Objective(make_batch(experiments, windows, lead=LEAD_S))
+    batch = lay_out(experiments, windows, lead=LEAD_S)
+    objective = Objective(SimdModel(batch, unknowns_of(experiments, FAULTS)))
     budget = CompactGa().budget
     outcome: dict[str, Any] = {}
     for solver in (CompactGa(), PygadGa().with_budget(budget)):

@@ -46,7 +46,7 @@ class Figures:
     rescued: int
     not_converged: int
     most_outliers: float
-    """Largest share of gaps beyond three deviations, %."""
+    """Largest share of residuals beyond three deviations, %."""
 
 
 def percent_errors(records: Sequence[Record], stage: str = "value") -> NDArray[np.float64]:

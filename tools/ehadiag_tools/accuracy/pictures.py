@@ -1,4 +1,4 @@
-"""Pictures of identifications: parity, residuals over time, objective along each severity."""
+"""Pictures of an identification: parity, residuals over time, objective along each severity."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from ehadiag.identify.refine.residual_model import CAP
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ehadiag.identify.experiment import ANCHOR_LSB, Experiment, make_batch
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.search.objective import SEARCH_CAP, Objective
-from ehadiag.model.parameters import FAULT_NAMES
+from ehadiag.identify.search.stages import LEAD_S
+from ehadiag.identify.spans import ANCHOR_LSB, lay_out, unknowns_of
+from ehadiag.model.batch import Batch
+from ehadiag.model.parameters import FAULT_NAMES, FAULTS
 from ehadiag.model.scalar.response import respond
+from ehadiag.model.simd.model import SimdModel
 from ehadiag_tools.accuracy.figures import percent_errors
 from ehadiag_tools.accuracy.runs import Run, experiments_of
+from ehadiag_tools.damaged import damaged
 
 __all__ = ["draw_all"]
 
@@ -38,13 +43,15 @@ def draw_all(
     paths = [_save(_parity(records), folder / f"{prefix}-parity.png")]
     for test in SHAPES:
         # The last of the paper's cases has all three faults.
-        chosen = [i for i, run in enumerate(runs) if run.test == test and run.faults == (0.6,) * 3]
+        chosen = [i for i, run in enumerate(runs) if run.test == test and set(run.faults) == {0.6}]
         chosen = chosen or [i for i, run in enumerate(runs) if run.test == test]
         if chosen:
             run, record = runs[chosen[0]], records[chosen[0]]
             (experiment,) = experiments_of(run)
             value = np.array(record["value"])
-            paths.append(_save(_gaps(run, experiment, value), folder / f"{prefix}-gaps-{test}.png"))
+            paths.append(
+                _save(_residuals(run, experiment, value), folder / f"{prefix}-gaps-{test}.png")
+            )
             drawn = _slices(run, experiment, value)
             paths.append(_save(drawn, folder / f"{prefix}-slices-{test}.png"))
     return paths
@@ -58,7 +65,7 @@ def _save(figure: Figure, path: Path) -> Path:
 def _parity(records: Sequence[Record]) -> Figure:
     """Estimate over truth, and error over truth with 95 % intervals."""
     figure = Figure(figsize=(11, 7), layout="constrained")
-    axes = figure.subplots(2, 3, sharex="col", height_ratios=(1.6, 1.0))
+    axes = figure.subplots(2, len(FAULTS), sharex="col", height_ratios=(1.6, 1.0))
     for j, name in enumerate(FAULT_NAMES):
         upper, lower = axes[0, j], axes[1, j]
         upper.plot([0, 1], [0, 1], color="0.7", lw=1, label="estimate = truth")
@@ -94,10 +101,10 @@ def _parity(records: Sequence[Record]) -> Figure:
     return figure
 
 
-def _gaps(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figure:
+def _residuals(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figure:
     """Measured signals and what the model leaves of them, in units of noise."""
     current = experiment.trace.current
-    answer = respond(experiment.constants, value, current, experiment.tick)
+    answer = respond(damaged(experiment.constants, value), current, experiment.tick)
     time = np.arange(1, experiment.ticks + 1) * experiment.tick
     rows = (
         ("spool, mm", experiment.spool * 1e3, answer.spool * 1e3, experiment.spool_noise * 1e3),
@@ -116,10 +123,10 @@ def _gaps(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figur
         upper.plot(time, modelled, lw=0.7, color="#a4140b", label="model at the estimate")
         upper.set(ylabel=label)
         upper.legend(fontsize=8, loc="upper left", ncols=2)
-        gap = (measured - modelled) / noise
-        lower.plot(time, gap, ".", ms=1.5, color=HUES[run.test])
-        reach = max(5.0, float(np.nanmax(np.abs(gap))) * 1.1)
-        lower.set(ylabel="gap / noise", ylim=(-reach, reach))
+        residual = (measured - modelled) / noise
+        lower.plot(time, residual, ".", ms=1.5, color=HUES[run.test])
+        reach = max(5.0, float(np.nanmax(np.abs(residual))) * 1.1)
+        lower.set(ylabel="residual / noise", ylim=(-reach, reach))
         for level in (-3.0, 3.0):
             lower.axhline(level, color="0.5", lw=0.7, ls="--")
     for axis in axes:
@@ -131,25 +138,29 @@ def _gaps(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figur
 
 
 def _slices(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figure:
-    """Objective of search and refinement along each constant through the estimate."""
+    """Objective of search and refinement along each severity through the estimate."""
     windows = [experiment.test.windows.refinement]
+
+    def objective_of(batch: Batch, cap: float) -> Objective:
+        return Objective(SimdModel(batch, unknowns_of([experiment], FAULTS)), cap)
+
     objectives = {
         "search (second part, runs free)": (
-            Objective(make_batch([experiment], windows, lead=0.1), cap=SEARCH_CAP), "#0b6fa4", "-",
+            objective_of(lay_out([experiment], windows, lead=LEAD_S), SEARCH_CAP), "#0b6fa4", "-",
         ),
         "refinement (all of the test, re-anchored)": (
-            Objective(make_batch([experiment], anchor_lsb=ANCHOR_LSB), cap=CAP), "#c45a10", "--",
+            objective_of(lay_out([experiment], anchor_lsb=ANCHOR_LSB), CAP), "#c45a10", "--",
         ),
     }  # fmt: skip
     figure = Figure(figsize=(11, 7), layout="constrained")
-    axes = figure.subplots(2, 3)
+    axes = figure.subplots(2, len(FAULTS))
     for j, name in enumerate(FAULT_NAMES):
         near = np.linspace(max(0.0, value[j] - CLOSE), min(1.0, value[j] + CLOSE), 81)
         for axis, grid, scale in ((axes[0, j], WIDE, 1.0), (axes[1, j], near, 100.0)):
             rows = np.tile(value, (len(grid), 1))
             rows[:, j] = grid
             for label, (objective, hue, line) in objectives.items():
-                samples = np.count_nonzero(objective.batch.weight)
+                samples = np.count_nonzero(objective.model.batch.weight)
                 cost = objective(rows)
                 shown = cost / samples if scale == 1.0 else cost - cost.min()
                 axis.plot(scale * grid, shown, color=hue, ls=line, lw=1.3, label=label)
@@ -161,7 +172,7 @@ def _slices(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Fig
             axis.grid(alpha=0.25)
         axes[0, j].set(title=name, xlabel=f"{name} (1 = limit of damage)", yscale="log")
         axes[1, j].set(xlabel=f"{name}, % of full damage")
-    axes[0, 0].set(ylabel="capped squared gap / noise², a sample")
+    axes[0, 0].set(ylabel="capped squared residual, a sample")
     axes[1, 0].set(ylabel="objective above its lowest value")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ehadiag.identify.pipeline import identify
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.channels import PRESSURE, SPOOL
@@ -19,12 +18,13 @@ from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import make_solver
-from ehadiag.model.plant import plant_constants
+from ehadiag.identify.session import identify
 from ehadiag.model.scalar.response import respond
 from ehadiag_sim.plant.conditions import Faults, Sensors
 from ehadiag_sim.plant.simulator import simulate
 from ehadiag_tools.accuracy.bound import cramer_rao
 from ehadiag_tools.accuracy.cases import Faults3
+from ehadiag_tools.damaged import damaged_unit
 from firmware_iface.logs.reader import read_recording
 
 __all__ = ["PLANTS", "TESTS", "Run", "experiments_of", "identified", "perform", "summary_of"]
@@ -137,8 +137,7 @@ def _own_plant(run: Run) -> tuple[Samples, Environment]:
     samples, environment = _detailed(run.test, run.faults, 0)
     (experiment,) = experiments_of(Run(run.test, run.faults))
     truth = respond(
-        plant_constants(default_actuator(), environment),
-        np.array(run.faults),
+        damaged_unit(run.faults, environment=environment),
         experiment.trace.current,
         experiment.tick,
     )

@@ -273,10 +273,10 @@ def _print_worst(records: Sequence[dict[str, Any]], count: int = 5) -> None:
     for index in np.argsort(-np.abs(error).max(axis=1))[:count]:
         record = records[index]
         truth = ", ".join(f"{x:.4f}" for x in record["faults"])
-        gaps = ", ".join(f"{x:+.4f}" for x in error[index])
+        off = ", ".join(f"{x:+.4f}" for x in error[index])
         std = ", ".join(f"{100.0 * x:.4f}" for x in record["std"])
         print(
-            f"| {record['noise_seed']} | {truth} | {gaps} | {std} "
+            f"| {record['noise_seed']} | {truth} | {off} | {std} "
             f"| {100.0 * record['outliers']:.2f} |"
         )
     print(flush=True)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.model.batch import SIGNALS, Batch
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.residuals import Batch
 from ehadiag.model.scalar.transition import SpoolTables
 from ehadiag.model.simd.jack import STAGES
 
@@ -45,7 +45,6 @@ class CModel:
         self,
         constants: PlantConstants,
         tables: SpoolTables,
-        fdj: float,
         current: NDArray[np.float64],
     ) -> None:
         n = len(current)
@@ -55,13 +54,12 @@ class CModel:
         # Arrays that the pointers below point into.
         self._kept = (
             np.array(constants),
-            np.array(tables.scalars),
             *(np.ascontiguousarray(part) for part in tables[:3]),
             np.ascontiguousarray(current),
         )
-        plant, scalars, moving, stuck, decay, currents = map(_pointer, self._kept)
+        plant, moving, stuck, decay, currents = map(_pointer, self._kept)
         self._arguments = (
-            *(plant, scalars, moving, stuck, decay, ctypes.c_double(fdj)),
+            *(plant, moving, stuck, decay),
             *(currents, ctypes.c_long(n), ctypes.c_double(1e-3)),
             *map(_pointer, (self.spool, self.pressure, self.position)),
         )
@@ -74,8 +72,9 @@ class CModel:
 class CLanes:
     """Costs of candidates by the algorithm of `ehadiag.model.simd.residuals`, one at a time.
 
-    levels: of `LaneWork`; candidates: shape (n, 5); single: computes in single precision. Leaves
-    `costs`, shape (n,), and, if wanted, `gaps`, shape (n, 2, N), 0 where a sample is missing.
+    levels: of `SimdModel`; candidates: rows of constants, shape (n, tests, FIELDS); single:
+    computes in single precision. Leaves `costs`, shape (n,), and, if wanted, `residuals`, shape
+    (n, SIGNALS, N), 0 where a sample is missing.
 
     Raises
     ------
@@ -89,22 +88,24 @@ class CLanes:
         candidates: NDArray[np.float64],
         cap: float,
         *,
-        gaps: bool = False,
+        residuals: bool = False,
         single: bool = False,
     ) -> None:
         n = len(candidates)
         self.costs = np.zeros(n)
         kind = np.dtype(np.float32 if single else np.float64)
-        self.gaps = np.zeros((n, 2, len(batch.current)), kind) if gaps else None
+        shape = (n, SIGNALS, len(batch.current))
+        self.residuals = np.zeros(shape, kind) if residuals else None
         self._function = _build("lanes.c", *SINGLE * single).eha_lane_costs
         self._function.restype = None
         # Arrays that the pointers below point into.
         self._kept = _of_kind(kind, *batch, levels, STAGES, candidates)
         *inputs, rows = map(_pointer, self._kept)
+        wanted = None if self.residuals is None else _pointer(self.residuals)
         self._arguments = (
             *inputs,
             *(ctypes.c_long(len(batch.tick)), _number(kind, cap), ctypes.c_long(n)),
-            *(rows, _pointer(self.costs), None if self.gaps is None else _pointer(self.gaps)),
+            *(ctypes.c_long(candidates.shape[1]), rows, _pointer(self.costs), wanted),
         )
 
     def __call__(self) -> None:
@@ -115,7 +116,8 @@ class CLanes:
 class CUnlocated:
     """Costs of a block of candidates with events at the ends of steps, all in vectors.
 
-    candidates: shape (n, 5); they are repeated to fill the block. Leaves `costs`, shape (block,).
+    candidates: rows of constants, shape (n, tests, FIELDS); they are repeated to fill the block.
+    Leaves `costs`, shape (block,).
 
     Raises
     ------
@@ -138,16 +140,18 @@ class CUnlocated:
         # Arrays that the pointers below point into.
         self._kept = _of_kind(
             kind,
-            *(batch.constants, batch.tick, batch.start, batch.current),
+            *(batch.test, batch.tick, batch.start, batch.current),
             *(np.nan_to_num(batch.spool), np.nan_to_num(batch.pressure)),
             *(np.where(seen, batch.weight, 0.0), levels, STAGES),
-            np.resize(candidates, (len(self.costs), 5)),
+            np.resize(candidates, (len(self.costs), *candidates.shape[1:])),
         )
         *inputs, rows = map(_pointer, self._kept)
         self._function = library.eha_unlocated_costs
         self._function.restype = None
         spans = ctypes.c_long(len(batch.tick))
-        self._arguments = (*inputs, spans, _number(kind, cap), rows, _pointer(self.costs))
+        tests = ctypes.c_long(candidates.shape[1])
+        cost = _pointer(self.costs)
+        self._arguments = (*inputs, spans, _number(kind, cap), tests, rows, cost)
 
     def __call__(self) -> None:
         """Evaluate the block."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 
-from ehadiag.identify.pipeline import identify
-
+from ehadiag.identify.session import identify
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import LOG, TRUTH, experiment
 from ehadiag_tools.bench.rivals import rivals

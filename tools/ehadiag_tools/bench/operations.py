@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.search.objective import SEARCH_CAP
-from ehadiag.model.scalar.residuals import Batch
-from ehadiag.model.simd.residuals import LaneWork, lane_costs
+from ehadiag.model.batch import Batch
+from ehadiag.model.simd.residuals import Scratch, block_costs, scratch_for
 
 __all__ = ["Job", "Operations", "Tally", "count_operations", "counting"]
 
@@ -58,12 +58,12 @@ class Operations:
         return self.vector + self.scalar
 
 
-Job = tuple[Batch, LaneWork, NDArray[np.float64]]
-"""Recordings, scratch with the jack's steps known, and candidates."""
+Job = tuple[Batch, NDArray[np.int64], NDArray[np.float64]]
+"""Recordings, the jack's steps in them (`SimdModel.levels`), and candidates."""
 
 
 def count_operations(jobs: Sequence[Job]) -> list[Operations]:
-    """Operations of `lane_costs` for each job as its source says, but for those of its tables.
+    """Operations of `block_costs` for each job as its source says, but for those of its tables.
 
     The compiler may find a few of them twice. Runs in a process of its own.
     """
@@ -157,11 +157,12 @@ def counting(tally: Tally) -> type[np.ndarray]:
 def main() -> None:
     """Count what stdin asks for."""
     found = []
-    for batch, work, candidates in pickle.load(sys.stdin.buffer):
+    for batch, levels, candidates in pickle.load(sys.stdin.buffer):
         tally = Tally()
         kind = counting(tally)
-        own = LaneWork(*(a.view(kind) if a.dtype == np.float64 else a for a in work))
-        lane_costs(batch, candidates, SEARCH_CAP, own, np.empty(len(candidates)))
+        work = scratch_for(levels)
+        own = Scratch._make(a.view(kind) if a.dtype == np.float64 else a for a in work)
+        block_costs(batch, candidates, SEARCH_CAP, own, np.empty(len(candidates)))
         found.append(asdict(tally.result()))
     print(json.dumps(found))
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.search.objective import SEARCH_CAP
-from ehadiag.model.scalar.residuals import Batch
+from ehadiag.model.batch import Batch
 from ehadiag.model.simd.layout import LANES
-from ehadiag.model.simd.residuals import lane_costs, lane_work
+from ehadiag.model.simd.model import SimdModel
 from ehadiag_tools.bench.c_model import CPeak
 from ehadiag_tools.bench.figures import Figure, Sizes, cpu_median, each
 from ehadiag_tools.bench.operations import Job, count_operations
@@ -27,7 +25,7 @@ COUNTED = 20
 """Ticks in which operations are counted, for each tick that a slow oracle takes."""
 
 
-def against_peak(batch: Batch, took: float, sizes: Sizes) -> list[Figure]:
+def against_peak(model: SimdModel, took: float, sizes: Sizes) -> list[Figure]:
     """Operations of the lanes, `took` s a candidate, against the vector peak in the same run.
 
     Raises
@@ -36,16 +34,17 @@ def against_peak(batch: Batch, took: float, sizes: Sizes) -> list[Figure]:
     """
     peak, width = _rate("products", sizes)
     divided, _ = _rate("divisions", sizes)
-    work, rows, ticks = lane_work(batch), population(LANES), len(batch.current)
+    batch, levels, points = model.batch, model.levels, population(LANES)
+    ticks, candidates = len(batch.current), model.unknowns.candidates(points)
     slow = batch._replace(current=_triangle(ticks))
-    call = partial(lane_costs, slow, rows, SEARCH_CAP, work, np.empty(LANES))
-    together = cpu_median(call, sizes.repeats) / LANES
+    calm = SimdModel(slow, model.unknowns, levels=levels)
+    together = cpu_median(lambda: calm.costs(points, SEARCH_CAP), sizes.repeats) / LANES
     counted = min(ticks, COUNTED * sizes.ticks)
     quarter = -(-counted // 4)
     jobs: list[Job] = [
-        (beginning(batch, counted), work._replace(levels=work.levels[:counted]), rows),
+        (beginning(batch, counted), levels[:counted], candidates),
         # Steps of the jack as in the whole test, on average.
-        (beginning(slow, quarter), work._replace(levels=work.levels[:counted:4].copy()), rows),
+        (beginning(slow, quarter), levels[:counted:4].copy(), candidates),
     ]
     whole, part = count_operations(jobs)
     total, per = whole.arithmetic / (counted * LANES), 1.0 / (quarter * LANES)

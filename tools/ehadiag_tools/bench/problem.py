@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import numpy as np
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import Recording, Samples
 from ehadiag.core.stored_test import resolve_test
-from ehadiag.identify.experiment import Experiment, build_experiment, make_batch
+from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.search.stages import LEAD_S
-from ehadiag.model.scalar.residuals import Batch
+from ehadiag.identify.spans import Spans, lay_out, unknowns_of
+from ehadiag.model.parameters import FAULTS
+from ehadiag.model.simd.model import SimdModel
 from firmware_iface.logs.reader import read_recording
 
 __all__ = [
@@ -52,13 +55,13 @@ def experiment(logs: Path) -> Experiment:
     )
 
 
-def whole_test(logs: Path, tests: int) -> Batch:
-    """Lay it out so many times, all of the test."""
-    return make_batch([experiment(logs)] * tests)
+def whole_test(logs: Path, tests: int) -> SimdModel:
+    """Model of the recording laid out so many times, all of the test; the severities unknown."""
+    return _model([experiment(logs)] * tests)
 
 
-def all_tests(logs: Path) -> list[Batch]:
-    """Lay out each recording of the paper's cases, all of the test."""
+def all_tests(logs: Path) -> list[SimdModel]:
+    """Model of each recording of the paper's cases, all of the test."""
     out = []
     for kind in ("open", "closed"):
         for log in sorted(logs.glob(f"paper-{kind}-*.blf")):
@@ -67,18 +70,23 @@ def all_tests(logs: Path) -> list[Batch]:
             item = build_experiment(
                 found.samples, found.environment, resolve_test(kind), default_actuator()
             )
-            out.append(make_batch([item]))
+            out.append(_model([item]))
     return out
 
 
 def population(size: int) -> np.ndarray:
-    """Candidates all over the cube, no offsets, shape (size, 5)."""
-    rows = np.zeros((size, 5))
-    rows[:, :3] = np.random.default_rng(0).uniform(0.0, 1.0, (size, 3))
-    return rows
+    """Points all over the space of the severities, shape (size, k)."""
+    return np.random.default_rng(0).uniform(0.0, 1.0, (size, len(FAULTS)))
 
 
-def search_window(logs: Path) -> Batch:
-    """Lay out the window on which the genetic search works."""
+def search_window(logs: Path) -> SimdModel:
+    """Model of the window on which the genetic search works."""
     item = experiment(logs)
-    return make_batch([item], [item.test.windows.refinement], lead=LEAD_S)
+    return _model([item], [item.test.windows.refinement], LEAD_S)
+
+
+def _model(
+    experiments: Sequence[Experiment], spans: Spans | None = None, lead: float = 0.0
+) -> SimdModel:
+    batch = lay_out(experiments, spans, lead=lead)
+    return SimdModel(batch, unknowns_of(experiments, FAULTS), threads=1)

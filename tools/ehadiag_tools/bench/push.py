@@ -7,10 +7,10 @@ import threading
 import time
 
 import numpy as np
-from ehadiag.identify.pipeline import identify
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
+from ehadiag.identify.session import identify
 from ehadiag.monitor import Monitor, Tick
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import TRUTH, experiment, recording, samples

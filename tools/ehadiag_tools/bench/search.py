@@ -23,6 +23,7 @@ from ehadiag.identify.search.first_approximation import first_approximation, fir
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import CompactGa, PygadGa
 from ehadiag.identify.search.stages import DEVIATION
+from ehadiag.model.parameters import FAULTS
 from ehadiag_tools.bench.figures import Figure, Sizes
 from ehadiag_tools.bench.problem import experiment, search_window
 
@@ -30,7 +31,7 @@ __all__ = ["Goal", "ReachedError", "measure"]
 
 SECTION = "search"
 POPULATION = 24
-"""Of the rivals but pygad: eight for each constant."""
+"""Of the rivals but pygad: eight for each severity."""
 SLACK = 1e-3
 """A rival is there when its cost is at most so much above (share)."""
 
@@ -45,8 +46,14 @@ class Goal(Objective):
     """The objective; ends the search that reaches the goal, or has spent its evaluations."""
 
     def __init__(self, of: Objective, goal: float, budget: int) -> None:
-        super().__init__(of.batch, of.offsets, of.cap)
-        self.goal, self.limit, self.best = goal, budget, np.inf
+        super().__init__(of.model, of.cap)
+        self.goal, self.best = goal, np.inf
+        self._before, self._budget = of.evaluations, budget
+
+    @property
+    def spent(self) -> int:
+        """Evaluations since it was made."""
+        return self.evaluations - self._before
 
     def __call__(self, population: Vector) -> Vector:
         """As the objective; raises ReachedError once the goal is reached."""
@@ -55,7 +62,7 @@ class Goal(Objective):
     def judged(self, values: Vector) -> Vector:
         """Return the costs, unless the search is to end."""
         self.best = min(self.best, float(values.min()))
-        if self.best <= self.goal or self.evaluations >= self.limit:
+        if self.best <= self.goal or self.spent >= self._budget:
             raise ReachedError
         return values
 
@@ -63,7 +70,8 @@ class Goal(Objective):
 def measure(sizes: Sizes) -> list[Figure]:
     """Run the section."""
     objective = Objective(search_window(sizes.logs))
-    start = np.array(first_approximation(first_inputs([experiment(sizes.logs)])).values)
+    first = first_approximation(first_inputs([experiment(sizes.logs)])).values
+    start = np.array([first[item.name] for item in FAULTS])
     goals, own = [], []
     for seed in range(sizes.seeds):
         found = CompactGa().minimise(objective, start, DEVIATION, seed)
@@ -85,7 +93,7 @@ def measure(sizes: Sizes) -> list[Figure]:
     base = statistics.median(spent for spent, _, _ in own)
     out = [
         Figure(SECTION, "compact GA to its own optimum", base * 1e3, "ms", _remark(own)),
-        Figure(SECTION, "compact GA's state", state_bytes(3), "bytes", _STATE),
+        Figure(SECTION, "compact GA's state", state_bytes(len(start)), "bytes", _STATE),
     ]
     for name, rival in rivals.items():
         spent = _race(rival, objective, start, goals, sizes)
@@ -125,7 +133,7 @@ def _race(
             begin = time.thread_time()
             _to_end(rival, race, start, seed, sizes.budget)
             spent = time.thread_time() - begin
-            out.append((spent, race.evaluations, race.best <= goal))
+            out.append((spent, race.spent, race.best <= goal))
     return out
 
 

@@ -20,12 +20,12 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
-from ehadiag.identify.pipeline import identify
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.errors import BusLostError, ConfigurationError
 from ehadiag.core.recording import CommandMode
 from ehadiag.core.stored_test import resolve_test
+from ehadiag.identify.session import identify
 from ehadiag.monitor import Monitor
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_sim.plant.simulator import Plant

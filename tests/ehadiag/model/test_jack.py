@@ -1,0 +1,149 @@
+"""The jack's one algorithm against scipy's stiff solver, piece by piece."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from ehadiag.core.channels import POSITION
+from ehadiag.model.jack import JackState, Piece, jack_piece
+from ehadiag.model.laws import jack_law, resistance
+from ehadiag_tools.damaged import damaged_unit
+
+SPAN = 1e-3
+PLACE = 0.5 * POSITION.lsb
+"""Largest error of the place, m: each step goes by its mean velocity, and no residual has it."""
+CONSTANTS = damaged_unit((0.0, 0.0, 0.4))
+LAW = jack_law(CONSTANTS)
+
+
+def place_of(piece, q):
+    r = 1.0 - q
+    return (
+        piece.x0
+        + q * q * (3.0 - 2.0 * q) * (piece.x1 - piece.x0)
+        + q * r * (r * piece.rise0 - q * piece.rise1)
+    )
+
+
+def exactly(piece, state, begin=0.0, stop=1.0):
+    """Stops and starts located by the solver's own events; place, velocity, direction."""
+    c, law = CONSTANTS, LAW
+    place, velocity, d, _ = state
+    now, end = begin * piece.span, stop * piece.span
+
+    def force(t, v):
+        x = place_of(piece, t / piece.span)
+        e = resistance(law, x)
+        return c.AJ * (law.flow * x - v) / e - c.CJ * v - c.FR
+
+    for _ in range(200):
+        if d == 0.0:
+            times = np.linspace(now, end, 4001)
+            pushes = np.array([force(t, 0.0) for t in times])
+            over = np.flatnonzero(np.abs(pushes) > law.static)
+            if not over.size:
+                return place, 0.0, 0.0
+            now, d, velocity = times[over[0]], np.sign(pushes[over[0]]), 0.0
+
+        def rates(t, y, d=d):
+            return [y[1], (force(t, y[1]) - d * law.friction) / c.MJ]
+
+        def stops(t, y, d=d, begun=now):
+            return y[1] * d if t > begun + 1e-9 else 1.0
+
+        stops.terminal, stops.direction = True, -1
+        done = solve_ivp(
+            rates, (now, end), [place, velocity], "Radau", rtol=1e-9, atol=[1e-13, 1e-11],
+            events=stops, max_step=piece.span / 50.0,
+        )  # fmt: skip
+        place, velocity = done.y[:, -1]
+        now = done.t[-1]
+        if done.status != 1:
+            return place, velocity, d
+        velocity, d = 0.0, 0.0
+    raise AssertionError("it never ends")
+
+
+def piece_through(x0, x1, bend=0.0):
+    straight = x1 - x0
+    return Piece(SPAN, x0, x1, straight + bend, straight - bend)
+
+
+MOVING = [
+    (piece_through(30e-6, 31e-6), JackState(0.0, 0.012, 1.0, 0.0)),
+    (piece_through(30e-6, 40e-6, 3e-6), JackState(0.0, 0.01, 1.0, 0.0)),
+    (piece_through(-200e-6, -150e-6), JackState(0.0, -0.09, -1.0, 0.0)),
+    (piece_through(300e-6, 320e-6), JackState(0.0, 0.0, 0.0, 0.0)),
+    (piece_through(40e-6, -60e-6), JackState(0.0, 0.02, 1.0, 0.0)),
+    (piece_through(5e-6, -5e-6, 4e-6), JackState(0.0, 0.001, 1.0, 0.0)),
+    (piece_through(0.0, 60e-6), JackState(0.0, 0.0, 0.0, 0.0)),
+    (piece_through(60e-6, 0.0), JackState(0.0, 0.02, 1.0, 0.0)),
+]
+
+
+@pytest.mark.parametrize(("piece", "state"), MOVING)
+def test_a_piece_ends_where_the_stiff_solver_ends(piece, state):
+    """Sliding, starting, stopping, turning round."""
+    place, velocity, d = exactly(piece, state)
+    found = jack_piece(LAW, piece, 0.0, 1.0, state)
+    assert found[2] == d
+    fastest = max(abs(state.velocity), abs(velocity), 1e-3)
+    assert found[1] == pytest.approx(velocity, abs=5e-3 * fastest)
+    assert found[0] == pytest.approx(place, abs=PLACE)
+
+
+@given(
+    x0=st.floats(-100e-6, 100e-6),
+    travel=st.floats(-20e-6, 20e-6),
+    share=st.floats(-1.2, 1.2),
+    begin=st.floats(0.0, 0.9),
+    length=st.floats(0.05, 1.0),
+)
+@settings(max_examples=40, deadline=None)
+def test_so_it_does_over_any_part_of_a_piece(x0, travel, share, begin, length):
+    """The velocity before is any share of the one that would be steady."""
+    piece, stop = piece_through(x0, x0 + travel), min(1.0, begin + length)
+    velocity = share * LAW.flow * place_of(piece, begin)
+    state = JackState(0.0, velocity, float(np.sign(velocity)), 1.0 if velocity else 0.0)
+    place, after, d = exactly(piece, state, begin, stop)
+    found = jack_piece(LAW, piece, begin, stop, state)
+    fastest = max(abs(velocity), abs(after), LAW.flow * (abs(x0) + abs(travel)), 1e-3)
+    assert found[1] == pytest.approx(after, abs=1e-2 * fastest)
+    assert found[0] == pytest.approx(place, abs=PLACE)
+    if abs(after) > 1e-2 * fastest:
+        assert found[2] == d
+
+
+@pytest.mark.parametrize("parts", [2, 4, 16, 64])
+def test_pieces_cut_finer_converge(parts):
+    """Of a sliding jack: what is left after a cut is less than a thousandth of a velocity."""
+    piece, state = MOVING[1]
+    once = jack_piece(LAW, piece, 0.0, 1.0, state)
+    cut = state
+    for k in range(parts):
+        cut = JackState(*jack_piece(LAW, piece, k / parts, (k + 1) / parts, cut))
+    _, velocity, _ = exactly(piece, state)
+    assert cut.velocity == pytest.approx(velocity, rel=1e-4)
+    assert cut.velocity == pytest.approx(once[1], rel=1e-3)
+
+
+def test_a_jack_against_its_stop_stays_and_comes_back():
+    at_stop = JackState(LAW.stroke, 0.0, 0.0, 0.0)
+    pushed = jack_piece(LAW, piece_through(200e-6, 220e-6), 0.0, 1.0, at_stop)
+    assert tuple(pushed) == (LAW.stroke, 0.0, 0.0, 0.0)
+    back = JackState(*jack_piece(LAW, piece_through(-200e-6, -220e-6), 0.0, 1.0, at_stop))
+    assert back.place < LAW.stroke
+    assert (back.velocity < 0.0, back.direction) == (True, -1.0)
+    striking = JackState(LAW.stroke - 1e-9, 0.09, 1.0, 0.0)
+    struck = JackState(*jack_piece(LAW, piece_through(250e-6, 250e-6), 0.0, 1.0, striking))
+    assert (struck.place, struck.velocity, struck.direction) == (LAW.stroke, 0.0, 0.0)
+
+
+def test_friction_holds_a_resting_jack():
+    """Up to its static friction: over the middle nothing moves, and nothing is kept in mind."""
+    rest = JackState(1e-3, 0.0, 0.0, 1.0)
+    small = 0.9 * LAW.static / (CONSTANTS.AJ * CONSTANTS.GP)
+    found = jack_piece(LAW, piece_through(-small, small), 0.0, 1.0, rest)
+    assert tuple(found) == (1e-3, 0.0, 0.0, 0.0)

@@ -1,0 +1,40 @@
+"""Physical constants of a unit with given severities, for models that are run by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.core.recording import Environment
+from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.model.plant import PlantConstants, plant_constants
+
+__all__ = ["damaged", "damaged_unit"]
+
+
+def damaged(
+    constants: PlantConstants, severities: Sequence[float] | NDArray[np.float64]
+) -> PlantConstants:
+    """Constants of a unit with severities in the order of `FAULTS`.
+
+    Parameters
+    ----------
+    constants : PlantConstants
+        Of the unit as new.
+    severities : shape (k,)
+        0 … 1.
+    """
+    point = np.asarray(severities, dtype=np.float64)
+    return Unknowns(FAULTS, (constants,), {}).constants(point)
+
+
+def damaged_unit(
+    severities: Sequence[float] | NDArray[np.float64],
+    actuator: Actuator | None = None,
+    environment: Environment | None = None,
+) -> PlantConstants:
+    """Constants of an actuator, the reference one unless given, with these severities."""
+    return damaged(plant_constants(actuator or default_actuator(), environment), severities)
