@@ -23,7 +23,8 @@ from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_j
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
-from ehadiag.identify.session import Session
+from ehadiag.identify.session import Nuisances, Session
+from ehadiag.model.parameters import parameter
 
 __all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
 
@@ -70,6 +71,8 @@ class DiagnosisSession:
         Global search; the compact genetic algorithm unless given.
     seed : int
         The same seed gives the same answer on the same machine.
+    nuisances : Nuisances
+        Which effects of the installation are estimated beside the faults.
     """
 
     def __init__(
@@ -81,12 +84,13 @@ class DiagnosisSession:
         levels: Levels | None = None,
         solver: Solver | None = None,
         seed: int = 0,
+        nuisances: Nuisances = Nuisances.AUTO,
     ) -> None:
         self._actuator = actuator
         self._tests = tuple(tests)
         self._default = default
         self._levels = levels or Levels()
-        self._session = Session(solver, seed)
+        self._session = Session(solver, seed, nuisances)
 
     @property
     def reused(self) -> int:
@@ -138,7 +142,7 @@ class DiagnosisSession:
             reasons=why,
             identification=identification,
             experiments=tuple(experiments) if identification else (),
-            notes=_notes(recordings, matched, self._actuator),
+            notes=(*_notes(recordings, matched, self._actuator), *_freed(identification)),
             elapsed=time.perf_counter() - begin,
         )
 
@@ -170,11 +174,18 @@ def diagnose(
     levels: Levels | None = None,
     solver: Solver | None = None,
     seed: int = 0,
+    nuisances: Nuisances = Nuisances.AUTO,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Diagnose one actuator from complete recordings: see `DiagnosisSession`."""
     session = DiagnosisSession(
-        actuator, tests, default=default, levels=levels, solver=solver, seed=seed
+        actuator,
+        tests,
+        default=default,
+        levels=levels,
+        solver=solver,
+        seed=seed,
+        nuisances=nuisances,
     )
     return session.finish(recordings, progress)
 
@@ -229,3 +240,11 @@ def _notes(
         for recording, test in zip(recordings, tests, strict=True)
     )
     return tuple(dict.fromkeys(note for notes in each for note in notes))
+
+
+def _freed(identification: Identification | None) -> tuple[str, ...]:
+    """What was estimated beside the faults, if anything."""
+    if identification is None or not identification.freed:
+        return ()
+    words = ", ".join(parameter(name).short for name in identification.freed)
+    return (f"estimated beside the faults: {words}",)

@@ -99,6 +99,13 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="search: compact GA (default) or pygad",
     )
     parser.add_argument(
+        "--nuisances",
+        choices=("auto", "none", "all"),
+        default="auto",
+        help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
+        " alone do not explain a recording (auto, the default), never, or always",
+    )
+    parser.add_argument(
         "--seed",
         type=_seed,
         default=0,

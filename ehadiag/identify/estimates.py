@@ -10,17 +10,60 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.refine.least_squares import Refinement
-from ehadiag.identify.result import Estimate, Fit
+from ehadiag.identify.result import Estimate, Fit, Identification, Nuisance, Timing
 from ehadiag.identify.search.first_approximation import FirstApproximation
 from ehadiag.identify.search.solvers import SearchResult
 from ehadiag.identify.uncertainty import interval95
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
-from ehadiag.model.parameters import FAULTS
+from ehadiag.model.parameters import FAULTS, Kind
 
-__all__ = ["estimates_of", "fit_of", "of_faults", "outliers"]
+__all__ = ["estimates_of", "fit_of", "identification", "of_faults", "outliers"]
 
 NOT_SHOWN_STD = 0.1
 BOUND = 1e-6
+
+
+def identification(
+    first: FirstApproximation,
+    found: SearchResult,
+    refined: Refinement,
+    spread: NDArray[np.float64],
+    experiments: Sequence[Experiment],
+    *,
+    solver: str,
+    seed: int,
+    evaluations: int,
+    attempts: int,
+    timing: Timing,
+) -> Identification:
+    """Put together what an identification says.
+
+    spread: covariance of all that was refined, SI.
+    """
+    deviations = np.sqrt(np.diag(spread)).tolist()
+    nuisances = {
+        item.name: Nuisance(
+            value=refined.values[item.name],
+            std=std,
+            at_bound=not item.lower < refined.values[item.name] < item.upper,
+        )
+        for item, std in zip(refined.parameters, deviations, strict=True)
+        if item.kind is Kind.NUISANCE
+    }
+    return Identification(
+        estimates=estimates_of(first, found, refined, spread),
+        nuisances=nuisances,
+        covariance=of_faults(refined, spread),
+        fit=fit_of(refined, experiments),
+        solver=solver,
+        seed=seed,
+        evaluations=evaluations,
+        generations=found.generations,
+        cost=refined.cost,
+        converged=refined.converged,
+        attempts=attempts,
+        timing=timing,
+    )
 
 
 def of_faults(refined: Refinement, spread: NDArray[np.float64]) -> NDArray[np.float64]:

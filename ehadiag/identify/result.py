@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Estimate", "Fit", "Identification", "Timing"]
+from ehadiag.model.parameters import OFFSETS
+
+__all__ = ["Estimate", "Fit", "Identification", "Nuisance", "Timing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,16 @@ class Estimate:
     """The estimate stands at a bound."""
     shown: bool
     """Whether the test shows this fault at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """An effect of the installation, as estimated; SI."""
+
+    value: float
+    std: float
+    at_bound: bool
+    """The estimate stands at a bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +80,8 @@ class Identification:
     """What the recordings say about the actuator's faults."""
 
     estimates: tuple[Estimate, ...]
-    nuisances: Mapping[str, float]
-    """What was estimated beside the severities, SI by name."""
+    nuisances: Mapping[str, Nuisance]
+    """What was estimated beside the severities, by name; all else was held."""
     covariance: NDArray[np.float64]
     """Of the severities, in the order of `estimates`, shape (k, k)."""
     fit: Fit
@@ -96,6 +108,12 @@ class Identification:
             if item.name == name:
                 return item
         raise KeyError(name)
+
+    @property
+    def freed(self) -> tuple[str, ...]:
+        """Names of the effects that were estimated beside severities and offsets."""
+        offsets = {item.name for item in OFFSETS}
+        return tuple(name for name in self.nuisances if name not in offsets)
 
     @property
     def rescued(self) -> bool:

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.estimates import estimates_of, fit_of, of_faults, outliers
+from ehadiag.identify.estimates import identification
 from ehadiag.identify.experiment import Experiment, share_offsets
+from ehadiag.identify.nuisance.estimate import estimate
+from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.refine.first_part import (
+    CONSIDERED,
     FirstPart,
     first_spans,
     refine_first_part,
-    residuals_at,
 )
-from ehadiag.identify.refine.least_squares import Refinement, median_offsets
-from ehadiag.identify.refine.update import add_last_part
 from ehadiag.identify.result import Identification, Timing
 from ehadiag.identify.search.first_approximation import FirstApproximation
-from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import CompactGa, SearchResult, Solver
 from ehadiag.identify.search.stages import (
-    DEVIATION_SHARE,
-    LEAD_S,
     STAGES,
     Memory,
     Progress,
@@ -38,41 +36,30 @@ from ehadiag.identify.search.stages import (
     stage_ends_at,
     staged_search,
 )
-from ehadiag.identify.spans import lay_out, unknowns_of
-from ehadiag.identify.uncertainty import covariance
-from ehadiag.model.parameters import FAULTS, OFFSETS
-from ehadiag.model.simd.model import SimdModel
-
-__all__ = ["Session", "first_ticks", "identify"]
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """How a further attempt searches.
-
-    deviation: of the genetic search about its start, severities.
-    budget: in budgets of the solver.
-    median_offsets: take the median residual at the start for constant errors of the sensors; else
-        take only what the actuator at rest showed.
-    """
-
-    deviation: float
-    budget: float = 1.0
-    median_offsets: bool = False
-
-
-RESCUES = (
-    Plan(0.02, median_offsets=True),
-    Plan(0.1, budget=2.0),
-    Plan(0.1, budget=2.0, median_offsets=True),
-    Plan(0.4, budget=3.0),
+from ehadiag.identify.spans import lay_out
+from ehadiag.identify.textbook import (
+    Attempt,
+    attempt,
+    explains,
+    first_ticks,
+    named,
+    rescued,
+    resembles,
 )
-"""One after the other where the staged search does not explain the recording."""
-POOR_FIT = 0.01
-"""Share of residuals beyond three deviations that asks for another attempt."""
-MOST_ANCHORED = 4
-"""Times that the model may be put back on the measured spool. Away from the optimum break-aways
-come at other ticks; at it the model stays on the spool in all but one of 200 tests."""
+from ehadiag.identify.uncertainty import covariance
+from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
+
+__all__ = ["Nuisances", "Session", "identify"]
+
+
+class Nuisances(Enum):
+    """Which effects of the installation are estimated beside the severities and the offsets."""
+
+    AUTO = "auto"
+    """Those that are needed: none where the severities alone explain the recording."""
+    NONE = "none"
+    ALL = "all"
+    """From the start."""
 
 
 class Session:
@@ -88,11 +75,19 @@ class Session:
         Global search; the compact genetic algorithm unless given.
     seed : int
         The same seed gives the same answer on the same machine.
+    nuisances : Nuisances
+        Which effects of the installation are estimated beside the severities.
     """
 
-    def __init__(self, solver: Solver | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        solver: Solver | None = None,
+        seed: int = 0,
+        nuisances: Nuisances = Nuisances.AUTO,
+    ) -> None:
         self.solver = solver or CompactGa()
         self.seed = seed
+        self.nuisances = nuisances
         self._memory = Memory()
 
     @property
@@ -118,7 +113,7 @@ class Session:
         """Estimate the severities from one or more complete recordings of one actuator."""
         windows = [repr(item.test.windows) for item in experiments]
         arrays = [array for item in experiments for array in experiment_arrays(item)]
-        key = digest(f"identify {self.seed} {self.solver!r} {windows}", arrays)
+        key = digest(f"identify {self.seed} {self.solver!r} {self.nuisances} {windows}", arrays)
         tell = progress or (lambda _stage, _share: None)
         return self._memory.recall(key, Identification, lambda: self._identify(experiments, tell))
 
@@ -128,39 +123,85 @@ class Session:
         experiments = share_offsets(experiments)
         first, start = self._first(experiments)
         searched_at = time.perf_counter()
-        found = staged_search(self._stages(experiments, start), tell)
-        search_s = time.perf_counter() - searched_at
-        tell("refinement", 0.0)
-        best = self._attempt(experiments, found)
-        evaluations, attempts = first.evaluations + found.evaluations + best.evaluations, 1
-        for plan in RESCUES:
-            if _explains(best.refined):
-                break
-            before = time.perf_counter()
-            seed = self.seed + len(STAGES) + attempts
-            found = _rescue(experiments, best.refined.values, self.solver, seed, plan, tell)
-            search_s += time.perf_counter() - before
+        best: Attempt | None = None
+        search_s = 0.0
+        if self.nuisances is not Nuisances.ALL:
+            found = staged_search(self._stages(experiments, start), tell)
+            search_s = time.perf_counter() - searched_at
             tell("refinement", 0.0)
-            attempt = self._attempt(experiments, found)
-            evaluations += found.evaluations + attempt.evaluations
-            attempts += 1
-            if attempt.score < best.score:
-                best = attempt
-        end = time.perf_counter()
+            if self.nuisances is Nuisances.NONE or resembles(experiments, found.best):
+                best = attempt(experiments, found, self._first_part)
+                best = replace(best, evaluations=best.evaluations + found.evaluations)
+        if best is not None and self.nuisances is Nuisances.NONE:
+            best = rescued(
+                experiments, best, self._first_part, self.solver, self.seed, tell,
+                time.perf_counter,
+            )  # fmt: skip
+            search_s += best.search_s
+        if best is not None and (self.nuisances is Nuisances.NONE or explains(best.refined)):
+            spent = Timing(searched_at - begin, search_s, 0.0)
+            return self._textbook(first, best, spent, begin)
+        return self._with_nuisances(experiments, first, best, searched_at - begin, begin, tell)
+
+    def _textbook(
+        self, first: FirstApproximation, best: Attempt, spent: Timing, begin: float
+    ) -> Identification:
+        """Put together what three severities alone explain."""
         spread = covariance(best.refined)
-        return Identification(
-            estimates=estimates_of(first, best.found, best.refined, spread),
-            nuisances={item.name: best.refined.values[item.name] for item in OFFSETS},
-            covariance=of_faults(best.refined, spread),
-            fit=fit_of(best.refined, best.experiments),
+        return identification(
+            first,
+            best.found,
+            best.refined,
+            spread,
+            best.experiments,
+            solver=self.solver.name,
+            seed=self.seed,
+            evaluations=first.evaluations + best.evaluations,
+            attempts=best.count,
+            timing=replace(spent, refine=time.perf_counter() - begin - spent.first - spent.search),
+        )
+
+    def _with_nuisances(
+        self,
+        experiments: Sequence[Experiment],
+        first: FirstApproximation,
+        before: Attempt | None,
+        first_s: float,
+        begin: float,
+        tell: Progress,
+    ) -> Identification:
+        """Free the nuisances too."""
+        searched_at = time.perf_counter()
+        free = (*FAULTS, *OFFSETS, *nuisances_of(REGISTRY))
+        tell("nuisances", 0.0)
+        done = estimate(
+            experiments,
+            free,
+            considered=CONSIDERED,
+            seed=self.seed,
+            tell=lambda share: tell("nuisances", share),
+        )
+        values = done.refined.values
+        found = SearchResult(
+            best=np.array([values[item.name] for item in FAULTS]),
+            cost=done.refined.cost,
+            evaluations=done.evaluations,
+            generations=0,
+            history=np.zeros(0),
+        )
+        evaluations = first.evaluations + done.evaluations + (before.evaluations if before else 0)
+        now = time.perf_counter()
+        return identification(
+            first,
+            found,
+            done.refined,
+            covariance(done.refined) + done.covariance,
+            done.experiments,
             solver=self.solver.name,
             seed=self.seed,
             evaluations=evaluations,
-            generations=best.found.generations,
-            cost=best.refined.cost,
-            converged=best.refined.converged,
-            attempts=attempts,
-            timing=Timing(searched_at - begin, search_s, end - searched_at - search_s),
+            attempts=done.starts + (1 if before else 0),
+            timing=Timing(first_s, now - searched_at, searched_at - begin - first_s),
         )
 
     def _first(
@@ -185,24 +226,8 @@ class Session:
         return self._memory.recall(
             digest("first part", [*free, *base, start]),
             FirstPart,
-            lambda: refine_first_part(experiments, until, _named(start)),
+            lambda: refine_first_part(experiments, until, named(start)),
         )
-
-    def _attempt(self, experiments: Sequence[Experiment], found: SearchResult) -> _Attempt:
-        """Refine the optimum of a search."""
-        until = [first_ticks(item) for item in experiments]
-        first = self._first_part(experiments, found.best)
-        judged = first.judged(experiments)
-        best = add_last_part(judged, until, first)
-        if best is None:
-            ends = [item.ticks for item in experiments]
-            whole = refine_first_part(experiments, ends, first.refined.values)
-            judged, best = whole.judged(experiments), whole.refined
-            best = replace(best, evaluations=whole.evaluations)
-        evaluations = first.evaluations + best.evaluations
-        weight = lay_out(judged).weight
-        score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())
-        return _Attempt(found, best, judged, evaluations, score)
 
 
 def identify(
@@ -210,15 +235,11 @@ def identify(
     *,
     solver: Solver | None = None,
     seed: int = 0,
+    nuisances: Nuisances = Nuisances.AUTO,
     progress: Progress | None = None,
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
-    return Session(solver, seed).finish(experiments, progress)
-
-
-def _named(point: NDArray[np.float64]) -> dict[str, float]:
-    """Severities by name, of a point among them."""
-    return {item.name: float(value) for item, value in zip(FAULTS, point, strict=True)}
+    return Session(solver, seed, nuisances).finish(experiments, progress)
 
 
 def _stages_ready(experiment: Experiment) -> int:
@@ -227,53 +248,3 @@ def _stages_ready(experiment: Experiment) -> int:
     if seconds < first_ends_at(test):
         return -1
     return sum(seconds >= stage_ends_at(test, stage) for stage in range(len(STAGES)))
-
-
-def first_ticks(experiment: Experiment) -> int:
-    """Ticks that some stage before has seen the end of: windows of the test, in any order."""
-    test = experiment.test
-    seconds = max(first_ends_at(test), stage_ends_at(test, len(STAGES) - 1))
-    return min(round(seconds / experiment.tick), experiment.ticks)
-
-
-def _rescue(
-    experiments: Sequence[Experiment],
-    start: Mapping[str, float],
-    solver: Solver,
-    seed: int,
-    plan: Plan,
-    tell: Progress,
-) -> SearchResult:
-    """Search the whole window anew, wider than before."""
-    offsets = {item.name: 0.0 for item in OFFSETS}
-    if plan.median_offsets:
-        severities = {item.name: start[item.name] for item in FAULTS}
-        offsets = median_offsets(*residuals_at(experiments, None, severities))
-    windows = [experiment.test.windows.refinement for experiment in experiments]
-    unknowns = unknowns_of(experiments, FAULTS).holding(offsets)
-    return solver.with_budget(round(solver.budget * plan.budget)).minimise(
-        Objective(SimdModel(lay_out(experiments, windows, lead=LEAD_S), unknowns)),
-        np.array([start[item.name] for item in FAULTS]),
-        plan.deviation * DEVIATION_SHARE,
-        seed,
-        lambda done, budget: tell("search", done / budget),
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Attempt:
-    """One search and its refinement."""
-
-    found: SearchResult
-    refined: Refinement
-    experiments: Sequence[Experiment]
-    """With their noise as judged."""
-    evaluations: int
-    """Of the refinement."""
-    score: float
-    """Twice the negative logarithm of the likelihood: comparable where the noise differs."""
-
-
-def _explains(refinement: Refinement) -> bool:
-    """Whether the optimum explains the recording, so that there is none better to look for."""
-    return outliers(refinement) <= POOR_FIT and refinement.anchored <= MOST_ANCHORED

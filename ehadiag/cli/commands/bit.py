@@ -94,6 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         not_tested,
     )
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
+    from ehadiag.identify.session import Nuisances  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
 
     # Before the test: a verdict must not wait for the compiler.
@@ -108,6 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
         levels=levels,
         solver=make_solver(arguments.solver),
         seed=arguments.seed,
+        nuisances=Nuisances(arguments.nuisances),
     )
     with stop_on_signals() as stop:
         heard = acquire(arguments, actuator, test, bus_map, folder.path, session, stop)

@@ -174,6 +174,7 @@ class _Diagnosis:
     def _diagnose(self, recordings: Sequence[Recording]) -> Diagnosis:
         from ehadiag.assess.diagnosis import diagnose  # noqa: PLC0415 - loads numba
         from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
+        from ehadiag.identify.session import Nuisances  # noqa: PLC0415
 
         with progress_bar() as progress:
             return diagnose(
@@ -184,5 +185,6 @@ class _Diagnosis:
                 levels=self._levels,
                 solver=make_solver(self._arguments.solver),
                 seed=self._arguments.seed,
+                nuisances=Nuisances(self._arguments.nuisances),
                 progress=Deadline(self._arguments.time_limit).watch(progress),
             )

@@ -201,7 +201,7 @@ class Derivatives:
         runs: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Derivatives from runs on both sides, and the rows where these agree with the middle."""
-        out = np.zeros((len(x), *residuals.shape))
+        out = self.additive_slopes()
         smooth = np.ones(residuals.shape, dtype=np.bool_)
         for row, j in enumerate(self.curved):
             above, below = sides[2 * row, j], sides[2 * row + 1, j]
@@ -209,10 +209,16 @@ class Derivatives:
             out[j] = (high - low) / (above - below)
             straight = low + out[j] * (x[j] - below)
             smooth &= np.abs(residuals - straight) < KINK
+        return out, smooth
+
+    def additive_slopes(self) -> NDArray[np.float64]:
+        """Derivatives by what is simply added to a signal, 0 by all else, shape (k, SIGNALS, N)."""
+        weight = self.model.batch.weight
+        out = np.zeros((len(self.estimated), *weight.shape))
         for j, item in enumerate(self.estimated):
             if item.adds_to is not None:
-                out[j, item.adds_to] = -self.model.batch.weight[item.adds_to] * self.scale[j]
-        return out, smooth
+                out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
+        return out
 
 
 def scale_of(item: Parameter, noise: Sequence[float]) -> float:

@@ -10,7 +10,7 @@ from identify_cases import named, own_experiment
 from ehadiag.identify.refine.first_part import anchored_derivatives, refine_first_part
 from ehadiag.identify.refine.least_squares import refine
 from ehadiag.identify.refine.update import add_last_part
-from ehadiag.identify.session import first_ticks
+from ehadiag.identify.textbook import first_ticks
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.batch import SIGNALS
 from ehadiag.model.parameters import FAULT_NAMES

@@ -13,24 +13,28 @@ from functools import cache
 from importlib import resources
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ehadiag.core.errors import InputOutputError
-from ehadiag_tools.accuracy.runs import Run
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 __all__ = ["key_of", "perform_all"]
 
-Worker = Callable[[Run], dict[str, Any]]
+R = TypeVar("R", bound="DataclassInstance")
+"""Settings of a run."""
+Worker = Callable[[R], dict[str, Any]]
 
-CODE = ("ehadiag", "ehadiag.model", "ehadiag.identify", "ehadiag_sim", "firmware_iface")
-"""Packages on whose sources a result depends."""
+CODE = ("ehadiag", "ehadiag_sim", "firmware_iface")
+"""Packages on whose sources, those of their own packages too, a result depends."""
 
 
 def perform_all(
-    worker: Worker, runs: Sequence[Run], results: Path, jobs: int, label: str
+    worker: Worker[R], runs: Sequence[R], results: Path, jobs: int, label: str
 ) -> list[dict[str, Any]]:
     """Records of all runs in their order; those that the results file has are taken from there.
 
@@ -66,8 +70,8 @@ def perform_all(
 
 
 def _work(
-    worker: Worker,
-    waiting: dict[str, Run],
+    worker: Worker[R],
+    waiting: dict[str, R],
     jobs: int,
     keep: Callable[[str, dict[str, Any]], None],
     advance: Callable[[], None],
@@ -92,7 +96,7 @@ def _work(
             raise
 
 
-def key_of(worker: str, run: Run) -> str:
+def key_of(worker: str, run: DataclassInstance) -> str:
     """Key of a run in the results file."""
     settings = json.dumps([worker, asdict(run), _code_digest()], sort_keys=True)
     return hashlib.sha256(settings.encode()).hexdigest()[:24]
@@ -102,10 +106,8 @@ def key_of(worker: str, run: Run) -> str:
 def _code_digest() -> str:
     digest = hashlib.sha256()
     for package in CODE:
-        folder = resources.files(package)
-        for source in sorted(folder.iterdir(), key=lambda item: item.name):
-            if source.name.endswith(".py"):
-                digest.update(source.read_bytes())
+        for source in sorted(Path(str(resources.files(package))).rglob("*.py")):
+            digest.update(source.read_bytes())
     return digest.hexdigest()
 
 

@@ -1,0 +1,1 @@
+"""Identification with nuisance parameters: what the installation adds, estimated beside faults."""

@@ -1,0 +1,186 @@
+"""Severities and nuisances of one actuator from its recordings: search, noise, uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.nuisance.explained import excess, is_noise
+from ehadiag.identify.nuisance.linearisation import Belief, linearised
+from ehadiag.identify.nuisance.posterior import sharpen
+from ehadiag.identify.nuisance.prior import ALIAS, Known, belief_of, information_of
+from ehadiag.identify.nuisance.starts import Found, robust_cost, search
+from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives, capped
+from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
+from ehadiag.model.parameters import Parameter
+from ehadiag.model.simd.model import SimdModel
+
+__all__ = ["BUDGET", "Estimated", "estimate", "spread_of_optima"]
+
+BUDGET = 1600
+"""Runs of the model after which no further start is made."""
+LOOK = 3.0
+"""Spread of the last look, with the noise as judged, in spreads of the search's end."""
+CLEAR = 1.0
+"""Scatter about the linear model, in variances of the noise, from which a row tells nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimated:
+    """What recordings say of the free parameters.
+
+    Attributes
+    ----------
+    refined : Refinement
+        Optimum, residuals and derivatives over the width of what is known.
+    experiments : list of Experiment
+        With their noise as judged.
+    covariance : shape (k, k)
+        SI, of what several optima of like cost leave open, beside that of the refinement.
+    explained : bool
+    excess : float
+        See `ehadiag.identify.nuisance.explained.excess`.
+    starts : int
+        Searches that it took.
+    evaluations : int
+        Runs of the model, all told.
+    """
+
+    refined: Refinement
+    experiments: list[Experiment]
+    covariance: NDArray[np.float64]
+    explained: bool
+    excess: float
+    starts: int
+    evaluations: int
+
+
+def estimate(
+    experiments: Sequence[Experiment],
+    free: Sequence[Parameter],
+    *,
+    known: Mapping[str, Known] | None = None,
+    considered: Sequence[Considered] = (),
+    budget: int = BUDGET,
+    seed: int = 0,
+    tell: Callable[[float], None] | None = None,
+) -> Estimated:
+    """Estimate parameters of one actuator from one or more recordings of it.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    free : sequence of Parameter
+        What is estimated.
+    known : mapping, optional
+        What is known of some of them beforehand, by name.
+    considered : sequence of Considered
+        What is held, with a tolerance that counts in the interval.
+    budget : int
+        See `BUDGET`.
+    seed : int
+        The same seed gives the same answer.
+    tell : callable, optional
+        Called from time to time with the share of the budget that is spent.
+    """
+    known = known or {}
+    coarse = _free_running(experiments, free)
+    model = _scaled(coarse, experiments)
+    first, information = belief_of(model, known), information_of(model, known)
+    found = search(
+        model, first, information, is_noise, alias=ALIAS, budget=budget, seed=seed, tell=tell
+    )
+    judged = _judged(experiments, found.residuals)
+    held = [item.parameter for item in considered]
+    fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
+    belief = _last_look(fine, model, found, known, seed)
+    refined = _described(fine, belief, settled=found.explained, seed=seed)
+    return Estimated(
+        refined=refined,
+        experiments=judged,
+        covariance=spread_of_optima(found, model.scale),
+        explained=is_noise(refined.residuals),
+        excess=excess(refined.residuals),
+        starts=found.starts,
+        evaluations=model.evaluations + fine.evaluations,
+    )
+
+
+def _free_running(
+    experiments: Sequence[Experiment],
+    parameters: Sequence[Parameter],
+    levels: NDArray[np.int64] | None = None,
+) -> SimdModel:
+    """Model of whole tests; `levels`: of one of the same tests, if there was one."""
+    return SimdModel(lay_out(experiments), unknowns_of(experiments, parameters), levels=levels)
+
+
+def _scaled(
+    model: SimdModel, experiments: Sequence[Experiment], considered: Sequence[Considered] = ()
+) -> Derivatives:
+    """Coordinates scaled by the noise."""
+    noise = (experiments[0].spool_noise, experiments[0].pressure_noise)
+    return Derivatives(model, noise, considered)
+
+
+def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:
+    """Weigh the experiments by the noise that residuals of all their ticks show."""
+    ends = np.cumsum([item.ticks for item in experiments])[:-1]
+    parts = np.split(residuals, ends, axis=1)
+    return [judge_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
+
+
+def _last_look(
+    fine: Derivatives, model: Derivatives, found: Found, known: Mapping[str, Known], seed: int
+) -> Belief:
+    """Optimum by the noise as judged: of the search, or a better one beside it."""
+    ratio = model.scale / fine.scale
+    there = Belief(found.belief.x * ratio, found.belief.root)
+    wider = Belief(there.x, LOOK * there.root)
+    rng = np.random.default_rng([seed, -1 % 2**32])
+    again, _ = sharpen(fine, belief_of(fine, known), wider, information_of(fine, known), rng)
+    costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
+    return again if costs[1] < costs[0] else there
+
+
+def _described(model: Derivatives, belief: Belief, *, settled: bool, seed: int) -> Refinement:
+    """Put together what is known at the optimum."""
+    linear = linearised(model, belief, np.random.default_rng(seed))
+    residuals, considered, anchored, _ = model.at(belief.x)
+    weighted = model.model.batch.weight > 0.0
+    used = (linear.scatter < CLEAR) & (residuals**2 < CAP) & weighted
+    return Refinement(
+        parameters=model.estimated,
+        x=belief.x,
+        scale=model.scale,
+        cost=capped(residuals),
+        residuals=residuals,
+        jacobian=np.where(used, linear.jacobian, 0.0),
+        considered=considered,
+        used=used,
+        weighted=weighted,
+        evaluations=model.evaluations,
+        converged=settled,
+        jagged=not settled,
+        anchored=anchored,
+    )
+
+
+def spread_of_optima(found: Found, scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance of the optima that the starts ended in, about the best, SI, shape (k, k).
+
+    Each has the weight of its likelihood, exp(-cost / 2), costs in units of what the best one
+    leaves unexplained (a Birge ratio, R. T. Birge, Phys. Rev. 40, 1932): a mixture density, as
+    JCGM 101:2008 would sample it.
+    """
+    count = max(int((found.residuals != 0.0).sum()), 1)
+    unit = max(found.cost / count, 1.0)
+    costs = np.array([place.cost for place in found.places])
+    weights = np.exp(-0.5 * (costs - found.cost) / unit)
+    shifts = np.array([place.x - found.belief.x for place in found.places]) * scale
+    return np.asarray((shifts.T * (weights / weights.sum())) @ shifts)

@@ -1,0 +1,104 @@
+"""A model made linear over the spread of what is believed, by regression on runs.
+
+A derivative at a point sees no break-away that comes a tick earlier or later; the regression over
+points as far apart as the parameters are uncertain sees their mean effect, and what it leaves over
+tells how far each sample can be trusted (statistical linear regression: Lefebvre, Bruyninckx,
+De Schutter, IEEE Trans. Automatic Control 47(8), 2002).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.refine.derivatives import Derivatives
+
+__all__ = ["Belief", "Linearised", "linearised"]
+
+BLOCK = 16
+"""Runs come in blocks of that size."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """Where the parameters are believed to be.
+
+    Attributes
+    ----------
+    x : shape (k,)
+        Mean, in units of the model's scales.
+    root : shape (c, c)
+        Root of the covariance of the coordinates that act through the model: root rootᵀ.
+    """
+
+    x: NDArray[np.float64]
+    root: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearised:
+    """Residuals as a linear function about a point.
+
+    Attributes
+    ----------
+    x : shape (k,)
+        Mean of the points that were run.
+    residuals : shape (SIGNALS, N)
+        Their mean.
+    jacobian : shape (k, SIGNALS, N)
+    scatter : shape (SIGNALS, N)
+        Variance about the linear function.
+    """
+
+    x: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    scatter: NDArray[np.float64]
+
+
+def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> Linearised:
+    """Regress the residuals on points drawn about a belief.
+
+    The points are as many as fill whole blocks of runs, in pairs that mirror each other, along
+    random orthogonal directions: their mean and covariance are nearly the belief's own.
+    """
+    curved, count = model.curved, len(model.curved)
+    pairs = BLOCK // 2 * -(-(count + 1) // (BLOCK // 2))
+    shares = _directions(rng, count, pairs)
+    points = np.repeat(belief.x[None, :], 2 * pairs, axis=0)
+    points[:, curved] += np.vstack([shares, -shares]) @ belief.root.T
+    points[:, curved] = _mirrored(points[:, curved], model.lower[curved], model.upper[curved])
+    x = points.mean(axis=0)
+    runs = model.many(points)
+    shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+    # Offsets in units of the spread, so that the regression is well conditioned.
+    inverse = np.linalg.inv(belief.root)
+    offsets = (points - x)[:, curved] @ inverse.T
+    basis, triangle = np.linalg.qr(np.column_stack([np.ones(len(points)), offsets]))
+    along = basis.T @ flat
+    left = np.einsum("ij,ij->j", flat, flat) - np.einsum("ij,ij->j", along, along)
+    scatter = np.maximum(left, 0.0) / max(len(points) - 1 - count, 1)
+    slopes = inverse.T @ np.linalg.pinv(triangle[1:, 1:], rcond=1e-6)
+    jacobian = model.additive_slopes()
+    jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
+    mean = (along[0] * basis[0, 0]).reshape(shape)
+    return Linearised(x, mean, jacobian, scatter.reshape(shape))
+
+
+def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:
+    """Rows of random rotations, each as long as a standard normal vector, shape (pairs, count)."""
+    turns = [
+        np.linalg.qr(rng.standard_normal((count, count)))[0] for _ in range(-(-pairs // count))
+    ]
+    return np.asarray(np.vstack(turns)[:pairs] * np.sqrt(count))
+
+
+def _mirrored(
+    points: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points beyond a bound as far inside of it."""
+    points = np.where(points < lower, 2.0 * lower - points, points)
+    points = np.where(points > upper, 2.0 * upper - points, points)
+    return np.clip(points, lower, upper)

@@ -1,0 +1,98 @@
+"""Search for many parameters at once: a belief that is sharpened by linearising over its own width.
+
+Iterated posterior linearisation (García-Fernández, Svensson, Morelande, Särkkä, IEEE Trans. Signal
+Processing 63(20), 2015): the model is made linear over the spread of what is believed, the linear
+problem gives a sharper belief, and so on until the spread is that of the noise. While the belief is
+wide, samples that break-aways make jump have a large scatter and count little; so the search sees
+the smooth outline first and the fine structure last, each sample in its own time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.nuisance.linearisation import Belief, Linearised, linearised
+from ehadiag.identify.refine.bounded_step import bounded_step
+from ehadiag.identify.refine.derivatives import Derivatives
+
+__all__ = ["TAIL", "robust_weights", "sharpen"]
+
+TAIL = 3.0
+"""Deviations beyond which a residual counts little (Cauchy's weight)."""
+MOST_ROUNDS = 30
+LEAST_RATIO = 0.5
+"""By which the belief may become narrower in a round, in any direction."""
+WIDTH = 2.0
+"""Of the belief, in deviations of what the linear problem leaves."""
+SETTLED_RATIO = 0.85
+SETTLED_STEP = 0.5
+"""Of a round after which nothing changes: ratio of the widths, step in units of them."""
+HELD_BACK = 0.1
+"""Share of the belief's information that a round's step is held back by."""
+FREE = 1e-9
+
+
+def sharpen(
+    model: Derivatives,
+    known: Belief,
+    begin: Belief,
+    information: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> tuple[Belief, bool]:
+    """Sharpen a belief until the noise stops it; also whether it came to rest.
+
+    Parameters
+    ----------
+    model : Derivatives
+        That runs free: re-anchored on the spool it jumps more.
+    known : Belief
+        Its mean is what was known before the recording.
+    begin : Belief
+        Where the search begins.
+    information : shape (k,)
+        What was known of each coordinate: reciprocal variance, 0 where nothing.
+    """
+    belief = begin
+    for _ in range(MOST_ROUNDS):
+        belief, ratio, step = _round(model, known, belief, information, rng)
+        if ratio > SETTLED_RATIO and step < SETTLED_STEP:
+            return belief, True
+    return belief, False
+
+
+def robust_weights(linear: Linearised) -> NDArray[np.float64]:
+    """Weight of each residual: less where it scatters, and less where it is large."""
+    variance = 1.0 + linear.scatter
+    return np.asarray(1.0 / (variance + linear.residuals**2 / TAIL**2))
+
+
+def _round(
+    model: Derivatives,
+    known: Belief,
+    belief: Belief,
+    information: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> tuple[Belief, float, float]:
+    """One linearisation; also the ratio by which the belief would narrow most, and the step."""
+    linear = linearised(model, belief, rng)
+    weights = robust_weights(linear).ravel()
+    rows = linear.jacobian.reshape(len(belief.x), -1)
+    weighed = rows * weights
+    normal = weighed @ rows.T + np.diag(information)
+    gradient = weighed @ linear.residuals.ravel() + information * (linear.x - known.x)
+    curved = model.curved
+    inverse_root = np.linalg.inv(belief.root)
+    held = FREE * np.eye(len(belief.x))
+    held[np.ix_(curved, curved)] += HELD_BACK * inverse_root.T @ inverse_root
+    x = bounded_step(linear.x, normal + held, gradient, model.lower, model.upper)
+    # What is left unexplained widens the belief.
+    variance = (1.0 + linear.scatter).ravel()
+    excess = float((linear.residuals.ravel() ** 2 * weights).sum() / (variance * weights).sum())
+    spread = np.linalg.inv(normal + held * FREE)[np.ix_(curved, curved)]
+    spread *= WIDTH**2 * max(excess, 1.0)
+    squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
+    ratios = np.sqrt(np.maximum(squares, 0.0))
+    kept = np.clip(ratios, LEAST_RATIO, 1.0)
+    step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
+    return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step

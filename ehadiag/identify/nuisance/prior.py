@@ -1,0 +1,81 @@
+"""What is believed of each parameter before a recording is seen, and which pass for each other.
+
+All that the search knows of the actuator stands here; the search itself is generic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ehadiag.identify.nuisance.linearisation import Belief
+from ehadiag.identify.refine.derivatives import Derivatives
+from ehadiag.model.parameters import Kind, Parameter
+
+__all__ = ["ALIAS", "Known", "belief_of", "information_of", "nuisances_of"]
+
+ALIAS = "null_bias"
+"""What a constant error of the spool's sensor passes for: only the pressure tells them apart, and
+where it saturates the search may stop at a wrong pair."""
+CENTRE_OF_SEVERITY, SPREAD_OF_SEVERITY = 0.4, 0.3
+CENTRE, SPREAD = 0.5, 0.4
+"""Of a nuisance that is never negative: mean and deviation, in units of its scale."""
+SPREAD_BOTH_WAYS = 0.5
+"""Deviation of one that may have either sign."""
+LEFT_OUT = frozenset({"sampling_lead"})
+"""Nuisances that `--nuisances` does not free: no unit of section 8's basic set has them, and what
+is not known of them is considered in the interval."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What is known of a parameter beforehand: a normal density, in its unit.
+
+    Attributes
+    ----------
+    mean, std : float
+    """
+
+    mean: float
+    std: float
+
+
+def nuisances_of(registry: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Nuisances that an identification may free beside the constant errors of the sensors."""
+    return tuple(
+        item
+        for item in registry
+        if item.kind is Kind.NUISANCE and item.adds_to is None and item.name not in LEFT_OUT
+    )
+
+
+def belief_of(model: Derivatives, known: Mapping[str, Known]) -> Belief:
+    """Belief with which the search begins: what is known, else the usual sizes."""
+    usual = [_usual(item) for item in model.estimated]
+    given = [known.get(item.name) for item in model.estimated]
+    mean = [k.mean if k else u.mean for k, u in zip(given, usual, strict=True)]
+    spread = np.array([k.std if k else u.std for k, u in zip(given, usual, strict=True)])
+    x = np.clip(np.array(mean) / model.scale, model.lower, model.upper)
+    return Belief(x, np.diag((spread / model.scale)[model.curved]))
+
+
+def information_of(model: Derivatives, known: Mapping[str, Known]) -> np.ndarray:
+    """Reciprocal variance of each coordinate: of what is known, and a little of the usual sizes.
+
+    The latter keeps finite what no recording shows, shape (k,).
+    """
+    out = np.zeros(len(model.estimated))
+    for k, item in enumerate(model.estimated):
+        if item.adds_to is None or item.name in known:
+            out[k] = (model.scale[k] / known.get(item.name, _usual(item)).std) ** 2
+    return out
+
+
+def _usual(item: Parameter) -> Known:
+    if item.kind is Kind.FAULT:
+        return Known(CENTRE_OF_SEVERITY, SPREAD_OF_SEVERITY)
+    if item.lower >= 0.0:
+        return Known(CENTRE * item.scale, SPREAD * item.scale)
+    return Known(0.0, SPREAD_BOTH_WAYS * item.scale)

@@ -1,0 +1,142 @@
+"""Search from several starts, until a recording is explained.
+
+A search may settle beside the optimum; its residuals show it. From such a place a fresh look over a
+tenth of the first spread mostly finds the way on, else a start of its own does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.identify.nuisance.linearisation import BLOCK, Belief
+from ehadiag.identify.nuisance.posterior import TAIL, sharpen
+from ehadiag.identify.refine.derivatives import Derivatives
+
+__all__ = ["Found", "Place", "robust_cost", "search"]
+
+AGAIN = 0.1
+"""Spread of a further look about the best so far, in spreads of the first."""
+FRESH_EVERY = 2
+"""Every so many starts begin anew."""
+ALIAS_SPAN = 1.25
+"""Half-width over which a parameter is moved against what it passes for, in units of its scale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where one start ended.
+
+    Attributes
+    ----------
+    x : shape (k,)
+    cost : float
+    """
+
+    x: NDArray[np.float64]
+    cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The best place that a search has come to.
+
+    Attributes
+    ----------
+    belief : Belief
+    residuals : shape (SIGNALS, N)
+        Weighted, at its mean.
+    cost : float
+        Robust, see `robust_cost`.
+    explained : bool
+    places : tuple of Place
+        Where all starts ended.
+    """
+
+    belief: Belief
+    residuals: NDArray[np.float64]
+    cost: float
+    explained: bool
+    places: tuple[Place, ...]
+
+    @property
+    def starts(self) -> int:
+        """How many it took."""
+        return len(self.places)
+
+
+def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cauchy's cost of weighted residuals, shape (n, SIGNALS, N): shape (n,)."""
+    return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
+
+
+def search(
+    model: Derivatives,
+    first: Belief,
+    information: NDArray[np.float64],
+    explains: Callable[[NDArray[np.float64]], bool],
+    *,
+    alias: str = "",
+    budget: int = 1600,
+    seed: int = 0,
+    tell: Callable[[float], None] | None = None,
+) -> Found:
+    """Search until the residuals are explained, or the budget is spent.
+
+    Parameters
+    ----------
+    first : Belief
+        Of the first start and every fresh one.
+    information : shape (k,)
+        See `sharpen`.
+    explains : callable
+        Of residuals, shape (SIGNALS, N): whether there is nothing better to look for
+        (a search that has not come to rest goes on all the same).
+    alias : str
+        Name of a parameter that passes for a sensor's constant error.
+    budget : int
+        Runs of the model after which no further start is made.
+    tell : callable, optional
+        Called after each start with the share of the budget that is spent.
+    """
+    until = model.evaluations + budget
+    best: Found | None = None
+    places: list[Place] = []
+    while best is None or (not best.explained and model.evaluations < until):
+        begin = first
+        if best is not None and len(places) % FRESH_EVERY != 0:
+            x = _past_alias(model, best, alias)
+            begin = Belief(x, AGAIN * first.root)
+        rng = np.random.default_rng([seed, len(places)])
+        belief, settled = sharpen(model, first, begin, information, rng)
+        residuals = model.many(belief.x[None, :])[0]
+        cost = float(robust_cost(residuals))
+        places.append(Place(belief.x, cost))
+        if best is None or cost < best.cost:
+            best = Found(belief, residuals, cost, settled and explains(residuals), ())
+        if tell is not None:
+            tell(min(1.0 - (until - model.evaluations) / budget, 1.0))
+    return replace(best, places=tuple(places))
+
+
+def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:
+    """Best point along the line on which a parameter and a sensor's constant error trade."""
+    names = [item.name for item in model.estimated]
+    x = best.belief.x
+    if alias not in names:
+        return x
+    j = names.index(alias)
+    shifts = ALIAS_SPAN * (np.arange(BLOCK) - 0.5 * BLOCK + 1.0) / (0.5 * BLOCK)
+    points = np.repeat(x[None, :], BLOCK, axis=0)
+    points[:, j] = np.clip(x[j] + shifts, model.lower[j], model.upper[j])
+    # Medians do not see the samples that a wrong pair spoils.
+    slopes, runs = model.additive_slopes(), model.many(points)
+    for k, item in enumerate(model.estimated):
+        if item.adds_to is not None:
+            slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
+            used = slope != 0.0
+            points[:, k] -= np.median(run[:, used] / slope[used], axis=1)
+    return points[int(np.argmin(robust_cost(model.many(points))))]
