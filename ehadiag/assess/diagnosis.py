@@ -61,13 +61,13 @@ class DiagnosisSession:
     Parameters
     ----------
     actuator : Actuator
-    tests : iterable of StoredTest
+    tests : Iterable[StoredTest]
         The tests that a recording may be of, told apart by number.
-    default : StoredTest, optional
+    default : StoredTest | None
         Test of recordings whose bus does not carry a number.
-    levels : Levels, optional
+    levels : Levels | None
         Advisory level and limit.
-    solver : Solver, optional
+    solver : Solver | None
         Global search; the compact genetic algorithm unless given.
     seed : int
         The same seed gives the same answer on the same machine.

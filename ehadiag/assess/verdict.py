@@ -46,6 +46,15 @@ class Rule(StrEnum):
 class Levels:
     """Levels of a severity, 0 … 1, and the rule by which they are held against it.
 
+    Attributes
+    ----------
+    advisory : float
+        DEGRADED at or above.
+    limit : float
+        FAULT at or above.
+    rule : Rule
+        What a verdict goes by.
+
     Raises
     ------
     ConfigurationError
@@ -53,9 +62,7 @@ class Levels:
     """
 
     advisory: float = 0.25
-    """DEGRADED at or above."""
     limit: float = 0.75
-    """FAULT at or above."""
     rule: Rule = Rule.INTERVAL
 
     def __post_init__(self) -> None:

@@ -28,9 +28,16 @@ class Deadline:
     def watch(self, progress: Callable[[str, float], None]) -> Callable[[str, float], None]:
         """Return a progress report that ends what reports to it when the time is over.
 
-        Raises (the report)
-        -------------------
-        NotTestedError: the time is over.
+        Parameters
+        ----------
+        progress : Callable[[str, float], None]
+            Report that it hands on to.
+
+        Returns
+        -------
+        Callable[[str, float], None]
+            Report of a stage and the share of it that is done; it raises NotTestedError once the
+            time is over.
         """
 
         def tell(stage: str, share: float) -> None:

@@ -219,9 +219,20 @@ def add_effect_options(parser: argparse.ArgumentParser) -> None:
 def the_effects(arguments: argparse.Namespace) -> Effects:
     """Return the effects that the options describe.
 
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        The parsed command line.
+
+    Returns
+    -------
+    Effects
+        The effects.
+
     Raises
     ------
-    ConfigurationError: a value out of its range, `--data-error` without a known name and a number.
+    ConfigurationError
+        A value out of its range, `--data-error` without a known name and a number.
     """
     from ehadiag_sim.plant.conditions import Effects, Strangers  # noqa: PLC0415
 
@@ -238,9 +249,20 @@ def the_effects(arguments: argparse.Namespace) -> Effects:
 def the_sensors(arguments: argparse.Namespace) -> Sensors:
     """Return how the sensors err by the options.
 
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        The parsed command line.
+
+    Returns
+    -------
+    Sensors
+        The errors of the sensors.
+
     Raises
     ------
-    ConfigurationError: a value out of its range.
+    ConfigurationError
+        A value out of its range.
     """
     from ehadiag_sim.plant.conditions import Sensors  # noqa: PLC0415
 

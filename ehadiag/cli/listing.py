@@ -27,9 +27,12 @@ def print_list(source: str, recordings: Iterable[Recording], *, as_json: bool) -
 
     Parameters
     ----------
-    source: name of the recording.
-    recordings: its tests, taken one at a time.
-    as_json: one JSON object a line instead of a table.
+    source : str
+        Name of the recording.
+    recordings : Iterable[Recording]
+        Its tests, taken one at a time.
+    as_json : bool
+        One JSON object a line instead of a table.
     """
     rows = (_row(item, number) for number, item in enumerate(recordings, start=1))
     if as_json:

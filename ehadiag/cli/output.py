@@ -45,9 +45,15 @@ def say(text: str) -> None:
 def put(text: str) -> None:
     """Print lines of plain text to standard output.
 
+    Parameters
+    ----------
+    text : str
+        The text to print.
+
     Raises
     ------
-    InputOutputError: it is closed, or full.
+    InputOutputError
+        It is closed, or full.
     """
     emit(printable_lines(text) + "\n")
 

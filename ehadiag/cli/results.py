@@ -31,9 +31,20 @@ MAX_RESULT_BYTES = 1 << 20
 def make_folder(name: str) -> Folder:
     """Open the output folder, created if need be.
 
+    Parameters
+    ----------
+    name : str
+        As the user named it.
+
+    Returns
+    -------
+    Folder
+        The folder, held open.
+
     Raises
     ------
-    InputOutputError: it cannot be created, or is a link.
+    InputOutputError
+        It cannot be created, or is a link.
     """
     path = Path(name)
     try:
@@ -50,7 +61,10 @@ class Results:
 
     Parameters
     ----------
-    folder: for JSON and pictures; None: nothing is written.
+    arguments : argparse.Namespace
+        The parsed command line.
+    folder : Folder | None
+        For JSON and pictures; None: nothing is written.
     """
 
     def __init__(self, arguments: argparse.Namespace, folder: Folder | None) -> None:

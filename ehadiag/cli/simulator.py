@@ -31,9 +31,26 @@ def make_core(
 ) -> FccCore:
     """Return the computer with the actuator that the options describe, its kernels loaded.
 
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        The parsed command line.
+    actuator : Actuator
+        Data of the actuator.
+    tests : Iterable[StoredTest]
+        Tests that the computer stores, each with a number of its own.
+    bus_map : BusMap
+        Which message and signal plays which role.
+
+    Returns
+    -------
+    FccCore
+        The emulated computer.
+
     Raises
     ------
-    ConfigurationError: a value out of its range, an unknown kind of broken hardware.
+    ConfigurationError
+        A value out of its range, an unknown kind of broken hardware.
     """
     item = Hardware(actuator, the_effects(arguments), the_sensors(arguments))
     if arguments.broken:

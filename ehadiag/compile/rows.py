@@ -18,10 +18,15 @@ def unpacker(kind: Any, start: int = 0) -> Any:
 
     Parameters
     ----------
-    kind : type
+    kind : Any
         Named tuple whose fields are all numbers.
     start : int
         Place of its first field in the array.
+
+    Returns
+    -------
+    Any
+        The function.
     """
     numbers = ", ".join(f"row[{start + index}]" for index in range(len(kind._fields)))
     return _compiled(f"def unpack(row):\n    return kind({numbers})", "unpack", kind)

@@ -39,13 +39,16 @@ CREATE = os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | getattr(os, "O_BINARY", 
 class Folder:
     """One folder, named by a descriptor: what is put in its place later is not followed.
 
+    Every method takes the plain name of a file and raises OSError.
+
     Parameters
     ----------
-    path: of the folder, for messages (and for the work where there are no descriptors of folders).
-    descriptor: of the open folder, which this object closes; None where there is none.
-    mode: of the files that are created.
-
-    Every method takes the plain name of a file and raises OSError.
+    path : Path
+        Of the folder, for messages (and for the work where there are no descriptors of folders).
+    descriptor : int | None
+        Of the open folder, which this object closes; None where there is none.
+    mode : int
+        Of the files that are created.
     """
 
     def __init__(self, path: Path, descriptor: int | None, mode: int) -> None:

@@ -16,10 +16,26 @@ def read_small_file(path: Path, limit: int, what: str) -> bytes:
 
     A pipe or a device is refused at once, without waiting for its other end.
 
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    limit : int
+        Most bytes that it may have.
+    what : str
+        Its kind, for errors.
+
+    Returns
+    -------
+    bytes
+        All of it.
+
     Raises
     ------
-    InputOutputError: it cannot be read, or is no regular file.
-    ConfigurationError: larger than `limit` bytes.
+    InputOutputError
+        It cannot be read, or is no regular file.
+    ConfigurationError
+        Larger than `limit` bytes.
     """
     try:
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

@@ -26,12 +26,28 @@ T = TypeVar("T")
 
 
 def read_toml(path: Path, kind: type[T], what: str) -> T:
-    """Read `path` into `kind` (a msgspec structure); `what` names the file in errors.
+    """Read a TOML file into a msgspec structure.
+
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    kind : type[T]
+        Structure that it is checked against.
+    what : str
+        Name of the kind of file, for errors.
+
+    Returns
+    -------
+    T
+        The content.
 
     Raises
     ------
-    InputOutputError: the file cannot be read, or is no regular file.
-    ConfigurationError: too large, not TOML, or not what `kind` demands.
+    InputOutputError
+        The file cannot be read, or is no regular file.
+    ConfigurationError
+        Too large, not TOML, or not what `kind` demands.
     """
     return decode_toml(read_small_file(path, MAX_BYTES, what), kind, f"{what} {path}")
 

@@ -41,7 +41,8 @@ def read(
     Parameters
     ----------
     path : PathLike
-        BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); also packed as `.gz`.
+        BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); also packed as
+        `.gz`.
     mapping : BusMap | PathLike | None
         Which signals of a DBC are which channels; None: the computer's own bus.
     dbc : PathLike | None
@@ -157,8 +158,8 @@ def diagnose(
     actuator : Actuator | PathLike | None
         Actuator, or its file; None: the reference actuator.
     test : StoredTest | PathLike | Iterable[StoredTest | PathLike] | None
-        Further test that a recording may be of, besides the stored ones: a test, a name, a file, or
-        several. One alone also stands for recordings whose bus carries no test number.
+        Further test that a recording may be of, besides the stored ones: a test, a name, a
+        file, or several. One alone also stands for recordings whose bus carries no test number.
     levels : Levels | None
         From which severity on an actuator is degraded, or at fault; None: 0.25 and 0.75.
     solver : Solver | str

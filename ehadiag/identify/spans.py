@@ -68,7 +68,9 @@ def lay_out(
             anchor = Anchor(ANCHOR_GAIN, anchor_lsb[0] * unit, anchor_lsb[1] * unit)
         anchors.append(anchor.as_array())
         origins.append(_origin(experiment, first))
-    begins = np.cumsum([0, *(item.ticks for item in experiments)])
+    # Nothing after the spans: a stage's inputs must not change while the test goes on.
+    ends = [max((b for i, _, _, b in parts if i == k), default=0) for k in range(len(experiments))]
+    begins = np.cumsum([0, *ends])
     return Batch(
         test=np.array([index for index, _, _, _ in parts]),
         tick=np.array([experiments[i].tick for i, _, _, _ in parts]),
@@ -76,7 +78,9 @@ def lay_out(
         origin=np.array(origins),
         history=np.array([first for _, first, _, _ in parts]),
         since=np.array([begins[i] + first for i, first, _, _ in parts]),
-        current=np.concatenate([item.trace.current for item in experiments]),
+        current=np.concatenate(
+            [item.trace.current[:end] for item, end in zip(experiments, ends, strict=True)]
+        ),
         spool=np.concatenate([experiments[i].spool[first:b] for i, first, _, b in parts]),
         pressure=np.concatenate([experiments[i].pressure[first:b] for i, first, _, b in parts]),
         weight=np.hstack(weight),

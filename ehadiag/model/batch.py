@@ -35,7 +35,8 @@ class Batch(NamedTuple):
     since : shape (m,)
         Place of each span's first tick in `current`.
     current : shape (M,)
-        Of whole tests, each once, A: what comes before a span has loaded the hysteresis.
+        Of the tests from their beginning, each once, A: what comes before a span has loaded the
+        hysteresis.
     spool, pressure : shape (N,)
         Measured, m and Pa, NaN where missing.
     weight : shape (SIGNALS, N)

@@ -45,6 +45,8 @@ MOST_STEPS = 32
 ITERATIONS = 30
 SHORTEST = 1e-6
 """Share of a piece that counts as nothing."""
+BALANCED = 1e-9
+"""Share of the holding force that counts as no excess."""
 SLOWEST = 1e-12
 """Velocity that counts as none, m/s."""
 
@@ -193,7 +195,10 @@ def _break_away(j: JackLaw, p: Piece, hold: float, d: float, begin: float, end: 
         else:
             high, at_high = q, value
             at_low *= 0.5
-        if high - low < SHORTEST or abs(value) < 1e-6 * abs(hold) * resistance(j, x):
+        if abs(value) < BALANCED * abs(hold) * resistance(j, x):
+            # Not `high`: where the path is straight the first q is the root, from either side.
+            return q
+        if high - low < SHORTEST:
             break
     return high
 

@@ -49,13 +49,22 @@ def design_cusum(hours: float, tick: float, shift: float = 1.0) -> CusumDesign:
 
     Parameters
     ----------
-    hours: mean time between false alarms, 1e-4 … 1e7 h.
-    tick: s.
-    shift: of the mean, in units of the noise, that is to be found soonest; 0.1 … 5.
+    hours : float
+        Mean time between false alarms, 1e-4 … 1e7 h.
+    tick : float
+        s.
+    shift : float
+        Of the mean, in units of the noise, that is to be found soonest; 0.1 … 5.
+
+    Returns
+    -------
+    CusumDesign
+        Reference value and threshold.
 
     Raises
     ------
-    ConfigurationError: a value out of its range, or so short a time that no threshold gives it.
+    ConfigurationError
+        A value out of its range, or so short a time that no threshold gives it.
     """
     if not HOURS[0] <= hours <= HOURS[1]:
         raise ConfigurationError(f"hours between false alarms {hours:g}: need {HOURS[0]:g} … 1e7")

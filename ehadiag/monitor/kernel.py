@@ -143,12 +143,16 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
 
     Parameters
     ----------
-    address: of the SIZE numbers of `ehadiag.monitor.layout`.
-    sample: command, current, spool, pressure and position of the tick, SI, NaN where lost.
+    address : int
+        Of the SIZE numbers of `ehadiag.monitor.layout`.
+    sample : tuple[float, float, float, float, float]
+        Command, current, spool, pressure and position of the tick, SI, NaN where lost.
 
     Returns
     -------
-    The sums that gave alarm: 1 spool's upper, 2 its lower, 4 pressure's upper, 8 its lower one.
+    int
+        The sums that gave alarm: 1 spool's upper, 2 its lower, 4 pressure's upper, 8 its lower
+        one.
     """
     command, current, spool, pressure, position = sample
     p = _part(address, 0, (SIZE,))

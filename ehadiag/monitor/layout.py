@@ -20,16 +20,38 @@ class Settings(NamedTuple):
 
     Attributes
     ----------
-    plays: number of plays of the hysteresis.
-    closed: not 0: the command is a position.
-    invertible: not 0: a lost position's code follows from the current.
-    linear: below this current it does, A.
-    code_position: converter step of the position, m.
-    anchor_gain, anchor_small, anchor_large: see `ehadiag.model.anchor.Anchor`.
-    spool_offset, pressure_offset: constant errors of the sensors, m and Pa.
-    spool_weight, pressure_weight: reciprocal noise of both.
-    reference, threshold, limit: of the CUSUM: k, h, largest residual that counts.
-    deviation: a lost command did not go on where the current is off by more, A.
+    plays : float
+        Number of plays of the hysteresis.
+    closed : float
+        Not 0: the command is a position.
+    invertible : float
+        Not 0: a lost position's code follows from the current.
+    linear : float
+        Below this current it does, A.
+    code_position : float
+        Converter step of the position, m.
+    anchor_gain : float
+        See `ehadiag.model.anchor.Anchor`.
+    anchor_small : float
+        See `anchor_gain`.
+    anchor_large : float
+        See `anchor_gain`.
+    spool_offset : float
+        Constant errors of the sensors, m and Pa.
+    pressure_offset : float
+        See `spool_offset`.
+    spool_weight : float
+        Reciprocal noise of both.
+    pressure_weight : float
+        See `spool_weight`.
+    reference : float
+        Of the CUSUM: k, h, largest residual that counts.
+    threshold : float
+        See `reference`.
+    limit : float
+        See `reference`.
+    deviation : float
+        A lost command did not go on where the current is off by more, A.
     """
 
     plays: float
@@ -55,8 +77,24 @@ class Moving(NamedTuple):
 
     Attributes
     ----------
-    filtered: innovation of the re-anchoring, m.
-    jack_spool: where the jack has the spool, m.
+    xf : float
+        Flapper deflection, m.
+    wf : float
+        Its rate, m/s.
+    xs : float
+        Spool position, m.
+    vs : float
+        Its velocity, m/s.
+    wire : float
+        End of the feedback wire, m.
+    direction : float
+        Of the spool's motion, +1 or -1; 0 at rest.
+    clamped : float
+        Not 0: the flapper is on its stop.
+    filtered : float
+        Innovation of the re-anchoring, m.
+    jack_spool : float
+        Where the jack has the spool, m.
     """
 
     xf: float
@@ -75,10 +113,14 @@ class Followed(NamedTuple):
 
     Attributes
     ----------
-    seen: measured position of the tick before, m; NaN if lost.
-    command: of the tick before, known or not.
-    slope: its rise over a tick.
-    lost: ticks lost since one was known.
+    seen : float
+        Measured position of the tick before, m; NaN if lost.
+    command : float
+        Of the tick before, known or not.
+    slope : float
+        Its rise over a tick.
+    lost : float
+        Ticks lost since one was known.
     """
 
     seen: float

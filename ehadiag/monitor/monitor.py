@@ -64,12 +64,16 @@ class Reading:
 
     Attributes
     ----------
-    predicted: spool (m), pressure (Pa), position (m; from 0 at the start), shape (3,).
-    residual: measured less modelled spool and pressure, in units of noise, shape (2,); NaN where
-        the sample is lost.
-    cusum: upper and lower sum (columns) of spool and pressure (rows), in units of noise; a sum
+    predicted : NDArray[np.float64]
+        Spool (m), pressure (Pa), position (m; from 0 at the start), shape (3,).
+    residual : NDArray[np.float64]
+        Measured less modelled spool and pressure, in units of noise, shape (2,); NaN where the
+        sample is lost.
+    cusum : NDArray[np.float64]
+        Upper and lower sum (columns) of spool and pressure (rows), in units of noise; a sum
         that gave alarm is back at 0.
-    alarmed: which sums gave alarm at this tick, shape (2, 2).
+    alarmed : NDArray[np.bool_]
+        Which sums gave alarm at this tick, shape (2, 2).
     """
 
     predicted: NDArray[np.float64]
@@ -92,20 +96,30 @@ class Monitor:
 
     Parameters
     ----------
-    actuator: data of the actuator.
-    faults: severities in the order of the registry (Kintas, FSS, FDJ), each 0 … 1, as last
+    actuator : Actuator
+        Data of the actuator.
+    faults : Sequence[float] | NDArray[np.float64]
+        Severities in the order of the registry (Kintas, FSS, FDJ), each 0 … 1, as last
         identified.
-    environment: oil and supply; None: as the actuator's data say.
-    mode: what commands are.
-    hours: mean time between false alarms of the monitor as a whole, on white noise, h.
-    shift: of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
-    noise: standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
-    offsets: constant errors of spool (m) and pressure sensor (Pa).
-    anchor: how the modelled spool is kept on the measured one.
+    environment : Environment | None
+        Oil and supply; None: as the actuator's data say.
+    mode : CommandMode
+        What commands are.
+    hours : float
+        Mean time between false alarms of the monitor as a whole, on white noise, h.
+    shift : float
+        Of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
+    noise : tuple[float, float] | None
+        Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
+    offsets : tuple[float, float]
+        Constant errors of spool (m) and pressure sensor (Pa).
+    anchor : Anchor
+        How the modelled spool is kept on the measured one.
 
     Raises
     ------
-    ConfigurationError: a value out of its range.
+    ConfigurationError
+        A value out of its range.
     """
 
     def __init__(
@@ -185,10 +199,21 @@ class Monitor:
         takes time that this call does not have: what `float` takes for a number, a text too, is
         taken.
 
+        Parameters
+        ----------
+        sample : tuple[float, float, float, float, float]
+            The tick: command, current, spool, pressure, position.
+
+        Returns
+        -------
+        Reading
+            The monitor's reading, always the same object.
+
         Raises
         ------
-        TypeError: not a tuple of five of these, or whatever a `__float__` raised; the monitor is as
-            it was.
+        TypeError
+            Not a tuple of five of these, or whatever a `__float__` raised; the monitor is as it
+            was.
         """
         try:
             alarms = self._push(self._address, sample)

@@ -23,8 +23,19 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
 
     Parameters
     ----------
-    spent: around the diagnosis.
-    solver, seed: what was asked for; stated also where nothing was identified.
+    diagnosis : Diagnosis
+        What was found.
+    spent : Spent
+        Around the diagnosis.
+    solver : str
+        What was asked for; stated also where nothing was identified.
+    seed : int
+        See `solver`.
+
+    Returns
+    -------
+    str
+        The object without a line end, strict JSON.
     """
     found = diagnosis.identification
     timing = found.timing if found else None

@@ -42,9 +42,20 @@ class Picture(Figure):
 def draw_diagnosis(diagnosis: Diagnosis) -> bytes:
     """Return the picture of a diagnosis as a PNG.
 
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        What was found.
+
+    Returns
+    -------
+    bytes
+        The file's content.
+
     Raises
     ------
-    ValueError: nothing was identified.
+    ValueError
+        Nothing was identified.
     """
     with matplotlib.rc_context(matplotlib.rcParamsDefault), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # in names of others
@@ -54,9 +65,20 @@ def draw_diagnosis(diagnosis: Diagnosis) -> bytes:
 def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
     """Draw one column for each recording: current, spool, pressure, and their residuals.
 
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        What was found.
+
+    Returns
+    -------
+    Picture
+        The figure.
+
     Raises
     ------
-    ValueError: nothing was identified, so there is no modelled response to draw.
+    ValueError
+        Nothing was identified, so there is no modelled response to draw.
     """
     found = diagnosis.identification
     if found is None:

@@ -52,7 +52,12 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent | None 
 
     Parameters
     ----------
-    spent: around the diagnosis; where nothing is known of it the diagnosis' own time is told.
+    diagnosis : Diagnosis
+        What was found.
+    console : Console
+        Console to print to.
+    spent : Spent | None
+        Around the diagnosis; where nothing is known of it the diagnosis' own time is told.
     """
     serials = [str(item.serial) for item in diagnosis.recordings if item.serial is not None]
     verdict = diagnosis.verdict

@@ -57,12 +57,23 @@ def assemble(
 
     Parameters
     ----------
-    table: frames in order of arrival.
-    bus_map: what they mean.
-    source: file or bus, for reports.
-    notes: facts known before decoding.
-    channels: adapter channels on which the actuator's frames came so far; None: in this table.
-    unsaid_is_test: take frames without command and status for one test.
+    table : FrameTable
+        Frames in order of arrival.
+    bus_map : BusMap
+        What they mean.
+    source : str
+        File or bus, for reports.
+    notes : tuple[str, ...]
+        Facts known before decoding.
+    channels : frozenset[int] | None
+        Adapter channels on which the actuator's frames came so far; None: in this table.
+    unsaid_is_test : bool
+        Take frames without command and status for one test.
+
+    Returns
+    -------
+    tuple[Recording, ...]
+        The tests in order of time; one recording without samples if there is none.
     """
     present = channels_in(table, bus_map) if channels is None else channels
     channel, ambiguous = choose_channel(bus_map.channel, present)
@@ -189,8 +200,12 @@ class _Bounds:
 
     Attributes
     ----------
-    highest: highest tick up to each axis frame; ascending.
-    lowest: lowest tick from each axis frame on; ascending.
+    axis : TickAxis
+        The control ticks of the recording.
+    highest : NDArray[np.int64]
+        Highest tick up to each axis frame; ascending.
+    lowest : NDArray[np.int64]
+        Lowest tick from each axis frame on; ascending.
     """
 
     axis: TickAxis

@@ -28,7 +28,15 @@ def time_bases(status: Status, running: Rows) -> tuple[Rows, str]:
 
     Parameters
     ----------
-    running: rows of `status` that say so and give the elapsed time.
+    status : Status
+        All status frames, in columns.
+    running : Rows
+        Rows of `status` that say so and give the elapsed time.
+
+    Returns
+    -------
+    tuple[Rows, str]
+        Rows of one time base, and the reason against the recording (empty: none).
     """
     start = status.start[running].astype(np.int64)
     order = np.argsort(start, kind="stable")
@@ -63,10 +71,23 @@ def contradictions(
 
     Parameters
     ----------
-    inside: rows of `status` between first and last tick.
-    final: row that told of the end; None without one.
-    first, stop: ticks of the test.
-    test_id: what the commands say; None: nothing.
+    status : Status
+        All status frames, in columns.
+    inside : Rows
+        Rows of `status` between first and last tick.
+    final : int | None
+        Row that told of the end; None without one.
+    first : int
+        Ticks of the test.
+    stop : int
+        See `first`.
+    test_id : int | None
+        What the commands say; None: nothing.
+
+    Returns
+    -------
+    tuple[tuple[str, ...], tuple[str, ...]]
+        Reasons and notes, a sentence each.
     """
     told = inside if final is None else np.append(inside[inside != final], final)
     reasons, notes = [], []

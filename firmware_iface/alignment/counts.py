@@ -30,11 +30,23 @@ def count_frames(
 
     Parameters
     ----------
-    item: its frames.
-    axis: ticks; None without telemetry.
-    episode: the test.
-    begin, end: rows of the table that belong to the test.
-    conflicts: counter values among them that came with different payloads.
+    item : Decoded
+        Its frames.
+    axis : TickAxis | None
+        Ticks; None without telemetry.
+    episode : Episode
+        The test.
+    begin : int
+        Rows of the table that belong to the test.
+    end : int
+        See `begin`.
+    conflicts : int
+        Counter values among them that came with different payloads.
+
+    Returns
+    -------
+    MessageCounts
+        The counts.
     """
     received = within(item.received, begin, end)
     crc_errors = within(item.crc_bad, begin, end)

@@ -31,13 +31,22 @@ class Episode:
 
     Attributes
     ----------
-    first: tick of row 0.
-    ticks: length; 0 if the test never ran.
-    test_id, serial: None if the bus does not say.
-    outcome: how it ended.
-    ended: row of the status frame that told of the end; None without one.
-    notes: what a reader should know.
-    refused: why it is not one test on one unit.
+    first : int
+        Tick of row 0.
+    ticks : int
+        Length; 0 if the test never ran.
+    test_id : int | None
+        None if the bus does not say.
+    serial : int | None
+        See `test_id`.
+    outcome : Outcome
+        How it ended.
+    ended : int | None
+        Row of the status frame that told of the end; None without one.
+    notes : tuple[str, ...]
+        What a reader should know.
+    refused : tuple[str, ...]
+        Why it is not one test on one unit.
     """
 
     first: int

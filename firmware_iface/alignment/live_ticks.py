@@ -52,21 +52,31 @@ class LiveTicks:
 
     Parameters
     ----------
-    bus_map: mapping; all channels must come in one frame, and its counter and that of the command
+    bus_map : BusMap | None
+        Mapping; all channels must come in one frame, and its counter and that of the command
         must count ticks.
-    mode: of the commands to take; those of the other mode count as lost.
+    mode : CommandMode
+        Of the commands to take; those of the other mode count as lost.
 
     Attributes
     ----------
-    lost: ticks whose telemetry did not come, or was damaged.
-    breaks: silences so long that the ticks began anew after them.
-    conflicts: counter values that came with different payloads: a second sender. The `DOUBTFUL`
-        ticks after each are given out as lost: nothing tells which sender is right.
+    lost : int
+        Ticks whose telemetry did not come, or was damaged.
+    breaks : int
+        Silences so long that the ticks began anew after them.
+    conflicts : int
+        Counter values that came with different payloads: a second sender. The `DOUBTFUL` ticks
+        after each are given out as lost: nothing tells which sender is right.
 
     Raises
     ------
-    ConfigurationError: a bus whose ticks cannot be told from single frames.
+    ConfigurationError
+        A bus whose ticks cannot be told from single frames.
     """
+
+    lost: int
+    breaks: int
+    conflicts: int
 
     def __init__(
         self, bus_map: BusMap | None = None, mode: CommandMode = CommandMode.POSITION

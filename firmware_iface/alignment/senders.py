@@ -36,9 +36,12 @@ class Conflicts:
 
     Attributes
     ----------
-    row: rows of the table, ascending, shape (n,).
-    position: which counter value each belongs to, shape (n,).
-    apart: whether the counters of successive ones lie far apart, shape (n,).
+    row : Rows
+        Rows of the table, ascending, shape (n,).
+    position : Rows
+        Which counter value each belongs to, shape (n,).
+    apart : NDArray[np.bool_]
+        Whether the counters of successive ones lie far apart, shape (n,).
     """
 
     row: Rows

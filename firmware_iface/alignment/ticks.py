@@ -27,13 +27,23 @@ class TickAxis:
 
     Attributes
     ----------
-    ticks: per message, tick of each accepted frame, far below zero for one out of line; messages
+    ticks : Mapping[str, Ticks]
+        Per message, tick of each accepted frame, far below zero for one out of line; messages
         that no tick fits are left out.
-    rows: per message, row of the table of each accepted frame.
-    row, tick, time_ns: the frames that define the axis, in order of arrival.
-    every: per message, ticks between two frames of one stream.
-    turn: ticks after which the counter repeats; 0 without a counter.
-    notes: what a reader should know.
+    rows : Mapping[str, NDArray[np.int64]]
+        Per message, row of the table of each accepted frame.
+    row : NDArray[np.int64]
+        The frames that define the axis, in order of arrival.
+    tick : Ticks
+        See `row`.
+    time_ns : NDArray[np.int64]
+        See `row`.
+    every : Mapping[str, int]
+        Per message, ticks between two frames of one stream.
+    turn : int
+        Ticks after which the counter repeats; 0 without a counter.
+    notes : tuple[str, ...]
+        What a reader should know.
     """
 
     ticks: Mapping[str, Ticks]

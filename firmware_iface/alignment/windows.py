@@ -36,11 +36,21 @@ def recordings_of(
 
     Parameters
     ----------
-    tables: blocks of frames in order of arrival.
-    bus_map: what they mean.
-    source: file or bus, for reports.
-    held: frames that a window may have at most; a test beyond that is cut, and said to be.
-    least: frames from which on a window is closed where no test runs.
+    tables : Iterable[FrameTable]
+        Blocks of frames in order of arrival.
+    bus_map : BusMap
+        What they mean.
+    source : str
+        File or bus, for reports.
+    held : int
+        Frames that a window may have at most; a test beyond that is cut, and said to be.
+    least : int
+        Frames from which on a window is closed where no test runs.
+
+    Yields
+    ------
+    Recording
+        Each test as soon as it is complete.
     """
     reading = _Reading(bus_map, source)
     empty: Recording | None = None

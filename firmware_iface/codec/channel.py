@@ -36,8 +36,15 @@ def choose_channel(chosen: int | None, present: frozenset[int]) -> tuple[int | N
 
     Parameters
     ----------
-    chosen: by the mapping or by `--log-channel`; None: not at all.
-    present: what `channels_in` found in the recording.
+    chosen : int | None
+        By the mapping or by `--log-channel`; None: not at all.
+    present : frozenset[int]
+        What `channels_in` found in the recording.
+
+    Returns
+    -------
+    tuple[int | None, str]
+        The channel, and the reason why there is none (empty: there is one).
     """
     listed = ", ".join(map(str, sorted(present)))
     if chosen is None:

@@ -24,17 +24,31 @@ class Decoded:
 
     Attributes
     ----------
-    message: what it is.
-    received: rows of the table with its identifier, good or bad.
-    crc_bad, length_bad, range_bad: rows that failed a check.
-    row: rows that passed length and check sum, shape (n,), ascending.
-    data: their payloads, shape (n, width).
-    time_ns: host time, shape (n,).
-    counter: counter values, shape (n,); None without a counter.
-    values: SI value per role, shape (n,); NaN where a multiplexed signal is absent or its value
+    message : MessageMap
+        What it is.
+    received : Rows
+        Rows of the table with its identifier, good or bad.
+    crc_bad : Rows
+        Rows that failed a check.
+    length_bad : Rows
+        See `crc_bad`.
+    range_bad : Rows
+        See `crc_bad`.
+    row : Rows
+        Rows that passed length and check sum, shape (n,), ascending.
+    data : NDArray[np.uint8]
+        Their payloads, shape (n, width).
+    time_ns : NDArray[np.int64]
+        Host time, shape (n,).
+    counter : NDArray[np.int64] | None
+        Counter values, shape (n,); None without a counter.
+    values : Mapping[str, NDArray[np.float64]]
+        SI value per role, shape (n,); NaN where a multiplexed signal is absent or its value
         lies outside the range of the DBC.
-    saturated: per channel role, value at an end of its range, shape (n,).
-    stream: which set of multiplexed signals the frame carries, shape (n,); 0 without multiplexers.
+    saturated : Mapping[str, NDArray[np.bool_]]
+        Per channel role, value at an end of its range, shape (n,).
+    stream : NDArray[np.int64]
+        Which set of multiplexed signals the frame carries, shape (n,); 0 without multiplexers.
     """
 
     message: MessageMap

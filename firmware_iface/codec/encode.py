@@ -60,10 +60,18 @@ class Encoder:
 
         Parameters
         ----------
-        codes: converter codes of current, spool, pressure, position (0 … 4095); they survive
-            decoding exactly.
-        time_ns: time stamp of the frames.
-        counter: counter value; None continues each message's own.
+        codes : Sequence[int]
+            Converter codes of current, spool, pressure, position (0 … 4095); they survive decoding
+            exactly.
+        time_ns : int
+            Time stamp of the frames.
+        counter : int | None
+            Counter value; None continues each message's own.
+
+        Returns
+        -------
+        tuple[Frame, ...]
+            The frames of one sample.
         """
         raw = {
             key: self._codes[key][int(code)] for key, code in zip(CHANNEL_KEYS, codes, strict=True)
@@ -122,9 +130,24 @@ class Encoder:
     def request(self, code: str | int, test_id: int, time_ns: int = 0) -> tuple[Frame, ...]:
         """Frames that ask for a test: code `start` or `abort`, or its number on the bus.
 
+        Parameters
+        ----------
+        code : str | int
+            "start" or "abort".
+        test_id : int
+            Number of the test.
+        time_ns : int
+            Time stamp of the frames, ns.
+
+        Returns
+        -------
+        tuple[Frame, ...]
+            The frames of the request.
+
         Raises
         ------
-        ConfigurationError: the mapping has no such request.
+        ConfigurationError
+            The mapping has no such request.
         """
         if isinstance(code, str):
             if code not in self._map.requests:

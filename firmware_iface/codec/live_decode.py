@@ -32,10 +32,18 @@ class LiveDecoder:
     Keeps the last value of each channel, for buses that spread a sample over several messages.
     Telemetry whose counter was just used with another payload is left out, and said to be.
 
+    Parameters
+    ----------
+    bus_map : BusMap | None
+        Which message and signal plays which role.
+
     Attributes
     ----------
-    second_sender: what gives away that somebody else sends as the computer does; empty if nothing.
+    second_sender : str
+        What gives away that somebody else sends as the computer does; empty if nothing.
     """
+
+    second_sender: str
 
     def __init__(self, bus_map: BusMap | None = None) -> None:
         self._map = bus_map or default_map()

@@ -61,14 +61,19 @@ def crc8_rows(
 
     Parameters
     ----------
-    can_id: identifier that all rows share.
-    data: payloads, shape (n, width).
-    crc_byte: position of the check sum, left out of the sum.
-    length: payload bytes.
+    can_id : int
+        Identifier that all rows share.
+    data : NDArray[np.uint8]
+        Payloads, shape (n, width).
+    crc_byte : int
+        Position of the check sum, left out of the sum.
+    length : int
+        Payload bytes.
 
     Returns
     -------
-    Check sums, shape (n,).
+    NDArray[np.uint8]
+        Check sums, shape (n,).
     """
     start = TABLE[TABLE[INITIAL ^ (can_id & 0xFF)] ^ (can_id >> 8 & 0xFF)]
     value = np.full(len(data), start, dtype=np.uint8)
@@ -90,16 +95,21 @@ def unwrap(
 
     Parameters
     ----------
-    counter: values in order of arrival, 0 … modulus - 1, shape (n,).
-    time_ns: host time stamps, shape (n,).
-    period_ns: time per count.
-    modulus: counts per turn.
+    counter : NDArray[np.int64]
+        Values in order of arrival, 0 … modulus - 1, shape (n,).
+    time_ns : NDArray[np.int64]
+        Host time stamps, shape (n,).
+    period_ns : int
+        Time per count.
+    modulus : int
+        Counts per turn.
 
     Returns
     -------
-    Position of each frame, congruent with its counter, the first one its counter value; OUTSIDE
-    for a few frames out of line with their neighbours (corrupt counters, frames that come much too
-    late); and notes.
+    tuple[NDArray[np.int64], tuple[str, ...]]
+        Position of each frame, congruent with its counter, the first one its counter value;
+        OUTSIDE for a few frames out of line with their neighbours (corrupt counters, frames
+        that come much too late); and notes.
     """
     if len(counter) == 0:
         return np.empty(0, dtype=np.int64), ()

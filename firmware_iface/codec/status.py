@@ -24,11 +24,20 @@ class Status:
 
     Attributes
     ----------
-    row: row of the frame table.
-    state: BitState, -1 unknown.
-    reason, test_id, serial: numbers, -1 unknown.
-    elapsed: ticks, NaN unknown.
-    following: tick of the next telemetry or command frame.
+    row : NDArray[np.int64]
+        Row of the frame table.
+    state : NDArray[np.int64]
+        BitState, -1 unknown.
+    reason : NDArray[np.int64]
+        Numbers, -1 unknown.
+    test_id : NDArray[np.int64]
+        See `reason`.
+    serial : NDArray[np.int64]
+        See `reason`.
+    elapsed : NDArray[np.float64]
+        Ticks, NaN unknown.
+    following : NDArray[np.int64]
+        Tick of the next telemetry or command frame.
     """
 
     row: NDArray[np.int64]

@@ -69,13 +69,20 @@ def sound_rows(
 
     Parameters
     ----------
-    received: rows of the message.
-    keep_bad_sums: tell frames with a wrong check sum, but let them pass.
+    table : FrameTable
+        Frames in columns.
+    received : Rows
+        Rows of the message.
+    message : MessageMap
+        The message that they should be.
+    keep_bad_sums : bool
+        Tell frames with a wrong check sum, but let them pass.
 
     Returns
     -------
-    Rows that pass, their payloads of shape (n, width), rows of a wrong length, and rows with a
-    wrong check sum.
+    tuple[Rows, NDArray[np.uint8], Rows, Rows]
+        Rows that pass, their payloads of shape (n, width), rows of a wrong length, and rows
+        with a wrong check sum.
     """
     fits = table.length[received] == message.length
     wrong_length, row = received[~fits], received[fits]
@@ -113,8 +120,15 @@ def conflicting(position: Rows, data: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    position: unlimited counter (and page, where a message has several) of each frame, shape (n,).
-    data: payloads, shape (n, width).
+    position : Rows
+        Unlimited counter (and page, where a message has several) of each frame, shape (n,).
+    data : NDArray[np.uint8]
+        Payloads, shape (n, width).
+
+    Returns
+    -------
+    NDArray[np.bool_]
+        Frames in conflict, shape (n,).
     """
     marked = np.zeros(len(position), dtype=np.bool_)
     order = np.argsort(position, kind="stable")
@@ -136,9 +150,19 @@ def event_positions(counter: Rows, time_ns: Rows, modulus: int) -> tuple[NDArray
     After a silence of half a turn the positions begin anew, and a counter that stands still says
     nothing.
 
+    Parameters
+    ----------
+    counter : Rows
+        Counter of each frame, shape (n,).
+    time_ns : Rows
+        Time stamp of each frame, ns, shape (n,).
+    modulus : int
+        Number of values of the counter.
+
     Returns
     -------
-    Frames that have a position, shape (n,), and those positions.
+    tuple[NDArray[np.bool_], Rows]
+        Frames that have a position, shape (n,), and those positions.
     """
     has = np.ones(len(counter), dtype=np.bool_)
     if len(counter) < 2:
@@ -163,13 +187,18 @@ class SenderWatch:
 
     Parameters
     ----------
-    modulus: counts per turn.
-    period_ns: usual time between two counts.
+    modulus : int
+        Counts per turn.
+    period_ns : int
+        Usual time between two counts.
 
     Attributes
     ----------
-    conflicts: counter values that came with two payloads within half a turn.
+    conflicts : int
+        Counter values that came with two payloads within half a turn.
     """
+
+    conflicts: int
 
     def __init__(self, modulus: int, period_ns: int) -> None:
         self._reach = min(REMEMBERED, max(modulus // 2, 1))

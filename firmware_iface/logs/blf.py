@@ -53,14 +53,25 @@ RUN = 16
 class BlfBlocks:
     """The frames of a BLF file, one table after another.
 
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    spending : Spending
+        What reading may still cost.
+
     Attributes
     ----------
-    trouble: what ended the reading early; empty at the regular end.
+    trouble : str
+        What ended the reading early; empty at the regular end.
 
     Raises
     ------
-    InputOutputError: not a BLF file, it cannot be read, or it costs more than its budget.
+    InputOutputError
+        Not a BLF file, it cannot be read, or it costs more than its budget.
     """
+
+    trouble: str
 
     def __init__(self, path: Path, spending: Spending) -> None:
         self._path = path

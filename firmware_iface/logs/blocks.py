@@ -40,21 +40,35 @@ class LogReader:
 
     A log that breaks off is read up to the break; `notes` then say so.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+    budget : Budget | None
+        Bytes, frames and seconds that reading may cost; None: the default.
+
     Attributes
     ----------
-    path: file.
-    notes: facts on the reading, complete once all blocks were taken.
+    path : Path
+        File.
+    notes : tuple[str, ...]
+        Facts on the reading, complete once all blocks were taken.
 
     Raises
     ------
-    InputOutputError: the file is missing, no regular file, unreadable, not what its suffix says,
-        without a frame, or beyond its budget.
-    ConfigurationError: unknown kind of log.
+    InputOutputError
+        The file is missing, no regular file, unreadable, not what its suffix says, without a
+        frame, or beyond its budget.
+    ConfigurationError
+        Unknown kind of log.
     """
+
+    path: Path
+    notes: tuple[str, ...]
 
     def __init__(self, path: Path | str, budget: Budget | None = None) -> None:
         self.path = Path(path)
-        self.notes: tuple[str, ...] = ()
+        self.notes = ()
         self._suffix = kind_of(self.path)
         self._budget = budget or Budget()
         self._spending = Spending(self.path, self._budget)

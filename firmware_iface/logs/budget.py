@@ -17,10 +17,14 @@ class Budget:
 
     Attributes
     ----------
-    frames: of the recording, foreign ones included; the default is some three hours of this bus.
-    size: bytes of the file, and of what a compressed one unpacks to.
-    seconds: wall time of reading.
-    held: frames held in memory at once, some 25 bytes each and ten times as many while they are
+    frames : int
+        Of the recording, foreign ones included; the default is some three hours of this bus.
+    size : int
+        Bytes of the file, and of what a compressed one unpacks to.
+    seconds : float
+        Wall time of reading.
+    held : int
+        Frames held in memory at once, some 25 bytes each and ten times as many while they are
         decoded; a test that is longer is cut off and said to be.
     """
 
@@ -33,9 +37,17 @@ class Budget:
 class Spending:
     """Counts what reading `path` has cost so far.
 
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    budget : Budget
+        What may be spent.
+
     Raises
     ------
-    InputOutputError: by each method, once a budget is spent; it names the option that allows more.
+    InputOutputError
+        By each method, once a budget is spent; it names the option that allows more.
     """
 
     def __init__(self, path: Path, budget: Budget) -> None:

@@ -54,8 +54,8 @@ def unpacked(path: Path, most: int) -> Iterator[Unpacked]:
     Raises
     ------
     InputOutputError
-        Not packed by gzip, larger than `most`, no room for it. Errors of the block that name the
-        temporary file name the packed one instead.
+        Not packed by gzip, larger than `most`, no room for it. Errors of the block that name
+        the temporary file name the packed one instead.
     """
     if path.suffix.lower() != PACKED:
         yield Unpacked(path, "")

@@ -36,11 +36,26 @@ def iterate_recordings(
     Memory is that of the longest test, whatever the length of the log. A log without a test gives
     one recording without samples.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+    bus_map : BusMap | None
+        Which message and signal plays which role.
+    budget : Budget | None
+        Bytes, frames and seconds that reading may cost; None: the default.
+
+    Yields
+    ------
+    Recording
+        Each test as soon as it is complete.
+
     Raises
     ------
-    InputOutputError: the file is missing, unreadable, not what its suffix says, or beyond its
-        budget.
-    ConfigurationError: unknown kind of log.
+    InputOutputError
+        The file is missing, unreadable, not what its suffix says, or beyond its budget.
+    ConfigurationError
+        Unknown kind of log.
     """
     budget = budget or Budget()
     reader = LogReader(path, budget)
@@ -71,9 +86,20 @@ def choose(recordings: Iterable[Recording]) -> Recording:
 
     Its notes name the other tests. Only the best so far is held.
 
+    Parameters
+    ----------
+    recordings : Iterable[Recording]
+        Tests of one log, in order of time.
+
+    Returns
+    -------
+    Recording
+        The chosen one, with notes on the others.
+
     Raises
     ------
-    ValueError: no recording at all.
+    ValueError
+        No recording at all.
     """
     best: Recording | None = None
     place, count = 0, 0
@@ -129,10 +155,23 @@ def describe(item: Recording, number: int) -> str:
 def read_frames(path: Path | str, budget: Budget | None = None) -> FrameTable:
     """Read all frames of a log at once; a log that breaks off is read up to the break.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+    budget : Budget | None
+        Bytes, frames and seconds that reading may cost; None: the default.
+
+    Returns
+    -------
+    FrameTable
+        The frames in columns, in order of arrival.
+
     Raises
     ------
-    InputOutputError, ConfigurationError: see `LogReader`; also where there are more frames than
-        the budget allows to hold at once.
+    InputOutputError, ConfigurationError
+        See `LogReader`; also where there are more frames than the budget allows to hold at
+        once.
     """
     budget = budget or Budget()
     tables: list[FrameTable] = []

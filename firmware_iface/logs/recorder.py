@@ -32,16 +32,26 @@ class Recorder:
     the exception. With `max_bytes` a file that has grown beyond it is closed and the next one begun
     (`name.blf`, `name-2.blf`, …). An existing file is never overwritten. Any thread may call.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to write; the suffix chooses the format.
+    max_bytes : int | None
+        Size at which the next file is begun; None: never.
+    channel : int | None
+        Adapter channel to write for frames of a bus that has only one.
+
     Raises
     ------
-    ConfigurationError: unknown suffix; MF4 without its library; `max_bytes` too small.
-    InputOutputError: the file exists, or cannot be written, now or later.
+    ConfigurationError
+        Unknown suffix; MF4 without its library; `max_bytes` too small.
+    InputOutputError
+        The file exists, or cannot be written, now or later.
     """
 
     def __init__(
         self, path: Path | str, *, max_bytes: int | None = None, channel: int | None = None
     ) -> None:
-        """`channel` is the adapter channel to write for frames of a bus that has only one."""
         self._first = Path(path)
         self._suffix = self._first.suffix.lower()
         if self._suffix not in SUFFIXES:
@@ -83,9 +93,15 @@ class Recorder:
     def write(self, frame: Frame) -> None:
         """Take one frame; after `close` nothing is taken.
 
+        Parameters
+        ----------
+        frame : Frame
+            The frame to write.
+
         Raises
         ------
-        InputOutputError: the file cannot be written.
+        InputOutputError
+            The file cannot be written.
         """
         with self._guarded():
             if self._closed:

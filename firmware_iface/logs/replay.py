@@ -51,13 +51,22 @@ class ReplayTransport(Transport):
     `now_ns` is the time in the log: of the frame read last, or, in real time, of the moment.
     Nothing can be sent.
 
+    Parameters
+    ----------
+    table : FrameTable
+        The log's frames.
+    name : str
+        Name of the log.
+    speed : float | None
+        1: real time; 10: ten times as fast; None: as fast as possible.
+
     Raises
     ------
-    ConfigurationError: speed not positive.
+    ConfigurationError
+        Speed not positive.
     """
 
     def __init__(self, table: FrameTable, name: str, *, speed: float | None = None) -> None:
-        """`speed` 1 replays in real time, 10 ten times as fast, None as fast as possible."""
         super().__init__(f"replay of {name}", transmit=False)
         if speed is not None and not speed > 0:
             raise ConfigurationError(f"{self.name}: speed {speed:g}, need more than 0")
@@ -108,15 +117,29 @@ class ReplayTransport(Transport):
 class StoredLog:
     """The frames of a log on one adapter channel, as often as they are asked for.
 
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+    channel : int | None
+        Adapter channel to read; None: the only one.
+    budget : Budget | None
+        Bytes, frames and seconds that reading may cost; None: the default.
+
     Attributes
     ----------
-    frames: how many there are.
+    frames : int
+        How many there are.
 
     Raises
     ------
-    InputOutputError: the log cannot be read, or has no frame on that channel.
-    ConfigurationError: several channels and none chosen: on one bus they would be two senders.
+    InputOutputError
+        The log cannot be read, or has no frame on that channel.
+    ConfigurationError
+        Several channels and none chosen: on one bus they would be two senders.
     """
+
+    frames: int
 
     def __init__(self, path: Path | str, channel: int | None, budget: Budget | None = None) -> None:
         self._path, self._budget = path, budget
@@ -162,10 +185,30 @@ def play(
     be told to send them. `speed` None sends as fast as the bus takes them. `progress` gets the
     number sent, after every block.
 
+    Parameters
+    ----------
+    log : FrameTable | Iterable[FrameTable]
+        The log's frames, whole or in blocks.
+    transport : Transport
+        The bus to send and receive on.
+    speed : float | None
+        1: real time; 10: ten times as fast; None: as fast as the bus takes them.
+    stop : threading.Event | None
+        Set from outside to end early.
+    progress : Callable[[int], None] | None
+        Gets the number sent after every block.
+
+    Returns
+    -------
+    int
+        Number of frames sent.
+
     Raises
     ------
-    ConfigurationError: the transport was opened to listen only; speed not positive.
-    BusLostError: the bus failed.
+    ConfigurationError
+        The transport was opened to listen only; speed not positive.
+    BusLostError
+        The bus failed.
     """
     if speed is not None and not speed > 0:
         raise ConfigurationError(f"speed {speed:g}, need more than 0")

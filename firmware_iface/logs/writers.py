@@ -41,10 +41,22 @@ class FlushingBlfWriter(can.BLFWriter):
 def open_writer(path: Path) -> Any:
     """Create `path`, which must not exist, and return the writer for its suffix.
 
+    Parameters
+    ----------
+    path : Path
+        File to create; the suffix chooses the format.
+
+    Returns
+    -------
+    Any
+        A writer of python-can or asammdf.
+
     Raises
     ------
-    ConfigurationError: MF4 without its library.
-    OSError: the file exists or cannot be created.
+    ConfigurationError
+        MF4 without its library.
+    OSError
+        The file exists or cannot be created.
     """
     suffix = path.suffix.lower()
     descriptor = create_file(path)

@@ -124,10 +124,24 @@ def default_map() -> BusMap:
 def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
     """Read a mapping file and its DBC (`dbc` overrides the one that the mapping names).
 
+    Parameters
+    ----------
+    path : Path | str
+        Mapping file.
+    dbc : Path | str | None
+        DBC to use instead of the one that the mapping names.
+
+    Returns
+    -------
+    BusMap
+        The map, checked.
+
     Raises
     ------
-    InputOutputError: a file cannot be read.
-    ConfigurationError: not a mapping, not a DBC, a signal that does not exist or has a wrong unit.
+    InputOutputError
+        A file cannot be read.
+    ConfigurationError
+        Not a mapping, not a DBC, a signal that does not exist or has a wrong unit.
     """
     path = Path(path)
     tree = read_toml(path, MappingFile, "mapping file")

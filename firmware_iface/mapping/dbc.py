@@ -89,9 +89,22 @@ def recall_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
 def parse_dbc(text: bytes, name: str) -> Dbc:
     """Messages of a DBC by their name; `name` is the file's, for errors.
 
+    Parameters
+    ----------
+    text : bytes
+        Contents of the file.
+    name : str
+        Name of the file, for error messages.
+
+    Returns
+    -------
+    Dbc
+        Messages and signals.
+
     Raises
     ------
-    ConfigurationError: not a DBC, or too large.
+    ConfigurationError
+        Not a DBC, or too large.
     """
     _check_budget(text, name)
     import cantools.database  # noqa: PLC0415 - slow to import

@@ -19,15 +19,31 @@ class SignalLayout:
 
     Attributes
     ----------
-    name: as in the DBC.
-    start: DBC start bit: the least significant bit of a little-endian signal, the most
-        significant one of a big-endian signal, both counted 8 * byte + bit.
-    length: bits, 1 … 64.
-    big_endian, signed, is_float: number format; floats have 16, 32 or 64 bits.
-    scale, offset: physical value = raw * scale + offset.
-    minimum, maximum: physical range, None where the DBC gives none.
-    unit: unit text of the DBC.
-    selectors: multiplexers that must all hold one of their values for the signal to be present.
+    name : str
+        As in the DBC.
+    start : int
+        DBC start bit: the least significant bit of a little-endian signal, the most significant
+        one of a big-endian signal, both counted 8 * byte + bit.
+    length : int
+        Bits, 1 … 64.
+    big_endian : bool
+        Number format; floats have 16, 32 or 64 bits.
+    signed : bool
+        See `big_endian`.
+    is_float : bool
+        See `big_endian`.
+    scale : float
+        Physical value = raw * scale + offset.
+    offset : float
+        See `scale`.
+    minimum : float | None
+        Physical range, None where the DBC gives none.
+    maximum : float | None
+        See `minimum`.
+    unit : str
+        Unit text of the DBC.
+    selectors : tuple[tuple[SignalLayout, frozenset[int]], ...]
+        Multiplexers that must all hold one of their values for the signal to be present.
     """
 
     name: str

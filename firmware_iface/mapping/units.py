@@ -57,9 +57,24 @@ SPELLINGS = {
 def si_factor(text: str, dimension: str, where: str) -> tuple[float, float]:
     """Gain and bias to SI of a unit text; `where` begins the error text.
 
+    Parameters
+    ----------
+    text : str
+        The unit as written.
+    dimension : str
+        Quantity that it must measure, a key of `UNITS`.
+    where : str
+        Beginning of the error message.
+
+    Returns
+    -------
+    tuple[float, float]
+        Gain and bias: SI value = gain · value + bias.
+
     Raises
     ------
-    ConfigurationError: no unit, or not one of the dimension.
+    ConfigurationError
+        No unit, or not one of the dimension.
     """
     known = UNITS[dimension]
     unit = SPELLINGS.get(text.strip(), text.strip())

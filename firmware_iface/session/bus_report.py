@@ -29,15 +29,36 @@ class MessageReport:
 
     Attributes
     ----------
-    name, can_id, extended: which.
-    roles: what it carries for us.
-    received, crc_errors, length_errors, range_errors: frames.
-    lost: frames that the counter says are missing; None without a counter.
-    conflicts: counter values that came with different payloads.
-    rate: frames per second, 0 with fewer than two.
-    longest_pause: between two frames, s.
-    jitter: standard deviation of the time between frames, s.
-    counter, crc: whether the mapping has them.
+    name : str
+        Which.
+    can_id : int
+        See `name`.
+    extended : bool
+        See `name`.
+    roles : tuple[str, ...]
+        What it carries for us.
+    received : int
+        Frames.
+    crc_errors : int
+        See `received`.
+    length_errors : int
+        See `received`.
+    range_errors : int
+        See `received`.
+    lost : int | None
+        Frames that the counter says are missing; None without a counter.
+    conflicts : int
+        Counter values that came with different payloads.
+    rate : float
+        Frames per second, 0 with fewer than two.
+    longest_pause : float
+        Between two frames, s.
+    jitter : float
+        Standard deviation of the time between frames, s.
+    counter : bool
+        Whether the mapping has them.
+    crc : bool
+        See `counter`.
     """
 
     name: str
@@ -76,14 +97,24 @@ class BusReport:
 
     Attributes
     ----------
-    duration: s.
-    frames, errors: all frames, error frames.
-    messages: mapped messages, heard or not.
-    ranges: channels of which a sample was heard.
-    foreign: identifier, whether extended, frames; the most frequent first.
-    delay: median time from a command to the telemetry of its tick, s; None if unknown.
-    problems: what stands in the way of a diagnosis, one sentence each; empty if nothing.
-    remarks: what a diagnosis has to assume, or may stumble over, one sentence each.
+    duration : float
+        s.
+    frames : int
+        All frames, error frames.
+    errors : int
+        See `frames`.
+    messages : tuple[MessageReport, ...]
+        Mapped messages, heard or not.
+    ranges : tuple[RangeUse, ...]
+        Channels of which a sample was heard.
+    foreign : tuple[tuple[int, bool, int], ...]
+        Identifier, whether extended, frames; the most frequent first.
+    delay : float | None
+        Median time from a command to the telemetry of its tick, s; None if unknown.
+    problems : tuple[str, ...]
+        What stands in the way of a diagnosis, one sentence each; empty if nothing.
+    remarks : tuple[str, ...]
+        What a diagnosis has to assume, or may stumble over, one sentence each.
     """
 
     duration: float

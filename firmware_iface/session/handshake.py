@@ -92,10 +92,14 @@ class Verdict:
 
     Attributes
     ----------
-    complete: the computer said so for our test, and telemetry flowed until then.
-    why: one clause for NOT TESTED; empty when complete.
-    status: last word of the computer on the test, None when there was none.
-    abort_confirmed: an abort was requested and obeyed; None when none was requested.
+    complete : bool
+        The computer said so for our test, and telemetry flowed until then.
+    why : str
+        One clause for NOT TESTED; empty when complete.
+    status : BitStatus | None
+        Last word of the computer on the test, None when there was none.
+    abort_confirmed : bool | None
+        An abort was requested and obeyed; None when none was requested.
     """
 
     complete: bool

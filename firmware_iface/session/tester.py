@@ -49,15 +49,26 @@ class TesterOutcome:
 
     Attributes
     ----------
-    complete: the computer completed our test while telemetry flowed: worth diagnosing.
-    why: one clause for NOT TESTED; empty when complete.
-    outcome: last state and reason that the computer gave for the test.
-    test_id, serial: number of the test and of the actuator; None where the bus did not say.
-    abort_confirmed: whether an abort was obeyed; None when none was requested.
-    frames: frames received.
-    dropped: frames that the reader was too slow for; the recording has them.
-    degraded: what the transport said of itself, empty if nothing.
-    recorded: files that hold the raw frames.
+    complete : bool
+        The computer completed our test while telemetry flowed: worth diagnosing.
+    why : str
+        One clause for NOT TESTED; empty when complete.
+    outcome : Outcome
+        Last state and reason that the computer gave for the test.
+    test_id : int | None
+        Number of the test and of the actuator; None where the bus did not say.
+    serial : int | None
+        See `test_id`.
+    abort_confirmed : bool | None
+        Whether an abort was obeyed; None when none was requested.
+    frames : int
+        Frames received.
+    dropped : int
+        Frames that the reader was too slow for; the recording has them.
+    degraded : str
+        What the transport said of itself, empty if nothing.
+    recorded : tuple[Path, ...]
+        Files that hold the raw frames.
     """
 
     complete: bool
@@ -89,25 +100,49 @@ def run_test(
 ) -> TesterOutcome:
     """Run one test, or with `transmit` false wait for one that someone else starts.
 
-    Parameters
-    ----------
-    transport: open; to be closed by the caller.
-    test_id: number of the test; None (listening only): any.
-    duration: of the test, s.
-    recorder: gets every frame before anything else does, own requests included; it is closed at
-        the end, whatever happens.
-    on_frame: gets every frame in order, in the caller's thread.
-    stop: when set, the test is aborted.
-    all_there: asked once, when the computer has said that the test is complete: whether no frame of
-        it may still come, so that there is nothing left to listen for.
-
     The end of a bus, the stop, an exceeded limit and a computer that does not answer are outcomes,
     not exceptions.
 
+    Parameters
+    ----------
+    transport : Transport
+        Open; to be closed by the caller.
+    test_id : int | None
+        Number of the test; None (listening only): any.
+    duration : float
+        Of the test, s.
+    transmit : bool
+        Request the test, or only listen.
+    recorder : Recorder | None
+        Gets every frame before anything else does, own requests included; it is closed at the
+        end, whatever happens.
+    bus_map : BusMap | None
+        Which message and signal plays which role.
+    limits : Limits | None
+        Values beyond which the test is aborted; None: none.
+    times : TimeLimits | None
+        Time limits of the handshake; None: the defaults.
+    on_frame : Callable[[Frame], None] | None
+        Gets every frame in order, in the caller's thread.
+    stop : threading.Event | None
+        When set, the test is aborted.
+    progress : Callable[[Progress], None] | None
+        Called with the state of the test as it runs.
+    all_there : Callable[[], bool] | None
+        Asked once, when the computer has said that the test is complete: whether no frame of it
+        may still come, so that there is nothing left to listen for.
+
+    Returns
+    -------
+    TesterOutcome
+        How the test ended, and the frames that were recorded.
+
     Raises
     ------
-    ConfigurationError: `transmit` without a test number or on a transport that listens only.
-    InputOutputError: the recording cannot be written (an abort was requested).
+    ConfigurationError
+        `transmit` without a test number or on a transport that listens only.
+    InputOutputError
+        The recording cannot be written (an abort was requested).
     """
     if transmit and not transport.transmits:
         raise ConfigurationError(f"{transport.name}: opened to listen only, nothing is sent")

@@ -67,13 +67,22 @@ class BusOptions:
 
     Attributes
     ----------
-    interface: socketcan, virtual, udp_multicast, slcan, pcan, kvaser, vector, ixxat, …
-    channel: as the interface understands it.
-    bitrate, data_bitrate: bit/s.
-    fd: accept CAN FD frames.
-    app_name: Vector's application name.
-    extra: further keyword arguments of the interface (python-can's `--bus-kwargs`).
-    allow_multicast: let udp_multicast join a group beyond the loopback interface.
+    interface : str
+        Socketcan, virtual, udp_multicast, slcan, pcan, kvaser, vector, ixxat, …
+    channel : str | None
+        As the interface understands it.
+    bitrate : int | None
+        bit/s.
+    data_bitrate : int | None
+        See `bitrate`.
+    fd : bool
+        Accept CAN FD frames.
+    app_name : str | None
+        Vector's application name.
+    extra : Mapping[str, Any]
+        Further keyword arguments of the interface (python-can's `--bus-kwargs`).
+    allow_multicast : bool
+        Let udp_multicast join a group beyond the loopback interface.
     """
 
     interface: str
@@ -89,11 +98,26 @@ class BusOptions:
 def open_bus(options: BusOptions, *, transmit: bool) -> can.BusABC:
     """Open a bus, silenced where the adapter can be unless it shall transmit.
 
+    Parameters
+    ----------
+    options : BusOptions
+        Which bus, and how to open it.
+    transmit : bool
+        Whether the bus may be sent to; otherwise it is opened listen-only where the adapter can
+        be.
+
+    Returns
+    -------
+    can.BusABC
+        The open bus.
+
     Raises
     ------
-    ConfigurationError: unknown interface, missing driver or module, a wrong option, multicast that
-        would leave the machine without leave.
-    InputOutputError: the channel is absent, busy or refused.
+    ConfigurationError
+        Unknown interface, missing driver or module, a wrong option, multicast that would leave
+        the machine without leave.
+    InputOutputError
+        The channel is absent, busy or refused.
     """
     import can  # noqa: PLC0415 - costs half a second
 
@@ -154,9 +178,23 @@ def _reach_daemon(arguments: Mapping[str, Any], name: str) -> None:
 def bus_arguments(options: BusOptions, transmit: bool) -> dict[str, Any]:
     """Keyword arguments of python-can's `Bus`.
 
+    Parameters
+    ----------
+    options : BusOptions
+        Which bus, and how to open it.
+    transmit : bool
+        Whether the bus may be sent to; otherwise it is opened listen-only where the adapter can
+        be.
+
+    Returns
+    -------
+    dict[str, Any]
+        Keyword arguments of `can.Bus`.
+
     Raises
     ------
-    ConfigurationError: an option that may not be given, or multicast that would leave the machine.
+    ConfigurationError
+        An option that may not be given, or multicast that would leave the machine.
     """
     if options.extra.get("receive_own_messages"):
         raise ConfigurationError(

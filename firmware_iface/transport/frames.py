@@ -22,15 +22,24 @@ class Frame:
 
     Attributes
     ----------
-    time_ns: host time stamp, ns since the epoch (or since the start of a log without a date).
-    can_id: identifier, 11 or 29 bits, without flag bits.
-    data: payload, 0 to 64 bytes.
-    extended: 29-bit identifier.
-    fd: CAN FD frame.
-    error: error frame; identifier and payload then carry no message.
-    remote: remote request; carries no payload.
-    sent: transmitted by this program (own echo), not received.
-    channel: adapter channel as loggers count them, from 1; 0 where the source has only one or does
+    time_ns : int
+        Host time stamp, ns since the epoch (or since the start of a log without a date).
+    can_id : int
+        Identifier, 11 or 29 bits, without flag bits.
+    data : bytes
+        Payload, 0 to 64 bytes.
+    extended : bool
+        29-bit identifier.
+    fd : bool
+        CAN FD frame.
+    error : bool
+        Error frame; identifier and payload then carry no message.
+    remote : bool
+        Remote request; carries no payload.
+    sent : bool
+        Transmitted by this program (own echo), not received.
+    channel : int
+        Adapter channel as loggers count them, from 1; 0 where the source has only one or does
         not say.
     """
 
@@ -58,12 +67,26 @@ class FrameTable:
 
     Attributes
     ----------
-    time_ns: int64, shape (n,).
-    can_id: uint32, shape (n,).
-    length: uint8, payload bytes, shape (n,).
-    data: uint8, shape (n, width), zero beyond `length`; width 8, or 64 where a frame is longer.
-    extended, fd, error, remote, sent: bool, shape (n,).
-    channel: uint16, adapter channel of each frame, 0 where it is not said, shape (n,).
+    time_ns : NDArray[np.int64]
+        int64, shape (n,).
+    can_id : NDArray[np.uint32]
+        uint32, shape (n,).
+    length : NDArray[np.uint8]
+        uint8, payload bytes, shape (n,).
+    data : NDArray[np.uint8]
+        uint8, shape (n, width), zero beyond `length`; width 8, or 64 where a frame is longer.
+    extended : NDArray[np.bool_]
+        Bool, shape (n,).
+    fd : NDArray[np.bool_]
+        See `extended`.
+    error : NDArray[np.bool_]
+        See `extended`.
+    remote : NDArray[np.bool_]
+        See `extended`.
+    sent : NDArray[np.bool_]
+        See `extended`.
+    channel : NDArray[np.uint16]
+        uint16, adapter channel of each frame, 0 where it is not said, shape (n,).
     """
 
     time_ns: NDArray[np.int64]

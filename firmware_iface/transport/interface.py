@@ -127,9 +127,20 @@ class Transport(abc.ABC):
     def receive(self, timeout: float) -> Frame | None:
         """Return the next frame, None when none came within `timeout` s.
 
+        Parameters
+        ----------
+        timeout : float
+            Longest wait, s.
+
+        Returns
+        -------
+        Frame | None
+            The next frame; None if there was none in time.
+
         Raises
         ------
-        BusLostError: the bus failed, now or before, or is closed.
+        BusLostError
+            The bus failed, now or before, or is closed.
         """
         self._check_usable()
         return self._receive(timeout)
@@ -137,10 +148,17 @@ class Transport(abc.ABC):
     def send(self, frame: Frame) -> None:
         """Send one frame.
 
+        Parameters
+        ----------
+        frame : Frame
+            The frame to send.
+
         Raises
         ------
-        ConfigurationError: the transport was opened to listen only.
-        BusLostError: the bus failed, now or before, or did not take the frame.
+        ConfigurationError
+            The transport was opened to listen only.
+        BusLostError
+            The bus failed, now or before, or did not take the frame.
         """
         self._check_usable()
         if not self._transmit:

@@ -55,9 +55,18 @@ class PythonCanTransport(Transport):
     A bus on which nobody listens fills up: frames that find no room are dropped and counted
     (DEGRADED), and sending goes on when there is room again.
 
+    Parameters
+    ----------
+    options : BusOptions
+        Which bus, and how to open it.
+    transmit : bool
+        Whether the bus may be sent to; otherwise it is opened listen-only where the adapter can
+        be.
+
     Raises
     ------
-    ConfigurationError, InputOutputError: see `open_bus`.
+    ConfigurationError, InputOutputError
+        See `open_bus`.
     """
 
     def __init__(self, options: BusOptions, *, transmit: bool = False) -> None:
@@ -290,9 +299,20 @@ def _descriptor(bus: can.BusABC) -> int | None:
 def _socket_of(bus: can.BusABC) -> Iterator[socket.socket]:
     """The socket behind an interface, until the block ends.
 
+    Parameters
+    ----------
+    bus : can.BusABC
+        The open bus.
+
+    Yields
+    ------
+    socket.socket
+        The socket.
+
     Raises
     ------
-    NotImplementedError, OSError, AttributeError, TypeError: there is none.
+    NotImplementedError, OSError, AttributeError, TypeError
+        There is none.
     """
     descriptor = os.dup(bus.fileno())
     try:

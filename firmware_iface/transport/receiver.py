@@ -125,6 +125,16 @@ class Receiver:
     def receive(self, timeout: float) -> Frame | None:
         """Return the next frame, None when none came within `timeout` s.
 
+        Parameters
+        ----------
+        timeout : float
+            Longest wait, s.
+
+        Returns
+        -------
+        Frame | None
+            The next frame; None if there was none in time.
+
         Raises
         ------
         BusLostError or another EhadiagError: what ended the thread, once the queue is empty.

@@ -44,9 +44,20 @@ NO_WRITE_TIMEOUT = ("rfc2217://",)
 def packet_of(frame: Frame) -> bytes:
     """Encode one frame with its delimiter.
 
+    Parameters
+    ----------
+    frame : Frame
+        The frame to encode.
+
+    Returns
+    -------
+    bytes
+        The packet with its delimiter.
+
     Raises
     ------
-    ConfigurationError: the link carries 11-bit identifiers and payloads of up to 8 bytes only.
+    ConfigurationError
+        The link carries 11-bit identifiers and payloads of up to 8 bytes only.
     """
     from cobs import cobs  # noqa: PLC0415 - only serial users need it
 
@@ -65,8 +76,10 @@ class Framer:
 
     Attributes
     ----------
-    bad: packets dropped: not COBS, wrong length, wrong CRC, identifier beyond 11 bits.
-    bytes_seen: bytes fed so far.
+    bad : int
+        Packets dropped: not COBS, wrong length, wrong CRC, identifier beyond 11 bits.
+    bytes_seen : int
+        Bytes fed so far.
     """
 
     bad: int = 0
@@ -139,10 +152,22 @@ class SerialTransport(Transport):
     fills up when nobody does: frames that find no room are dropped and counted (DEGRADED), and
     sending goes on when there is room again.
 
+    Parameters
+    ----------
+    url : str
+        Port, or pyserial URL.
+    baudrate : int
+        Bd; ignored by URLs without a line.
+    transmit : bool
+        Whether the bus may be sent to; otherwise it is opened listen-only where the adapter can
+        be.
+
     Raises
     ------
-    ConfigurationError: pyserial does not know the URL or the settings.
-    InputOutputError: the port is absent or busy.
+    ConfigurationError
+        Pyserial does not know the URL or the settings.
+    InputOutputError
+        The port is absent or busy.
     """
 
     def __init__(

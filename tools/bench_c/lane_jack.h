@@ -7,7 +7,7 @@ enum { NODES = 4, MOST_CUTS = 32, ITERATIONS = 30 };
 
 static const real COARSE_TRAVEL = 8.0e-6, CORNER_TRAVEL = 4.0e-6;
 static const real FINE_TRAVEL = 3.0e-6, FINE_RATIO = 0.3, FRESH_DECAY = 3.0, SHORTEST = 1e-6,
-                  SLOWEST = 1e-12;
+                  BALANCED = 1e-9, SLOWEST = 1e-12;
 #define ROOT 2.449489742783178098
 static const real C1 = (4.0 - ROOT) / 10.0, C2 = (4.0 + ROOT) / 10.0;
 static const real A11 = (88.0 - 7.0 * ROOT) / 360.0, A12 = (296.0 - 169.0 * ROOT) / 1800.0;
@@ -178,7 +178,10 @@ static void jack_piece(const Fixed *f, const Piece *p, real begin, real stop, Ja
                     at_low *= 0.5;
                 }
                 real width = greater(fabs(piece_place(p, q)), f->corner);
-                if (high - low < SHORTEST || fabs(value) < 1e-6 * fabs(hold) * divide(c, width))
+                if (fabs(value) < BALANCED * fabs(hold) * divide(c, width))
+                    break;
+                q = high;
+                if (high - low < SHORTEST)
                     break;
             }
             j->velocity = 0.0;

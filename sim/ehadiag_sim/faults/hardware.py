@@ -50,9 +50,24 @@ class Kind:
 def break_hardware(kind: str, rng: np.random.Generator, whole: Hardware) -> Hardware:
     """Break hardware in one way; sizes are drawn from `rng`.
 
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    rng : np.random.Generator
+        Source of the sizes that are drawn.
+    whole : Hardware
+        The hardware before it breaks.
+
+    Returns
+    -------
+    Hardware
+        The broken hardware.
+
     Raises
     ------
-    ConfigurationError: no such kind.
+    ConfigurationError
+        No such kind.
     """
     if kind not in KINDS:
         raise ConfigurationError(f"broken hardware {kind!r}: not one of {', '.join(KINDS)}")
@@ -74,14 +89,32 @@ def broken(
 
     Parameters
     ----------
-    kind: one of `KINDS`.
-    rng: sizes of the damage and the seed of the noise.
-    actuator, test, faults, effects, sensors: what runs, but for the damage.
-    step: longest integration step, s.
+    kind : str
+        One of `KINDS`.
+    rng : np.random.Generator
+        Sizes of the damage and the seed of the noise.
+    actuator : Actuator
+        What runs, but for the damage.
+    test : StoredTest
+        See `actuator`.
+    faults : Faults | None
+        See `actuator`.
+    effects : Effects | None
+        See `actuator`.
+    sensors : Sensors | None
+        See `actuator`.
+    step : float
+        Longest integration step, s.
+
+    Returns
+    -------
+    Recording
+        The recording, without losses.
 
     Raises
     ------
-    ConfigurationError: no such kind; a value out of range.
+    ConfigurationError
+        No such kind; a value out of range.
     """
     whole = Hardware(actuator, effects or Effects(), sensors or Sensors())
     item = break_hardware(kind, rng, whole)

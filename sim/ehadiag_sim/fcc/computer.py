@@ -53,10 +53,38 @@ class FccCore:
     at rest there and with noise drawn from (seed, number of the test), so a run does not depend on
     how long the computer idled before. An abort commands zero current in the very next tick.
 
+    Parameters
+    ----------
+    actuator : Actuator
+        Data of the actuator.
+    tests : Iterable[StoredTest]
+        Tests that the computer stores, each with a number of its own.
+    faults : Faults | None
+        Severities of the three faults; None: as new.
+    effects : Effects | None
+        Effects beside the faults; None: none of them, default oil and supply.
+    sensors : Sensors | None
+        How the converters err; None: the specified noise, no offsets.
+    seed : int
+        Seed of the noise; each test draws from it and its own number.
+    serial : int
+        Serial number of the actuator, 0 … 65535.
+    preconditions : Preconditions | None
+        What a test must find to be started; None: the defaults.
+    idle_telemetry : bool
+        Whether telemetry is sent between tests too.
+    start_ns : int
+        Time of the first tick, ns.
+    bus_map : BusMap | None
+        Messages to send and accept; None: the default bus.
+    channel_faults : Sequence[ChannelFault]
+        Damage to the readings of the channels; None: none.
+
     Raises
     ------
-    ConfigurationError: two tests with one number, a test at another rate than the controller, a
-        serial number that the bus cannot carry.
+    ConfigurationError
+        Two tests with one number, a test at another rate than the controller, a serial number
+        that the bus cannot carry.
     """
 
     def __init__(

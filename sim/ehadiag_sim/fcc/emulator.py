@@ -34,9 +34,28 @@ def run_emulator(
     Ticks have absolute deadlines, so lateness is made up and the rate does not drift. With
     `real_time` false ticks follow at once and only the frames' time stamps tell the time.
 
+    Parameters
+    ----------
+    core : FccCore
+        The emulated computer.
+    transport : Transport
+        The bus to send and receive on.
+    stop : threading.Event
+        Set from outside to end the loop.
+    real_time : bool
+        Keep to the wall clock, or run as fast as the bus takes frames.
+    tell : Callable[[str], None] | None
+        Called once with what the transport says of itself when it is first degraded.
+
+    Returns
+    -------
+    int
+        Number of ticks run.
+
     Raises
     ------
-    BusLostError: the bus failed.
+    BusLostError
+        The bus failed.
     """
     period = core.period_ns
     started = time.monotonic_ns()

@@ -19,10 +19,17 @@ def number(default: float, low: float, high: float, what: str = "") -> Any:
 def check_ranges(item: Any, kind: str) -> None:
     """Check each field that `number` made.
 
+    Parameters
+    ----------
+    item : Any
+        Data class whose fields have ranges.
+    kind : str
+        What its fields are, for error messages ("fault").
+
     Raises
     ------
-    ConfigurationError: a value that is not finite or outside its range; the text names `kind` and
-        field.
+    ConfigurationError
+        A value that is not finite or outside its range; the text names `kind` and field.
     """
     for entry in fields(item):
         if "range" in entry.metadata:

@@ -17,17 +17,24 @@ CHANNEL_COUNT = 4
 class Faults:
     """The three progressive faults (PHY-12 to 15), each 0 (as new) … 1 (limit of damage).
 
+    Attributes
+    ----------
+    Kintas : float
+        Clogging of the servovalve first-stage filter.
+    FSS : float
+        Dry friction between spool and sleeve.
+    FDJ : float
+        Dry friction between jack and cylinder.
+
     Raises
     ------
-    ConfigurationError: a constant outside 0 … 1.
+    ConfigurationError
+        A constant outside 0 … 1.
     """
 
     Kintas: float = number(0.0, 0.0, 1.0)
-    """Clogging of the servovalve first-stage filter."""
     FSS: float = number(0.0, 0.0, 1.0)
-    """Dry friction between spool and sleeve."""
     FDJ: float = number(0.0, 0.0, 1.0)
-    """Dry friction between jack and cylinder."""
 
     def __post_init__(self) -> None:
         check_ranges(self, "fault")
@@ -39,9 +46,33 @@ class DataErrors:
 
     Each -0.5 … 1; 0.05 means 5 % more than the file says.
 
+    Attributes
+    ----------
+    GM : float
+        Torque-motor gain.
+    KSF : float
+        Stiffness of the feedback wire.
+    KF : float
+        Net stiffness of the flapper.
+    GP : float
+        Pressure gain of the second stage.
+    GQ : float
+        Flow gain of the second stage.
+    CS : float
+        Viscous coefficient of the spool.
+    CJ : float
+        Viscous coefficient of the jack.
+    MJ : float
+        Mass of jack and surface.
+    FSS0 : float
+        Static spool friction as new.
+    FDJ0 : float
+        Dynamic jack friction as new.
+
     Raises
     ------
-    ConfigurationError: a share outside its range.
+    ConfigurationError
+        A share outside its range.
     """
 
     GM: float = number(0.0, -0.5, 1.0)
@@ -63,39 +94,57 @@ class DataErrors:
 class Effects:
     """What the three faults leave out (PHY-16 to 39).
 
+    Attributes
+    ----------
+    hysteresis : float
+        Torque-motor hysteresis: width of the loop as a fraction of rated current, 0 … 1.
+    plays : int
+        Number of plays whose mean the hysteresis is, 1 … 256.
+    null_bias : float
+        Added to the current before hysteresis and gain, A, ±5e-3.
+    gain_change : float
+        Relative change of the torque-motor gain, -2 (wired the wrong way round) … 1.
+    backlash : float
+        Half-width of the play between spool and feedback-spring ball, m, 0 … 1e-3.
+    oil_temperature : float
+        degC, -54 … 205: the range of MIL-PRF-83282.
+    supply_pressure : float
+        Pa, above the return pressure, at most 100 MPa.
+    return_pressure : float
+        Pa, 0 … 100 MPa.
+    spool_stribeck : float
+        Stribeck velocity of the spool's friction, m/s, 0 (none) … 10.
+    jack_stribeck : float
+        Stribeck velocity of the jack's friction, m/s, 0 (none) … 10.
+    load : float
+        Constant load on the jack beside the actuator file's FR, N, ±1e6.
+    load_spring : float
+        Stiffness that draws the jack to its middle, N/m, 0 … 1e8.
+    data : DataErrors
+        By what the unit's data differ from the actuator file.
+    strangers : Strangers
+        Effects that no requirement names.
+
     Raises
     ------
-    ConfigurationError: a value outside the range given beside it.
+    ConfigurationError
+        A value outside the range given beside it.
     """
 
     hysteresis: float = number(0.0, 0.0, 1.0)
-    """Torque-motor hysteresis: width of the loop as a fraction of rated current, 0 … 1."""
     plays: int = 1
-    """Number of plays whose mean the hysteresis is, 1 … 256."""
     null_bias: float = number(0.0, -5e-3, 5e-3, "effect null_bias (A)")
-    """Added to the current before hysteresis and gain, A, ±5e-3."""
     gain_change: float = number(0.0, -2.0, 1.0)
-    """Relative change of the torque-motor gain, -2 (wired the wrong way round) … 1."""
     backlash: float = number(0.0, 0.0, 1e-3, "effect backlash (m)")
-    """Half-width of the play between spool and feedback-spring ball, m, 0 … 1e-3."""
     oil_temperature: float = number(40.0, -54.0, 205.0, "oil temperature (degC)")
-    """degC, -54 … 205: the range of MIL-PRF-83282."""
     supply_pressure: float = number(20.7e6, 0.0, 100e6, "supply pressure (Pa)")
-    """Pa, above the return pressure, at most 100 MPa."""
     return_pressure: float = number(0.7e6, 0.0, 100e6, "return pressure (Pa)")
-    """Pa, 0 … 100 MPa."""
     spool_stribeck: float = number(0.0, 0.0, 10.0, "effect spool_stribeck (m/s)")
-    """Stribeck velocity of the spool's friction, m/s, 0 (none) … 10."""
     jack_stribeck: float = number(0.0, 0.0, 10.0, "effect jack_stribeck (m/s)")
-    """Stribeck velocity of the jack's friction, m/s, 0 (none) … 10."""
     load: float = number(0.0, -1e6, 1e6, "effect load (N)")
-    """Constant load on the jack beside the actuator file's FR, N, ±1e6."""
     load_spring: float = number(0.0, 0.0, 1e8, "effect load_spring (N/m)")
-    """Stiffness that draws the jack to its middle, N/m, 0 … 1e8."""
     data: DataErrors = field(default_factory=DataErrors)
-    """By what the unit's data differ from the actuator file."""
     strangers: Strangers = field(default_factory=Strangers)
-    """Effects that no requirement names."""
 
     def __post_init__(self) -> None:
         check_ranges(self, "effect")
@@ -110,25 +159,36 @@ class Effects:
 class Sensors:
     """How converters and probes err (PHY-21, 22, 33 to 38); offsets in LSB of each channel.
 
+    Attributes
+    ----------
+    noise_lsb : float
+        Electrical noise before conversion, rms, 0 … 100.
+    offsets_lsb : tuple[float, float, float, float]
+        Constant offset of current, spool, pressure, position, ±4096.
+    gains : tuple[float, float, float, float]
+        Relative gain errors of current, spool, pressure, position, -1 … 1.
+    filter_time : float
+        Time constant of the analogue filter before spool and pressure converters, s, 0 … 0.1.
+    early : float
+        All channels are sampled so long before the end of the tick, s; less than a tick.
+    temperature_error : float
+        What the oil temperature probe reads too much, K, ±100.
+    supply_error : float
+        What the supply pressure probe reads too much, Pa, ±20e6.
+
     Raises
     ------
-    ConfigurationError: a value outside the range given beside it.
+    ConfigurationError
+        A value outside the range given beside it.
     """
 
     noise_lsb: float = number(0.5, 0.0, 100.0, "sensor noise (LSB)")
-    """Electrical noise before conversion, rms, 0 … 100."""
     offsets_lsb: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Constant offset of current, spool, pressure, position, ±4096."""
     gains: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Relative gain errors of current, spool, pressure, position, -1 … 1."""
     filter_time: float = number(0.0, 0.0, 0.1, "sensor filter_time (s)")
-    """Time constant of the analogue filter before spool and pressure converters, s, 0 … 0.1."""
     early: float = number(0.0, 0.0, 1.0, "sensor early (s)")
-    """All channels are sampled so long before the end of the tick, s; less than a tick."""
     temperature_error: float = number(0.0, -100.0, 100.0, "temperature probe error (K)")
-    """What the oil temperature probe reads too much, K, ±100."""
     supply_error: float = number(0.0, -20e6, 20e6, "supply probe error (Pa)")
-    """What the supply pressure probe reads too much, Pa, ±20e6."""
 
     def __post_init__(self) -> None:
         check_ranges(self, "sensor")

@@ -32,11 +32,16 @@ class Converters:
 
     Parameters
     ----------
-    actuator: its stops scale the bends.
-    sensors: gains, offsets, noise.
-    strangers: bends of the two displacement sensors.
-    seed: of the noise.
-    faults: damage to sensors and wires, in turn; copied.
+    actuator : Actuator
+        Its stops scale the bends.
+    sensors : Sensors
+        Gains, offsets, noise.
+    strangers : Strangers
+        Bends of the two displacement sensors.
+    seed : int
+        Of the noise.
+    faults : Sequence[ChannelFault]
+        Damage to sensors and wires, in turn; copied.
     """
 
     def __init__(

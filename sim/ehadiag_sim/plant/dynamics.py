@@ -30,15 +30,23 @@ class Dynamics:
 
     Parameters
     ----------
-    actuator, faults, effects: the unit and what it suffers from.
-    step: longest integration step, s; a whole number of equal steps makes a tick.
-    filter_time: time constant of the analogue filter before the spool's and the pressure's
-        converter, s.
-    early: what is `seen` was sampled so long before the end of the tick, s.
+    actuator : Actuator
+        The unit and what it suffers from.
+    faults : Faults | None
+        See `actuator`.
+    effects : Effects | None
+        See `actuator`.
+    step : float
+        Longest integration step, s; a whole number of equal steps makes a tick.
+    filter_time : float
+        Time constant of the analogue filter before the spool's and the pressure's converter, s.
+    early : float
+        What is `seen` was sampled so long before the end of the tick, s.
 
     Raises
     ------
-    ConfigurationError: a step that is not within 1 ns … one tick, an instant outside the tick.
+    ConfigurationError
+        A step that is not within 1 ns … one tick, an instant outside the tick.
     """
 
     def __init__(

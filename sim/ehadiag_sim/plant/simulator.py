@@ -48,10 +48,28 @@ class Plant:
     In each tick the control law works on the jack position that was digitised at the end of the
     tick before, its current is held for the tick, and at the end all channels are digitised.
 
+    Parameters
+    ----------
+    actuator : Actuator
+        Data of the actuator.
+    faults : Faults | None
+        Severities of the three faults; None: as new.
+    effects : Effects | None
+        Effects beside the faults; None: none of them, default oil and supply.
+    sensors : Sensors | None
+        How the converters err; None: the specified noise, no offsets.
+    seed : int
+        Seed of the noise; the same seed gives the same samples.
+    step : float
+        Integration step, s.
+    channel_faults : Sequence[ChannelFault]
+        Damage to the readings of the channels; None: none.
+
     Raises
     ------
-    ConfigurationError: a step that is not finite or not within 1 ns … one tick; sensors sampled
-        a tick early or more.
+    ConfigurationError
+        A step that is not finite or not within 1 ns … one tick; sensors sampled a tick early or
+        more.
     """
 
     def __init__(
@@ -121,12 +139,24 @@ class SimulatedRun:
 
     Attributes
     ----------
-    test: the stored test that ran.
-    effects: the conditions it ran under.
-    command: command of each tick at the bus's resolution, A or m, shape (ticks,).
-    current, spool, pressure, position: noise-free A, m, Pa, m at the end of each tick, (ticks,).
-    codes: ADC codes of the four channels as sampled in each tick, shape (4, ticks).
-    environment: what the probes read half-way through the test, at the bus's resolution.
+    test : StoredTest
+        The stored test that ran.
+    effects : Effects
+        The conditions it ran under.
+    command : NDArray[np.float64]
+        Command of each tick at the bus's resolution, A or m, shape (ticks,).
+    current : NDArray[np.float64]
+        Noise-free A, m, Pa, m at the end of each tick, (ticks,).
+    spool : NDArray[np.float64]
+        See `current`.
+    pressure : NDArray[np.float64]
+        See `current`.
+    position : NDArray[np.float64]
+        See `current`.
+    codes : NDArray[np.int64]
+        ADC codes of the four channels as sampled in each tick, shape (4, ticks).
+    environment : Environment
+        What the probes read half-way through the test, at the bus's resolution.
     """
 
     test: StoredTest
@@ -197,9 +227,34 @@ def simulate(
     `step` is the integration step in s, shortened so that a whole number makes a tick;
     `channel_faults` damage sensors and wires.
 
+    Parameters
+    ----------
+    actuator : Actuator
+        Data of the actuator.
+    test : StoredTest
+        The stored test.
+    faults : Faults | None
+        Severities of the three faults; None: as new.
+    effects : Effects | None
+        Effects beside the faults; None: none of them, default oil and supply.
+    sensors : Sensors | None
+        How the converters err; None: the specified noise, no offsets.
+    seed : int
+        Seed of the noise; the same seed gives the same samples.
+    step : float
+        Integration step, s.
+    channel_faults : Sequence[ChannelFault]
+        Damage to the readings of the channels; None: none.
+
+    Returns
+    -------
+    SimulatedRun
+        Truth and samples of the whole test.
+
     Raises
     ------
-    ConfigurationError: a step out of range; test and controller at different rates.
+    ConfigurationError
+        A step out of range; test and controller at different rates.
     """
     if test.rate != actuator.controller.rate:
         raise ConfigurationError(

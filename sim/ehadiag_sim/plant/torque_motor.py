@@ -24,9 +24,12 @@ class TorqueMotor:
 
     Parameters
     ----------
-    gain: torque-motor gain with its change, N m/A.
-    rated: rated current, A.
-    effects: null bias, hysteresis, and the strangers among them.
+    gain : float
+        Torque-motor gain with its change, N m/A.
+    rated : float
+        Rated current, A.
+    effects : Effects
+        Null bias, hysteresis, and the strangers among them.
     """
 
     def __init__(self, gain: float, rated: float, effects: Effects) -> None:

@@ -121,7 +121,7 @@ def test_the_end_does_not_wait_for_stale_snapshots(monkeypatch: pytest.MonkeyPat
             join(timeout)
 
         monkeypatch.setattr(ahead._thread, "join", waiting)
-        ahead.finish()
+        assert ahead.finish(Deadline(60.0), threading.Event())
     assert session.taken == [1, 4]
 
 

@@ -139,7 +139,7 @@ def test_one_in_the_identification(
 ) -> None:
     from ehadiag.assess import diagnosis
 
-    monkeypatch.setattr(diagnosis, "identify", lambda *_, **__: send(number))
+    monkeypatch.setattr(diagnosis.DiagnosisSession, "finish", lambda *_, **__: send(number))
     if command == "bit":
         result = run("bit", "--simulate", "--fast", "--json", "--test", "open", "--out", "o")
     else:

@@ -12,7 +12,7 @@ import pytest
 from places import LOGS
 
 from ehadiag.assess.diagnosis import Diagnosis, diagnose
-from ehadiag.assess.verdict import Levels, Verdict, judge
+from ehadiag.assess.verdict import Levels, Rule, Verdict, judge
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitReason, BitState, Environment, Outcome, Recording
@@ -200,12 +200,14 @@ def test_two_actuators_have_no_joint_estimate(recording: Recording) -> None:
         ((0.3, 1.0, 0.3), Verdict.FAULT, ["Kintas", "FSS", "FDJ"]),
     ],
 )
-def test_levels(values: tuple[float, ...], verdict: Verdict, named: list[str]) -> None:
+def test_levels_of_the_estimates(
+    values: tuple[float, ...], verdict: Verdict, named: list[str]
+) -> None:
     names = ("Kintas", "FSS", "FDJ")
     estimates = [
         SimpleNamespace(name=name, value=value) for name, value in zip(names, values, strict=True)
     ]
-    given, why = judge(SimpleNamespace(estimates=estimates), Levels())
+    given, why = judge(SimpleNamespace(estimates=estimates), Levels(rule=Rule.ESTIMATE))
     assert given is verdict
     assert [reason.split()[0] for reason in why] == named
 

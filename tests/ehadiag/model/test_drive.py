@@ -15,11 +15,11 @@ CURRENT = resolve_test("open").command()[:3000]
 TICK = 1e-3
 
 
-def response_with(name, value, current=CURRENT, before=0.0):
+def response_with(name, value, current=CURRENT, history=None):
     """Response of a worn actuator with one parameter at a value."""
     unknowns = Unknowns((*FAULTS, parameter(name)), (plant_constants(default_actuator()),), {})
     constants = unknowns.constants(np.array([0.3, 0.2, 0.4, value]))
-    return respond(constants, current, TICK, current_before=before)
+    return respond(constants, current, TICK, history=history)
 
 
 @pytest.mark.parametrize("value", [-0.05, 0.02])
@@ -32,7 +32,7 @@ def test_a_gain_of_the_torque_motor_acts_like_as_much_more_current(value):
 
 @pytest.mark.parametrize("value", [-2e-4, 5e-5])
 def test_a_null_bias_acts_like_as_much_current(value):
-    found = response_with("null_bias", value)
-    expected = response_with("null_bias", 0.0, CURRENT + value, before=value)
+    found = response_with("null_bias", value, history=np.zeros(1))
+    expected = response_with("null_bias", 0.0, CURRENT + value, np.array([value]))
     np.testing.assert_allclose(found.spool, expected.spool, atol=1e-12)
     np.testing.assert_allclose(found.pressure, expected.pressure, atol=1e-2)

@@ -129,6 +129,24 @@ def test_pieces_cut_finer_converge(parts):
     assert cut.velocity == pytest.approx(once[1], rel=1e-3)
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_jack_breaks_away_when_the_force_is_there(way):
+    """On a straight path, where the first guess of the instant is the root, from either side."""
+    breaks_at = (
+        LAW.static
+        / (CONSTANTS.AJ * CONSTANTS.GP)
+        * (1.0 + CONSTANTS.GP * CONSTANTS.CLK / CONSTANTS.GQ)
+    )
+    for share in np.linspace(0.03, 0.97, 48):
+        piece = piece_through(0.0, way * breaks_at / share)
+        rest = JackState(0.0, 0.0, 0.0, 0.0)
+        early = JackState(*jack_piece(LAW, piece, 0.0, share - 1e-4, rest))
+        assert early.direction == 0.0
+        later = JackState(*jack_piece(LAW, piece, 0.0, share + 1e-3, rest))
+        assert later.direction == way
+        assert later.velocity * way > 0.0
+
+
 def test_a_jack_against_its_stop_stays_and_comes_back():
     at_stop = JackState(LAW.stroke, 0.0, 0.0, 0.0)
     pushed = jack_piece(LAW, piece_through(200e-6, 220e-6), 0.0, 1.0, at_stop)

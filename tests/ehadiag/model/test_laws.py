@@ -12,7 +12,8 @@ from ehadiag.model.laws import (
     jack_law,
     pressure,
     resistance,
-    seen_weights,
+    sampled,
+    sensor_law,
     spool_law,
     steady_rate,
 )
@@ -24,7 +25,7 @@ AMOUNTS = st.floats(-1e-3, 1e-3)
 
 
 def second_stage(c, x, velocity):
-    """PHY-4 as it stands: pressure gain that saturates, flow gain, leakage."""
+    """PHY-6 as it stands: pressure gain that saturates, flow gain, leakage."""
     saturated = abs(c.GP * x) > c.PSR
     source = min(max(c.GP * x, -c.PSR), c.PSR)
     drop = c.PSR / (c.GQ * abs(x)) if saturated else c.GP / c.GQ
@@ -49,7 +50,7 @@ def test_excess_is_the_force_beyond_what_holds(x, hold):
 
 
 def test_friction_is_that_of_the_specification():
-    """PHY-11: half of the spool's static friction slides; PHY-12: twice the jack's holds."""
+    """PHY-14: half of the spool's static friction slides; PHY-15: twice the jack's holds."""
     constants = damaged_unit((0.3, 0.6, 0.4))
     spool, jack = spool_law(constants), jack_law(constants)
     assert spool.dynamic == pytest.approx(0.5 * constants.FSS)
@@ -81,21 +82,19 @@ def test_the_sampled_spool_is_on_the_cubic_through_the_ends(cubic, span, share):
     def rate(t):
         return b + t * (2.0 * c + 3.0 * d * t)
 
-    w = seen_weights(share * span, span)
-    found = w[0] * place(0.0) + w[1] * place(span) + w[2] * rate(0.0) + w[3] * rate(span)
+    law = sensor_law(C, share * span, span)
+    found = sampled(law, place(0.0), place(span), rate(0.0), rate(span))
     at = (1.0 - share) * span
     size = abs(a) + span * (abs(b) + span * (abs(c) + span * abs(d)))
     assert found == pytest.approx(place(at), abs=1e-12 * size + 1e-300)
-    assert w[0] + w[1] == pytest.approx(1.0, rel=1e-12)
+    assert law.place_before + law.place == pytest.approx(1.0, rel=1e-12)
 
 
 @given(st.floats(1e-6, 1e-3))
 def test_sampled_at_the_ends_of_a_piece_or_beyond_it_is_the_end(span):
-    assert seen_weights(0.0, span)[:2] == (0.0, 1.0)
+    assert sampled(sensor_law(C, 0.0, span), 3.0, 5.0, 7.0, 11.0) == 5.0
     for lead in (span, 2.0 * span):
-        w = seen_weights(lead, span)
-        assert w[:2] == (1.0, 0.0)
-        assert [abs(x) for x in w[2:]] == [0.0, 0.0]
+        assert sampled(sensor_law(C, lead, span), 3.0, 5.0, 7.0, 11.0) == 3.0
 
 
 def test_a_flapper_that_is_damped_too_much_does_not_ring():

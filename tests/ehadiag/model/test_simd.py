@@ -43,7 +43,8 @@ def own_batch(
         tick=np.array([tick]),
         start=np.array([0, n]),
         origin=np.zeros(1),
-        current_before=np.zeros(1),
+        history=np.zeros(1, dtype=np.int64),
+        since=np.zeros(1, dtype=np.int64),
         current=current,
         spool=truth.spool + offsets[0],
         pressure=truth.pressure + offsets[1],
@@ -204,7 +205,8 @@ def test_spans_start_from_their_own_origin():
         tick=np.repeat(one.tick, 2),
         start=np.array([0, 120, 300]),
         origin=np.array([0.0, 4e-5]),
-        current_before=np.array([0.0, current[119]]),
+        history=np.array([0, 120]),
+        since=np.array([0, 120]),
         anchor=np.vstack([one.anchor] * 2),
     )
     hot = plant_constants(default_actuator())._replace(CS=1.0, PSR=18e6)

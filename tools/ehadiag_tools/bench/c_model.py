@@ -29,6 +29,39 @@ BRANCHLESS = ("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-f
 WIDEST = ("-mprefer-vector-width=512",) if platform.machine() in ("x86_64", "AMD64") else ()
 
 
+IN_C = (
+    "GM",
+    "JF",
+    "CF",
+    "KF",
+    "KSF",
+    "XFM",
+    "GQF",
+    "GPF",
+    "AS",
+    "MS",
+    "CS",
+    "XSM",
+    "FSS",
+    "FSS1",
+    "PSR",
+    "GP",
+    "GQ",
+    "CLK",
+    "AJ",
+    "MJ",
+    "CJ",
+    "XJM",
+    "FDJ",
+    "FDJ1",
+    "FR",
+    "OXS",
+    "OPD",
+    "DLY",
+)
+"""Fields of `Plant` in `plant.h`: the C side has neither hysteresis nor backlash nor null bias."""
+
+
 class NoCompilerError(Exception):
     """C cannot be compiled here; the text says why."""
 
@@ -53,8 +86,8 @@ class CModel:
         self._function.restype = None
         # Arrays that the pointers below point into.
         self._kept = (
-            np.array(constants),
-            *(np.ascontiguousarray(part) for part in tables[:3]),
+            _in_c(np.array(constants)),
+            *map(np.ascontiguousarray, (tables.moving, tables.stuck, tables.decay)),
             np.ascontiguousarray(current),
         )
         plant, moving, stuck, decay, currents = map(_pointer, self._kept)
@@ -94,12 +127,17 @@ class CLanes:
         n = len(candidates)
         self.costs = np.zeros(n)
         kind = np.dtype(np.float32 if single else np.float64)
-        shape = (n, SIGNALS, len(batch.current))
+        shape = (n, SIGNALS, batch.weight.shape[1])
         self.residuals = np.zeros(shape, kind) if residuals else None
         self._function = _build("lanes.c", *SINGLE * single).eha_lane_costs
         self._function.restype = None
         # Arrays that the pointers below point into.
-        self._kept = _of_kind(kind, *batch, levels, STAGES, candidates)
+        self._kept = _of_kind(
+            kind,
+            *(batch.test, batch.tick, batch.start, batch.origin, _currents_before(batch)),
+            *(_currents(batch), batch.spool, batch.pressure, batch.weight, batch.anchor),
+            *(levels, STAGES, _in_c(candidates)),
+        )
         *inputs, rows = map(_pointer, self._kept)
         wanted = None if self.residuals is None else _pointer(self.residuals)
         self._arguments = (
@@ -140,10 +178,10 @@ class CUnlocated:
         # Arrays that the pointers below point into.
         self._kept = _of_kind(
             kind,
-            *(batch.test, batch.tick, batch.start, batch.current),
+            *(batch.test, batch.tick, batch.start, _currents(batch)),
             *(np.nan_to_num(batch.spool), np.nan_to_num(batch.pressure)),
             *(np.where(seen, batch.weight, 0.0), levels, STAGES),
-            np.resize(candidates, (len(self.costs), *candidates.shape[1:])),
+            _in_c(np.resize(candidates, (len(self.costs), *candidates.shape[1:]))),
         )
         *inputs, rows = map(_pointer, self._kept)
         self._function = library.eha_unlocated_costs
@@ -218,3 +256,20 @@ def _compiled(compiler: str, source: str, options: tuple[str, ...]) -> ctypes.CD
             first = (done.stderr.strip().splitlines() or ["without a word"])[0]
             raise NoCompilerError(f"cc failed: {first}")
         return ctypes.CDLL(str(library))
+
+
+def _in_c(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Constants in the order of C's structure, shape (..., fields of it)."""
+    return np.ascontiguousarray(rows[..., [PlantConstants._fields.index(name) for name in IN_C]])
+
+
+def _currents(batch: Batch) -> NDArray[np.float64]:
+    """Current of each tick of the spans, A, shape (N,)."""
+    lengths = np.diff(batch.start)
+    spans = [batch.current[a : a + n] for a, n in zip(batch.since, lengths, strict=True)]
+    return np.concatenate(spans)
+
+
+def _currents_before(batch: Batch) -> NDArray[np.float64]:
+    """Current before each span, 0 at the beginning of a test, A, shape (m,)."""
+    return np.where(batch.history > 0, batch.current[np.maximum(batch.since - 1, 0)], 0.0)

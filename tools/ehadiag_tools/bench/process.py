@@ -1,4 +1,4 @@
-"""Benchmark of `ehadiag diagnose` as a process: with cached kernels, and the first run ever."""
+"""Whole processes: `ehadiag --help`; `ehadiag diagnose` with kernels cached, and its first run."""
 
 from __future__ import annotations
 
@@ -44,10 +44,11 @@ class _Run(NamedTuple):
 
 def measure(sizes: Sizes) -> list[Figure]:
     """Run the section."""
-    log = sizes.logs / LOG
+    diagnose, times = ("diagnose", str(sizes.logs / LOG)), max(1, sizes.repeats // 3)
     with tempfile.TemporaryDirectory() as folder:
-        first = _diagnose(log, Path(folder))
-        runs = [_diagnose(log, Path(folder)) for _ in range(max(1, sizes.repeats // 3))]
+        first = _run(diagnose, Path(folder))
+        runs = [_run(diagnose, Path(folder)) for _ in range(times)]
+        helps = [_run(("--help",), Path(folder)) for _ in range(times)]
         sizes_mb = sum(item.stat().st_size for item in Path(folder).glob("kernels-*/*")) / (1 << 20)
     hint = (
         "says that it compiles"
@@ -55,6 +56,7 @@ def measure(sizes: Sizes) -> list[Figure]:
         else "does not say that it compiles"
     )
     return [
+        Figure(SECTION, "help, wall", statistics.median(run.wall for run in helps), "s"),
         Figure(
             SECTION,
             "diagnose one log, kernels cached, wall",
@@ -75,10 +77,10 @@ def measure(sizes: Sizes) -> list[Figure]:
     ]
 
 
-def _diagnose(log: Path, cache: Path) -> _Run:
+def _run(arguments: tuple[str, ...], cache: Path) -> _Run:
     """Run one process."""
     done = subprocess.run(
-        [sys.executable, "-S", "-c", WATCH, sys.executable, "-c", COMMAND, "diagnose", str(log)],
+        [sys.executable, "-S", "-c", WATCH, sys.executable, "-c", COMMAND, *arguments],
         env={**os.environ, "EHADIAG_CACHE_DIR": str(cache)},
         capture_output=True,
         text=True,
@@ -87,5 +89,5 @@ def _diagnose(log: Path, cache: Path) -> _Run:
     code, wall, cpu, peak = done.stdout.split()
     if int(code) not in (0, 10, 20):
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise InputOutputError(f"ehadiag diagnose ended with {code}: {last}")
+        raise InputOutputError(f"ehadiag {arguments[0]} ended with {code}: {last}")
     return _Run(float(wall), float(cpu), float(peak) / PER_MB, done.stderr)
