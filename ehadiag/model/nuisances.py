@@ -4,10 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
+from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.parameter import Kind, Parameter
 
 __all__ = ["NUISANCES"]
+
+
+def _gain(signal: str, symbol: str, sensor: str) -> Parameter:
+    """Relative error of a sensor's gain."""
+    return Parameter(
+        name=f"{signal}_gain",
+        symbol=symbol,
+        unit="1",
+        lower=-0.5,
+        upper=0.5,
+        kind=Kind.NUISANCE,
+        scale=0.01,
+        short=f"{signal} sensor gain",
+        meaning=f"relative error of the gain of {sensor}",
+        changes=lambda c, value: {symbol: getattr(c, symbol) + value},
+    )
+
 
 NUISANCES: tuple[Parameter, ...] = (
     Parameter(
@@ -37,6 +54,34 @@ NUISANCES: tuple[Parameter, ...] = (
         adds_to=PRESSURE_ROW,
     ),
     Parameter(
+        name="position_offset",
+        symbol="OXJ",
+        unit="m",
+        lower=-np.inf,
+        upper=np.inf,
+        kind=Kind.NUISANCE,
+        scale=1.2e-3,
+        short="position sensor offset",
+        meaning="constant error of the jack's sensor",
+        changes=lambda c, value: {"OXJ": c.OXJ + value},
+        adds_to=POSITION_ROW,
+    ),
+    _gain("spool", "GXS", "the spool's sensor"),
+    _gain("pressure", "GPD", "the sensor of differential pressure"),
+    _gain("position", "GXJ", "the jack's sensor"),
+    Parameter(
+        name="filter_time",
+        symbol="τ",
+        unit="s",
+        lower=0.0,
+        upper=5e-4,
+        kind=Kind.NUISANCE,
+        scale=1e-4,
+        short="analogue filter",
+        meaning="time constant of the filter before the converters of spool and pressure",
+        changes=lambda c, value: {"TAU": c.TAU + value},
+    ),
+    Parameter(
         name="sampling_lead",
         symbol="DLY",
         unit="s",
@@ -45,7 +90,7 @@ NUISANCES: tuple[Parameter, ...] = (
         kind=Kind.NUISANCE,
         scale=1e-4,
         short="sampling instant",
-        meaning="time before the end of the tick at which the spool is sampled",
+        meaning="time before the end of the tick at which the channels are sampled",
         changes=lambda c, value: {"DLY": c.DLY + value},
     ),
     Parameter(
@@ -95,6 +140,30 @@ NUISANCES: tuple[Parameter, ...] = (
         short="feedback backlash",
         meaning="half-width of the backlash between spool and feedback spring",
         changes=lambda c, value: {"BKL": c.BKL + value},
+    ),
+    Parameter(
+        name="load",
+        symbol="FR",
+        unit="N",
+        lower=-2e4,
+        upper=2e4,
+        kind=Kind.NUISANCE,
+        scale=100.0,
+        short="load",
+        meaning="constant load on the jack beside that of the actuator file",
+        changes=lambda c, value: {"FR": c.FR + value},
+    ),
+    Parameter(
+        name="load_spring",
+        symbol="ka",
+        unit="N/m",
+        lower=0.0,
+        upper=1e6,
+        kind=Kind.NUISANCE,
+        scale=1e4,
+        short="load spring",
+        meaning="stiffness of a load that draws the jack to its middle",
+        changes=lambda c, value: {"KA": c.KA + value},
     ),
 )
 """In the order of the chain, the sensors first."""

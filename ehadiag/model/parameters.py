@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.data_errors import DATA
 from ehadiag.model.nuisances import NUISANCES
 from ehadiag.model.parameter import Kind, Parameter
@@ -75,8 +76,10 @@ FAULTS: tuple[Parameter, ...] = (
 REGISTRY: tuple[Parameter, ...] = (*DATA, *NUISANCES, *FAULTS)
 """All that can be estimated, in the order in which it is applied."""
 FAULT_NAMES: tuple[str, ...] = tuple(item.name for item in FAULTS)
-OFFSETS: tuple[Parameter, ...] = tuple(item for item in REGISTRY if item.adds_to is not None)
-"""Constant errors of sensors, which a test shows directly."""
+OFFSETS: tuple[Parameter, ...] = tuple(
+    item for item in REGISTRY if item.adds_to in (SPOOL_ROW, PRESSURE_ROW)
+)
+"""Constant errors of the sensors of spool and pressure, which a test shows directly."""
 
 
 def parameter(name: str) -> Parameter:

@@ -10,6 +10,7 @@ from ehadiag.model.jack import JackState
 from ehadiag.model.laws import DriveLaw, JackLaw, SpoolLaw
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import FINEST
+from ehadiag.model.sensors import SensorLaw
 
 NUMBER: Final = 8
 """Bytes."""
@@ -26,7 +27,6 @@ class Settings(NamedTuple):
     linear: below this current it does, A.
     code_position: converter step of the position, m.
     anchor_gain, anchor_small, anchor_large: see `ehadiag.model.anchor.Anchor`.
-    spool_offset, pressure_offset: constant errors of the sensors, m and Pa.
     spool_weight, pressure_weight: reciprocal noise of both.
     reference, threshold, limit: of the CUSUM: k, h, largest residual that counts.
     deviation: a lost command did not go on where the current is off by more, A.
@@ -40,8 +40,6 @@ class Settings(NamedTuple):
     anchor_gain: float
     anchor_small: float
     anchor_large: float
-    spool_offset: float
-    pressure_offset: float
     spool_weight: float
     pressure_weight: float
     reference: float
@@ -57,6 +55,7 @@ class Moving(NamedTuple):
     ----------
     filtered: innovation of the re-anchoring, m.
     jack_spool: where the jack has the spool, m.
+    lagged: the spool behind the filter before its converter, m.
     """
 
     xf: float
@@ -68,6 +67,7 @@ class Moving(NamedTuple):
     clamped: float
     filtered: float
     jack_spool: float
+    lagged: float
 
 
 class Followed(NamedTuple):
@@ -95,7 +95,8 @@ def _place(start: int, kind: Any) -> int:
 DRIVE_LAW: Final = 0
 SPOOL_LAW: Final = _place(DRIVE_LAW, DriveLaw)
 JACK_LAW: Final = _place(SPOOL_LAW, SpoolLaw)
-CONTROL_LAW: Final = _place(JACK_LAW, JackLaw)
+SENSOR_LAW: Final = _place(JACK_LAW, JackLaw)
+CONTROL_LAW: Final = _place(SENSOR_LAW, SensorLaw)
 SETTINGS: Final = _place(CONTROL_LAW, ControlLaw)
 STATE: Final = _place(SETTINGS, Settings)
 MOVING: Final = STATE
@@ -124,6 +125,7 @@ SIZE: Final = NODES + NODES_PER_TICK * NODE_COLUMNS
 
 drive_law_of = unpacker(DriveLaw, DRIVE_LAW)
 spool_law_of, jack_law_of = unpacker(SpoolLaw, SPOOL_LAW), unpacker(JackLaw, JACK_LAW)
+sensor_law_of = unpacker(SensorLaw, SENSOR_LAW)
 control_law_of = unpacker(ControlLaw, CONTROL_LAW)
 settings_of = unpacker(Settings, SETTINGS)
 moving_of, keep_moving = unpacker(Moving, MOVING), packer(Moving, MOVING)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.kernels import kernel, merged
+from ehadiag.compile.kernels import bare_kernel, kernel, merged
 from ehadiag.compile.vector import (
     WIDTH,
     anywhere,
@@ -20,10 +20,17 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch
+from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch
 from ehadiag.model.plant import FIELDS, plant_of
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
-from ehadiag.model.simd.jack import jack_lanes, pressures
+from ehadiag.model.simd.jack import (
+    follow_lanes,
+    jack_lanes,
+    positions,
+    pressures,
+    rest_jacks,
+    sensed_jack_lanes,
+)
 from ehadiag.model.simd.jack_events import jack_events
 from ehadiag.model.simd.layout import (
     ANCHORED,
@@ -31,7 +38,8 @@ from ehadiag.model.simd.layout import (
     LANES,
     PATH_ROWS,
     PLAYS,
-    PRESSURE,
+    POSITION,
+    PRESSURE_SEEN,
     SEEN,
     STATE_ROWS,
     sensor_laws,
@@ -113,9 +121,9 @@ def scratch_for(batch: Batch, scattered: NDArray[np.float64]) -> Scratch:
         sample=np.zeros(LANES),
         no_costs=np.zeros(0),
         uncounted=np.zeros(0, dtype=np.int64),
-        no_residuals=np.zeros((0, SIGNALS, 0)),
+        no_residuals=np.zeros((0, 0, 0)),
     )
-    if batch.weight[PRESSURE_ROW].any():
+    if batch.weight[PRESSURE_ROW:].any():
         # Without weights the jack is left out, and the spool's path is all that is looked at.
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
         block_costs(spool_only, scattered, 1.0, work, np.empty(LANES))
@@ -163,8 +171,13 @@ def _hold_against(
     """
     for o in range(0, LANES, WIDTH):
         law = sensor_laws(coefficients, o)
-        offset = law.spool_offset if signal == SPOOL_ROW else law.pressure_offset
-        residual = (measured - offset - load(state, row * LANES + o)) * weight
+        if signal == SPOOL_ROW:
+            offset, gain = law.spool_offset, law.spool_gain
+        elif signal == PRESSURE_ROW:
+            offset, gain = law.pressure_offset, law.pressure_gain
+        else:
+            offset, gain = law.position_offset, law.position_gain
+        residual = (measured - offset - gain * load(state, row * LANES + o)) * weight
         store(sample, o, residual)
         store(sums, o, load(sums, o) + least(residual * residual, cap))
 
@@ -183,6 +196,20 @@ def _jack_tick(
             jack_events(level, step, tick, state, path, coefficients)
 
 
+@bare_kernel
+def _sensed_jack_tick(
+    tick: float,
+    level: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+) -> None:
+    """The same, with the pressure as the filter before its converter has it."""
+    for step in range(1 << level):
+        if sensed_jack_lanes(level, step, tick, state, path, coefficients):
+            jack_events(level, step, tick, state, path, coefficients)
+
+
 @merged
 def _block(
     batch: Batch, candidates: NDArray[np.float64], cap: float, work: Scratch,
@@ -190,40 +217,42 @@ def _block(
 ) -> None:  # fmt: skip
     """Costs of up to LANES candidates into `work.sums`, residuals of the first ones into `out`.
 
-    out: shape (LANES or less, SIGNALS, N), or of no candidate.
+    out: shape (LANES or less, signals, N), or of no candidate.
     """
     state, path, coefficients = work.state, work.path, work.coefficients
     moving, loose, stuck, rows = work.moving, work.loose, work.stuck, work.rows
     sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
-    weight, levels, start = batch.weight, work.levels, batch.start
+    position, weight, levels, start = batch.position, batch.weight, work.levels, batch.start
+    located = weight.shape[0] > POSITION_ROW
     wanted, last_candidate = out.shape[0], candidates.shape[0] - 1
     sums[:] = 0.0
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
         tick, test = batch.tick[index], batch.test[index]
-        gain, small, large = batch.anchor[index]
+        gain, small, large, follow = batch.anchor[index]
         anchored = math.isfinite(small) or math.isfinite(large)
         for i in range(LANES):
             for field in range(FIELDS):
                 rows[i, field] = candidates[min(i, last_candidate), test, field]
-        backlash = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        backlash, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
         state[PLAYS * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
             drive_lanes(current[k], plays, state, coefficients)
         deflect_lanes(plays, state, coefficients)
         rest_lanes(batch.origin[index], state, coefficients)
+        rest_jacks(batch.origin[index], batch.place[index], state, coefficients)
         last = start[index + 1] - 1
-        while last >= start[index] and weight[PRESSURE_ROW, last] == 0.0:
+        while last >= start[index] and not weight[PRESSURE_ROW:, last].any():
             last -= 1
         for k in range(start[index], start[index + 1]):
             drive_lanes(current[since + k - start[index]], plays, state, coefficients)
             if spool_lanes(tick, backlash, state, path, coefficients):
                 event_ticks(tick, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
-            if seen:
-                see_lanes(state, path, coefficients)
+            if seen or senses:
+                see_lanes(tick, senses, state, path, coefficients)
             if weight[SPOOL_ROW, k] != 0.0 and seen:
                 _hold_against(
                     spool[k], weight[SPOOL_ROW, k], cap, SEEN, SPOOL_ROW,
@@ -233,16 +262,30 @@ def _block(
                     out[i, SPOOL_ROW, k] = sample[i]
             if levels[k] < 0:
                 levels[k] = _level(path)
-            if k <= last:  # nothing depends on the jack but the pressure
-                _jack_tick(tick, levels[k], state, path, coefficients)
+            if k <= last:  # nothing depends on the jack but pressure and position
+                if senses:
+                    _sensed_jack_tick(tick, levels[k], state, path, coefficients)
+                else:
+                    _jack_tick(tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(state, path, coefficients)
+                pressures(senses, state, path, coefficients)
                 _hold_against(
-                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_ROW,
+                    pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE_SEEN, PRESSURE_ROW,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
                     out[i, PRESSURE_ROW, k] = sample[i]
+            if located and math.isfinite(position[k]):
+                positions(state, coefficients)
+                if weight[POSITION_ROW, k] != 0.0:
+                    _hold_against(
+                        position[k], weight[POSITION_ROW, k], cap, POSITION, POSITION_ROW,
+                        state, coefficients, sample, sums,
+                    )  # fmt: skip
+                    for i in range(wanted):
+                        out[i, POSITION_ROW, k] = sample[i]
+                if follow != 0.0:
+                    follow_lanes(position[k], follow, state, coefficients)
             if anchored and seen:
                 anchor_lanes(spool[k], gain, small, large, state, coefficients)
 
@@ -290,7 +333,7 @@ def block_residuals(
     out: NDArray[np.float64],
     anchored: NDArray[np.int64],
 ) -> None:
-    """Weighted residuals, measured less modelled, of every candidate: out, shape (n, SIGNALS, N).
+    """Weighted residuals, measured less modelled, of every candidate: out, shape (n, signals, N).
 
     `candidates` has shape (n, tests, FIELDS). A missing sample gives 0.
     anchored: out, how often the model was re-anchored, shape (n,).
