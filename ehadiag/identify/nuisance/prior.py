@@ -24,9 +24,8 @@ CENTRE, SPREAD = 0.5, 0.4
 """Of a nuisance that is never negative: mean and deviation, in units of its scale."""
 SPREAD_BOTH_WAYS = 0.5
 """Deviation of one that may have either sign."""
-LEFT_OUT = frozenset({"sampling_lead"})
-"""Nuisances that `--nuisances` does not free: no unit of section 8's basic set has them, and what
-is not known of them is considered in the interval."""
+BASIC = ("null_bias", "torque_motor_gain", "hysteresis", "backlash")
+"""Nuisances that `--nuisances` frees: those of section 8's basic set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +43,7 @@ class Known:
 
 def nuisances_of(registry: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Nuisances that an identification may free beside the constant errors of the sensors."""
-    return tuple(
-        item
-        for item in registry
-        if item.kind is Kind.NUISANCE and item.adds_to is None and item.name not in LEFT_OUT
-    )
+    return tuple(item for item in registry if item.name in BASIC)
 
 
 def belief_of(model: Derivatives, known: Mapping[str, Known]) -> Belief:

@@ -47,7 +47,7 @@ class Found:
     Attributes
     ----------
     belief : Belief
-    residuals : shape (SIGNALS, N)
+    residuals : shape (signals, N)
         Weighted, at its mean.
     cost : float
         Robust, see `robust_cost`.
@@ -69,7 +69,7 @@ class Found:
 
 
 def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cauchy's cost of weighted residuals, shape (n, SIGNALS, N): shape (n,)."""
+    """Cauchy's cost of weighted residuals, shape (n, signals, N): shape (n,)."""
     return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
 
 
@@ -93,7 +93,7 @@ def search(
     information : shape (k,)
         See `sharpen`.
     explains : callable
-        Of residuals, shape (SIGNALS, N): whether there is nothing better to look for
+        Of residuals, shape (signals, N): whether there is nothing better to look for
         (a search that has not come to rest goes on all the same).
     alias : str
         Name of a parameter that passes for a sensor's constant error.
