@@ -135,7 +135,7 @@ def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float
     # Medians do not see the samples that a wrong pair spoils.
     slopes, runs = model.additive_slopes(), model.many(points)
     for k, item in enumerate(model.estimated):
-        if item.adds_to is not None:
+        if item.adds_to is not None and item.adds_to < slopes.shape[1]:
             slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
             used = slope != 0.0
             points[:, k] -= np.median(run[:, used] / slope[used], axis=1)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.batch import SIGNALS, Batch
+from ehadiag.model.batch import Batch
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.transition import SpoolTables
 from ehadiag.model.simd.jack import STAGES
@@ -27,6 +27,12 @@ SINGLE = ("-DREAL=float", "-fsingle-precision-constant")
 BRANCHLESS = ("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros")
 """What lets a compiler turn choices into vector instructions."""
 WIDEST = ("-mprefer-vector-width=512",) if platform.machine() in ("x86_64", "AMD64") else ()
+
+PLANT = [PlantConstants._fields.index(name) for name in (
+    "GM", "JF", "CF", "KF", "KSF", "XFM", "GQF", "GPF", "AS", "MS", "CS", "XSM", "FSS", "FSS1",
+    "PSR", "GP", "GQ", "CLK", "AJ", "MJ", "CJ", "XJM", "FDJ", "FDJ1", "FR", "OXS", "OPD",
+)]  # fmt: skip
+"""Places of the constants that `plant.h` has."""
 
 
 class NoCompilerError(Exception):
@@ -53,8 +59,8 @@ class CModel:
         self._function.restype = None
         # Arrays that the pointers below point into.
         self._kept = (
-            np.array(constants),
-            *(np.ascontiguousarray(part) for part in tables[:3]),
+            np.array(constants)[PLANT],
+            *(np.ascontiguousarray(part) for part in (tables.moving, tables.stuck, tables.decay)),
             np.ascontiguousarray(current),
         )
         plant, moving, stuck, decay, currents = map(_pointer, self._kept)
@@ -74,7 +80,7 @@ class CLanes:
 
     levels: of `SimdModel`; candidates: rows of constants, shape (n, tests, FIELDS); single:
     computes in single precision. Leaves `costs`, shape (n,), and, if wanted, `residuals`, shape
-    (n, SIGNALS, N), 0 where a sample is missing.
+    (n, signals, N), 0 where a sample is missing.
 
     Raises
     ------
@@ -94,12 +100,17 @@ class CLanes:
         n = len(candidates)
         self.costs = np.zeros(n)
         kind = np.dtype(np.float32 if single else np.float64)
-        shape = (n, SIGNALS, len(batch.current))
+        shape = (n, *batch.weight.shape)
         self.residuals = np.zeros(shape, kind) if residuals else None
         self._function = _build("lanes.c", *SINGLE * single).eha_lane_costs
         self._function.restype = None
         # Arrays that the pointers below point into.
-        self._kept = _of_kind(kind, *batch, levels, STAGES, candidates)
+        self._kept = _of_kind(
+            kind,
+            *(batch.test, batch.tick, batch.start, batch.origin, *_currents(batch)),
+            *(batch.spool, batch.pressure, batch.weight, batch.anchor[:, :3]),
+            *(levels, STAGES, candidates[..., PLANT]),
+        )
         *inputs, rows = map(_pointer, self._kept)
         wanted = None if self.residuals is None else _pointer(self.residuals)
         self._arguments = (
@@ -140,10 +151,10 @@ class CUnlocated:
         # Arrays that the pointers below point into.
         self._kept = _of_kind(
             kind,
-            *(batch.test, batch.tick, batch.start, batch.current),
+            *(batch.test, batch.tick, batch.start, _currents(batch)[1]),
             *(np.nan_to_num(batch.spool), np.nan_to_num(batch.pressure)),
             *(np.where(seen, batch.weight, 0.0), levels, STAGES),
-            np.resize(candidates, (len(self.costs), *candidates.shape[1:])),
+            np.resize(candidates[..., PLANT], (len(self.costs), candidates.shape[1], len(PLANT))),
         )
         *inputs, rows = map(_pointer, self._kept)
         self._function = library.eha_unlocated_costs
@@ -182,6 +193,17 @@ class CPeak:
         """Run."""
         self._out[0] = 0.0
         self.operations = self._function(self._rounds, _pointer(self._out))
+
+
+def _currents(batch: Batch) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Current before each span (0 at the beginning of a test), and of the ticks of all, A."""
+    before = [
+        batch.current[since - 1] if history else 0.0
+        for since, history in zip(batch.since, batch.history, strict=True)
+    ]
+    lengths = np.diff(batch.start)
+    spans = [batch.current[a : a + n] for a, n in zip(batch.since, lengths, strict=True)]
+    return np.array(before), np.concatenate(spans)
 
 
 def _of_kind(kind: np.dtype[Any], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
