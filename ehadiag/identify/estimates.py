@@ -48,7 +48,7 @@ def identification(
             at_bound=not item.lower < refined.values[item.name] < item.upper,
         )
         for item, std in zip(refined.parameters, deviations, strict=True)
-        if item.kind is Kind.NUISANCE
+        if item.kind is not Kind.FAULT
     }
     return Identification(
         estimates=estimates_of(first, found, refined, spread),

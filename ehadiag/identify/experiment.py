@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import PRESSURE, SPOOL
+from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
 from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.commanded_current import CurrentTrace, commanded_current
@@ -23,6 +23,8 @@ DISPLACED = 0.3e6
 LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 LEAST_QUIET_BLOCKS = 20
+FIRST = 10
+"""Ticks in which the jack has not yet moved from its middle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,14 +41,20 @@ class Experiment:
     """Measured less its offset, m; NaN where missing or at the converter's end."""
     pressure: NDArray[np.float64]
     """Measured less its offset, Pa; NaN where missing or at the converter's end."""
+    position: NDArray[np.float64]
+    """Measured less its first samples, m; NaN where missing or at the converter's end."""
     spool_noise: float
     """Standard deviation, m."""
     pressure_noise: float
     """Standard deviation, Pa."""
+    position_noise: float
+    """Standard deviation, m."""
     spool_offset: float
     """Already taken off `spool`, m: its mean while the actuator rests before the test moves it."""
     pressure_offset: float
     """Already taken off `pressure`, Pa."""
+    position_offset: float
+    """Already taken off `position`, m."""
     rested: bool
     """Whether the actuator rested long enough before the test to show them."""
     origin: float
@@ -57,6 +65,16 @@ class Experiment:
         """Number of ticks."""
         return len(self.spool)
 
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Standard deviations of spool, pressure and position (m, Pa, m), as rows of residuals."""
+        return self.spool_noise, self.pressure_noise, self.position_noise
+
+    def with_noise(self, noise: tuple[float, ...]) -> Experiment:
+        """Return the same with other standard deviations, see `noise`."""
+        spool, pressure, position = noise
+        return replace(self, spool_noise=spool, pressure_noise=pressure, position_noise=position)
+
 
 def build_experiment(
     samples: Samples, environment: Environment, test: StoredTest, actuator: Actuator
@@ -64,6 +82,7 @@ def build_experiment(
     """Prepare a recording for identification."""
     spool = np.where(samples.saturated[1], np.nan, samples.spool)
     pressure = np.where(samples.saturated[2], np.nan, samples.pressure)
+    position = np.where(samples.saturated[3], np.nan, samples.position)
     trace = commanded_current(samples, test, actuator.controller)
     rest = _ticks_at_rest(trace.current)
     constants = plant_constants(actuator, environment)
@@ -78,6 +97,7 @@ def build_experiment(
         origin = min(max(pressure_offset * leak / constants.GP, -constants.XSM), constants.XSM)
         spool_offset, pressure_offset = spool_offset - origin, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
+    position_offset = _first(position)
     # Before the sines only, where that suffices: the same while the test still runs.
     quiet = _first_part(test) if noise_is_judged_early(test) else len(spool)
     return Experiment(
@@ -87,10 +107,13 @@ def build_experiment(
         trace=trace,
         spool=spool,
         pressure=pressure,
+        position=position - position_offset,
         spool_noise=noise_of_signal(spool[:quiet], SPOOL),
         pressure_noise=noise_of_signal(pressure[:quiet], PRESSURE),
+        position_noise=noise_of_signal(position[:quiet], POSITION),
         spool_offset=spool_offset,
         pressure_offset=pressure_offset,
+        position_offset=position_offset,
         rested=rest >= LEAST_REST,
         origin=origin,
     )
@@ -119,6 +142,12 @@ def _mean(values: NDArray[np.float64]) -> float:
     """Mean of what is there; 0 of too little."""
     seen = values[np.isfinite(values)]
     return float(seen.mean()) if seen.size >= LEAST_REST else 0.0
+
+
+def _first(values: NDArray[np.float64]) -> float:
+    """Mean of the first samples, before anything has moved."""
+    seen = values[:FIRST][np.isfinite(values[:FIRST])]
+    return float(seen.mean()) if seen.size else 0.0
 
 
 def share_offsets(experiments: Sequence[Experiment]) -> list[Experiment]:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.channels import PRESSURE, SPOOL
+from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
 from ehadiag.core.stored_test import Window
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.noise import TYPICAL_NOISE_LSB, relative_noise, rounding_noise
 from ehadiag.model.anchor import FREE_RUN, Anchor
-from ehadiag.model.batch import Batch
+from ehadiag.model.batch import POSITION_ROW, Batch
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, Unknowns
 
 __all__ = ["ANCHOR_LSB", "Spans", "judge_noise", "lay_out", "unknowns_of"]
@@ -23,6 +22,9 @@ Spans = Sequence[Sequence[Window]]
 ANCHOR_GAIN = 0.3
 ANCHOR_LSB = (1.3, 6.0)
 """Filtered and single innovations beyond which the model is put back on the spool, LSB."""
+FOLLOW = 0.01
+"""Share of the jack's innovation by which the model is moved each tick: what lasts longer than a
+tenth of a second is taken away from the residual."""
 
 
 def lay_out(
@@ -30,7 +32,7 @@ def lay_out(
     windows: Sequence[Sequence[Window]] | None = None,
     *,
     lead: float = 0.0,
-    channels: tuple[bool, bool] = (True, True),
+    channels: tuple[bool, ...] = (True, True),
     anchor_lsb: tuple[float, float] | None = None,
 ) -> Batch:
     """Lay spans of experiments one behind the other.
@@ -39,7 +41,7 @@ def lay_out(
     ----------
     windows: for each experiment the spans (s) to explain; None: all of every test.
     lead: run-in before each span, s, without weight.
-    channels: whether spool and pressure count.
+    channels: whether spool and pressure count, and the jack's position where it is named.
     anchor_lsb: re-anchoring thresholds (small, large) in units of LSB-sized noise; None: free run.
     """
     parts: list[tuple[int, int, int, int]] = []
@@ -53,21 +55,26 @@ def lay_out(
                 parts.append((index, first, a, b))
     if not parts:
         raise ValueError("no span of any experiment is inside its recording")
-    weight, anchors, origins = [], [], []
+    weight, anchors, origins, places = [], [], [], []
     for index, first, a, b in parts:
         experiment = experiments[index]
         inside = np.arange(first, b) >= a
         on_spool = inside & np.isfinite(experiment.spool[first:b]) & channels[0]
         on_pressure = inside & np.isfinite(experiment.pressure[first:b]) & channels[1]
-        weight.append(
-            np.vstack([on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise])
-        )
+        rows = [on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise]
+        if len(channels) > POSITION_ROW:
+            on_position = (
+                inside & np.isfinite(experiment.position[first:b]) & channels[POSITION_ROW]
+            )
+            rows.append(on_position / experiment.position_noise)
+        weight.append(np.vstack(rows))
         unit = experiment.spool_noise / TYPICAL_NOISE_LSB
         anchor = FREE_RUN
         if anchor_lsb is not None:
-            anchor = Anchor(ANCHOR_GAIN, anchor_lsb[0] * unit, anchor_lsb[1] * unit)
+            anchor = Anchor(ANCHOR_GAIN, anchor_lsb[0] * unit, anchor_lsb[1] * unit, FOLLOW)
         anchors.append(anchor.as_array())
         origins.append(_origin(experiment, first))
+        places.append(_place(experiment, first))
     # Nothing after the spans: a stage's inputs must not change while the test goes on.
     ends = [max((b for i, _, _, b in parts if i == k), default=0) for k in range(len(experiments))]
     begins = np.cumsum([0, *ends])
@@ -76,6 +83,7 @@ def lay_out(
         tick=np.array([experiments[i].tick for i, _, _, _ in parts]),
         start=np.concatenate([[0], np.cumsum([b - first for _, first, _, b in parts])]),
         origin=np.array(origins),
+        place=np.array(places),
         history=np.array([first for _, first, _, _ in parts]),
         since=np.array([begins[i] + first for i, first, _, _ in parts]),
         current=np.concatenate(
@@ -83,6 +91,7 @@ def lay_out(
         ),
         spool=np.concatenate([experiments[i].spool[first:b] for i, first, _, b in parts]),
         pressure=np.concatenate([experiments[i].pressure[first:b] for i, first, _, b in parts]),
+        position=np.concatenate([experiments[i].position[first:b] for i, first, _, b in parts]),
         weight=np.hstack(weight),
         anchor=np.array(anchors),
     )
@@ -97,14 +106,27 @@ def _origin(experiment: Experiment, first: int) -> float:
     return float(seen[-1]) if seen.size else 0.0
 
 
+def _place(experiment: Experiment, first: int) -> float:
+    """Jack position before tick `first`, m: in the middle before the test, else measured."""
+    if first == 0:
+        return 0.0
+    before = experiment.position[max(0, first - 5) : first]
+    seen = before[np.isfinite(before)]
+    return float(seen.mean()) if seen.size else 0.0
+
+
 def judge_noise(experiment: Experiment, residuals: NDArray[np.float64]) -> Experiment:
-    """Weigh an experiment anew, by the noise that its residuals show, shape (SIGNALS, n)."""
-    spool, pressure = (relative_noise(row) for row in residuals)
-    return replace(
-        experiment,
-        spool_noise=max(experiment.spool_noise * spool, rounding_noise(SPOOL)),
-        pressure_noise=max(experiment.pressure_noise * pressure, rounding_noise(PRESSURE)),
-    )
+    """Weigh an experiment anew, by the noise that its residuals show, shape (signals, n).
+
+    A signal without residuals keeps the noise that it has.
+    """
+    shown = [
+        max(noise * relative_noise(row), rounding_noise(channel))
+        for noise, row, channel in zip(
+            experiment.noise, residuals, (SPOOL, PRESSURE, POSITION), strict=False
+        )
+    ]
+    return experiment.with_noise((*shown, *experiment.noise[len(shown) :]))
 
 
 def unknowns_of(

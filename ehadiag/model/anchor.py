@@ -15,11 +15,14 @@ __all__ = ["FREE_RUN", "Anchor", "re_anchored"]
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """Re-anchoring of the modelled spool on the measured one, once a tick.
+    """Re-anchoring of the modelled spool and jack on the measured ones, once a tick.
 
     The innovation is filtered, f += gain (e - f); a sample further off than `large` moves the model
     onto it, a filtered innovation above `small` moves it by that. It undoes a break-away that went
     the other way, and leaves a model that runs true alone.
+
+    The jack integrates what the valve lets pass, and with it every small error. It is moved by a
+    share of its innovation each tick: what is left of that is its fast part.
     """
 
     gain: float
@@ -27,10 +30,12 @@ class Anchor:
     """m."""
     large: float
     """m."""
+    follow: float = 0.0
+    """Share of the jack's innovation by which it is moved, 0 … 1; where its position counts."""
 
     def as_array(self) -> NDArray[np.float64]:
         """The form that kernels take."""
-        return np.array([self.gain, self.small, self.large])
+        return np.array([self.gain, self.small, self.large, self.follow])
 
 
 FREE_RUN = Anchor(0.0, np.inf, np.inf)

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PRESSURE_ROW", "SIGNALS", "SPOOL_ROW", "Batch", "longest_span"]
+__all__ = ["POSITION_ROW", "PRESSURE_ROW", "SIGNALS", "SPOOL_ROW", "Batch", "longest_span"]
 
-SPOOL_ROW, PRESSURE_ROW = 0, 1
-SIGNALS = 2
-"""Rows of weights and residuals: the signals that a candidate has to explain."""
+SPOOL_ROW, PRESSURE_ROW, POSITION_ROW = 0, 1, 2
+SIGNALS = 3
+"""Rows of weights and residuals: the signals that a candidate has to explain. Weights without the
+last row leave the jack's position out, and residuals are then without it too."""
 
 
 class Batch(NamedTuple):
@@ -30,6 +31,8 @@ class Batch(NamedTuple):
         First tick of each span in the flat arrays, then N.
     origin : shape (m,)
         Spool position before the first tick of each span, m.
+    place : shape (m,)
+        Jack position before the first tick of each span, m.
     history : shape (m,)
         Ticks of its test before the first one of each span.
     since : shape (m,)
@@ -37,11 +40,11 @@ class Batch(NamedTuple):
     current : shape (M,)
         Of the tests from their beginning, each once, A: what comes before a span has loaded the
         hysteresis.
-    spool, pressure : shape (N,)
-        Measured, m and Pa, NaN where missing.
-    weight : shape (SIGNALS, N)
-        Reciprocal noise of spool and pressure, 0 where not used.
-    anchor : shape (m, 3)
+    spool, pressure, position : shape (N,)
+        Measured, m, Pa, m; NaN where missing.
+    weight : shape (signals, N)
+        Reciprocal noise of spool and pressure, and of the position if it counts; 0 where not used.
+    anchor : shape (m, 4)
         Re-anchoring in each span, see `ehadiag.model.anchor.Anchor`.
     """
 
@@ -49,11 +52,13 @@ class Batch(NamedTuple):
     tick: NDArray[np.float64]
     start: NDArray[np.int64]
     origin: NDArray[np.float64]
+    place: NDArray[np.float64]
     history: NDArray[np.int64]
     since: NDArray[np.int64]
     current: NDArray[np.float64]
     spool: NDArray[np.float64]
     pressure: NDArray[np.float64]
+    position: NDArray[np.float64]
     weight: NDArray[np.float64]
     anchor: NDArray[np.float64]
 

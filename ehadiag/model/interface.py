@@ -50,8 +50,8 @@ class ResidualModel(Protocol):
 
         Returns
         -------
-        residuals : shape (n, SIGNALS, N)
-            In units of noise; 0 where no sample counts.
+        residuals : shape (n, signals, N)
+            Rows as the batch's weights have them; in units of noise, 0 where no sample counts.
         anchored : shape (n,)
         """
         ...

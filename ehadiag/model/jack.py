@@ -1,11 +1,7 @@
 """Jack and surface over a piece of the spool's path: one algorithm for all kernels.
 
-Radau's collocation of order 5 (IIA, three stages; Hairer, Wanner, Solving Ordinary Differential
-Equations II, section IV.5), which damps what is stiff. Unknown are the pressures of the stages, not
-the velocities: the second stage reads P12 = (flow x - v) / e at any x (`ehadiag.model.laws`), so
-the stages' equations are linear with coefficients that need no division, no branch and no
-exponential, and a step takes one division, for the last stage's pressure. Stops and starts are
-located inside the piece.
+A piece is cut into steps of the collocation (`ehadiag.model.collocation`). Stops and starts are
+located inside of it.
 """
 
 from __future__ import annotations
@@ -18,23 +14,11 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined
 from ehadiag.compile.vector import packed
+from ehadiag.model.collocation import C1, C2, radau_pressures, radau_velocity
 from ehadiag.model.laws import JackLaw, excess, pressure, resistance
+from ehadiag.model.sensors import LATE, SensorLaw, followed, following, sensing, through_stages
 
-__all__ = ["C1", "C2", "JackState", "Piece", "jack_piece", "jack_tick", "radau_velocity"]
-
-ROOT = math.sqrt(6.0)
-C1, C2 = (4.0 - ROOT) / 10.0, (4.0 + ROOT) / 10.0
-A11, A12, A13 = (
-    (88.0 - 7.0 * ROOT) / 360.0,
-    (296.0 - 169.0 * ROOT) / 1800.0,
-    (3.0 * ROOT - 2.0) / 225.0,
-)
-A21, A22, A23 = (
-    (296.0 + 169.0 * ROOT) / 1800.0,
-    (88.0 + 7.0 * ROOT) / 360.0,
-    -(3.0 * ROOT + 2.0) / 225.0,
-)
-A31, A32, A33 = (16.0 - ROOT) / 36.0, (16.0 + ROOT) / 36.0, 1.0 / 9.0
+__all__ = ["JackState", "Piece", "Probe", "jack_piece", "jack_rest", "jack_tick"]
 
 FINE_TRAVEL = 3.0e-6
 FINE_RATIO = 0.3
@@ -60,12 +44,16 @@ class JackState(NamedTuple):
     velocity: m/s.
     direction: of its motion, +1 or -1; 0 at rest.
     fresh: not 0 if it has just started or stopped.
+    lagged: differential pressure behind the filter, Pa.
+    seen: the same when it was sampled last, Pa.
     """
 
     place: float
     velocity: float
     direction: float
     fresh: float
+    lagged: float
+    seen: float
 
 
 class Piece(NamedTuple):
@@ -85,32 +73,18 @@ class Piece(NamedTuple):
     rise1: float
 
 
-@packed
-def radau_velocity(
-    j: JackLaw, h: float, load: Any, velocity: Any,
-    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
-) -> Any:  # fmt: skip
-    """Velocity (m/s) of the moving jack after a step of `h` seconds.
+class Probe(NamedTuple):
+    """How the sensor of pressure looks at a piece.
 
-    load: external and friction force, N; x1, x2, x3: spool at the three stages, m;
-    e1, e2, e3: `resistance` there. Numbers or vectors of them.
+    Attributes
+    ----------
+    lag: of the filter before its converter, s.
+    due: from the start of the piece to the instant of sampling, s; none of this piece if negative
+        or beyond it.
     """
-    k = h * j.by_mass
-    thrust, drag = k * j.area, k * j.viscosity
-    y1, y2, y3 = j.flow * x1, j.flow * x2, j.flow * x3
-    f1, f2, f3 = thrust + drag * e1, thrust + drag * e2, thrust + drag * e3
-    pull = k * load
-    z1 = y1 + drag * (A11 * y1 + A12 * y2 + A13 * y3) + C1 * pull - velocity
-    z2 = y2 + drag * (A21 * y1 + A22 * y2 + A23 * y3) + C2 * pull - velocity
-    z3 = y3 + drag * (A31 * y1 + A32 * y2 + A33 * y3) + pull - velocity
-    m11, m12, m13 = e1 + A11 * f1, A12 * f2, A13 * f3
-    m21, m22, m23 = A21 * f1, e2 + A22 * f2, A23 * f3
-    m31, m32, m33 = A31 * f1, A32 * f2, e3 + A33 * f3
-    # Cramer's rule for the last stage's pressure.
-    minor = m11 * m22 - m12 * m21
-    above = m31 * (m12 * z2 - z1 * m22) - m32 * (m11 * z2 - z1 * m21) + z3 * minor
-    below = m31 * (m12 * m23 - m13 * m22) - m32 * (m11 * m23 - m13 * m21) + m33 * minor
-    return y3 - e3 * above / below
+
+    lag: float
+    due: float
 
 
 @packed
@@ -215,66 +189,164 @@ def _steps(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) ->
     return min(MOST_STEPS, 1 + int(wanted))
 
 
+@packed
+def _limited(j: JackLaw, p12: float) -> float:
+    """Pressure within what the supply allows, Pa."""
+    return min(max(p12, -j.supply), j.supply)
+
+
+@packed
+def _still_pressure(j: JackLaw, x: float) -> float:
+    """Pressure beside a resting jack, Pa."""
+    return _limited(j, pressure(j, x, 0.0))
+
+
 @bare_kernel
-def jack_piece(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> JackState:
-    """Jack over the shares begin … stop of a piece of the spool's path."""
-    place, velocity, d, fresh = state
-    if d == 0.0:
-        x = _place(p, stop)
-        if excess(j, x, j.static) <= 0.0 <= excess(j, x, -j.static):
-            return JackState(place, velocity, 0.0, 0.0)
-    steps = _steps(j, p, begin, stop, state)
-    q, step, fresh = begin, 1, 0.0
-    while step <= steps:
-        end = begin + (stop - begin) * step / steps
+def _sensed(
+    j: JackLaw, probe: Probe, p: Piece, load: float, velocity: float,
+    moving: bool, begin: float, end: float, lagged: float, seen: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Pressure behind the filter at the share `end` of a piece, and when it was sampled, Pa.
+
+    lagged, seen: before; velocity: of the jack at `begin`, m/s.
+    """
+    step = end - begin
+    x0, x1 = _place(p, begin), _place(p, begin + C1 * step)
+    x2, x3 = _place(p, begin + C2 * step), _place(p, end)
+    if moving:
+        p1, p2, p3 = radau_pressures(
+            j, step * p.span, load, velocity, x1, x2, x3,
+            resistance(j, x1), resistance(j, x2), resistance(j, x3),
+        )  # fmt: skip
+        cubic = through_stages(
+            _limited(j, pressure(j, x0, velocity)),
+            _limited(j, p1), _limited(j, p2), _limited(j, p3),
+        )  # fmt: skip
+    else:
+        cubic = through_stages(
+            _still_pressure(j, x0), _still_pressure(j, x1),
+            _still_pressure(j, x2), _still_pressure(j, x3),
+        )  # fmt: skip
+    span, upto = step * p.span, probe.due - begin * p.span
+    if 0.0 < upto <= LATE * span:
+        seen = followed(following(probe.lag, span, upto), lagged, cubic)
+    return followed(following(probe.lag, span, span), lagged, cubic), seen
+
+
+def _pieces(senses: bool) -> Any:
+    """Compiled `jack_piece`, with or without the sensor of pressure."""
+
+    @bare_kernel
+    def piece(
+        j: JackLaw, probe: Probe, p: Piece, begin: float, stop: float, state: JackState
+    ) -> JackState:
+        place, velocity, d, fresh, lagged, seen = state
         if d == 0.0:
-            x = _place(p, end)
-            up, down = excess(j, x, j.static), excess(j, x, -j.static)
-            if (up <= 0.0 and down >= 0.0) or (
-                abs(place) >= j.stroke and place * (up + down) > 0.0
-            ):
+            x, load = _place(p, stop), j.spring * place
+            if excess(j, x, load + j.static) <= 0.0 <= excess(j, x, load - j.static):
+                if senses:
+                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, begin, stop, lagged, seen)
+                return JackState(place, velocity, 0.0, 0.0, lagged, seen)
+        steps = _steps(j, p, begin, stop, state)
+        q, step, fresh = begin, 1, 0.0
+        while step <= steps:
+            end = begin + (stop - begin) * step / steps
+            spring = j.spring * place
+            if d == 0.0:
+                x = _place(p, end)
+                up, down = excess(j, x, spring + j.static), excess(j, x, spring - j.static)
+                if (up <= 0.0 and down >= 0.0) or (
+                    abs(place) >= j.stroke and place * (up + down) > 0.0
+                ):
+                    if senses:
+                        lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, q, end, lagged, seen)
+                    q, step = end, step + 1
+                    continue
+                d = 1.0 if up > 0.0 else -1.0
+                away = _break_away(j, p, spring + j.static * d, d, q, end)
+                if senses and away > q:
+                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, q, away, lagged, seen)
+                q, velocity, fresh = away, 0.0, 1.0
+            load = j.load + spring + d * j.friction
+            later = _velocity(j, p, load, velocity, q, end)
+            if later * d > 0.0:
+                if senses and end > q:
+                    lagged, seen = _sensed(j, probe, p, load, velocity, True, q, end, lagged, seen)
+                place += 0.5 * (end - q) * p.span * (velocity + later)
+                velocity = later
+                if abs(place) >= j.stroke and place * velocity > 0.0:
+                    place = math.copysign(j.stroke, place)
+                    velocity, d = 0.0, 0.0
                 q, step = end, step + 1
                 continue
-            d = 1.0 if up > 0.0 else -1.0
-            q = _break_away(j, p, j.static * d, d, q, end)
-            velocity, fresh = 0.0, 1.0
-        load = j.load + d * j.friction
-        later = _velocity(j, p, load, velocity, q, end)
-        if later * d > 0.0:
-            place += 0.5 * (end - q) * p.span * (velocity + later)
-            velocity = later
-            if abs(place) >= j.stroke and place * velocity > 0.0:
-                place = math.copysign(j.stroke, place)
-                velocity, d = 0.0, 0.0
-            q, step = end, step + 1
-            continue
-        q = _stop(j, p, load, velocity, d, later, q, end) if velocity != 0.0 else end
-        velocity, d, fresh = 0.0, 0.0, 1.0
-        if end - q < SHORTEST:
-            q, step = end, step + 1
-    return JackState(place, velocity, d, fresh)
+            stopped = _stop(j, p, load, velocity, d, later, q, end) if velocity != 0.0 else end
+            if senses and stopped > q:
+                lagged, seen = _sensed(
+                    j, probe, p, load, velocity, velocity != 0.0, q, stopped, lagged, seen
+                )
+            place += 0.5 * (stopped - q) * p.span * velocity
+            q, velocity, d, fresh = stopped, 0.0, 0.0, 1.0
+            if end - q < SHORTEST:
+                q, step = end, step + 1
+        return JackState(place, velocity, d, fresh, lagged, seen)
+
+    return piece
+
+
+_piece, _sensed_piece = _pieces(False), _pieces(True)
+
+
+@inlined
+def jack_piece(
+    j: JackLaw, probe: Probe, senses: bool, p: Piece, begin: float, stop: float, state: JackState
+) -> JackState:
+    """Jack over the shares begin … stop of a piece of the spool's path.
+
+    senses: whether the pressure is to be followed as its sensor sees it.
+    """
+    if senses:
+        return _sensed_piece(j, probe, p, begin, stop, state)
+    return _piece(j, probe, p, begin, stop, state)
+
+
+@inlined
+def jack_rest(j: JackLaw, place: float, spool: float) -> JackState:
+    """Jack at rest, jack and spool at these positions, m."""
+    p12 = _still_pressure(j, spool)
+    return JackState(place, 0.0, 0.0, 0.0, p12, p12)
 
 
 @inlined
 def jack_tick(
-    j: JackLaw, nodes: NDArray[np.float64], first: int, end: int, state: JackState, spool: float
+    j: JackLaw,
+    sensor: SensorLaw,
+    tick: float,
+    nodes: NDArray[np.float64],
+    first: int,
+    end: int,
+    state: JackState,
+    spool: float,
 ) -> tuple[float, JackState, float]:
     """Second stage and jack over the spool's path of one tick.
 
     Parameters
     ----------
+    tick: s.
     nodes, first, end: the path, rows first … end - 1, see `ehadiag.model.scalar.spool_tick`.
     spool: position before the tick, m.
 
     Returns
     -------
-    Differential pressure at the end of the tick (Pa), jack and spool there. Jumps of the path are
-    the caller's.
+    Differential pressure when it is sampled (Pa), jack and spool at the end of the tick. Jumps of
+    the path are the caller's.
     """
+    due, senses = tick - min(sensor.lead, tick), sensing(sensor)
     for node in range(first, end):
         span, x1 = nodes[node, 0], nodes[node, 1]
         piece = Piece(span, spool, x1, span * nodes[node, 2], span * nodes[node, 3])
-        state = jack_piece(j, piece, 0.0, 1.0, state)
+        state = jack_piece(j, Probe(sensor.lag, due), senses, piece, 0.0, 1.0, state)
+        due -= span
         spool = x1
-    p12 = pressure(j, spool, state.velocity)
-    return min(max(p12, -j.supply), j.supply), state, spool
+    if senses:
+        return state.seen, state, spool
+    return _limited(j, pressure(j, spool, state.velocity)), state, spool

@@ -16,7 +16,6 @@ from ehadiag.model.plant import PlantConstants
 __all__ = [
     "DriveLaw",
     "JackLaw",
-    "SensorLaw",
     "SpoolLaw",
     "drive_law",
     "excess",
@@ -26,8 +25,6 @@ __all__ = [
     "play",
     "pressure",
     "resistance",
-    "sampled",
-    "sensor_law",
     "slide_base",
     "spool_law",
     "steady_rate",
@@ -167,7 +164,8 @@ class JackLaw(NamedTuple):
     by_mass: reciprocal of its mass, 1/kg.
     supply: supply minus return pressure, Pa.
     stroke: m.
-    load: external, N.
+    load: external with the jack in its middle, N.
+    spring: what it gains by the jack's travel, N/m.
     friction: dry friction of the moving jack, N.
     static: of the resting one, N.
     """
@@ -182,13 +180,14 @@ class JackLaw(NamedTuple):
     supply: Any
     stroke: Any
     load: Any
+    spring: Any
     friction: Any
     static: Any
 
 
 @inlined
 def jack_law(c: PlantConstants) -> JackLaw:
-    """Precombine what the laws of second stage and jack need (PHY-6, PHY-7, PHY-15)."""
+    """Precombine what the laws of second stage and jack need (PHY-6, PHY-7, PHY-15, PHY-32)."""
     return JackLaw(
         c.GQ / c.AJ,
         c.GQ / (c.PSR * c.AJ),
@@ -200,6 +199,7 @@ def jack_law(c: PlantConstants) -> JackLaw:
         c.PSR,
         c.XJM,
         c.FR,
+        c.KA,
         c.FDJ,
         STATIC_RATIO_JACK * c.FDJ,
     )
@@ -227,46 +227,3 @@ def pressure(j: JackLaw, x: Any, velocity: Any) -> Any:
 def excess(j: JackLaw, x: Any, hold: Any) -> Any:
     """Force on the resting jack beyond `hold` (N, signed), times e, which is positive."""
     return j.area * j.flow * x - (j.load + hold) * resistance(j, x)
-
-
-class SensorLaw(NamedTuple):
-    """How the sensors of one candidate show spool and pressure.
-
-    Attributes
-    ----------
-    spool_offset, pressure_offset: constant errors, m and Pa.
-    place_before, place, slope_before, slope: weights by which the ends of the last piece of the
-        spool's path give the spool at the instant of sampling (Hermite's cubic).
-    """
-
-    spool_offset: Any
-    pressure_offset: Any
-    place_before: Any
-    place: Any
-    slope_before: Any
-    slope: Any
-
-
-@inlined
-def sensor_law(c: PlantConstants, lead: float, span: float) -> SensorLaw:
-    """Precombine what the sensors' laws need.
-
-    lead: of sampling before the end of a piece of the path, s; span: of the piece, s.
-    """
-    u = 1.0 - min(max(lead / span, 0.0), 1.0)
-    v = 1.0 - u
-    return SensorLaw(
-        c.OXS,
-        c.OPD,
-        (1.0 + 2.0 * u) * v * v,
-        u * u * (3.0 - 2.0 * u),
-        u * v * v * span,
-        -u * u * v * span,
-    )
-
-
-@packed
-def sampled(law: SensorLaw, before: Any, now: Any, slope_before: Any, slope: Any) -> Any:
-    """Spool as its sensor samples it, m, from the ends of the path's last piece (m and m/s)."""
-    place = law.place_before * before + law.place * now
-    return place + law.slope_before * slope_before + law.slope * slope

@@ -7,14 +7,16 @@ tables and files) follows from the registry.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
+from ehadiag.model.data_errors import DATA
+from ehadiag.model.nuisances import NUISANCES
+from ehadiag.model.parameter import Kind, Parameter
 from ehadiag.model.plant import FIELDS, PlantConstants, Value, plant_row
 
 __all__ = [
@@ -28,148 +30,10 @@ __all__ = [
     "parameter",
 ]
 
-Changes = Mapping[str, Value]
-"""Fields of `PlantConstants` with the values that they take."""
-
-
-class Kind(Enum):
-    """What a parameter is to the diagnosis. The order is that in which they are applied."""
-
-    NUISANCE = "nuisance"
-    """Of the installation or of the day: estimated so that it does not pass for a fault."""
-    FAULT = "fault"
-    """A progressive fault: a severity from 0, as new, to 1, limit of damage."""
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One scalar that can be estimated.
-
-    Attributes
-    ----------
-    name : str
-        Identifier in tables, files and reports.
-    symbol : str
-        As the specification writes it.
-    unit : str
-        SI.
-    lower, upper : float
-        Bounds.
-    kind : Kind
-    scale : float
-        What is large: points of a search are in units of it, derivatives over a share of it.
-    short, meaning : str
-        In two words, and in a line.
-    changes : callable
-        (constants, value) -> the fields of the constants that it changes; pure, and for arrays too.
-    adds_to : int or None
-        Row of the residuals to which the parameter is simply added (a constant error of a sensor):
-        its derivative is known. None: it acts through the model.
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    lower: float
-    upper: float
-    kind: Kind
-    scale: float
-    short: str
-    meaning: str
-    changes: Callable[[PlantConstants, Value], Changes]
-    adds_to: int | None = None
-
-
 CLOGGED = 0.8
 """Share of the first stage's flow gain that is lost at the limit of damage (PHY-13)."""
 
-REGISTRY: tuple[Parameter, ...] = (
-    Parameter(
-        name="spool_offset",
-        symbol="OXS",
-        unit="m",
-        lower=-np.inf,
-        upper=np.inf,
-        kind=Kind.NUISANCE,
-        scale=1e-5,
-        short="spool sensor offset",
-        meaning="constant error of the spool's sensor",
-        changes=lambda c, value: {"OXS": c.OXS + value},
-        adds_to=SPOOL_ROW,
-    ),
-    Parameter(
-        name="pressure_offset",
-        symbol="OPD",
-        unit="Pa",
-        lower=-np.inf,
-        upper=np.inf,
-        kind=Kind.NUISANCE,
-        scale=5e5,
-        short="pressure sensor offset",
-        meaning="constant error of the sensor of differential pressure",
-        changes=lambda c, value: {"OPD": c.OPD + value},
-        adds_to=PRESSURE_ROW,
-    ),
-    Parameter(
-        name="sampling_lead",
-        symbol="DLY",
-        unit="s",
-        lower=0.0,
-        upper=2e-4,
-        kind=Kind.NUISANCE,
-        scale=1e-4,
-        short="sampling instant",
-        meaning="time before the end of the tick at which the spool is sampled",
-        changes=lambda c, value: {"DLY": c.DLY + value},
-    ),
-    Parameter(
-        name="null_bias",
-        symbol="ib",
-        unit="A",
-        lower=-5e-4,
-        upper=5e-4,
-        kind=Kind.NUISANCE,
-        scale=2e-4,
-        short="null bias",
-        meaning="current that the torque motor adds to the commanded one",
-        changes=lambda c, value: {"IB": c.IB + value},
-    ),
-    Parameter(
-        name="torque_motor_gain",
-        symbol="dGM",
-        unit="1",
-        lower=-0.1,
-        upper=0.1,
-        kind=Kind.NUISANCE,
-        scale=0.1,
-        short="torque-motor gain",
-        meaning="relative change of the torque motor's gain",
-        changes=lambda c, value: {"GM": c.GM * (1.0 + value)},
-    ),
-    Parameter(
-        name="hysteresis",
-        symbol="hyst",
-        unit="1",
-        lower=0.0,
-        upper=0.1,
-        kind=Kind.NUISANCE,
-        scale=0.04,
-        short="torque-motor hysteresis",
-        meaning="width of the torque motor's hysteresis over rated current",
-        changes=lambda c, value: {"HYS": c.HYS + value},
-    ),
-    Parameter(
-        name="backlash",
-        symbol="b",
-        unit="m",
-        lower=0.0,
-        upper=2e-5,
-        kind=Kind.NUISANCE,
-        scale=5e-6,
-        short="feedback backlash",
-        meaning="half-width of the backlash between spool and feedback spring",
-        changes=lambda c, value: {"BKL": c.BKL + value},
-    ),
+FAULTS: tuple[Parameter, ...] = (
     Parameter(
         name="Kintas",
         symbol="Kintas",
@@ -207,12 +71,15 @@ REGISTRY: tuple[Parameter, ...] = (
         changes=lambda c, value: {"FDJ": c.FDJ + value * (c.FDJ1 - c.FDJ)},
     ),
 )
-"""All that can be estimated; the progressive faults are those of the paper (PHY-13 to PHY-15)."""
+"""The progressive faults of the paper (PHY-13 to PHY-15)."""
 
-FAULTS: tuple[Parameter, ...] = tuple(item for item in REGISTRY if item.kind is Kind.FAULT)
+REGISTRY: tuple[Parameter, ...] = (*DATA, *NUISANCES, *FAULTS)
+"""All that can be estimated, in the order in which it is applied."""
 FAULT_NAMES: tuple[str, ...] = tuple(item.name for item in FAULTS)
-OFFSETS: tuple[Parameter, ...] = tuple(item for item in REGISTRY if item.adds_to is not None)
-"""Constant errors of sensors, which a test shows directly."""
+OFFSETS: tuple[Parameter, ...] = tuple(
+    item for item in REGISTRY if item.adds_to in (SPOOL_ROW, PRESSURE_ROW)
+)
+"""Constant errors of the sensors of spool and pressure, which a test shows directly."""
 
 
 def parameter(name: str) -> Parameter:

@@ -104,12 +104,24 @@ class PlantConstants(NamedTuple):
     """Dynamic dry friction of the jack at the limit of damage, N."""
     FR: Value
     """External load, N."""
+    KA: Value
+    """Load spring that draws the jack to its middle, N/m."""
     OXS: Value
     """Constant error of the spool's sensor, m."""
     OPD: Value
     """Constant error of the sensor of differential pressure, Pa."""
+    OXJ: Value
+    """Constant error of the jack's sensor, m."""
+    GXS: Value
+    """Relative error of the gain of the spool's sensor."""
+    GPD: Value
+    """The same of the sensor of differential pressure."""
+    GXJ: Value
+    """The same of the jack's sensor."""
+    TAU: Value
+    """Time constant of the analogue filter before the converters of spool and pressure, s."""
     DLY: Value
-    """Time before the end of the tick at which the spool is sampled, s."""
+    """Time before the end of the tick at which the channels are sampled, s."""
 
 
 FIELDS = len(PlantConstants._fields)
@@ -182,7 +194,13 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         FDJ=jack.FDJ0,
         FDJ1=jack.FDJ1,
         FR=jack.FR,
+        KA=0.0,
         OXS=0.0,
         OPD=0.0,
+        OXJ=0.0,
+        GXS=0.0,
+        GPD=0.0,
+        GXJ=0.0,
+        TAU=0.0,
         DLY=0.0,
     )

@@ -17,7 +17,7 @@ from ehadiag.model.anchor import re_anchored
 from ehadiag.model.control import ControlLaw, ControlState, control
 from ehadiag.model.jack import jack_tick
 from ehadiag.model.scalar.drive import drive
-from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, spool_tick
+from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, sensed_path, spool_tick
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.spool_events import SpoolState
 from ehadiag.monitor.layout import (
@@ -46,6 +46,7 @@ from ehadiag.monitor.layout import (
     keep_jack,
     keep_moving,
     moving_of,
+    sensor_law_of,
     settings_of,
     spool_law_of,
 )
@@ -169,12 +170,18 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
     deflection = drive(drive_law_of(p), held, _commanded(p, s, command, current, position))
     before = SpoolState(m.xf, m.wf, m.xs, m.vs, m.wire, int(m.direction), m.clamped != 0.0)
     after, count = spool_tick(tables, deflection, control_law_of(p).tick, before, nodes, 0)
-    innovation = spool - s.spool_offset - after.xs
-    p12, jack, jack_spool = jack_tick(jack_law_of(p), nodes, 0, count, jack_of(p), m.jack_spool)
+    sensor, tick = sensor_law_of(p), control_law_of(p).tick
+    seen, lagged = sensed_path(sensor, tick, nodes, 0, count, m.xs, m.lagged)
+    innovation = spool - sensor.spool_offset - sensor.spool_gain * seen
+    p12, jack, jack_spool = jack_tick(
+        jack_law_of(p), sensor, tick, nodes, 0, count, jack_of(p), m.jack_spool
+    )
     keep_jack(p, jack)
-    p[PREDICTED], p[PREDICTED + 1], p[PREDICTED + 2] = after.xs, p12, jack.place
+    p[PREDICTED], p[PREDICTED + 1] = seen, p12
+    p[PREDICTED + 2] = jack.place - sensor.lead * jack.velocity
     p[RESIDUAL] = innovation * s.spool_weight
-    p[RESIDUAL + 1] = (pressure - s.pressure_offset - p12) * s.pressure_weight
+    missed = pressure - sensor.pressure_offset - sensor.pressure_gain * p12
+    p[RESIDUAL + 1] = missed * s.pressure_weight
     xs, filtered, _ = re_anchored(
         innovation, s.anchor_gain, s.anchor_small, s.anchor_large, after.xs, m.filtered, law.stroke
     )
@@ -191,6 +198,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
             clamped,
             filtered,
             jack_spool + (xs - after.xs),
+            lagged + (xs - after.xs),
         ),
     )
     return _accumulate(p, s, 0) + 4 * _accumulate(p, s, 1)

@@ -10,6 +10,7 @@ from ehadiag.model.jack import JackState
 from ehadiag.model.laws import DriveLaw, JackLaw, SpoolLaw
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import FINEST
+from ehadiag.model.sensors import SensorLaw
 
 NUMBER: Final = 8
 """Bytes."""
@@ -36,10 +37,6 @@ class Settings(NamedTuple):
         See `anchor_gain`.
     anchor_large : float
         See `anchor_gain`.
-    spool_offset : float
-        Constant errors of the sensors, m and Pa.
-    pressure_offset : float
-        See `spool_offset`.
     spool_weight : float
         Reciprocal noise of both.
     pressure_weight : float
@@ -62,8 +59,6 @@ class Settings(NamedTuple):
     anchor_gain: float
     anchor_small: float
     anchor_large: float
-    spool_offset: float
-    pressure_offset: float
     spool_weight: float
     pressure_weight: float
     reference: float
@@ -95,6 +90,8 @@ class Moving(NamedTuple):
         Innovation of the re-anchoring, m.
     jack_spool : float
         Where the jack has the spool, m.
+    lagged : float
+        The spool behind the filter before its converter, m.
     """
 
     xf: float
@@ -106,6 +103,7 @@ class Moving(NamedTuple):
     clamped: float
     filtered: float
     jack_spool: float
+    lagged: float
 
 
 class Followed(NamedTuple):
@@ -137,7 +135,8 @@ def _place(start: int, kind: Any) -> int:
 DRIVE_LAW: Final = 0
 SPOOL_LAW: Final = _place(DRIVE_LAW, DriveLaw)
 JACK_LAW: Final = _place(SPOOL_LAW, SpoolLaw)
-CONTROL_LAW: Final = _place(JACK_LAW, JackLaw)
+SENSOR_LAW: Final = _place(JACK_LAW, JackLaw)
+CONTROL_LAW: Final = _place(SENSOR_LAW, SensorLaw)
 SETTINGS: Final = _place(CONTROL_LAW, ControlLaw)
 STATE: Final = _place(SETTINGS, Settings)
 MOVING: Final = STATE
@@ -166,6 +165,7 @@ SIZE: Final = NODES + NODES_PER_TICK * NODE_COLUMNS
 
 drive_law_of = unpacker(DriveLaw, DRIVE_LAW)
 spool_law_of, jack_law_of = unpacker(SpoolLaw, SPOOL_LAW), unpacker(JackLaw, JACK_LAW)
+sensor_law_of = unpacker(SensorLaw, SENSOR_LAW)
 control_law_of = unpacker(ControlLaw, CONTROL_LAW)
 settings_of = unpacker(Settings, SETTINGS)
 moving_of, keep_moving = unpacker(Moving, MOVING), packer(Moving, MOVING)

@@ -22,6 +22,7 @@ from ehadiag.model.laws import SpoolLaw, drive_law, jack_law
 from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.scalar.transition import spool_tables
+from ehadiag.model.sensors import sensor_law
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
@@ -140,7 +141,7 @@ class Monitor:
         noise = noise or (NOISE_LSB * SPOOL.lsb, NOISE_LSB * PRESSURE.lsb)
         values = _checked(faults, noise, offsets, tick)
         unknowns = Unknowns(FAULTS, (plant_constants(actuator, environment),), {})
-        constants = unknowns.constants(np.array(values))
+        constants = unknowns.constants(np.array(values))._replace(OXS=offsets[0], OPD=offsets[1])
         tables = spool_tables(constants, tick)
         self._law = SpoolLaw(*tables.law)
         self.design: CusumDesign = design_cusum(hours, tick, shift)
@@ -156,8 +157,6 @@ class Monitor:
             anchor_gain=anchor.gain,
             anchor_small=anchor.small,
             anchor_large=anchor.large,
-            spool_offset=offsets[0],
-            pressure_offset=offsets[1],
             spool_weight=1.0 / noise[0],
             pressure_weight=1.0 / noise[1],
             reference=self.design.reference,
@@ -171,6 +170,7 @@ class Monitor:
             *drive_law(constants),
             *tables.law,
             *jack_law(constants),
+            *sensor_law(constants),
             *control,
             *settings,
         ]
@@ -235,7 +235,7 @@ class Monitor:
         self._alarms, self._alarmed[:] = 0, False
         xs = min(max(spool, -law.stroke), law.stroke)
         xf = min(max(-law.ratio * xs, -law.breakaway), law.breakaway)
-        rest = layout.Moving(xf, 0.0, xs, 0.0, xs, 0.0, 0.0, 0.0, xs)
+        rest = layout.Moving(xf, 0.0, xs, 0.0, xs, 0.0, 0.0, 0.0, xs, xs)
         p[layout.MOVING : layout.JACK] = rest
         p[layout.FOLLOWED : layout.PREDICTED] = layout.Followed(math.nan, 0.0, 0.0, 0.0)
 

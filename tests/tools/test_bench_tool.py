@@ -47,7 +47,7 @@ def test_each_section_gives_figures(section, capsys):
 @pytest.mark.parametrize("faults", [(0.0, 0.0, 0.0), (0.3, 0.6, 0.3), (1.0, 1.0, 1.0)])
 def test_c_and_numba_are_the_same_algorithm(faults):
     """Else their times could not be compared."""
-    constants = damaged_unit(faults)._replace(DLY=1.5e-4)
+    constants = damaged_unit(faults)
     current = resolve_test("open").command()
     model = CModel(constants, spool_tables(constants, 1e-3), current)
     model()
@@ -59,7 +59,7 @@ def test_c_and_numba_are_the_same_algorithm(faults):
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 @pytest.mark.parametrize(
-    "anchor", [(0.0, np.inf, np.inf), (0.1, 2.0 * SPOOL.lsb, 20.0 * SPOOL.lsb)]
+    "anchor", [(0.0, np.inf, np.inf, 0.0), (0.1, 2.0 * SPOOL.lsb, 20.0 * SPOOL.lsb, 0.0)]
 )
 def test_c_and_lanes_are_the_same_algorithm(anchor):
     two = whole_test(bench.LOGS, 2)

@@ -201,7 +201,9 @@ static void jack_piece(const Fixed *f, const Piece *p, real begin, real stop, Ja
             continue;
         }
         if (j->velocity != 0.0) {
+            real from = q;
             q = stop_share(f, p, load, j->velocity, j->d, later, q, end);
+            j->place += 0.5 * (q - from) * p->span * j->velocity;
         } else {
             q = end;
         }

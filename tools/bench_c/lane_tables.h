@@ -9,7 +9,7 @@
 enum { GRID = WHOLE >> 3, HALVINGS = 3, ORDER = 8 };
 
 typedef struct {
-    real dry, room, ring_time, seen[4];
+    real dry, room, ring_time;
     real quarter[16], rest[4];
     real moving[GRID + 1][16], stuck[GRID + 1][4];
 } Tables;
@@ -83,7 +83,6 @@ static void tabulate(const Fixed *f, Tables *m)
     m->dry = 0.5 * c->FSS / force;
     m->room = lesser(f->t.breakaway, c->XFM);
     m->ring_time = f->t.ring_rate > 0.0 ? 1.0 / f->t.ring_rate : 1e30;
-    seen_weights(c->DLY, f->tick / NODES, m->seen);
     double rates[16] = {0.0, 1.0, 0.0, 0.0,
                         -(double)c->KF / c->JF, -(double)c->CF / c->JF, -(double)c->KSF / c->JF, 0.0,
                         0.0, 0.0, 0.0, 1.0,

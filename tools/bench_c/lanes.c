@@ -174,14 +174,14 @@ static inline int plain_tick(const Fixed *f, const Tables *m, real torque, Spool
 
 /* Summed squared weighted residual of each candidate, each square at most `cap`.
  *
- * Arguments as the fields of ehadiag.model.batch.Batch, the levels of SimdModel and STAGES;
- * candidates: (n, tests); residuals: (n, 2, ticks), or null. All of type real but the costs.
+ * Arguments as the fields of ehadiag.model.batch.Batch, but the currents of each span's ticks and
+ * the one before them (no hysteresis); the levels of SimdModel and STAGES; candidates: (n, tests); residuals: (n, 2, ticks), or null. All of type real but the costs.
  */
 void eha_lane_costs(const int64_t *test, const real *ticks, const int64_t *start,
                     const real *origin, const real *current_before, const real *current,
                     const real *spool, const real *pressure, const real *weight,
                     const real (*anchor)[3], const int64_t *levels,
-                    const real (*stages)[16][3][5], long spans, real cap, long n, long tests,
+                    const real (*stages)[16][4][5], long spans, real cap, long n, long tests,
                     const Plant *candidates, double *costs, real *residuals)
 {
     Tables m;
@@ -207,9 +207,7 @@ void eha_lane_costs(const int64_t *test, const real *ticks, const int64_t *start
                 real torque = c->GM * current[k];
                 int done = !plain_tick(&f, &m, torque, &s, path)
                            && event_tick(&f, &m, torque, &s, path, &jack);
-                real error = spool[k] - c->OXS
-                             - (m.seen[0] * path[0][NODES - 1] + m.seen[1] * path[0][NODES]
-                                + m.seen[2] * path[1][NODES - 1] + m.seen[3] * path[1][NODES]);
+                real error = spool[k] - c->OXS - path[0][NODES];
                 if (weight[k] != 0.0 && isfinite(error)) {
                     real residual = error * weight[k];
                     sum += lesser(residual * residual, cap);

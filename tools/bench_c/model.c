@@ -102,11 +102,11 @@ void eha_respond(const Plant *c, const double (*moving)[4][4], const double (*st
 {
     const Fixed f = fixed_of(c, tick);
     const Scalars *t = &f.t;
-    double nodes[ROOM][COLUMNS], w[4];
+    double nodes[ROOM][COLUMNS];
     Spool s = {0};
     Jack jack = {0};
     for (long k = 0; k < n; k++) {
-        double x = s.xs, before = x, lead = c->DLY;
+        double x = s.xs;
         int count = spool_tick(c, t, moving, stuck, decay, c->GM * current[k], tick, &s, nodes);
         for (int node = 0; node < count; node++) {
             double span = nodes[node][0];
@@ -114,12 +114,7 @@ void eha_respond(const Plant *c, const double (*moving)[4][4], const double (*st
             jack_piece(&f, &p, 0.0, 1.0, &jack);
             x = p.x1;
         }
-        int last = count - 1;
-        for (; lead > nodes[last][0] && last > 0; last--)
-            lead -= nodes[last][0];
-        seen_weights(lead, nodes[last][0], w);
-        spool_out[k] = w[0] * (last > 0 ? nodes[last - 1][1] : before) + w[1] * nodes[last][1]
-                       + w[2] * nodes[last][2] + w[3] * nodes[last][3];
+        spool_out[k] = x;
         double p12 = (f.flow * x - jack.velocity) / (f.scale * divide(c, greater(fabs(x), f.corner)));
         pressure_out[k] = greater(lesser(p12, c->PSR), -c->PSR);
         position_out[k] = jack.place;

@@ -11,10 +11,10 @@ typedef REAL real;
 enum { FINEST = 10, WHOLE = 1 << FINEST };
 enum { UNSURE = -1, NOTHING, REVERSAL, SPOOL_STOP, BREAKAWAY, FLAPPER_STOP, RELEASE };
 
-/* In the order of ehadiag.model.plant.PlantConstants. */
+/* What a unit needs that has no nuisance but offsets: PLANT of ehadiag_tools.bench.c_model. */
 typedef struct {
     real GM, JF, CF, KF, KSF, XFM, GQF, GPF, AS, MS, CS, XSM, FSS, FSS1, PSR, GP, GQ, CLK;
-    real AJ, MJ, CJ, XJM, FDJ, FDJ1, FR, OXS, OPD, DLY;
+    real AJ, MJ, CJ, XJM, FDJ, FDJ1, FR, OXS, OPD;
 } Plant;
 
 typedef struct {
@@ -32,16 +32,6 @@ static Scalars spool_law(const Plant *c)
     double ring = 0.5 * (double)c->CF / c->JF, square = (double)c->KF / c->JF - ring * ring;
     return (Scalars){force, damping, 0.5 * (double)c->FSS, c->FSS / force,
                      ring, square > 0.0 ? sqrt(square) : 0.0};
-}
-
-/* Weights by which the ends of a path's last piece give the spool as it is sampled. */
-static void seen_weights(real lead, real span, real w[4])
-{
-    real share = lead / span, u = 1.0 - (share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share), v = 1.0 - u;
-    w[0] = (1.0 + 2.0 * u) * v * v;
-    w[1] = u * u * (3.0 - 2.0 * u);
-    w[2] = u * v * v * span;
-    w[3] = -u * u * v * span;
 }
 
 static int held(const Plant *c, const Scalars *t, real xf, real xs)

@@ -145,7 +145,7 @@ static void pressure_residuals(const Fixed *f, real measured, real weight, real 
 void eha_unlocated_costs(const int64_t *test, const real *ticks, const int64_t *start,
                          const real *current, const real *spool, const real *pressure,
                          const real *weight, const int64_t *levels,
-                         const real (*stages)[16][3][5], long spans, real cap, long tests,
+                         const real (*stages)[16][4][5], long spans, real cap, long tests,
                          const Plant *candidates, double *costs)
 {
     int64_t all = start[spans];

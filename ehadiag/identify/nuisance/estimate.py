@@ -145,8 +145,7 @@ def _scaled(
     model: SimdModel, experiments: Sequence[Experiment], considered: Sequence[Considered] = ()
 ) -> Derivatives:
     """Coordinates scaled by the noise."""
-    noise = (experiments[0].spool_noise, experiments[0].pressure_noise)
-    return Derivatives(model, noise, considered)
+    return Derivatives(model, experiments[0].noise, considered)
 
 
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:

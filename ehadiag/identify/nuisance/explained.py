@@ -25,7 +25,7 @@ def excess(residuals: NDArray[np.float64]) -> float:
 
     Parameters
     ----------
-    residuals : shape (SIGNALS, N)
+    residuals : shape (signals, N)
         Weighted; 0 where no sample counts.
     """
     out = 0.0

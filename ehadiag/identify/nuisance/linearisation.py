@@ -45,10 +45,10 @@ class Linearised:
     ----------
     x : shape (k,)
         Mean of the points that were run.
-    residuals : shape (SIGNALS, N)
+    residuals : shape (signals, N)
         Their mean.
-    jacobian : shape (k, SIGNALS, N)
-    scatter : shape (SIGNALS, N)
+    jacobian : shape (k, signals, N)
+    scatter : shape (signals, N)
         Variance about the linear function.
     """
 

@@ -37,9 +37,8 @@ NEARBY = 0.1
 """Spread about a hint, in spreads of what is believed without one."""
 SMALL = 0.2
 """Spread of nuisances about 0, likewise."""
-LEFT_OUT = frozenset({"sampling_lead"})
-"""Nuisances that `--nuisances` does not free: no unit of section 8's basic set has them, and what
-is not known of them is considered in the interval."""
+BASIC = ("null_bias", "torque_motor_gain", "hysteresis", "backlash")
+"""Nuisances that `--nuisances` frees: those of section 8's basic set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +56,7 @@ class Known:
 
 def nuisances_of(registry: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Nuisances that an identification may free beside the constant errors of the sensors."""
-    return tuple(
-        item
-        for item in registry
-        if item.kind is Kind.NUISANCE and item.adds_to is None and item.name not in LEFT_OUT
-    )
+    return tuple(item for item in registry if item.name in BASIC)
 
 
 def belief_of(model: Derivatives, known: Mapping[str, Known]) -> Belief:

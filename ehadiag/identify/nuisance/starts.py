@@ -45,7 +45,7 @@ class Found:
     Attributes
     ----------
     belief : Belief
-    residuals : shape (SIGNALS, N)
+    residuals : shape (signals, N)
         Weighted, at its mean.
     cost : float
         Robust, see `robust_cost`.
@@ -67,7 +67,7 @@ class Found:
 
 
 def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cauchy's cost of weighted residuals, shape (n, SIGNALS, N): shape (n,)."""
+    """Cauchy's cost of weighted residuals, shape (n, signals, N): shape (n,)."""
     return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
 
 
@@ -94,7 +94,7 @@ def search(
     origins : sequence of Belief
         Where every other start begins, in turn; those between begin beside the best so far.
     explains : callable
-        Of residuals, shape (SIGNALS, N): whether there is nothing better to look for
+        Of residuals, shape (signals, N): whether there is nothing better to look for
         (a search that has not come to rest goes on all the same).
     alias : str
         Name of a parameter that passes for a sensor's constant error.
@@ -137,7 +137,7 @@ def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float
     # Medians do not see the samples that a wrong pair spoils.
     slopes, runs = model.additive_slopes(), model.many(points)
     for k, item in enumerate(model.estimated):
-        if item.adds_to is not None:
+        if item.adds_to is not None and item.adds_to < slopes.shape[1]:
             slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
             used = slope != 0.0
             points[:, k] -= np.median(run[:, used] / slope[used], axis=1)

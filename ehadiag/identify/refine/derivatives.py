@@ -55,13 +55,13 @@ class Slope:
     ----------
     x : shape (k,)
         The point, in units of the scales.
-    residuals : shape (SIGNALS, N)
+    residuals : shape (signals, N)
         Weighted, there.
     cost : float
         Their capped sum of squares.
-    jacobian : shape (k, SIGNALS, N)
+    jacobian : shape (k, signals, N)
         Derivatives of the residuals.
-    smooth : shape (SIGNALS, N)
+    smooth : shape (signals, N)
         Rows whose derivatives hold.
     """
 
@@ -73,7 +73,7 @@ class Slope:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Rows that a step goes by, shape (SIGNALS, N)."""
+        """Rows that a step goes by, shape (signals, N)."""
         return self.smooth & (self.residuals**2 < CAP)
 
 
@@ -114,7 +114,7 @@ class Derivatives:
         return self.model.evaluations
 
     def many(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Weighted residuals of points, shape (n, SIGNALS, N) for points of shape (n, k)."""
+        """Weighted residuals of points, shape (n, signals, N) for points of shape (n, k)."""
         return self.model.residuals(self._values(points))[0]
 
     def at(
@@ -124,8 +124,8 @@ class Derivatives:
 
         Returns
         -------
-        residuals : shape (SIGNALS, N)
-        considered : shape (c, SIGNALS, N)
+        residuals : shape (signals, N)
+        considered : shape (c, signals, N)
             Change of the residuals by a standard deviation of each considered parameter.
         anchored : int
         costs : list of float
@@ -212,11 +212,11 @@ class Derivatives:
         return out, smooth
 
     def additive_slopes(self) -> NDArray[np.float64]:
-        """Derivatives by what is simply added to a signal, 0 by all else, shape (k, SIGNALS, N)."""
+        """Derivatives by what is simply added to a signal, 0 by all else, shape (k, signals, N)."""
         weight = self.model.batch.weight
         out = np.zeros((len(self.estimated), *weight.shape))
         for j, item in enumerate(self.estimated):
-            if item.adds_to is not None:
+            if item.adds_to is not None and item.adds_to < len(weight):
                 out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
         return out
 

@@ -52,7 +52,7 @@ class FirstPart:
     ----------
     refined : Refinement
     noise : tuple
-        Of spool (m) and pressure (Pa) of each test, as the residuals show it.
+        Of the signals of each test (m, Pa, m), as the residuals show it.
     levels : shape (N,)
         How a model of these spans cuts its ticks (`ehadiag.model.simd.model.SimdModel`).
     evaluations : int
@@ -60,16 +60,13 @@ class FirstPart:
     """
 
     refined: Refinement
-    noise: tuple[tuple[float, float], ...]
+    noise: tuple[tuple[float, ...], ...]
     levels: NDArray[np.int64]
     evaluations: int
 
     def judged(self, experiments: Sequence[Experiment]) -> list[Experiment]:
         """Return the experiments with the noise that was found."""
-        return [
-            replace(item, spool_noise=spool, pressure_noise=pressure)
-            for item, (spool, pressure) in zip(experiments, self.noise, strict=True)
-        ]
+        return [item.with_noise(noise) for item, noise in zip(experiments, self.noise, strict=True)]
 
 
 def refine_first_part(
@@ -87,9 +84,9 @@ def refine_first_part(
     best = _refine(experiments, spans, start, levels)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
-        before = [(item.spool_noise, item.pressure_noise) for item in experiments]
+        before = [item.noise for item in experiments]
         judged = _judged(experiments, until, best.residuals)
-        after = [(item.spool_noise, item.pressure_noise) for item in judged]
+        after = [item.noise for item in judged]
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
@@ -98,7 +95,7 @@ def refine_first_part(
     if best.jagged:
         best = _polish(experiments, spans, best, levels)
         evaluations += best.evaluations
-    noise = tuple((item.spool_noise, item.pressure_noise) for item in experiments)
+    noise = tuple(item.noise for item in experiments)
     return FirstPart(best, noise, levels, evaluations)
 
 
@@ -159,9 +156,7 @@ def anchored_derivatives(
 
 def derivatives_of(model: SimdModel, experiments: Sequence[Experiment]) -> Derivatives:
     """A model of `anchored_model`, in coordinates scaled by the noise."""
-    return Derivatives(
-        model, (experiments[0].spool_noise, experiments[0].pressure_noise), CONSIDERED
-    )
+    return Derivatives(model, experiments[0].noise, CONSIDERED)
 
 
 def anchored_model(
@@ -189,6 +184,6 @@ def first_spans(experiments: Sequence[Experiment], until: Sequence[int]) -> Span
 def _judged(
     experiments: Sequence[Experiment], until: Sequence[int], residuals: NDArray[np.float64]
 ) -> list[Experiment]:
-    """Weigh all experiments by the noise that residuals show, shape (SIGNALS, sum of `until`)."""
+    """Weigh all experiments by the noise that residuals show, shape (signals, sum of `until`)."""
     parts = np.split(residuals, np.cumsum(until)[:-1], axis=1)
     return [judge_noise(item, part) for item, part in zip(experiments, parts, strict=True)]

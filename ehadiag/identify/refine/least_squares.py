@@ -48,15 +48,15 @@ class Refinement:
     scale : shape (k,)
     cost : float
         Capped sum of squares there.
-    residuals : shape (SIGNALS, N)
+    residuals : shape (signals, N)
         Weighted, there; 0 where no sample.
-    jacobian : shape (k, SIGNALS, N)
+    jacobian : shape (k, signals, N)
         Derivative of the residuals by x; 0 in rows left out.
-    considered : shape (c, SIGNALS, N)
+    considered : shape (c, signals, N)
         Change of the residuals by a standard deviation of each considered parameter.
-    used : shape (SIGNALS, N)
+    used : shape (signals, N)
         Rows that took part.
-    weighted : shape (SIGNALS, N)
+    weighted : shape (signals, N)
         Rows that have a sample.
     evaluations : int
         Runs of the model.
@@ -175,11 +175,12 @@ def _described(
 def median_offsets(model: ResidualModel, residuals: NDArray[np.float64]) -> dict[str, float]:
     """Median residual of each signal as the constant error of its sensor, SI by name.
 
-    For a model that runs free: re-anchoring would take most of an offset away.
+    For a model that runs free: re-anchoring would take most of an offset away. A signal that is
+    left out has none.
     """
     out = {}
     for item in model.unknowns.free:
-        if item.adds_to is not None:
+        if item.adds_to is not None and item.adds_to < len(model.batch.weight):
             weight = model.batch.weight[item.adds_to]
             used = weight > 0.0
             shares = residuals[item.adds_to, used] / weight[used]

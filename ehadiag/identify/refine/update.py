@@ -100,7 +100,7 @@ def _stepped(
 ) -> NDArray[np.float64]:
     """Where the residuals of the last part lead to.
 
-    taken: those that count, shape (SIGNALS, n).
+    taken: those that count, shape (signals, n).
     """
     before, now = first.jacobian[:, first.used], slope.jacobian[:, taken]
     stands, pulls = before @ first.residuals[first.used], now @ slope.residuals[taken]

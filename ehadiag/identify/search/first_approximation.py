@@ -243,7 +243,10 @@ def _pressure_costs(
     out = np.zeros(candidates.shape[0])
     for i in range(candidates.shape[0]):
         constants = plant_of(candidates[i, creep.test])
-        jack_response(constants, creep.before, creep.nodes, node_end, pressure, position)
+        jack_response(
+            constants, creep.nodes[0, 0], creep.before, 0.0, 0.0, position,
+            creep.nodes, node_end, pressure, position,
+        )  # fmt: skip
         for k in range(n):
             residual = (creep.pressure[k] - constants.OPD - pressure[k]) / creep.noise
             if math.isfinite(residual):

@@ -185,10 +185,11 @@ def experiment_arrays(experiment: Experiment) -> Iterable[NDArray[np.generic]]:
     """Return all numbers that an identification of a whole test works on."""
     item = experiment
     yield np.array([*item.constants, item.tick, item.origin, float(item.rested)])
-    yield np.array([item.spool_noise, item.pressure_noise, item.spool_offset, item.pressure_offset])
+    yield np.array([*item.noise, item.spool_offset, item.pressure_offset, item.position_offset])
     yield item.trace.current
     yield item.spool
     yield item.pressure
+    yield item.position
 
 
 def digest(label: str, arrays: Iterable[NDArray[np.generic]]) -> bytes:

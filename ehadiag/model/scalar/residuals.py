@@ -11,14 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.kernels import kernel
-from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch, longest_span
+from ehadiag.compile.kernels import inlined, kernel
+from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch, longest_span
 from ehadiag.model.parameters import Unknowns
 from ehadiag.model.plant import plant_of
 from ehadiag.model.scalar.jack import jack_response
 from ehadiag.model.scalar.spool import spool_response
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import spool_tables
+from ehadiag.model.sensors import sensor_law
 
 __all__ = ["ScalarModel"]
 
@@ -44,12 +45,19 @@ def _workspace(batch: Batch) -> _Workspace:
     )
 
 
+@inlined
+def _weighted(error: float, weight: float) -> float:
+    """Residual of a sample, 0 where it is missing."""
+    residual = error * weight
+    return residual if math.isfinite(residual) else 0.0
+
+
 @kernel
 def _residuals(
     batch: Batch, candidate: NDArray[np.float64], work: _Workspace, out: NDArray[np.float64]
 ) -> int:
     """Weighted residuals of one candidate, rows of constants of shape (tests, FIELDS)."""
-    anchored = 0
+    anchored, signals = 0, batch.weight.shape[0]
     for index in range(batch.tick.shape[0]):
         a, b = batch.start[index], batch.start[index + 1]
         n = b - a
@@ -67,21 +75,30 @@ def _residuals(
             work.nodes,
             work.node_end[:n],
         )
+        follow = batch.anchor[index, 3] if signals > POSITION_ROW else 0.0
         jack_response(
             constants,
+            tick,
             batch.origin[index],
+            batch.place[index],
+            follow,
+            batch.position[a:b],
             work.nodes,
             work.node_end[:n],
             work.pressure[:n],
             work.position[:n],
         )
+        law = sensor_law(constants)
         for k in range(n):
-            spool = batch.spool[a + k] - constants.OXS - work.spool[k]
-            spool *= batch.weight[SPOOL_ROW, a + k]
-            out[SPOOL_ROW, a + k] = spool if math.isfinite(spool) else 0.0
-            pressure = batch.pressure[a + k] - constants.OPD - work.pressure[k]
-            pressure *= batch.weight[PRESSURE_ROW, a + k]
-            out[PRESSURE_ROW, a + k] = pressure if math.isfinite(pressure) else 0.0
+            spool = batch.spool[a + k] - law.spool_offset - law.spool_gain * work.spool[k]
+            out[SPOOL_ROW, a + k] = _weighted(spool, batch.weight[SPOOL_ROW, a + k])
+            pressure = batch.pressure[a + k] - law.pressure_offset
+            pressure -= law.pressure_gain * work.pressure[k]
+            out[PRESSURE_ROW, a + k] = _weighted(pressure, batch.weight[PRESSURE_ROW, a + k])
+            if signals > POSITION_ROW:
+                position = batch.position[a + k] - law.position_offset
+                position -= law.position_gain * work.position[k]
+                out[POSITION_ROW, a + k] = _weighted(position, batch.weight[POSITION_ROW, a + k])
     return anchored
 
 
@@ -98,7 +115,7 @@ class ScalarModel:
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """See the protocol."""
-        out = np.empty((len(points), SIGNALS, self.batch.weight.shape[1]))
+        out = np.empty((len(points), *self.batch.weight.shape))
         anchored = np.empty(len(points), dtype=np.int64)
         for i, candidate in enumerate(self.unknowns.candidates(points)):
             anchored[i] = _residuals(self.batch, candidate, self._work, out[i])

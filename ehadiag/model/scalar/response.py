@@ -19,14 +19,14 @@ __all__ = ["FREE_RUN", "Anchor", "Response", "respond"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """Modelled response at the end of each tick, arrays of shape (n,)."""
+    """Modelled response of each tick when it is sampled, arrays of shape (n,)."""
 
     spool: NDArray[np.float64]
     """m, before any re-anchoring of the tick."""
     pressure: NDArray[np.float64]
     """Pa."""
     position: NDArray[np.float64]
-    """m, from 0 at the start."""
+    """m."""
     anchored: int
     """How many times the model was re-anchored."""
 
@@ -37,6 +37,7 @@ def respond(
     tick: float,
     *,
     origin: float = 0.0,
+    place: float = 0.0,
     history: NDArray[np.float64] | None = None,
     measured: NDArray[np.float64] | None = None,
     anchor: Anchor = FREE_RUN,
@@ -45,10 +46,10 @@ def respond(
 
     Parameters
     ----------
-    constants: of the candidate; its sensors' errors are not added to the response.
+    constants: of the candidate; offsets and gains of its sensors are not in the response.
     current: servovalve current of each tick, A, shape (n,).
     tick: length of a tick, s.
-    origin: spool position before the first tick, m.
+    origin, place: spool and jack position before the first tick, m.
     history: current before the first tick, A, shape (h,); None: the hysteresis is unloaded.
     measured: spool position to re-anchor on, m, shape (n,), NaN where missing.
     """
@@ -72,5 +73,6 @@ def respond(
         nodes,
         node_end,
     )
-    jack_response(plant, origin, nodes, node_end, pressure, position)
+    unseen = np.full(n, np.nan)
+    jack_response(plant, tick, origin, place, 0.0, unseen, nodes, node_end, pressure, position)
     return Response(spool, pressure, position, anchored)

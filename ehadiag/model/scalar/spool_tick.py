@@ -19,14 +19,12 @@ from ehadiag.model.laws import (
     SpoolLaw,
     flapper_held,
     play,
-    sampled,
-    sensor_law,
     slide_base,
     steady_rate,
     still_flapper,
 )
-from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
+from ehadiag.model.sensors import LATE, SensorLaw, followed, following, sensing, through_ends
 from ehadiag.model.spool_events import (
     NOTHING,
     SpoolState,
@@ -37,7 +35,7 @@ from ehadiag.model.spool_events import (
     switch,
 )
 
-__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "sampled_path", "spool_rest", "spool_tick"]
+__all__ = ["NODES_PER_TICK", "NODE_COLUMNS", "sensed_path", "spool_rest", "spool_tick"]
 
 Matrix = NDArray[np.float64]
 BASE = 3
@@ -224,15 +222,22 @@ def spool_tick(
 
 
 @inlined
-def sampled_path(c: PlantConstants, nodes: Matrix, first: int, end: int, before: float) -> float:
-    """Spool as its sensor samples it in a tick, m, so long before its end as the constants say.
+def sensed_path(
+    law: SensorLaw, tick: float, nodes: Matrix, first: int, end: int, before: float, lagged: float
+) -> tuple[float, float]:
+    """Spool as its sensor samples it in a tick, and behind the filter at the tick's end, m.
 
-    nodes, first, end: the path of the tick; before: position at its start, m.
+    nodes, first, end: the tick's path; before: position before it, m; lagged: behind the filter, m.
     """
-    lead, node = c.DLY, end - 1
-    while lead > nodes[node, 0] and node > first:
-        lead -= nodes[node, 0]
-        node -= 1
-    start = nodes[node - 1, 1] if node > first else before
-    law = sensor_law(c, lead, nodes[node, 0])
-    return sampled(law, start, nodes[node, 1], nodes[node, 2], nodes[node, 3])
+    if not sensing(law):
+        return nodes[end - 1, 1], nodes[end - 1, 1]
+    due, seen, x0 = tick - min(law.lead, tick), lagged, before
+    for node in range(first, end):
+        span, x1 = nodes[node, 0], nodes[node, 1]
+        cubic = through_ends(x0, x1, span * nodes[node, 2], span * nodes[node, 3])
+        if 0.0 < due <= LATE * span:
+            seen = followed(following(law.lag, span, due), lagged, cubic)
+        lagged = followed(following(law.lag, span, span), lagged, cubic)
+        due -= span
+        x0 = x1
+    return seen, lagged

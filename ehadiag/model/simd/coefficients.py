@@ -9,21 +9,26 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined, kernel
 from ehadiag.compile.vector import WIDTH, load, packed, store
-from ehadiag.model.laws import SpoolLaw, drive_law, jack_law, sensor_law, spool_law
+from ehadiag.model.laws import SpoolLaw, drive_law, jack_law, spool_law
 from ehadiag.model.plant import PlantConstants, plant_of
 from ehadiag.model.scalar.transition import FINEST, TAYLOR_HALVINGS
+from ehadiag.model.sensors import SensorLaw, following, sensing, sensor_law
 from ehadiag.model.simd.layout import (
     LANES,
     LOOSE,
+    MOST_HALVINGS,
     MOVE,
-    NODES,
     REST,
     RING_TIME,
     ROOM,
+    SENSING,
+    SENSING_ROWS,
     keep_drive_law,
     keep_jack_law,
+    keep_sampled_step,
     keep_sensor_law,
     keep_spool_law,
+    keep_whole_step,
     spool_law_of_lane,
 )
 
@@ -124,17 +129,30 @@ def _powers(
 
 
 @inlined
-def _laws(c: PlantConstants, tick: float, i: int, out: NDArray[np.float64]) -> SpoolLaw:
+def _laws(c: PlantConstants, i: int, out: NDArray[np.float64]) -> SpoolLaw:
     """Write the laws of lane `i`; returns that of the spool."""
     t = spool_law(c)
     keep_drive_law(out, i, drive_law(c))
     keep_spool_law(out, i, t)
     keep_jack_law(out, i, jack_law(c))
-    keep_sensor_law(out, i, sensor_law(c, c.DLY, tick / NODES))
+    keep_sensor_law(out, i, sensor_law(c))
     out[ROOM * LANES + i] = min(t.breakaway, t.flapper_stop)
     # A flapper that does not ring is never taken to rest: slower, not wrong.
     out[RING_TIME * LANES + i] = 1.0 / t.ring_rate if t.ring_rate > 0.0 else NEVER
     return t
+
+
+@inlined
+def _filter(law: SensorLaw, tick: float, i: int, out: NDArray[np.float64]) -> None:
+    """Write how lane `i` follows its signals before the converters."""
+    due = tick - min(law.lead, tick)
+    for level in range(MOST_HALVINGS + 1):
+        span = tick / (1 << level)
+        step = max(math.ceil(due / span) - 1, 0)
+        place = level * SENSING_ROWS * LANES + i
+        keep_whole_step(out, place, following(law.lag, span, span))
+        keep_sampled_step(out, place, following(law.lag, span, due - step * span))
+        out[(SENSING + SENSING_ROWS - 1) * LANES + place] = step
 
 
 @kernel
@@ -145,8 +163,8 @@ def tabulate(
     moving: NDArray[np.float64],
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
-) -> bool:
-    """Coefficients of all lanes; returns whether any has backlash.
+) -> tuple[bool, bool]:
+    """Coefficients of all lanes; returns whether any has backlash, and a filter or a lead.
 
     Parameters
     ----------
@@ -159,11 +177,12 @@ def tabulate(
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
-    any_backlash = False
+    any_backlash = any_filter = False
     for i in range(LANES):
         c = plant_of(candidates[i])
-        t = _laws(c, tick, i, coefficients)
+        t = _laws(c, i, coefficients)
         any_backlash = any_backlash or t.backlash > 0.0
+        any_filter = any_filter or sensing(sensor_law(c))
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
         rates[4 * LANES + i], rates[5 * LANES + i] = stiffness, friction
@@ -184,6 +203,9 @@ def tabulate(
                 moving[place + WIDTH] = math.exp(-time * rate)
     _, whole = _powers(ring, 2, tick, STUCK_ROWS, stuck)
     _copy(whole, coefficients, REST * LANES)
+    if any_filter:
+        for i in range(LANES):
+            _filter(sensor_law(plant_of(candidates[i])), tick, i, coefficients)
     if any_backlash:
         rates[6 * LANES : 7 * LANES] = 0.0
         quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, loose)
@@ -192,4 +214,4 @@ def tabulate(
             for level in range(len(SHIFTS)):
                 place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH
                 loose[place : place + WIDTH] = moving[place : place + WIDTH]
-    return any_backlash
+    return any_backlash, any_filter

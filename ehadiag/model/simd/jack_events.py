@@ -8,17 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined
-from ehadiag.model.jack import JackState, Piece, jack_piece
+from ehadiag.model.jack import JackState, Piece, Probe, jack_piece
+from ehadiag.model.sensors import sensing
 from ehadiag.model.simd.layout import (
     BUSY,
     FRESH,
     JACK,
     JACK_DIRECTION,
     JACK_VELOCITY,
+    LAGGED,
     LANES,
     NODES,
+    PRESSURE_SEEN,
     SLOPE,
     jack_law_of_lane,
+    sensor_law_of_lane,
 )
 
 __all__ = ["jack_events", "keep_lane_jack", "lane_jack"]
@@ -32,6 +36,8 @@ def lane_jack(state: NDArray[np.float64], i: int) -> JackState:
         state[JACK_VELOCITY * LANES + i],
         state[JACK_DIRECTION * LANES + i],
         state[FRESH * LANES + i],
+        state[LAGGED * LANES + i],
+        state[PRESSURE_SEEN * LANES + i],
     )
 
 
@@ -42,6 +48,8 @@ def keep_lane_jack(jack: JackState, state: NDArray[np.float64], i: int) -> None:
     state[JACK_VELOCITY * LANES + i] = jack.velocity
     state[JACK_DIRECTION * LANES + i] = jack.direction
     state[FRESH * LANES + i] = jack.fresh
+    state[LAGGED * LANES + i] = jack.lagged
+    state[PRESSURE_SEEN * LANES + i] = jack.seen
 
 
 @bare_kernel
@@ -65,9 +73,14 @@ def jack_events(
         if state[BUSY * LANES + i] == 0.0:
             continue
         j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
+        sensor = sensor_law_of_lane(coefficients, i)
+        due, senses = tick - min(sensor.lead, tick), sensing(sensor)
         for n in range(first, last):
             a, b = n * LANES + i, (n + 1) * LANES + i
             rise0, rise1 = span * path[SLOPE * LANES + a], span * path[SLOPE * LANES + b]
             piece = Piece(span, path[a], path[b], rise0, rise1)
-            jack = jack_piece(j, piece, max(begin - n, 0.0), min(stop - n, 1.0), jack)
+            probe = Probe(sensor.lag, due - n * span)
+            jack = jack_piece(
+                j, probe, senses, piece, max(begin - n, 0.0), min(stop - n, 1.0), jack
+            )
         keep_lane_jack(jack, state, i)

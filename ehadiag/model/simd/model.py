@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.batch import SIGNALS, Batch
+from ehadiag.model.batch import Batch
 from ehadiag.model.parameters import Unknowns
 from ehadiag.model.simd.layout import LANES
 from ehadiag.model.simd.residuals import (
@@ -69,7 +69,7 @@ class SimdModel:
         """See the protocol."""
         count = len(points)
         candidates = self.unknowns.candidates(points)
-        out = np.empty((count, SIGNALS, self.batch.weight.shape[1]))
+        out = np.empty((count, *self.batch.weight.shape))
         anchored = np.empty(count, dtype=np.int64)
         blocks = -(-count // LANES)
         threads = max(1, min(self._threads, blocks))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.kernels import kernel, merged
+from ehadiag.compile.kernels import bare_kernel, kernel, merged
 from ehadiag.compile.vector import (
     WIDTH,
     anywhere,
@@ -20,10 +20,17 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW, Batch
+from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch
 from ehadiag.model.plant import FIELDS, plant_of
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
-from ehadiag.model.simd.jack import jack_lanes, pressures
+from ehadiag.model.simd.jack import (
+    follow_lanes,
+    jack_lanes,
+    positions,
+    pressures,
+    rest_jacks,
+    sensed_jack_lanes,
+)
 from ehadiag.model.simd.jack_events import jack_events
 from ehadiag.model.simd.layout import (
     ANCHORED,
@@ -31,7 +38,8 @@ from ehadiag.model.simd.layout import (
     LANES,
     PATH_ROWS,
     PLAYS,
-    PRESSURE,
+    POSITION,
+    PRESSURE_SEEN,
     SEEN,
     SPOOL,
     STATE_ROWS,
@@ -116,7 +124,7 @@ def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64
     Shape (N,), see `Scratch.levels`.
     """
     levels = np.full(batch.weight.shape[1], -1, dtype=np.int64)
-    if batch.weight[PRESSURE_ROW].any():
+    if batch.weight[PRESSURE_ROW:].any():
         # Without weights the jack is left out, and the spool's path is all that is looked at.
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
         block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(LANES))
@@ -138,7 +146,7 @@ def scratch_for(levels: NDArray[np.int64]) -> Scratch:
         sample=np.zeros(LANES),
         no_costs=np.zeros(0),
         uncounted=np.zeros(0, dtype=np.int64),
-        no_residuals=np.zeros((0, SIGNALS, 0)),
+        no_residuals=np.zeros((0, 0, 0)),
     )
 
 
@@ -183,8 +191,13 @@ def _hold_against(
     """
     for o in range(0, end, WIDTH):
         law = sensor_laws(coefficients, o)
-        offset = law.spool_offset if signal == SPOOL_ROW else law.pressure_offset
-        residual = (measured - offset - load(state, row * LANES + o)) * weight
+        if signal == SPOOL_ROW:
+            offset, gain = law.spool_offset, law.spool_gain
+        elif signal == PRESSURE_ROW:
+            offset, gain = law.pressure_offset, law.pressure_gain
+        else:
+            offset, gain = law.position_offset, law.position_gain
+        residual = (measured - offset - gain * load(state, row * LANES + o)) * weight
         store(sample, o, residual)
         store(sums, o, load(sums, o) + least(residual * residual, cap))
 
@@ -205,6 +218,22 @@ def _jack_tick(
             jack_events(count, level, step, tick, state, path, coefficients)
 
 
+@bare_kernel
+def _sensed_jack_tick(
+    count: int,
+    end: int,
+    tick: float,
+    level: int,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+) -> None:
+    """The same, with the pressure as the filter before its converter has it."""
+    for step in range(1 << level):
+        if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
+            jack_events(count, level, step, tick, state, path, coefficients)
+
+
 @merged
 def _block(
     batch: Batch, candidates: NDArray[np.float64], cap: float, work: Scratch,
@@ -212,13 +241,14 @@ def _block(
 ) -> None:  # fmt: skip
     """Costs of up to LANES candidates into `work.sums`, residuals of the first ones into `out`.
 
-    out: shape (LANES or less, SIGNALS, N), or of no candidate.
+    out: shape (LANES or less, signals, N), or of no candidate.
     """
     state, path, coefficients = work.state, work.path, work.coefficients
     moving, loose, stuck, rows = work.moving, work.loose, work.stuck, work.rows
     sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
-    weight, levels, start = batch.weight, work.levels, batch.start
+    position, weight, levels, start = batch.position, batch.weight, work.levels, batch.start
+    located = weight.shape[0] > POSITION_ROW
     count, wanted = candidates.shape[0], out.shape[0]
     # Lanes that hold no candidate repeat the last one and take no events; a half of none is left.
     end = WIDTH if count <= WIDTH else LANES
@@ -226,33 +256,31 @@ def _block(
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
         tick, test = batch.tick[index], batch.test[index]
-        gain, small, large = batch.anchor[index]
+        gain, small, large, follow = batch.anchor[index]
         anchored = math.isfinite(small) or math.isfinite(large)
         for i in range(LANES):
             for field in range(FIELDS):
                 rows[i, field] = candidates[min(i, count - 1), test, field]
-        late = False
-        for i in range(count):
-            late = late or plant_of(rows[i]).DLY != 0.0
+        backlash, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
         # Most candidates are read at the end of the tick, where the spool is at hand.
-        read = SEEN if late else SPOOL
-        backlash = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
         state[PLAYS * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
             drive_lanes(end, current[k], plays, state, coefficients)
         deflect_lanes(end, plays, state, coefficients)
         rest_lanes(end, batch.origin[index], state, coefficients)
+        rest_jacks(end, batch.origin[index], batch.place[index], state, coefficients)
         last = start[index + 1] - 1
-        while last >= start[index] and weight[PRESSURE_ROW, last] == 0.0:
+        while last >= start[index] and not weight[PRESSURE_ROW:, last].any():
             last -= 1
         for k in range(start[index], start[index + 1]):
             drive_lanes(end, current[since + k - start[index]], plays, state, coefficients)
             if spool_lanes(end, tick, backlash, state, path, coefficients):
                 event_ticks(count, tick, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
-            if seen and late:
-                see_lanes(end, state, path, coefficients)
+            if senses:
+                see_lanes(end, tick, state, path, coefficients)
             if weight[SPOOL_ROW, k] != 0.0 and seen:
                 _hold_against(
                     end, spool[k], weight[SPOOL_ROW, k], cap, read, SPOOL_ROW,
@@ -262,16 +290,30 @@ def _block(
                     out[i, SPOOL_ROW, k] = sample[i]
             if levels[k] < 0:
                 levels[k] = _level(path)
-            if k <= last:  # nothing depends on the jack but the pressure
-                _jack_tick(count, end, tick, levels[k], state, path, coefficients)
+            if k <= last:  # nothing depends on the jack but pressure and position
+                if senses:
+                    _sensed_jack_tick(count, end, tick, levels[k], state, path, coefficients)
+                else:
+                    _jack_tick(count, end, tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(end, state, path, coefficients)
+                pressures(end, senses, state, path, coefficients)
                 _hold_against(
-                    end, pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE, PRESSURE_ROW,
+                    end, pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE_SEEN, PRESSURE_ROW,
                     state, coefficients, sample, sums,
                 )  # fmt: skip
                 for i in range(wanted):
                     out[i, PRESSURE_ROW, k] = sample[i]
+            if located and math.isfinite(position[k]):
+                positions(end, state, coefficients)
+                if weight[POSITION_ROW, k] != 0.0:
+                    _hold_against(
+                        end, position[k], weight[POSITION_ROW, k], cap, POSITION, POSITION_ROW,
+                        state, coefficients, sample, sums,
+                    )  # fmt: skip
+                    for i in range(wanted):
+                        out[i, POSITION_ROW, k] = sample[i]
+                if follow != 0.0:
+                    follow_lanes(end, position[k], follow, state, coefficients)
             if anchored and seen:
                 anchor_lanes(end, read, spool[k], gain, small, large, state, coefficients)
 
@@ -318,7 +360,7 @@ def block_residuals(
     out: NDArray[np.float64],
     anchored: NDArray[np.int64],
 ) -> None:
-    """Weighted residuals, measured less modelled, of every candidate: out, shape (n, SIGNALS, N).
+    """Weighted residuals, measured less modelled, of every candidate: out, shape (n, signals, N).
 
     `candidates` has shape (n, tests, FIELDS). A missing sample gives 0.
     anchored: out, how often the model was re-anchored, shape (n,).

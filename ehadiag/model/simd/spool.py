@@ -23,7 +23,8 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.laws import play, sampled, slide_base, still_flapper
+from ehadiag.model.laws import play, slide_base, still_flapper
+from ehadiag.model.sensors import followed, through_ends
 from ehadiag.model.simd.layout import (
     ANCHORED,
     BUSY,
@@ -44,18 +45,25 @@ from ehadiag.model.simd.layout import (
     RING_TIME,
     ROOM,
     SEEN,
+    SENSING,
+    SENSING_ROWS,
     SLOPE,
     SPOOL,
+    SPOOL_LAGGED,
     SPOOL_RATE,
     WIRE,
     drive_laws,
+    sampled_steps,
     sensor_laws,
     spool_laws,
+    whole_steps,
 )
 from ehadiag.model.spool_events import TOUCH
 
 __all__ = ["anchor_lanes", "deflect_lanes", "drive_lanes", "rest_lanes", "see_lanes", "spool_lanes"]
 
+QUARTERS = 2
+"""Halvings of a tick that make its pieces."""
 BIG = 1e30
 LEAST_DEPTH = -1e-14
 """m and (times 10) m/s: what rounding may make of a spool that creeps towards rest."""
@@ -114,6 +122,7 @@ def rest_lanes(
         store(state, FLAPPER * LANES + o, most(least(still, t.breakaway), -t.breakaway))
         store(state, SPOOL * LANES + o, xs)
         store(state, WIRE * LANES + o, xs)
+        store(state, SPOOL_LAGGED * LANES + o, xs)
 
 
 @packed
@@ -277,19 +286,30 @@ def spool_lanes(
 @packed
 def see_lanes(
     end: int,
+    tick: float,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Spool of all lanes as it is sampled in a tick, into the state."""
+    """Spool of all lanes as it is sampled in a tick, behind its filter or early, into the state."""
     for o in range(0, end, WIDTH):
-        seen = sampled(
-            sensor_laws(coefficients, o),
-            load(path, (PLACE + NODES - 1) * LANES + o),
-            load(path, (PLACE + NODES) * LANES + o),
-            load(path, (SLOPE + NODES - 1) * LANES + o),
-            load(path, (SLOPE + NODES) * LANES + o),
-        )
+        at_end = load(path, (PLACE + NODES) * LANES + o)
+        law = sensor_laws(coefficients, o)
+        place = QUARTERS * SENSING_ROWS * LANES + o
+        step = load(coefficients, (SENSING + SENSING_ROWS - 1) * LANES + place)
+        whole, upto = whole_steps(coefficients, place), sampled_steps(coefficients, place)
+        lagged, early = load(state, SPOOL_LAGGED * LANES + o), at_end
+        for n in range(NODES):
+            a, b = n * LANES + o, (n + 1) * LANES + o
+            cubic = through_ends(
+                load(path, a), load(path, b),
+                0.25 * tick * load(path, SLOPE * LANES + a),
+                0.25 * tick * load(path, SLOPE * LANES + b),
+            )  # fmt: skip
+            early = where(step == n * 1.0, followed(upto, lagged, cubic), early)
+            lagged = followed(whole, lagged, cubic)
+        store(state, SPOOL_LAGGED * LANES + o, lagged)
+        seen = where(law.lag + law.lead == 0.0, at_end, early)
         store(state, SEEN * LANES + o, seen)
 
 
@@ -310,8 +330,8 @@ def anchor_lanes(
     """
     for o in range(0, end, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
-        offset = sensor_laws(coefficients, o).spool_offset
-        error = measured - offset - load(state, read * LANES + o)
+        law = sensor_laws(coefficients, o)
+        error = measured - law.spool_offset - law.spool_gain * load(state, read * LANES + o)
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)
@@ -324,3 +344,6 @@ def anchor_lanes(
         placed = most(least(xs + move, stroke), -stroke)
         store(state, SPOOL * LANES + o, placed)
         store(state, WIRE * LANES + o, load(state, WIRE * LANES + o) + (placed - xs))
+        if read == SEEN:
+            lagged = load(state, SPOOL_LAGGED * LANES + o)
+            store(state, SPOOL_LAGGED * LANES + o, lagged + (placed - xs))

@@ -23,9 +23,10 @@ from ehadiag.compile.vector import (
     packed,
     store,
 )
-from ehadiag.model.jack import Piece, jack_piece
+from ehadiag.model.jack import Piece, Probe, jack_piece
 from ehadiag.model.laws import SpoolLaw, play, slide_base, steady_rate, still_flapper
 from ehadiag.model.scalar.transition import FINEST
+from ehadiag.model.sensors import sensing
 from ehadiag.model.simd.coefficients import MOVING_ROWS, SHIFTS, STUCK_ROWS
 from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack
 from ehadiag.model.simd.layout import (
@@ -45,6 +46,7 @@ from ehadiag.model.simd.layout import (
     SPOOL_RATE,
     WIRE,
     jack_law_of_lane,
+    sensor_law_of_lane,
     spool_law_of_lane,
 )
 from ehadiag.model.spool_events import (
@@ -307,7 +309,7 @@ def _event_tick(
                 path[(SLOPE + done // QUARTER) * LANES + i] = s.vs
         level = 0 if fine or steps == whole else level + 1
     if kinks:
-        _jack_beside(i, from_xs, count, state, path, coefficients)
+        _jack_beside(i, tick, from_xs, count, state, path, coefficients)
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = s.xf, s.wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = s.xs, s.vs
     state[WIRE * LANES + i] = s.wire
@@ -330,6 +332,7 @@ def _event(t: SpoolLaw, s: SpoolState, xf: float, xs: float, vs: float) -> int:
 @merged
 def _jack_beside(
     i: int,
+    tick: float,
     from_xs: float,
     count: int,
     state: NDArray[np.float64],
@@ -338,11 +341,14 @@ def _jack_beside(
 ) -> None:
     """Jack of lane `i` over the tick, by `count` pieces of the spool's path."""
     j, jack = jack_law_of_lane(coefficients, i), lane_jack(state, i)
+    sensor = sensor_law_of_lane(coefficients, i)
+    due, senses = tick - min(sensor.lead, tick), sensing(sensor)
     for n in range(count):
         o = PIECES + 4 * n
         span = path[o]
         piece = Piece(span, from_xs, path[o + 1], path[o + 2] * span, path[o + 3] * span)
-        jack = jack_piece(j, piece, 0.0, 1.0, jack)
+        jack = jack_piece(j, Probe(sensor.lag, due), senses, piece, 0.0, 1.0, jack)
+        due -= span
         from_xs = path[o + 1]
     keep_lane_jack(jack, state, i)
     state[DONE * LANES + i] = 1.0

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
-from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW
+from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, Unknowns, parameter
 
+ROWS = 2
 N = 60
 NOISE = (2e-7, 3e4)
 LEAD = parameter("sampling_lead")
@@ -28,12 +29,12 @@ class Formula:
 
     def residuals(self, points):
         self.evaluations += len(points)
-        out = np.array([np.broadcast_to(self.formula(*p), (SIGNALS, N)) for p in points])
+        out = np.array([np.broadcast_to(self.formula(*p), (ROWS, N)) for p in points])
         return out, np.arange(len(points))
 
 
 def rows(seed, size):
-    return np.random.default_rng(seed).standard_normal((size, SIGNALS, N))
+    return np.random.default_rng(seed).standard_normal((size, ROWS, N))
 
 
 @pytest.mark.parametrize("x", [(0.4, 0.5, 0.6), (0.0, 1.0, 0.5)])
@@ -71,7 +72,7 @@ def test_a_row_that_jumps_beside_the_point_is_left_out():
     for place, seen_narrow in ((2e-5, True), (1.2e-4, False)):
 
         def formula(kintas, _fss, _fdj, place=place):
-            out = np.zeros((SIGNALS, N))
+            out = np.zeros((ROWS, N))
             out[0, 7] = 5.0 if kintas > 0.5 + place else 0.0
             return out
 
@@ -79,7 +80,7 @@ def test_a_row_that_jumps_beside_the_point_is_left_out():
         slope = model.slopes([np.full(3, 0.5)])[0]
         assert slope.smooth[0, 7] == (not seen_narrow)
         assert not model.trusted(slope).smooth[0, 7]
-        assert model.trusted(slope).smooth.sum() == SIGNALS * N - 1
+        assert model.trusted(slope).smooth.sum() == ROWS * N - 1
 
 
 def test_what_is_considered_moves_the_residuals_but_is_not_estimated():

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from ehadiag.identify.refine.least_squares import Refinement
 from ehadiag.identify.uncertainty import DISCREPANCY_STD, covariance, interval95
-from ehadiag.model.batch import SIGNALS
 from ehadiag.model.parameters import FAULTS, OFFSETS
 
+ROWS = 2
 N = 400
 TRUTH = np.array([0.4, 0.5, 0.6])
 
@@ -23,12 +23,12 @@ SCALE = np.array([item.scale for item in PARAMETERS])
 
 def linear_problem(seed, noise):
     """Least squares on residuals = noise - J (x - truth), in units of the scales."""
-    jacobian = np.random.default_rng(seed).standard_normal((K, SIGNALS, N))
+    jacobian = np.random.default_rng(seed).standard_normal((K, ROWS, N))
     jacobian[: len(FAULTS)] *= 40.0
     rows = jacobian.reshape(K, -1)
     step = np.linalg.solve(rows @ rows.T, rows @ noise.ravel())
-    residuals = (noise.ravel() - step @ rows).reshape(SIGNALS, N)
-    used = np.ones((SIGNALS, N), dtype=np.bool_)
+    residuals = (noise.ravel() - step @ rows).reshape(ROWS, N)
+    used = np.ones((ROWS, N), dtype=np.bool_)
     return Refinement(
         parameters=PARAMETERS,
         x=np.concatenate([TRUTH, np.zeros(len(OFFSETS))]) + step,
@@ -36,7 +36,7 @@ def linear_problem(seed, noise):
         cost=float((residuals**2).sum()),
         residuals=residuals,
         jacobian=jacobian,
-        considered=np.zeros((0, SIGNALS, N)),
+        considered=np.zeros((0, ROWS, N)),
         used=used,
         weighted=used,
         evaluations=0,
@@ -89,7 +89,7 @@ def test_correlated_residuals_widen_what_correlates_with_them():
         fit.jacobian[0] = slow
         rows = fit.jacobian.reshape(K, -1)
         step = np.linalg.solve(rows @ rows.T, rows @ noise.ravel())
-        fit.residuals[:] = (noise.ravel() - step @ rows).reshape(SIGNALS, N)
+        fit.residuals[:] = (noise.ravel() - step @ rows).reshape(ROWS, N)
         errors.append(step[0])
         stds.append(np.sqrt(covariance(fit)[0, 0]))
     real = np.std(errors)

@@ -12,7 +12,6 @@ from ehadiag.identify.refine.least_squares import refine
 from ehadiag.identify.refine.update import add_last_part
 from ehadiag.identify.textbook import first_ticks
 from ehadiag.identify.uncertainty import covariance
-from ehadiag.model.batch import SIGNALS
 from ehadiag.model.parameters import FAULT_NAMES
 
 FAULTS = (0.4, 0.5, 0.6)
@@ -61,7 +60,7 @@ def test_the_last_part_adds_its_information_and_its_residuals():
     (experiment,) = pair = [own_experiment(FAULTS)]
     until, first, judged = parts(pair)
     found = add_last_part(judged, until, first)
-    assert found.residuals.shape == (SIGNALS, experiment.ticks)
+    assert found.residuals.shape == (2, experiment.ticks)
     assert np.all(np.diag(found.normal) > np.diag(first.refined.normal))
     assert found.used[:, until[0] :].mean() > 0.9
     assert not np.any(found.jacobian[:, ~found.used])

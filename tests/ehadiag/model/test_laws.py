@@ -12,8 +12,6 @@ from ehadiag.model.laws import (
     jack_law,
     pressure,
     resistance,
-    sampled,
-    sensor_law,
     spool_law,
     steady_rate,
 )
@@ -67,34 +65,6 @@ def test_a_steady_spool_has_its_forces_in_balance(kintas, xf, direction):
     flow_drag = constants.GPF / constants.GQF * constants.AS**2
     force = constants.AS * constants.GPF * xf - (flow_drag + constants.CS) * v
     assert force == pytest.approx(direction * law.dynamic, abs=1e-6)
-
-
-cubics = st.tuples(AMOUNTS, st.floats(-1.0, 1.0), st.floats(-1e3, 1e3), st.floats(-1e6, 1e6))
-
-
-@given(cubics, st.floats(1e-6, 1e-3), st.floats(0.0, 1.0))
-def test_the_sampled_spool_is_on_the_cubic_through_the_ends(cubic, span, share):
-    a, b, c, d = cubic
-
-    def place(t):
-        return a + t * (b + t * (c + t * d))
-
-    def rate(t):
-        return b + t * (2.0 * c + 3.0 * d * t)
-
-    law = sensor_law(C, share * span, span)
-    found = sampled(law, place(0.0), place(span), rate(0.0), rate(span))
-    at = (1.0 - share) * span
-    size = abs(a) + span * (abs(b) + span * (abs(c) + span * abs(d)))
-    assert found == pytest.approx(place(at), abs=1e-12 * size + 1e-300)
-    assert law.place_before + law.place == pytest.approx(1.0, rel=1e-12)
-
-
-@given(st.floats(1e-6, 1e-3))
-def test_sampled_at_the_ends_of_a_piece_or_beyond_it_is_the_end(span):
-    assert sampled(sensor_law(C, 0.0, span), 3.0, 5.0, 7.0, 11.0) == 5.0
-    for lead in (span, 2.0 * span):
-        assert sampled(sensor_law(C, lead, span), 3.0, 5.0, 7.0, 11.0) == 3.0
 
 
 def test_a_flapper_that_is_damped_too_much_does_not_ring():

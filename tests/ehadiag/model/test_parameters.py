@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ehadiag.core.actuator import default_actuator
-from ehadiag.model.batch import SIGNALS
+from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW
 from ehadiag.model.parameters import (
     FAULT_NAMES,
     FAULTS,
@@ -43,8 +43,10 @@ def test_each_parameter_is_told_apart():
 def test_the_derived_lists_are_parts_of_the_registry():
     assert tuple(item.name for item in FAULTS) == FAULT_NAMES
     assert {item.kind for item in FAULTS} == {Kind.FAULT}
-    assert {item.kind for item in REGISTRY if item not in FAULTS} <= {Kind.NUISANCE}
-    assert [item.adds_to for item in OFFSETS] == list(range(SIGNALS))
+    assert {item.kind for item in REGISTRY if item not in FAULTS} <= {Kind.DATUM, Kind.NUISANCE}
+    assert [item.adds_to for item in OFFSETS] == [SPOOL_ROW, PRESSURE_ROW]
+    adding = [item.adds_to for item in REGISTRY if item.adds_to is not None]
+    assert adding == list(range(SIGNALS))
 
 
 @pytest.mark.parametrize("item", REGISTRY, ids=NAMES)

@@ -137,7 +137,10 @@ def test_jack_alone_follows_small_steps(fdj):
     rate = (spool - before) / TICK
     nodes = np.column_stack([np.full(60, TICK), spool, rate, rate, np.zeros(60)])
     pressure, position = np.empty(60), np.empty(60)
-    jack_response(constants, 0.0, nodes, np.arange(1, 61), pressure, position)
+    unseen = np.full(60, np.nan)
+    jack_response(
+        constants, TICK, 0.0, 0.0, 0.0, unseen, nodes, np.arange(1, 61), pressure, position
+    )
     truth = jack_by_small_steps(constants, spool)
     assert np.sqrt(np.mean((pressure - truth[0]) ** 2)) < 0.3 * PRESSURE.lsb
     np.testing.assert_allclose(position, truth[1], atol=0.03 * POSITION.lsb)

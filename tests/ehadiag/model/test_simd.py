@@ -43,11 +43,13 @@ def own_batch(
         tick=np.array([tick]),
         start=np.array([0, n]),
         origin=np.zeros(1),
+        place=np.zeros(1),
         history=np.zeros(1, dtype=np.int64),
         since=np.zeros(1, dtype=np.int64),
         current=current,
         spool=truth.spool + offsets[0],
         pressure=truth.pressure + offsets[1],
+        position=truth.position,
         weight=np.vstack(
             [np.full(n, channels[0] / SPOOL.lsb), np.full(n, channels[1] / PRESSURE.lsb)]
         ),
@@ -205,6 +207,7 @@ def test_spans_start_from_their_own_origin():
         tick=np.repeat(one.tick, 2),
         start=np.array([0, 120, 300]),
         origin=np.array([0.0, 4e-5]),
+        place=np.zeros(2),
         history=np.array([0, 120]),
         since=np.array([0, 120]),
         anchor=np.vstack([one.anchor] * 2),
@@ -231,7 +234,7 @@ def test_a_flapper_that_does_not_ring():
 def test_residuals_and_anchors_are_the_scalar_kernels(recorded_model, population):
     batch = recorded_model.batch
     noise = 1.0 / batch.weight[0].max()
-    anchored = batch._replace(anchor=np.array([[0.1, 3.0 * noise, 12.0 * noise]]))
+    anchored = batch._replace(anchor=np.array([[0.1, 3.0 * noise, 12.0 * noise, 0.0]]))
     points = np.zeros((18, len(FAULTS) + 1))
     points[:, :3] = population[-18:]
     points[:, 3] = np.linspace(-1e-6, 1e-6, 18)
@@ -254,7 +257,7 @@ CUBE = st.tuples(*[st.floats(0.0, 1.0)] * 3)
 @given(one=CUBE, others=st.lists(CUBE, min_size=1, max_size=LANES + 2), place=st.integers(0, 99))
 def test_no_lane_depends_on_its_neighbours(one, others, place):
     batch = own_batch((0.3, 0.3, 0.3), SHORT)
-    model = SimdModel(batch._replace(anchor=np.array([[0.1, 1e-6, 4e-6]])), space())
+    model = SimdModel(batch._replace(anchor=np.array([[0.1, 1e-6, 4e-6, 0.0]])), space())
     place %= len(others) + 1
     together, counts = model.residuals(np.array([*others[:place], one, *others[place:]]))
     alone, count = model.residuals(np.array([one]))

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from ehadiag.core.channels import PRESSURE, SPOOL
 from ehadiag.identify.experiment import Experiment
-from ehadiag.model.batch import SIGNALS
 from ehadiag.model.parameters import FAULTS
 from ehadiag.model.scalar.response import respond
 from ehadiag_sim.plant.conditions import Sensors
@@ -53,9 +52,9 @@ def information(experiment: Experiment, faults: Sequence[float]) -> NDArray[np.f
 def _derivatives(
     experiment: Experiment, truth: NDArray[np.float64], step: float
 ) -> NDArray[np.float64]:
-    """Derivatives of spool and pressure in units of their noise, shape (k, SIGNALS, n)."""
+    """Derivatives of spool and pressure in units of their noise, shape (k, 2, n)."""
     noise = np.sqrt(Sensors().noise_lsb ** 2 + 1.0 / 12.0) * np.array([SPOOL.lsb, PRESSURE.lsb])
-    out = np.empty((len(FAULTS), SIGNALS, experiment.ticks))
+    out = np.empty((len(FAULTS), len(noise), experiment.ticks))
     for j in range(len(FAULTS)):
         sides = []
         for sign in (1.0, -1.0):

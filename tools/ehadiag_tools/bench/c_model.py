@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.batch import SIGNALS, Batch
+from ehadiag.model.batch import Batch
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.transition import SpoolTables
 from ehadiag.model.simd.jack import STAGES
@@ -28,38 +28,11 @@ BRANCHLESS = ("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-f
 """What lets a compiler turn choices into vector instructions."""
 WIDEST = ("-mprefer-vector-width=512",) if platform.machine() in ("x86_64", "AMD64") else ()
 
-
-IN_C = (
-    "GM",
-    "JF",
-    "CF",
-    "KF",
-    "KSF",
-    "XFM",
-    "GQF",
-    "GPF",
-    "AS",
-    "MS",
-    "CS",
-    "XSM",
-    "FSS",
-    "FSS1",
-    "PSR",
-    "GP",
-    "GQ",
-    "CLK",
-    "AJ",
-    "MJ",
-    "CJ",
-    "XJM",
-    "FDJ",
-    "FDJ1",
-    "FR",
-    "OXS",
-    "OPD",
-    "DLY",
-)
-"""Fields of `Plant` in `plant.h`: the C side has neither hysteresis nor backlash nor null bias."""
+PLANT = [PlantConstants._fields.index(name) for name in (
+    "GM", "JF", "CF", "KF", "KSF", "XFM", "GQF", "GPF", "AS", "MS", "CS", "XSM", "FSS", "FSS1",
+    "PSR", "GP", "GQ", "CLK", "AJ", "MJ", "CJ", "XJM", "FDJ", "FDJ1", "FR", "OXS", "OPD",
+)]  # fmt: skip
+"""Places of the constants that `plant.h` has."""
 
 
 class NoCompilerError(Exception):
@@ -86,8 +59,8 @@ class CModel:
         self._function.restype = None
         # Arrays that the pointers below point into.
         self._kept = (
-            _in_c(np.array(constants)),
-            *map(np.ascontiguousarray, (tables.moving, tables.stuck, tables.decay)),
+            np.array(constants)[PLANT],
+            *(np.ascontiguousarray(part) for part in (tables.moving, tables.stuck, tables.decay)),
             np.ascontiguousarray(current),
         )
         plant, moving, stuck, decay, currents = map(_pointer, self._kept)
@@ -107,7 +80,7 @@ class CLanes:
 
     levels: of `SimdModel`; candidates: rows of constants, shape (n, tests, FIELDS); single:
     computes in single precision. Leaves `costs`, shape (n,), and, if wanted, `residuals`, shape
-    (n, SIGNALS, N), 0 where a sample is missing.
+    (n, signals, N), 0 where a sample is missing.
 
     Raises
     ------
@@ -127,16 +100,16 @@ class CLanes:
         n = len(candidates)
         self.costs = np.zeros(n)
         kind = np.dtype(np.float32 if single else np.float64)
-        shape = (n, SIGNALS, batch.weight.shape[1])
+        shape = (n, *batch.weight.shape)
         self.residuals = np.zeros(shape, kind) if residuals else None
         self._function = _build("lanes.c", *SINGLE * single).eha_lane_costs
         self._function.restype = None
         # Arrays that the pointers below point into.
         self._kept = _of_kind(
             kind,
-            *(batch.test, batch.tick, batch.start, batch.origin, _currents_before(batch)),
-            *(_currents(batch), batch.spool, batch.pressure, batch.weight, batch.anchor),
-            *(levels, STAGES, _in_c(candidates)),
+            *(batch.test, batch.tick, batch.start, batch.origin, *_currents(batch)),
+            *(batch.spool, batch.pressure, batch.weight, batch.anchor[:, :3]),
+            *(levels, STAGES, candidates[..., PLANT]),
         )
         *inputs, rows = map(_pointer, self._kept)
         wanted = None if self.residuals is None else _pointer(self.residuals)
@@ -178,10 +151,10 @@ class CUnlocated:
         # Arrays that the pointers below point into.
         self._kept = _of_kind(
             kind,
-            *(batch.test, batch.tick, batch.start, _currents(batch)),
+            *(batch.test, batch.tick, batch.start, _currents(batch)[1]),
             *(np.nan_to_num(batch.spool), np.nan_to_num(batch.pressure)),
             *(np.where(seen, batch.weight, 0.0), levels, STAGES),
-            _in_c(np.resize(candidates, (len(self.costs), *candidates.shape[1:]))),
+            np.resize(candidates[..., PLANT], (len(self.costs), candidates.shape[1], len(PLANT))),
         )
         *inputs, rows = map(_pointer, self._kept)
         self._function = library.eha_unlocated_costs
@@ -222,6 +195,17 @@ class CPeak:
         self.operations = self._function(self._rounds, _pointer(self._out))
 
 
+def _currents(batch: Batch) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Current before each span (0 at the beginning of a test), and of the ticks of all, A."""
+    before = [
+        batch.current[since - 1] if history else 0.0
+        for since, history in zip(batch.since, batch.history, strict=True)
+    ]
+    lengths = np.diff(batch.start)
+    spans = [batch.current[a : a + n] for a, n in zip(batch.since, lengths, strict=True)]
+    return np.array(before), np.concatenate(spans)
+
+
 def _of_kind(kind: np.dtype[Any], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
     """Whole numbers as they are, the others of that kind."""
     return [np.ascontiguousarray(a, kind if a.dtype.kind == "f" else a.dtype) for a in arrays]
@@ -256,20 +240,3 @@ def _compiled(compiler: str, source: str, options: tuple[str, ...]) -> ctypes.CD
             first = (done.stderr.strip().splitlines() or ["without a word"])[0]
             raise NoCompilerError(f"cc failed: {first}")
         return ctypes.CDLL(str(library))
-
-
-def _in_c(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Constants in the order of C's structure, shape (..., fields of it)."""
-    return np.ascontiguousarray(rows[..., [PlantConstants._fields.index(name) for name in IN_C]])
-
-
-def _currents(batch: Batch) -> NDArray[np.float64]:
-    """Current of each tick of the spans, A, shape (N,)."""
-    lengths = np.diff(batch.start)
-    spans = [batch.current[a : a + n] for a, n in zip(batch.since, lengths, strict=True)]
-    return np.concatenate(spans)
-
-
-def _currents_before(batch: Batch) -> NDArray[np.float64]:
-    """Current before each span, 0 at the beginning of a test, A, shape (m,)."""
-    return np.where(batch.history > 0, batch.current[np.maximum(batch.since - 1, 0)], 0.0)

@@ -101,7 +101,11 @@ class CompiledModel:
         )
         jack_response(
             self.constants,
+            1e-3,
             0.0,
+            0.0,
+            0.0,
+            self._measured,
             self._nodes,
             self._node_end,
             self.pressure,

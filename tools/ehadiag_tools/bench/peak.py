@@ -114,5 +114,6 @@ def beginning(batch: Batch, ticks: int) -> Batch:
         current=batch.current[:ticks],
         spool=batch.spool[:ticks],
         pressure=batch.pressure[:ticks],
+        position=batch.position[:ticks],
         weight=np.ascontiguousarray(batch.weight[:, :ticks]),
     )
