@@ -1,4 +1,4 @@
-"""Has a built-in test run on a bus, recorded and worked on ahead: the first half of `bit`."""
+"""Runs a built-in test on a bus, recording it and starting its analysis: first half of `bit`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Named tuples of numbers as parts of a flat array inside kernels, no field counted by hand."""
+"""Packs named tuples into flat arrays for kernels, and unpacks them, with no indices by hand."""
 
 from __future__ import annotations
 

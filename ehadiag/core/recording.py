@@ -1,4 +1,4 @@
-"""What acquisition hands to diagnosis: samples on the tick grid, and their quality."""
+"""The recording that is diagnosed: one sample of each channel per control tick, and its quality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stored tests: the command that a flight-control computer plays, as data.
+"""Stored tests: the command profile that a flight-control computer plays out, as data.
 
 A test is a list of segments (straight lines through points, sines) and the windows of time that
 each stage of the diagnosis uses. A rig's computer may store others: a test is a file, not code.

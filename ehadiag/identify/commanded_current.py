@@ -1,4 +1,4 @@
-"""The servovalve current that was commanded, exactly where that is possible.
+"""Rebuilds the commanded servovalve current, free of measurement noise wherever possible.
 
 Measured current carries the converter's noise; the commanded one is known better. In open loop it
 is the command. In closed loop the control law is repeated on the *digitised* jack position, as the

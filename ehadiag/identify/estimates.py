@@ -1,4 +1,4 @@
-"""What a refinement says, as estimates with intervals and a measure of fit."""
+"""Turns the refined optimum into severities with confidence intervals and a measure of fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an identification says."""
+"""Result of an identification: severities, nuisances, quality of fit and time spent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spans of experiments laid out for the kernels: which windows count, and how they are anchored."""
+"""Lays out time spans of tests for the kernels: which windows count, and how each one starts."""
 
 from __future__ import annotations
 

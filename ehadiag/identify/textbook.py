@@ -1,4 +1,4 @@
-"""The three severities alone, of an actuator that is otherwise what its data say.
+"""Identifies the three fault severities alone, on a unit assumed to match its data file.
 
 The optimum of the staged search is refined; where it does not explain the recording the search may
 have ended beside the optimum, and further attempts search wider.

@@ -1,4 +1,4 @@
-"""Re-anchoring: how the modelled spool is kept on the measured one."""
+"""Re-anchoring: corrects the modelled spool and jack towards the measured ones, tick by tick."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spans of recorded tests laid out for the kernels: what candidates are held against."""
+"""The flat arrays of recorded data, by time span, that candidate models are compared with."""
 
 from __future__ import annotations
 

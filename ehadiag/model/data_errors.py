@@ -1,4 +1,4 @@
-"""Parameters for what an actuator file has wrong about a unit, and the probes of oil and supply.
+"""Parameters for errors of an actuator's data file, and of the oil and supply probes.
 
 The torque motor's gain is not among them: as a datum it does the same as `torque_motor_gain`, which
 no recording could tell from it. The ends of the friction scales (FSS1, FDJ1) have no tolerance.

@@ -1,4 +1,4 @@
-"""The laws of the actuator, each written once: inlined by the scalar and the vector kernels alike.
+"""The actuator's physical equations, each written once for the scalar and the vector kernels.
 
 Named tuples hold what a law needs of a candidate, precombined; the functions take plain numbers or
 vectors of lanes. Symbols and requirement numbers are those of docs/reference/physics.md.

@@ -1,4 +1,4 @@
-"""What the sensors make of spool, pressure and jack position: gain, offset, filter, instant.
+"""Model of the sensors' effect on the signals: gain, offset, filter lag and sampling instant.
 
 Before its converter a signal passes a first-order filter, and it is sampled some time before the
 end of the tick. The path of a signal is a chain of cubics in u = 0 … 1, and over a cubic the filter

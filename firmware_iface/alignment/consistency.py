@@ -1,4 +1,4 @@
-"""Checks that everything said during a test concerns one test on one unit."""
+"""Checks that all frames received during a test belong to one test of one unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finds a second sender: drops the frames in conflict and says what gave it away."""
+"""Detects a second sender of the same messages: drops conflicting frames and gives the reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""End-to-end protection: the CRC, and the unlimited position that a wrapping counter means."""
+"""End-to-end protection: the CRC, and the sequence counter unwrapped beyond its range."""
 
 from __future__ import annotations
 

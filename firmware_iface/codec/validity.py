@@ -1,4 +1,4 @@
-"""Decides which frames to believe: length, CRC, range, and the counter where two send.
+"""Decides which frames are valid: length, CRC, range, and counter conflicts between two senders.
 
 All that decides whether a frame of a mapped message is believed stands here, for frames in columns
 and for one at a time:

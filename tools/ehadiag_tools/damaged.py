@@ -1,4 +1,4 @@
-"""Physical constants of a unit with given severities, for models that are run by themselves."""
+"""Physical constants of a unit with given fault severities, to run the model by itself."""
 
 from __future__ import annotations
 

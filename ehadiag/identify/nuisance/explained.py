@@ -1,4 +1,4 @@
-"""Whether residuals are noise, whatever level the noise has."""
+"""Tests whether residuals are only noise, judged by the noise level in the recording itself."""
 
 from __future__ import annotations
 

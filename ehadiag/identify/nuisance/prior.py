@@ -1,4 +1,4 @@
-"""What is believed of each parameter before a recording is seen, and which pass for each other.
+"""What is known of each parameter before a recording is seen, and which are easily confused.
 
 All that the search knows of the actuator stands here; the search itself is generic.
 """

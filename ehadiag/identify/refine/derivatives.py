@@ -1,4 +1,4 @@
-"""Residuals of a model and their derivatives, with rows left out where a derivative means nothing.
+"""Residuals and their derivatives, without samples where a jump spoils the derivative.
 
 A break-away that comes a tick earlier on one side of a difference than on the other makes a jump
 that looks like information but is none.

@@ -1,4 +1,4 @@
-"""Refinement on the first part of a test, which all stages before have seen: ready before the end.
+"""Refinement on the first part of a test, done while the rest of the test is still running.
 
 What is left for the whole test is one step (`ehadiag.identify.refine.update`), where that suffices.
 """

@@ -1,4 +1,4 @@
-"""Minimum of a cost that break-aways make jump: the vertex of the smooth bowl beneath the jumps.
+"""Minimum of a cost with jumps from stick-slip: the vertex of the smooth bowl beneath them.
 
 A break-away that comes a tick earlier or later makes a step in the cost, and a descent stops at it,
 wherever it comes from. Parabolas through many points see past the steps.

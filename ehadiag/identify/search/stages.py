@@ -1,4 +1,4 @@
-"""The search in stages, each of which needs the test up to some instant only.
+"""Staged search on a growing part of the test, so that most of it runs before the test ends.
 
 The first approximation needs the parts of the test before the sines; the genetic search then runs
 on a window that grows over the second part, each stage from the best of the one before. So most of

@@ -1,4 +1,4 @@
-"""State of a simulated actuator: its faults, its effects, and the errors of its sensors."""
+"""Settings of a simulated unit: its faults, its other effects and its sensor errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects that no requirement names, to try the identification on the unknown."""
+"""Simulated effects outside the requirements, which the identification is not told about."""
 
 from __future__ import annotations
 

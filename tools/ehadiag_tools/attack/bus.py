@@ -1,4 +1,4 @@
-"""Attempts to turn the verdict on a worn actuator by sending beside it: `tools/attack`.
+"""Tries to falsify a worn actuator's verdict by frames from a second sender: `tools/attack`.
 
 Run it inside `tools/loopnet.sh`: all that it sends stays on the loopback interface.
 """

@@ -1,4 +1,4 @@
-"""Benchmark of the scalar kernel: against C and against oracles."""
+"""Benchmark of the scalar kernel: against C and against slow reference solvers."""
 
 from __future__ import annotations
 
