@@ -221,6 +221,7 @@ class FccCore:
 
     def _abort(self) -> None:
         if self._state in (BitState.ARMING, BitState.RUNNING):
+            self._refused = None  # of a second request in the same tick: no reason of an abort
             self._enter(BitState.ABORTED, self._test_id)
 
     def _advance(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import c_side
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ehadiag.core.actuator import default_actuator
@@ -117,6 +117,7 @@ STEPS = st.lists(
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
 @given(steps=STEPS)
+@example(steps=[(0, "start", 1), (0, "start", 1), (0, "abort", 1)])
 def test_random_requests(library: Any, steps: list[tuple[int, str | int, int]]) -> None:
     pair = Pair(library)
     for ticks, code, test_id in steps:
