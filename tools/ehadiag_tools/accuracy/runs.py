@@ -18,7 +18,7 @@ from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import make_solver
-from ehadiag.identify.session import Nuisances, identify
+from ehadiag.identify.session import identify
 from ehadiag.model.scalar.response import respond
 from ehadiag_sim.plant.conditions import Faults, Sensors
 from ehadiag_sim.plant.simulator import simulate
@@ -66,10 +66,8 @@ def perform(run: Run) -> dict[str, Any]:
 
 
 def identified(run: Run, experiments: list[Experiment]) -> Identification:
-    """Identify the severities alone, with the solver and seed of a run."""
-    return identify(
-        experiments, nuisances=Nuisances.NONE, solver=make_solver(run.solver), seed=run.search_seed
-    )
+    """Identify with the solver and seed of a run."""
+    return identify(experiments, solver=make_solver(run.solver), seed=run.search_seed)
 
 
 def summary_of(result: Identification) -> dict[str, Any]:
