@@ -153,5 +153,4 @@ def test_random_cases_of_the_cube(test):
     assert figures.mean_all <= mean
     assert figures.p95_case <= p95
     assert max(figures.maximum) <= largest
-    # All of so few may be inside: 97 % of 100 cases are (tools/accuracy sweep).
-    assert figures.coverage_all >= 88.0
+    assert 88.0 <= figures.coverage_all <= 99.5
