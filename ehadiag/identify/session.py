@@ -139,39 +139,38 @@ class Session:
         if alone or (near and self.nuisances is Nuisances.AUTO):
             best = attempt(experiments, found, self._first_part)
             best = replace(best, evaluations=best.evaluations + found.evaluations)
-        if best is not None and alone:
+        freed: Estimated | None = None
+        if not alone and (best is None or not _leaves_nothing(best.refined)):
+            hint = best.refined.values if best else named(found.best)
+            freed = self._freed(experiments, hint if near else None, tell)
+        if best is not None and (freed is None or _is_poorer(freed, best)):
             best = rescued(
                 experiments, best, self._first_part, self.solver, self.seed, tell,
                 time.perf_counter,
             )  # fmt: skip
-            search_s += best.search_s
-        refine_at = time.perf_counter()
-        timing = Timing(searched_at - begin, search_s, refine_at - searched_at - search_s)
-        evaluations = first.evaluations + (best.evaluations if best else found.evaluations)
-        if best is not None and (alone or (explains(best.refined) and _is_all(best.refined))):
             return self._said(
                 first,
                 best.found,
                 best.refined,
                 covariance(best.refined),
                 best.experiments,
-                evaluations,
-                best.count,
-                timing,
+                first.evaluations + best.evaluations + (freed.evaluations if freed else 0),
+                best.count + (freed.starts if freed else 0),
+                _timing(begin, searched_at, search_s + best.search_s),
             )
-        hint = best.refined.values if best else named(found.best)
-        done = self._freed(experiments, hint if near else None, tell)
-        values = done.refined.values
+        assert freed is not None
+        values = freed.refined.values
         severities = np.array([values[item.name] for item in FAULTS])
+        before = best.evaluations if best else found.evaluations
         return self._said(
             first,
-            replace(found, best=severities, cost=done.refined.cost),
-            done.refined,
-            covariance(done.refined) + done.covariance,
-            done.experiments,
-            evaluations + done.evaluations,
-            done.starts + (1 if best else 0),
-            replace(timing, refine=timing.refine + time.perf_counter() - refine_at),
+            replace(found, best=severities, cost=freed.refined.cost),
+            freed.refined,
+            covariance(freed.refined) + freed.covariance,
+            freed.experiments,
+            first.evaluations + before + freed.evaluations,
+            freed.starts + (1 if best else 0),
+            _timing(begin, searched_at, search_s),
         )
 
     def _freed(
@@ -253,9 +252,21 @@ def identify(
     return Session(solver, seed, nuisances).finish(experiments, progress)
 
 
-def _is_all(refinement: Refinement) -> bool:
-    """Whether nothing that lasts is left, of which small nuisances would be the cause."""
-    return excess(refinement.residuals) <= LASTING
+def _timing(begin: float, searched_at: float, search_s: float) -> Timing:
+    """Time spent so far, s: on the first approximation, on searches, and on the rest."""
+    return Timing(searched_at - begin, search_s, time.perf_counter() - searched_at - search_s)
+
+
+def _leaves_nothing(refinement: Refinement) -> bool:
+    """Whether the severities alone explain a recording, and nothing that lasts is left, of which
+    small nuisances would be the cause."""
+    return explains(refinement) and excess(refinement.residuals) <= LASTING
+
+
+def _is_poorer(freed: Estimated, alone: Attempt) -> bool:
+    """Whether nuisances explain a recording no better than the severities alone do: what is left
+    is none of theirs, as where guessed positions stand in for lost ones."""
+    return not freed.explained and freed.excess >= excess(alone.refined.residuals)
 
 
 def _stages_ready(experiment: Experiment) -> int:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Kind, Parameter
 
@@ -138,6 +139,8 @@ class Derivatives:
         runs, anchored = self.model.residuals(points)
         changes = runs[changed] - runs[0]
         considered = np.where(np.abs(changes) < JUMP, changes, 0.0)
+        # `CONSIDERED` is sized by the spool alone, which moves fastest.
+        considered[:, SPOOL_ROW + 1 :] = 0.0
         costs = [capped(run) for run in runs[changed.stop :]]
         return runs[0], considered, int(anchored[0]), costs
 
