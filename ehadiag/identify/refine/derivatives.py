@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Kind, Parameter
 
@@ -42,10 +41,13 @@ class Considered:
     parameter : Parameter
     std : float
         Standard deviation of what is not known of it, in its unit.
+    rows : tuple of int, optional
+        Signals on which it counts; all unless given.
     """
 
     parameter: Parameter
     std: float
+    rows: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,8 +141,9 @@ class Derivatives:
         runs, anchored = self.model.residuals(points)
         changes = runs[changed] - runs[0]
         considered = np.where(np.abs(changes) < JUMP, changes, 0.0)
-        # `CONSIDERED` is sized by the spool alone, which moves fastest.
-        considered[:, SPOOL_ROW + 1 :] = 0.0
+        for change, item in zip(considered, self.considered, strict=True):
+            if item.rows is not None:
+                change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
         costs = [capped(run) for run in runs[changed.stop :]]
         return runs[0], considered, int(anchored[0]), costs
 

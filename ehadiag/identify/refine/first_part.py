@@ -17,6 +17,7 @@ from ehadiag.identify.refine.least_squares import Refinement, describe, median_o
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import CompactGa
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
+from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
 from ehadiag.model.simd.model import SimdModel
 
@@ -40,8 +41,9 @@ FREE_LEVEL = 2
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
-CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6),)
-"""Half a step of a plant that is integrated at 0.25 µs is of this size."""
+CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6, (SPOOL_ROW,)),)
+"""Half a step of a plant that is integrated at 0.25 µs is of this size; sized on the spool, which
+moves fastest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

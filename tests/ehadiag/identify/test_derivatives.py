@@ -97,3 +97,12 @@ def test_what_is_considered_moves_the_residuals_but_is_not_estimated():
     np.testing.assert_allclose(considered[0], 0.15e-6 * shape)
     assert costs == [0.0]
     assert (anchored, len(considered), len(model.estimated)) == (0, 1, len(FAULTS))
+
+
+def test_what_is_considered_counts_on_the_rows_that_it_is_sized_by():
+    shape = rows(3, 1)[0] / 0.15e-6 / 10.0
+    item = Considered(LEAD, 0.15e-6, (SPOOL_ROW,))
+    model = Derivatives(Formula(lambda *p: p[-1] * shape, (*FAULTS, LEAD)), NOISE, [item])
+    considered = model.at(np.full(len(FAULTS), 0.5))[1][0]
+    np.testing.assert_allclose(considered[SPOOL_ROW], 0.15e-6 * shape[SPOOL_ROW])
+    assert not considered[PRESSURE_ROW].any()
