@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.explained import excess, is_noise
-from ehadiag.identify.nuisance.linearisation import Belief, linearised
-from ehadiag.identify.nuisance.posterior import sharpen
 from ehadiag.identify.nuisance.prior import (
     ALIAS,
     Known,
@@ -23,6 +21,8 @@ from ehadiag.identify.nuisance.prior import (
 from ehadiag.identify.nuisance.starts import Found, robust_cost, search
 from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives, capped
 from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.refine.linearisation import Belief, linearised
+from ehadiag.identify.refine.posterior import sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.parameters import Parameter
 from ehadiag.model.simd.model import SimdModel

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.noise import relative_noise
-from ehadiag.identify.nuisance.posterior import TAIL
+from ehadiag.identify.refine.posterior import TAIL
 
 __all__ = ["MOST_EXCESS", "excess", "is_noise"]
 

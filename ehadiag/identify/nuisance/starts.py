@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.nuisance.linearisation import BLOCK, Belief
-from ehadiag.identify.nuisance.posterior import TAIL, sharpen
 from ehadiag.identify.refine.derivatives import Derivatives
+from ehadiag.identify.refine.linearisation import BLOCK, Belief
+from ehadiag.identify.refine.posterior import TAIL, sharpen
 
 __all__ = ["Found", "Place", "robust_cost", "search"]
 
