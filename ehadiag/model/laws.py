@@ -35,6 +35,9 @@ STATIC_SHARE_SPOOL = 0.5
 """Dynamic over static dry friction of the spool (PHY-11)."""
 STATIC_RATIO_JACK = 2.0
 """Static over dynamic dry friction of the jack (PHY-12)."""
+BEND, FINE_BEND = 0.05e-6, 0.5e-9
+"""Bend of the spool's path (m) that the jack does not feel: with a linear second stage, which
+follows the spool at once, and with one that stores what flows."""
 
 
 class DriveLaw(NamedTuple):
@@ -81,6 +84,7 @@ class SpoolLaw(NamedTuple):
     breakaway: flapper deflection that overcomes the static friction, m.
     flapper_stop, stroke: of flapper and spool, m.
     backlash: half-width of the play between spool and feedback wire, m.
+    bend: of the spool's path that the second stage does not feel, m.
     ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper beside a resting
         spool; rate 0 where it does not ring.
     """
@@ -96,6 +100,7 @@ class SpoolLaw(NamedTuple):
     flapper_stop: float
     stroke: float
     backlash: float
+    bend: float
     ring_damping: float
     ring_rate: float
 
@@ -118,6 +123,7 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.XFM,
         c.XSM,
         c.BKL,
+        FINE_BEND if c.OIL > 0.0 else BEND,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
@@ -163,6 +169,9 @@ class JackLaw(NamedTuple):
     area, viscosity: of the jack, m² and N s/m.
     by_mass: reciprocal of its mass, 1/kg.
     supply: supply minus return pressure, Pa.
+    by_supply: its reciprocal, 1/Pa.
+    oil: rise of the pressure by the jack's travel where the oil yields, 2 β AJ / V, Pa/m; 0: it
+        does not, and the second stage is linear.
     stroke: m.
     load: external with the jack in its middle, N.
     spring: what it gains by the jack's travel, N/m.
@@ -178,6 +187,8 @@ class JackLaw(NamedTuple):
     viscosity: Any
     by_mass: Any
     supply: Any
+    by_supply: Any
+    oil: Any
     stroke: Any
     load: Any
     spring: Any
@@ -197,6 +208,8 @@ def jack_law(c: PlantConstants) -> JackLaw:
         c.CJ,
         1.0 / c.MJ,
         c.PSR,
+        1.0 / c.PSR,
+        c.OIL * c.AJ,
         c.XJM,
         c.FR,
         c.KA,

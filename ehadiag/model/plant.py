@@ -90,6 +90,9 @@ class PlantConstants(NamedTuple):
     """Flow gain, m²/s."""
     CLK: Value
     """Leakage, m³/(s Pa)."""
+    OIL: Value
+    """Rise of the differential pressure by a flow into the chambers, 2 β / V, Pa/m³; 0: of a linear
+    second stage, whose oil does not yield."""
     AJ: Value
     """Active area of the jack, m²."""
     MJ: Value
@@ -156,7 +159,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
     40 degC and its `PSR`. Viscous coefficients scale with the relative viscosity, the leakage with
     its inverse (PHY-20).
     """
-    valve, jack = actuator.servovalve, actuator.jack
+    valve, stage, jack = actuator.servovalve, actuator.second_stage, actuator.jack
     viscosity, supply = 1.0, valve.PSR
     if environment is not None:
         if environment.oil_temperature is not None:
@@ -187,6 +190,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         GP=valve.GP,
         GQ=valve.GQ,
         CLK=valve.CLK / viscosity,
+        OIL=2.0 * stage.beta / stage.volume if stage.kind == "orifice" else 0.0,
         AJ=jack.AJ,
         MJ=jack.MJ,
         CJ=jack.CJ * viscosity,

@@ -44,6 +44,7 @@ from ehadiag.model.simd.layout import (
     STATE_ROWS,
     sensor_laws,
 )
+from ehadiag.model.simd.orifice import orifice_level, orifice_tick, sensed_orifice_tick
 from ehadiag.model.simd.spool import (
     anchor_lanes,
     deflect_lanes,
@@ -197,17 +198,27 @@ def _jack_tick(
 
 
 @bare_kernel
-def _sensed_jack_tick(
+def _other_jack_tick(
+    orifice: bool,
+    senses: bool,
     tick: float,
     level: int,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """The same, with the pressure as the filter before its converter has it."""
-    for step in range(1 << level):
-        if sensed_jack_lanes(level, step, tick, state, path, coefficients):
-            jack_events(level, step, tick, state, path, coefficients)
+    """The same of an orifice stage, or with the pressure as the filter before its converter has it.
+
+    Apart from the plain one, so that this stays as it is.
+    """
+    if orifice and senses:
+        sensed_orifice_tick(tick, level, state, path, coefficients)
+    elif orifice:
+        orifice_tick(tick, level, state, path, coefficients)
+    else:
+        for step in range(1 << level):
+            if sensed_jack_lanes(level, step, tick, state, path, coefficients):
+                jack_events(level, step, tick, state, path, coefficients)
 
 
 @merged
@@ -237,6 +248,7 @@ def _block(
                 rows[i, field] = candidates[min(i, last_candidate), test, field]
         backlash, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
+        orifice = plant_of(rows[0]).OIL > 0.0
         state[PLAYS * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
             drive_lanes(current[k], plays, state, coefficients)
@@ -261,14 +273,14 @@ def _block(
                 for i in range(wanted):
                     out[i, SPOOL_ROW, k] = sample[i]
             if levels[k] < 0:
-                levels[k] = _level(path)
+                levels[k] = orifice_level(tick, coefficients) if orifice else _level(path)
             if k <= last:  # nothing depends on the jack but pressure and position
-                if senses:
-                    _sensed_jack_tick(tick, levels[k], state, path, coefficients)
+                if senses or orifice:
+                    _other_jack_tick(orifice, senses, tick, levels[k], state, path, coefficients)
                 else:
                     _jack_tick(tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(senses, state, path, coefficients)
+                pressures(senses or orifice, state, path, coefficients)
                 _hold_against(
                     pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE_SEEN, PRESSURE_ROW,
                     state, coefficients, sample, sums,
