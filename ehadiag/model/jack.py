@@ -23,6 +23,9 @@ FINE_RATIO = 0.3
 """Spool travel within a step (m, or share of the distance from the middle)."""
 FRESH_DECAY = 3.0
 """Decay (power of e) of the jack's velocity within a step, where it starts or stops."""
+CREEPING, FINE_FADE = 10.0, 0.5
+"""Velocity at which a jack no longer creeps, and its change within a step before; shares of the
+Stribeck velocity."""
 MOST_STEPS = 32
 ITERATIONS = 30
 SHORTEST = 1e-6
@@ -33,24 +36,35 @@ SLOWEST = 1e-12
 
 @packed
 def _velocity(
-    j: JackLaw, p: Piece, load: float, velocity: float, begin: float, end: float
-) -> float:
-    """Velocity of the moving jack at the share `end` of a piece, `velocity` at `begin`, m/s."""
-    step = end - begin
-    first, second, third = (
-        place_on(p, begin + C1 * step),
-        place_on(p, begin + C2 * step),
-        place_on(p, end),
-    )
-    return radau_velocity(
-        j, step * p.span, load, velocity, first, second, third,
-        resistance(j, first), resistance(j, second), resistance(j, third),
-    )  # fmt: skip
+    creeps: bool, j: JackLaw, p: Piece, load: float, d: float, velocity: float,
+    begin: float, end: float,
+) -> float:  # fmt: skip
+    """Velocity of the moving jack at the share `end` of a piece, `velocity` at `begin`, m/s.
+
+    creeps: whether friction may have Stribeck's part; a constant where this is compiled.
+    """
+    h = (end - begin) * p.span
+    x1, x2 = place_on(p, begin + C1 * (end - begin)), place_on(p, begin + C2 * (end - begin))
+    x3 = place_on(p, end)
+    e1, e2, e3 = resistance(j, x1), resistance(j, x2), resistance(j, x3)
+    if creeps and j.extra > 0.0:
+        return _creeping_velocity(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
+    return radau_velocity(j, h, load, velocity, x1, x2, x3, e1, e2, e3)
+
+
+@bare_kernel
+def _creeping_velocity(
+    j: JackLaw, h: float, load: float, d: float, velocity: float,
+    x1: float, x2: float, x3: float, e1: float, e2: float, e3: float,
+) -> float:  # fmt: skip
+    """With Stribeck's friction; apart, so that the plain one stays small."""
+    p3 = radau_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)[2]
+    return j.flow * x3 - e3 * p3
 
 
 @packed
 def _stop(
-    j: JackLaw, p: Piece, load: float, velocity: float, d: float, later: float,
+    creeps: bool, j: JackLaw, p: Piece, load: float, velocity: float, d: float, later: float,
     begin: float, end: float,
 ) -> float:  # fmt: skip
     """Share of a piece at which the jack stops, `velocity` at `begin`, `later` at `end`.
@@ -62,7 +76,7 @@ def _stop(
     share = at_newest / (at_newest - at_other)
     for _ in range(ITERATIONS):
         q = newest + share * (other - newest)
-        value = _velocity(j, p, load, velocity, begin, q) * d
+        value = _velocity(creeps, j, p, load, d, velocity, begin, q) * d
         if (value > 0.0) == (at_newest > 0.0):
             oldest, at_oldest = newest, at_newest
         else:
@@ -112,10 +126,13 @@ def _break_away(j: JackLaw, p: Piece, hold: float, d: float, begin: float, end: 
 
 
 @packed
-def _steps(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> int:
+def _steps(creeps: bool, j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> int:
     """Into how many steps a piece is cut."""
     near = min(abs(p.x0), abs(p.x1)) if p.x0 * p.x1 > 0.0 else 0.0
     wanted = (stop - begin) * abs(p.x1 - p.x0) / max(FINE_TRAVEL, FINE_RATIO * near)
+    fade = j.flow * j.by_stribeck
+    if creeps and near * fade < CREEPING:
+        wanted = max(wanted, (stop - begin) * abs(p.x1 - p.x0) * fade / FINE_FADE)
     if state.direction == 0.0 or state.fresh != 0.0:
         # The collocation is slow to forget what a start or a stop leaves.
         rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
@@ -137,8 +154,8 @@ def still_pressure(j: JackLaw, x: float) -> float:
 
 @bare_kernel
 def _sensed(
-    j: JackLaw, probe: Probe, p: Piece, load: float, velocity: float,
-    moving: bool, begin: float, end: float, lagged: float, seen: float,
+    j: JackLaw, probe: Probe, p: Piece, load: float, d: float, velocity: float,
+    begin: float, end: float, lagged: float, seen: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Pressure behind the filter at the share `end` of a piece, and when it was sampled, Pa.
 
@@ -147,9 +164,9 @@ def _sensed(
     step = end - begin
     x0, x1 = place_on(p, begin), place_on(p, begin + C1 * step)
     x2, x3 = place_on(p, begin + C2 * step), place_on(p, end)
-    if moving:
+    if d != 0.0:
         p1, p2, p3 = radau_pressures(
-            j, step * p.span, load, velocity, x1, x2, x3,
+            j, step * p.span, load, d, velocity, x1, x2, x3,
             resistance(j, x1), resistance(j, x2), resistance(j, x3),
         )  # fmt: skip
         cubic = through_stages(
@@ -165,9 +182,9 @@ def _sensed(
 
 
 def _pieces(senses: bool) -> Any:
-    """Compiled jack over a piece, with or without the sensor of pressure."""
+    """Compiled jack over a piece; senses: with the sensor of pressure and Stribeck's friction."""
 
-    @bare_kernel
+    @(bare_kernel if senses else inlined)
     def piece(
         j: JackLaw, probe: Probe, p: Piece, begin: float, stop: float, state: JackState
     ) -> JackState:
@@ -176,9 +193,9 @@ def _pieces(senses: bool) -> Any:
             x, load = place_on(p, stop), j.spring * place
             if excess(j, x, load + j.static) <= 0.0 <= excess(j, x, load - j.static):
                 if senses:
-                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, begin, stop, lagged, seen)
+                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, begin, stop, lagged, seen)
                 return JackState(place, velocity, 0.0, 0.0, p12, lagged, seen)
-        steps = _steps(j, p, begin, stop, state)
+        steps = _steps(senses, j, p, begin, stop, state)
         q, step, fresh = begin, 1, 0.0
         while step <= steps:
             end = begin + (stop - begin) * step / steps
@@ -190,19 +207,19 @@ def _pieces(senses: bool) -> Any:
                     abs(place) >= j.stroke and place * (up + down) > 0.0
                 ):
                     if senses:
-                        lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, q, end, lagged, seen)
+                        lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, q, end, lagged, seen)
                     q, step = end, step + 1
                     continue
                 d = 1.0 if up > 0.0 else -1.0
                 away = _break_away(j, p, spring + j.static * d, d, q, end)
                 if senses and away > q:
-                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, q, away, lagged, seen)
+                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, q, away, lagged, seen)
                 q, velocity, fresh = away, 0.0, 1.0
             load = j.load + spring + d * j.friction
-            later = _velocity(j, p, load, velocity, q, end)
+            later = _velocity(senses, j, p, load, d, velocity, q, end)
             if later * d > 0.0:
                 if senses and end > q:
-                    lagged, seen = _sensed(j, probe, p, load, velocity, True, q, end, lagged, seen)
+                    lagged, seen = _sensed(j, probe, p, load, d, velocity, q, end, lagged, seen)
                 place += 0.5 * (end - q) * p.span * (velocity + later)
                 velocity = later
                 if abs(place) >= j.stroke and place * velocity > 0.0:
@@ -210,10 +227,21 @@ def _pieces(senses: bool) -> Any:
                     velocity, d = 0.0, 0.0
                 q, step = end, step + 1
                 continue
-            stopped = _stop(j, p, load, velocity, d, later, q, end) if velocity != 0.0 else end
+            stopped = (
+                _stop(senses, j, p, load, velocity, d, later, q, end) if velocity != 0.0 else end
+            )
             if senses and stopped > q:
                 lagged, seen = _sensed(
-                    j, probe, p, load, velocity, velocity != 0.0, q, stopped, lagged, seen
+                    j,
+                    probe,
+                    p,
+                    load,
+                    d if velocity != 0.0 else 0.0,
+                    velocity,
+                    q,
+                    stopped,
+                    lagged,
+                    seen,
                 )
             place += 0.5 * (stopped - q) * p.span * velocity
             q, velocity, d, fresh = stopped, 0.0, 0.0, 1.0
@@ -225,7 +253,7 @@ def _pieces(senses: bool) -> Any:
 
 
 sensed_linear_piece = _pieces(True)
-"""Compiled: jack over the shares begin … stop of a piece, with the sensor of pressure."""
+"""Compiled: jack over the shares begin … stop of a piece, with what the plain one leaves out."""
 _bare_piece = _pieces(False)
 NO_PROBE = Probe(0.0, 0.0)
 

@@ -17,8 +17,10 @@ __all__ = [
     "DriveLaw",
     "JackLaw",
     "SpoolLaw",
+    "creeping",
     "drive_law",
     "excess",
+    "faded",
     "flapper_held",
     "jack_law",
     "opening",
@@ -35,6 +37,9 @@ STATIC_SHARE_SPOOL = 0.5
 """Dynamic over static dry friction of the spool (PHY-11)."""
 STATIC_RATIO_JACK = 2.0
 """Static over dynamic dry friction of the jack (PHY-12)."""
+SLOWEST_STRIBECK = 1e-5
+"""Stribeck velocity below which it is not felt, m/s."""
+MOST_FADED = 40.0
 BEND, FINE_BEND = 0.05e-6, 0.5e-9
 """Bend of the spool's path (m) that the jack does not feel: with a linear second stage, which
 follows the spool at once, and with one that stores what flows."""
@@ -177,6 +182,8 @@ class JackLaw(NamedTuple):
     spring: what it gains by the jack's travel, N/m.
     friction: dry friction of the moving jack, N.
     static: of the resting one, N.
+    extra: friction that a creeping jack has and a fast one has not, N; 0 without Stribeck's effect.
+    by_stribeck: reciprocal of the velocity over which that fades, s/m.
     """
 
     flow: Any
@@ -194,6 +201,8 @@ class JackLaw(NamedTuple):
     spring: Any
     friction: Any
     static: Any
+    extra: Any
+    by_stribeck: Any
 
 
 @inlined
@@ -215,7 +224,25 @@ def jack_law(c: PlantConstants) -> JackLaw:
         c.KA,
         c.FDJ,
         STATIC_RATIO_JACK * c.FDJ,
+        (STATIC_RATIO_JACK - 1.0) * c.FDJ if c.VSJ > 0.0 else 0.0,
+        1.0 / max(c.VSJ, SLOWEST_STRIBECK) if c.VSJ > 0.0 else 0.0,
     )
+
+
+@packed
+def faded(z: Any) -> Any:
+    """exp(-z) of z from 0 on, of numbers or vectors, to 1e-9: series and squarings."""
+    y = least(z, MOST_FADED) * (1.0 / 64.0)
+    out = 1.0 - y * (1.0 - y / 2.0 * (1.0 - y / 3.0 * (1.0 - y / 4.0 * (1.0 - y / 5.0))))
+    for _ in range(6):
+        out = out * out
+    return out
+
+
+@packed
+def creeping(j: JackLaw, speed: Any) -> Any:
+    """Friction that a jack at a speed (m/s) has beside that of a fast one, N (PHY-33)."""
+    return j.extra * faded(speed * j.by_stribeck)
 
 
 @packed

@@ -14,15 +14,27 @@ from typing import Any
 from ehadiag.compile.kernels import bare_kernel
 from ehadiag.compile.vector import magnitude, most, packed, root, with_sign
 from ehadiag.model.jack_state import JackState, Piece, Probe, place_on, sense
-from ehadiag.model.laws import JackLaw
+from ehadiag.model.laws import JackLaw, creeping
 from ehadiag.model.sensors import through_ends
 
-__all__ = ["LONGEST", "orifice_piece", "orifice_rate", "orifice_step", "sensed_orifice_piece"]
+__all__ = [
+    "CREEPING",
+    "LONGEST",
+    "STEEPEST",
+    "orifice_piece",
+    "orifice_rate",
+    "orifice_step",
+    "sensed_orifice_piece",
+]
 
 LONGEST = 0.2
 """Longest step in radians of the ringing."""
 LONGEST_S = 0.25e-3
 """… and in seconds: what the spool does to the orifices is to be followed too."""
+CREEPING = 20.0
+"""Velocity at which a jack no longer creeps, in Stribeck velocities."""
+STEEPEST = 0.1
+"""Largest growth (power of e) of a creeping jack's velocity within a step."""
 ITERATIONS = 40
 SHORTEST = 1e-7
 """Share of a piece that counts as nothing."""
@@ -47,26 +59,32 @@ def orifice_rate(j: JackLaw, x: Any, p12: Any, velocity: Any) -> Any:
 
 
 @packed
+def _friction(j: JackLaw, d: Any, velocity: Any) -> Any:
+    """Dry friction of a jack that moves in direction d, N."""
+    return d * (j.friction + creeping(j, most(velocity * d, velocity * 0.0)))
+
+
+@packed
 def orifice_step(
-    j: JackLaw, h: Any, load: Any, free: Any, x0: Any, x1: Any, x2: Any, p12: Any, velocity: Any
+    j: JackLaw, h: Any, load: Any, d: Any, x0: Any, x1: Any, x2: Any, p12: Any, velocity: Any
 ) -> Any:
     """Pressure (Pa), velocity (m/s) and travel (m) after a step of `h` seconds.
 
-    load: external and friction force, N; free: 1, or 0 where the jack rests; x0, x1, x2: spool at
-    the start, in the middle and at the end, m; p12, velocity: at the start. Numbers or vectors.
+    load: external force, N; d: direction of the motion, 0 where the jack rests; x0, x1, x2: spool
+    at the start, in the middle and at the end, m; p12, velocity: at the start. Numbers or vectors.
     """
-    half, ease = 0.5 * h, free * j.by_mass
+    half, ease = 0.5 * h, d * d * j.by_mass
     dp1 = orifice_rate(j, x0, p12, velocity)
-    dv1 = ease * (j.area * p12 - j.viscosity * velocity - load)
+    dv1 = ease * (j.area * p12 - j.viscosity * velocity - load - _friction(j, d, velocity))
     p, v = p12 + half * dp1, velocity + half * dv1
     dp2 = orifice_rate(j, x1, p, v)
-    dv2 = ease * (j.area * p - j.viscosity * v - load)
+    dv2 = ease * (j.area * p - j.viscosity * v - load - _friction(j, d, v))
     p, v2 = p12 + half * dp2, velocity + half * dv2
     dp3 = orifice_rate(j, x1, p, v2)
-    dv3 = ease * (j.area * p - j.viscosity * v2 - load)
+    dv3 = ease * (j.area * p - j.viscosity * v2 - load - _friction(j, d, v2))
     p, v3 = p12 + h * dp3, velocity + h * dv3
     dp4 = orifice_rate(j, x2, p, v3)
-    dv4 = ease * (j.area * p - j.viscosity * v3 - load)
+    dv4 = ease * (j.area * p - j.viscosity * v3 - load - _friction(j, d, v3))
     sixth = h / 6.0
     return (
         p12 + sixth * (dp1 + 2.0 * (dp2 + dp3) + dp4),
@@ -82,10 +100,9 @@ def _stepped(
 ) -> tuple[float, float, float]:  # fmt: skip
     """Place, pressure and velocity at the share `end` of a piece, from those at `begin`."""
     h = (end - begin) * p.span
-    load = j.load + j.spring * (place + 0.5 * h * velocity) + d * j.friction
-    free = 0.0 if d == 0.0 else 1.0
+    load = j.load + j.spring * (place + 0.5 * h * velocity)
     x0, x1, x2 = place_on(p, begin), place_on(p, 0.5 * (begin + end)), place_on(p, end)
-    p12, velocity, travel = orifice_step(j, h, load, free, x0, x1, x2, p12, velocity)
+    p12, velocity, travel = orifice_step(j, h, load, d, x0, x1, x2, p12, velocity)
     return place + travel, p12, velocity
 
 
@@ -139,10 +156,13 @@ def _time(
 
 
 @packed
-def _steps(j: JackLaw, span: float) -> int:
+def _steps(j: JackLaw, span: float, velocity: float) -> int:
     """Into how many steps a span (s) is cut."""
-    ringing = math.sqrt(j.oil * j.area * j.by_mass)
-    return 1 + int(span * max(ringing / LONGEST, 1.0 / LONGEST_S) * (1.0 - 1e-9))
+    rate = max(math.sqrt(j.oil * j.area * j.by_mass) / LONGEST, 1.0 / LONGEST_S)
+    if abs(velocity) * j.by_stribeck < CREEPING:
+        # Friction that falls with the velocity drives the jack away.
+        rate = max(rate, j.extra * j.by_stribeck * j.by_mass / STEEPEST)
+    return 1 + int(span * rate * (1.0 - 1e-9))
 
 
 def _pieces(senses: bool) -> Any:
@@ -153,7 +173,7 @@ def _pieces(senses: bool) -> Any:
         j: JackLaw, probe: Probe, p: Piece, begin: float, stop: float, state: JackState
     ) -> JackState:
         place, velocity, d, _, p12, lagged, seen = state
-        steps = _steps(j, (stop - begin) * p.span)
+        steps = _steps(j, (stop - begin) * p.span, velocity)
         q, step, events = begin, 1, 0
         while step <= steps:
             end = begin + (stop - begin) * step / steps

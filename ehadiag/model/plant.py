@@ -105,6 +105,8 @@ class PlantConstants(NamedTuple):
     """Dynamic dry friction of the jack, N."""
     FDJ1: Value
     """Dynamic dry friction of the jack at the limit of damage, N."""
+    VSJ: Value
+    """Stribeck velocity of the jack's friction, m/s; 0: moving, it is the dynamic one."""
     FR: Value
     """External load, N."""
     KA: Value
@@ -197,6 +199,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         XJM=jack.XJM,
         FDJ=jack.FDJ0,
         FDJ1=jack.FDJ1,
+        VSJ=0.0,
         FR=jack.FR,
         KA=0.0,
         OXS=0.0,

@@ -35,7 +35,7 @@ def jack_piece(
 
     senses: whether the pressure is to be followed as its sensor sees it.
     """
-    if senses or j.oil > 0.0:
+    if senses or j.oil > 0.0 or j.extra > 0.0:
         return _other_piece(j, probe, senses, p, begin, stop, state)
     return linear_piece(j, p, begin, stop, state)
 

@@ -25,6 +25,7 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.collocation import C1, C2, radau_pressures, radau_velocity
+from ehadiag.model.jack import CREEPING, FINE_FADE
 from ehadiag.model.laws import JackLaw, opening, pressure, resistance
 from ehadiag.model.sensors import followed, through_stages
 from ehadiag.model.simd.layout import (
@@ -188,10 +189,12 @@ def _lanes(senses: bool) -> Any:
             if anywhere(d != 0.0):
                 x1 = place_at(path, o, k, tick)
                 x2 = place_at(path, o, k + 5, tick)
-                later = radau_velocity(
-                    j, h, force + d * j.friction, velocity, x1, x2, x3,
-                    resistance(j, x1), resistance(j, x2), e3,
-                )  # fmt: skip
+                e1, e2, pull = resistance(j, x1), resistance(j, x2), force + d * j.friction
+                if senses:
+                    p1, p2, p3 = radau_pressures(j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3)
+                    later = j.flow * x3 - e3 * p3
+                else:
+                    later = radau_velocity(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
                 moved = place + 0.5 * h * (velocity + later)
                 slides = (later * d > 0.0) & (magnitude(moved) < j.stroke)
                 # What the collocation does not follow: a fresh start, a fast way past the closed
@@ -204,16 +207,15 @@ def _lanes(senses: bool) -> Any:
                     & (most(opening(j, x1), opening(j, x3)) > j.corner)
                     & (travel > CORNER_TRAVEL)
                 )
+                if senses:
+                    fade = j.flow * j.by_stribeck
+                    coarse = coarse | ((near * fade < CREEPING) & (travel * fade > FINE_FADE))
                 slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
                 slides = slides & ~done
                 store(state, JACK * LANES + o, where(slides, moved, place))
                 store(state, JACK_VELOCITY * LANES + o, where(slides, later, velocity))
                 fine = fine | slides
                 if senses and anywhere(slides):
-                    p1, p2, p3 = radau_pressures(
-                        j, h, force + d * j.friction, velocity, x1, x2, x3,
-                        resistance(j, x1), resistance(j, x2), e3,
-                    )  # fmt: skip
                     p0 = pressure(j, place_at(path, o, k + START, tick), velocity)
                     _sense(j, slides, level, step, o, p0, p1, p2, p3, state, coefficients)
             store(state, BUSY * LANES + o, where(fine, 0.0, 1.0))

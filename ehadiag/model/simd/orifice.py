@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined
-from ehadiag.compile.vector import WIDTH, anywhere, load, magnitude, packed, store, where
-from ehadiag.model.orifice import LONGEST, orifice_rate, orifice_step
+from ehadiag.compile.vector import WIDTH, anywhere, least, load, magnitude, packed, store, where
+from ehadiag.model.orifice import CREEPING, LONGEST, STEEPEST, orifice_rate, orifice_step
 from ehadiag.model.sensors import through_ends
 from ehadiag.model.simd.jack import END, MIDDLE, STAGE_NUMBERS, START, follow_pressure, place_at
 from ehadiag.model.simd.jack_events import jack_events
@@ -71,9 +71,8 @@ def _lanes(senses: bool) -> Any:
             d, p12 = load(state, JACK_DIRECTION * LANES + o), load(state, PRESSURE * LANES + o)
             x0, x2 = place_at(path, o, k + START, tick), place_at(path, o, k + END, tick)
             x1 = place_at(path, o, k + MIDDLE, tick)
-            force = j.load + j.spring * (place + 0.5 * h * velocity) + d * j.friction
-            free = where(d == 0.0, 0.0, 1.0)
-            p, v, travel = orifice_step(j, h, force, free, x0, x1, x2, p12, velocity)
+            force = j.load + j.spring * (place + 0.5 * h * velocity)
+            p, v, travel = orifice_step(j, h, force, d, x0, x1, x2, p12, velocity)
             push = j.area * p - j.load - j.spring * place
             held = magnitude(push) <= j.static
             held = held | ((magnitude(place) >= j.stroke) & (place * push > 0.0))
@@ -81,6 +80,9 @@ def _lanes(senses: bool) -> Any:
             done = load(state, DONE * LANES + o) != 0.0
             goes = (((d == 0.0) & held) | slides) & ~done
             goes = goes & (j.oil * j.area * j.by_mass * (h * h) < COARSEST * COARSEST)
+            steep = j.extra * j.by_stribeck * j.by_mass * h > STEEPEST
+            slow = least(magnitude(velocity), magnitude(v)) * j.by_stribeck < CREEPING
+            goes = goes & ~(steep & slow & (d != 0.0))
             if senses:
                 cubic = through_ends(
                     p12, p,

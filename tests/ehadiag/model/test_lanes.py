@@ -7,6 +7,7 @@ import llvmlite.binding
 import numba
 import numpy as np
 import pytest
+from ehadiag.model.simd.threads import residuals_on_cores
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from other_actuator import with_data
@@ -21,7 +22,6 @@ from ehadiag.model.scalar.residuals import Batch, costs, residuals, workspace
 from ehadiag.model.scalar.response import FREE_RUN, respond
 from ehadiag.model.simd.layout import LANES
 from ehadiag.model.simd.residuals import lane_costs, lane_residuals, lane_work, run_blocks
-from ehadiag.model.simd.threads import residuals_on_cores
 from firmware_iface.logs.reader import read_recording
 
 CORNERS = np.array(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0])).reshape(3, 8).T

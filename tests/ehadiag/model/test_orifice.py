@@ -44,7 +44,7 @@ def test_a_step_is_a_solvers(x):
     h, rise, load = 0.25e-3, 0.05, 150.0
 
     def rates(t, y):
-        force = j.area * y[0] - j.viscosity * y[1] - load
+        force = j.area * y[0] - j.viscosity * y[1] - load - j.friction
         return [orifice_rate(j, x + rise * t, y[0], y[1]), j.by_mass * force]
 
     start = [3e6, 0.02]
