@@ -45,6 +45,7 @@ from ehadiag.model.simd.layout import (
     STATE_ROWS,
     sensor_laws,
 )
+from ehadiag.model.simd.orifice import orifice_level, orifice_tick, sensed_orifice_tick
 from ehadiag.model.simd.spool import (
     anchor_lanes,
     deflect_lanes,
@@ -219,19 +220,29 @@ def _jack_tick(
 
 
 @bare_kernel
-def _sensed_jack_tick(
+def _other_jack_tick(
     count: int,
     end: int,
+    orifice: bool,
+    senses: bool,
     tick: float,
     level: int,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """The same, with the pressure as the filter before its converter has it."""
-    for step in range(1 << level):
-        if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
-            jack_events(count, level, step, tick, state, path, coefficients)
+    """The same of an orifice stage, or with the pressure as the filter before its converter has it.
+
+    Apart from the plain one, so that this stays as it is.
+    """
+    if orifice and senses:
+        sensed_orifice_tick(count, end, tick, level, state, path, coefficients)
+    elif orifice:
+        orifice_tick(count, end, tick, level, state, path, coefficients)
+    else:
+        for step in range(1 << level):
+            if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
+                jack_events(count, level, step, tick, state, path, coefficients)
 
 
 @merged
@@ -265,6 +276,7 @@ def _block(
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
+        orifice = plant_of(rows[0]).OIL > 0.0
         state[PLAYS * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
             drive_lanes(end, current[k], plays, state, coefficients)
@@ -289,14 +301,16 @@ def _block(
                 for i in range(wanted):
                     out[i, SPOOL_ROW, k] = sample[i]
             if levels[k] < 0:
-                levels[k] = _level(path)
+                levels[k] = orifice_level(tick, coefficients) if orifice else _level(path)
             if k <= last:  # nothing depends on the jack but pressure and position
-                if senses:
-                    _sensed_jack_tick(count, end, tick, levels[k], state, path, coefficients)
+                if senses or orifice:
+                    _other_jack_tick(
+                        count, end, orifice, senses, tick, levels[k], state, path, coefficients
+                    )
                 else:
                     _jack_tick(count, end, tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(end, senses, state, path, coefficients)
+                pressures(end, senses or orifice, state, path, coefficients)
                 _hold_against(
                     end, pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE_SEEN, PRESSURE_ROW,
                     state, coefficients, sample, sums,
