@@ -134,11 +134,14 @@ def _break_away(j: JackLaw, p: Piece, hold: float, d: float, begin: float, end: 
 def _steps(creeps: bool, j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> int:
     """Into how many steps a piece is cut."""
     near = min(abs(p.x0), abs(p.x1)) if p.x0 * p.x1 > 0.0 else 0.0
-    wanted = (stop - begin) * abs(p.x1 - p.x0) / max(FINE_TRAVEL, FINE_RATIO * near)
-    fade = j.flow * j.by_stribeck
-    if creeps and near * fade < CREEPING:
-        wanted = max(wanted, (stop - begin) * abs(p.x1 - p.x0) * fade / FINE_FADE)
-    if state.direction == 0.0 or state.fresh != 0.0:
+    travel, fine = (stop - begin) * abs(p.x1 - p.x0), max(FINE_TRAVEL, FINE_RATIO * near)
+    if creeps and j.by_stribeck > 0.0 and near * j.flow * j.by_stribeck < CREEPING:
+        fine = min(fine, FINE_FADE / (j.flow * j.by_stribeck))
+    slides = state.direction != 0.0 and state.fresh == 0.0
+    if slides and travel < fine:
+        return 1  # most pieces: no division
+    wanted = travel / fine
+    if not slides:
         # The collocation is slow to forget what a start or a stop leaves.
         rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
         wanted = max(wanted, (stop - begin) * p.span * rate / FRESH_DECAY)
@@ -203,7 +206,7 @@ def _pieces(senses: bool) -> Any:
         steps = _steps(senses, j, p, begin, stop, state)
         q, step, fresh = begin, 1, 0.0
         while step <= steps:
-            end = begin + (stop - begin) * step / steps
+            end = stop if step == steps else begin + (stop - begin) * step / steps
             spring = j.spring * place
             if d == 0.0:
                 x = place_on(p, end)

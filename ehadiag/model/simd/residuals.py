@@ -76,6 +76,8 @@ TRAVEL = 0.15
 CROSSING = 5.0e-6
 """Travel (m) past the closed orifice from which the jack takes eight steps, four times that:
 sixteen."""
+CACHE_LINE = 64
+"""Bytes; as many as a vector of lanes has."""
 
 
 class Scratch(NamedTuple):
@@ -136,24 +138,31 @@ def scratch_for(levels: NDArray[np.int64]) -> Scratch:
     """Scratch with the jack's steps; those below 0 are found by the first block that is run."""
     return Scratch(
         levels=levels,
-        state=np.zeros(STATE_ROWS * LANES),
-        path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
-        coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
-        moving=np.zeros(MOVING_SIZE),
-        loose=np.zeros(MOVING_SIZE),
-        stuck=np.zeros(STUCK_SIZE),
+        state=_aligned(STATE_ROWS * LANES),
+        path=_aligned(PATH_ROWS * LANES + SCRATCH_SIZE),
+        coefficients=_aligned(COEFFICIENT_ROWS * LANES),
+        moving=_aligned(MOVING_SIZE),
+        loose=_aligned(MOVING_SIZE),
+        stuck=_aligned(STUCK_SIZE),
         rows=np.zeros((LANES, FIELDS)),
-        sums=np.zeros(LANES),
-        sample=np.zeros(LANES),
+        sums=_aligned(LANES),
+        sample=_aligned(LANES),
         no_costs=np.zeros(0),
         uncounted=np.zeros(0, dtype=np.int64),
         no_residuals=np.zeros((0, 0, 0)),
     )
 
 
+def _aligned(size: int) -> NDArray[np.float64]:
+    """Zeros that begin where a line of the cache does: a vector that straddles two takes longer."""
+    raw = np.zeros(size + WIDTH)
+    first = -raw.ctypes.data % CACHE_LINE // raw.itemsize
+    return raw[first : first + size]
+
+
 def scratch_beside(work: Scratch) -> Scratch:
     """Scratch of another thread, with the same steps of the jack."""
-    return Scratch._make(part.copy() for part in work)
+    return scratch_for(work.levels.copy())
 
 
 @packed

@@ -330,7 +330,7 @@ def _event(t: SpoolLaw, s: SpoolState, xf: float, xs: float, vs: float) -> int:
     return SPOOL_STOP if abs(xs) >= t.stroke else ENGAGE
 
 
-@bare_kernel
+@merged
 def _jack_beside(
     i: int,
     tick: float,
