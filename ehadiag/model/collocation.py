@@ -15,7 +15,7 @@ from typing import Any
 from ehadiag.compile.vector import most, packed
 from ehadiag.model.laws import JackLaw, creeping
 
-__all__ = ["C1", "C2", "radau_pressures", "radau_velocity"]
+__all__ = ["C1", "C2", "creeping_pressures", "radau_pressures", "radau_velocity"]
 
 REPETITIONS = 3
 ROOT = math.sqrt(6.0)
@@ -75,6 +75,15 @@ def _solved(
 
 @packed
 def radau_pressures(
+    j: JackLaw, h: float, load: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+) -> Any:  # fmt: skip
+    """Pressures (Pa) at the three stages, Stribeck's friction left out: see `radau_velocity`."""
+    return _solved(j, h, load, velocity, x1, x2, x3, e1, e2, e3, None, None, None)
+
+
+@packed
+def creeping_pressures(
     j: JackLaw, h: float, load: Any, d: Any, velocity: Any,
     x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
 ) -> Any:  # fmt: skip
@@ -103,5 +112,5 @@ def radau_velocity(
     load: external and dynamic friction force at its start, N; x1, x2, x3: spool at the three
     stages, m; e1, e2, e3: `resistance` there. Numbers or vectors of them.
     """
-    p3 = _solved(j, h, load, velocity, x1, x2, x3, e1, e2, e3, None, None, None)[2]
+    p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)[2]
     return j.flow * x3 - e3 * p3

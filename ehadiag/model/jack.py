@@ -11,7 +11,7 @@ from typing import Any
 
 from ehadiag.compile.kernels import bare_kernel, inlined
 from ehadiag.compile.vector import packed
-from ehadiag.model.collocation import C1, C2, radau_pressures, radau_velocity
+from ehadiag.model.collocation import C1, C2, creeping_pressures, radau_pressures, radau_velocity
 from ehadiag.model.jack_state import JackState, Piece, Probe, place_on, sense
 from ehadiag.model.laws import JackLaw, excess, pressure, resistance
 from ehadiag.model.sensors import through_stages
@@ -60,7 +60,7 @@ def _creeping_velocity(
     x1: float, x2: float, x3: float, e1: float, e2: float, e3: float,
 ) -> float:  # fmt: skip
     """With Stribeck's friction; apart, so that the plain one stays small."""
-    p3 = radau_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)[2]
+    p3 = creeping_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)[2]
     return j.flow * x3 - e3 * p3
 
 
@@ -173,10 +173,11 @@ def _sensed(
     x0, x1 = place_on(p, begin), place_on(p, begin + C1 * step)
     x2, x3 = place_on(p, begin + C2 * step), place_on(p, end)
     if d != 0.0:
-        p1, p2, p3 = radau_pressures(
-            j, step * p.span, load, d, velocity, x1, x2, x3,
-            resistance(j, x1), resistance(j, x2), resistance(j, x3),
-        )  # fmt: skip
+        h, e1, e2, e3 = step * p.span, resistance(j, x1), resistance(j, x2), resistance(j, x3)
+        if j.extra > 0.0:
+            p1, p2, p3 = creeping_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
+        else:
+            p1, p2, p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)
         cubic = through_stages(
             limited(j, pressure(j, x0, velocity)),
             limited(j, p1), limited(j, p2), limited(j, p3),

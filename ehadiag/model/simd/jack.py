@@ -24,7 +24,7 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.collocation import C1, C2, radau_pressures, radau_velocity
+from ehadiag.model.collocation import C1, C2, creeping_pressures, radau_pressures, radau_velocity
 from ehadiag.model.jack import CREEPING, FINE_FADE
 from ehadiag.model.laws import JackLaw, opening, pressure, resistance
 from ehadiag.model.sensors import followed, through_stages
@@ -188,11 +188,17 @@ def _lanes(senses: bool) -> Any:
                     pressure(j, x3, 0.0), state, coefficients,
                 )  # fmt: skip
             if anywhere(d != 0.0):
+                creeps = senses and anywhere(j.extra > 0.0)
                 x1 = place_at(path, o, k, tick)
                 x2 = place_at(path, o, k + 5, tick)
                 e1, e2, pull = resistance(j, x1), resistance(j, x2), force + d * j.friction
                 if senses:
-                    p1, p2, p3 = radau_pressures(j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3)
+                    if creeps:
+                        p1, p2, p3 = creeping_pressures(
+                            j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
+                        )
+                    else:
+                        p1, p2, p3 = radau_pressures(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
                     later = j.flow * x3 - e3 * p3
                 else:
                     later = radau_velocity(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
@@ -208,7 +214,7 @@ def _lanes(senses: bool) -> Any:
                     & (most(opening(j, x1), opening(j, x3)) > j.corner)
                     & (travel > CORNER_TRAVEL)
                 )
-                if senses:
+                if creeps:
                     fade = j.flow * j.by_stribeck
                     coarse = coarse | ((near * fade < CREEPING) & (travel * fade > FINE_FADE))
                 slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
