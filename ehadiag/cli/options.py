@@ -9,7 +9,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.effects import add_effect_options
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.actuator import (
+    MOST_TOLERANCE,
+    Actuator,
+    default_actuator,
+    load_actuator,
+    with_tolerance,
+)
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 
@@ -104,6 +110,13 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
         " alone do not explain a recording (auto, the default), never, or always",
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=_share,
+        metavar="SHARE",
+        help="each datum of the actuator file may be off by this share, 0 … 0.3"
+        " (default: as the file says)",
     )
     parser.add_argument(
         "--seed",
@@ -257,7 +270,9 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    return load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    found = load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    tolerance = getattr(arguments, "tolerance", None)
+    return found if tolerance is None else with_tolerance(found, tolerance)
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
@@ -359,6 +374,16 @@ def positive(text: str) -> float:
         value = math.nan
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r}: need a number above 0")
+    return value
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= MOST_TOLERANCE:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a share, 0 … {MOST_TOLERANCE:g}")
     return value
 
 
