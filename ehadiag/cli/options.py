@@ -54,6 +54,17 @@ def add_actuator_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_tolerance_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--tolerance`."""
+    parser.add_argument(
+        "--tolerance",
+        type=_share,
+        metavar="SHARE",
+        help="each datum of the actuator file may be off by this share, 0 … 0.3"
+        " (default: as the file says)",
+    )
+
+
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
     """Add `--mapping` and `--dbc`."""
     parser.add_argument(
@@ -68,14 +79,14 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the channel of a recording, and what reading one may cost."""
     parser.add_argument(
         "--log-channel",
-        type=_count,
+        type=count,
         metavar="N",
         help="adapter channel of the recording that is the actuator's, from 1"
         " (default: the mapping's, else the only one)",
     )
     parser.add_argument(
         "--max-frames",
-        type=_count,
+        type=count,
         default=20_000_000,
         metavar="N",
         help="frames that a recording may have (default 20000000, some three hours)",
@@ -111,16 +122,10 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
         " alone do not explain a recording (auto, the default), never, or always",
     )
-    parser.add_argument(
-        "--tolerance",
-        type=_share,
-        metavar="SHARE",
-        help="each datum of the actuator file may be off by this share, 0 … 0.3"
-        " (default: as the file says)",
-    )
+    add_tolerance_option(parser)
     parser.add_argument(
         "--seed",
-        type=_seed,
+        type=seed,
         default=0,
         metavar="N",
         help="seed of the search (default 0); the same seed, the same answer",
@@ -179,10 +184,10 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
         default=os.environ.get("CAN_CHANNEL"),
         help="channel as the interface names it (default: CAN_CHANNEL)",
     )
-    group.add_argument("-b", "--bitrate", type=_count, metavar="N", help="bit/s")
+    group.add_argument("-b", "--bitrate", type=count, metavar="N", help="bit/s")
     group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
     group.add_argument(
-        "--data-bitrate", "--data_bitrate", type=_count, metavar="N", help="bit/s of CAN FD data"
+        "--data-bitrate", "--data_bitrate", type=count, metavar="N", help="bit/s of CAN FD data"
     )
     group.add_argument("--app-name", metavar="NAME", help="application name (Vector)")
     group.add_argument(
@@ -199,7 +204,7 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--baud",
-        type=_count,
+        type=count,
         metavar="N",
         default=DEFAULT_BAUD,
         help=f"of the serial link (default {DEFAULT_BAUD})",
@@ -253,7 +258,7 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--simulator-seed",
-        type=_seed,
+        type=seed,
         default=1,
         metavar="N",
         help="seed of the simulated noise (default 1)",
@@ -387,13 +392,13 @@ def _share(text: str) -> float:
     return value
 
 
-def _count(text: str) -> int:
+def count(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
     return int(text)
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:
         raise argparse.ArgumentTypeError(f"{text!r}: a seed is a whole number, 0 … 4294967295")
     return int(text)
