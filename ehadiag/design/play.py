@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,12 @@ class Played:
     pressure: float
 
 
-def play(test: StoredTest, actuator: Actuator, severities: tuple[float, ...]) -> Played:
+def play(
+    test: StoredTest,
+    actuator: Actuator,
+    severities: tuple[float, ...],
+    effects: Mapping[str, float],
+) -> Played:
     """Run a test from rest.
 
     Parameters
@@ -57,14 +63,16 @@ def play(test: StoredTest, actuator: Actuator, severities: tuple[float, ...]) ->
     actuator : Actuator
     severities : tuple of float
         In the order of the registry, each 0 … 1.
+    effects : mapping
+        Nuisances and errors of data by the registry's names, SI.
 
     Raises
     ------
     ConfigurationError
-        A severity out of its range.
+        A severity or an effect out of its range.
     """
     # The control law runs here, so the monitor is told currents.
-    monitor = Monitor(actuator, severities, mode=CommandMode.CURRENT)
+    monitor = Monitor(actuator, severities, mode=CommandMode.CURRENT, effects=effects)
     data = actuator.controller
     law = ControlLaw(data.IM, data.GAP, data.GAI, data.GAD, 1.0 / test.rate)
     commands = test.command()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.design.play import play
-from ehadiag.design.score import POINTS, Score, score
+from ehadiag.design.score import POINTS, Score, score, usual_effects
 from ehadiag.design.variant import Space, space_of
 
 __all__ = ["Limits", "Proposal", "propose"]
@@ -134,7 +134,7 @@ def _figure(space: Space, point: NDArray[np.float64], actuator: Actuator, limits
     """Figure of a variant; of one beyond its limits one larger than any."""
     test = space.variant(point)
     # As new the jack goes farthest and fastest: what is too much there is not scored.
-    new = play(test, actuator, (0.0,) * len(POINTS[0]))
+    new = play(test, actuator, (0.0,) * len(POINTS[0]), usual_effects())
     excess = limits.excess(new.travel, new.rate, new.pressure, test.duration)
     if excess > 0.0:
         return FORBIDDEN * (1.0 + excess)

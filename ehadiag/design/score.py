@@ -12,13 +12,13 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.design.play import Played, play
 from ehadiag.identify.nuisance.knowledge import knowledge_of
-from ehadiag.identify.nuisance.prior import information_of, nuisances_of
+from ehadiag.identify.nuisance.prior import information_of, nuisances_of, usual
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["POINTS", "Bound", "Score", "bound_of", "score"]
+__all__ = ["POINTS", "Bound", "Score", "bound_of", "score", "usual_effects"]
 
 POINTS = ((0.05, 0.05, 0.05), (0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
 """Severities at which a test is scored: nearly as new, degraded, worn."""
@@ -83,7 +83,8 @@ def score(
     """Score a test of an actuator.
 
     Unknown are the severities, the sensors' offsets, the nuisances, and the data that have a
-    tolerance in the actuator file.
+    tolerance in the actuator file. The unit has usual nuisances: what hysteresis hides is not
+    there to be seen on one without any.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def score(
     ConfigurationError
         A severity out of its range.
     """
-    played = [play(test, actuator, point) for point in points]
+    played = [play(test, actuator, point, usual_effects()) for point in points]
     bounds = tuple(
         bound_of(item, actuator, point) for item, point in zip(played, points, strict=True)
     )
@@ -109,6 +110,11 @@ def score(
         max(item.rate for item in played),
         max(item.pressure for item in played),
     )
+
+
+def usual_effects() -> dict[str, float]:
+    """Nuisances of a usual unit, by name: the middle of what is known of any unit."""
+    return {item.name: usual(item).mean for item in nuisances_of(REGISTRY)}
 
 
 def bound_of(played: Played, actuator: Actuator, point: tuple[float, ...]) -> Bound:
@@ -123,8 +129,9 @@ def bound_of(played: Played, actuator: Actuator, point: tuple[float, ...]) -> Bo
     model = Derivatives(
         SimdModel(lay_out(experiments), unknowns_of(experiments, free)), played.experiment.noise
     )
-    x = np.zeros(len(free))
-    x[: len(point)] = np.array(point) / model.scale[: len(point)]
+    severities = {item.name: value for item, value in zip(FAULTS, point, strict=True)}
+    values = {**usual_effects(), **severities}
+    x = np.array([values.get(item.name, 0.0) for item in free]) / model.scale
     slope = model.trusted_slope(x)
     rows = slope.jacobian[:, slope.smooth]
     prior = information_of(model, knowledge.known, knowledge.joint)

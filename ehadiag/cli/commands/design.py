@@ -133,9 +133,10 @@ def _limits(
     """Limits that were given, else what the test does; as new the actuator goes farthest."""
     from ehadiag.design.play import play  # noqa: PLC0415
     from ehadiag.design.propose import Limits  # noqa: PLC0415
+    from ehadiag.design.score import usual_effects  # noqa: PLC0415
     from ehadiag.model.parameters import FAULTS  # noqa: PLC0415
 
-    new = play(test, actuator, (0.0,) * len(FAULTS))
+    new = play(test, actuator, (0.0,) * len(FAULTS), usual_effects())
 
     def limit(given: float | None, unit: float, *does: float) -> float:
         return ROOM * max(does) if given is None else given * unit

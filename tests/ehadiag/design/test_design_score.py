@@ -9,7 +9,7 @@ from ehadiag.core.channels import PRESSURE, SPOOL
 from ehadiag.core.stored_test import encode_test, load_test, resolve_test
 from ehadiag.design.play import play
 from ehadiag.design.propose import FORBIDDEN, Limits, propose
-from ehadiag.design.score import score
+from ehadiag.design.score import score, usual_effects
 from ehadiag.design.variant import space_of
 from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
 from ehadiag_sim.plant.simulator import simulate
@@ -20,7 +20,7 @@ ACTUATOR = default_actuator()
 
 def test_an_open_loop_test_is_played_as_the_detailed_simulator_does():
     test = resolve_test("open")
-    played = play(test, ACTUATOR, DEGRADED).experiment
+    played = play(test, ACTUATOR, DEGRADED, {}).experiment
     sensors = Sensors(noise_lsb=0.0)
     samples = simulate(ACTUATOR, test, Faults(*DEGRADED), Effects(), sensors, seed=0).samples
     assert np.std(samples.spool - played.spool) < 0.5 * SPOOL.lsb
@@ -29,7 +29,7 @@ def test_an_open_loop_test_is_played_as_the_detailed_simulator_does():
 
 def test_a_closed_loop_test_follows_its_command():
     test = resolve_test("closed")
-    played = play(test, ACTUATOR, DEGRADED)
+    played = play(test, ACTUATOR, DEGRADED, {})
     assert played.travel == pytest.approx(10e-3, rel=0.05)
     held = slice(1500, 1690)  # 10 mm are held
     assert np.abs(played.experiment.position[held] - 10e-3).max() < 0.2e-3
@@ -90,7 +90,7 @@ def test_every_variant_is_a_valid_test_file(seed, tmp_path):
 def test_a_better_test_is_found_and_keeps_its_limits():
     test = resolve_test("open")
     now = score(test, ACTUATOR)
-    new = play(test, ACTUATOR, (0.0, 0.0, 0.0))
+    new = play(test, ACTUATOR, (0.0, 0.0, 0.0), usual_effects())
     most = (max(now.travel, new.travel), max(now.rate, new.rate), max(now.pressure, new.pressure))
     limits = Limits(*(1.001 * value for value in most), test.duration)
     found = propose(test, ACTUATOR, limits, budget=25, seed=1)
