@@ -42,8 +42,8 @@ def test_a_bound_is_what_the_identification_reaches(name):
     found = score(resolve_test(name), ACTUATOR)
     for bound in found.bounds:
         assert np.all(bound.alone <= bound.std * (1.0 + 1e-9))
-        assert np.all((bound.std > 1e-5) & (bound.std < 2e-3))
-        assert np.all((bound.alone > 1e-5) & (bound.alone < 6e-4))
+        assert np.all((bound.std > 5e-6) & (bound.std < 2e-3))
+        assert np.all((bound.alone > 5e-6) & (bound.alone < 6e-4))
 
 
 def test_more_unknowns_show_less():
