@@ -20,6 +20,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
+from ehadiag.identify.nuisance.knowledge import knowledge_of
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
@@ -90,7 +91,7 @@ class DiagnosisSession:
         self._tests = tuple(tests)
         self._default = default
         self._levels = levels or Levels()
-        self._session = Session(solver, seed, nuisances)
+        self._session = Session(solver, seed, nuisances, knowledge_of(actuator))
 
     @property
     def reused(self) -> int:

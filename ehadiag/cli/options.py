@@ -9,7 +9,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.effects import add_effect_options
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.actuator import (
+    MOST_TOLERANCE,
+    Actuator,
+    default_actuator,
+    load_actuator,
+    with_tolerance,
+)
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 
@@ -48,6 +54,17 @@ def add_actuator_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_tolerance_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--tolerance`."""
+    parser.add_argument(
+        "--tolerance",
+        type=_share,
+        metavar="SHARE",
+        help="each datum of the actuator file may be off by this share, 0 … 0.3"
+        " (default: as the file says)",
+    )
+
+
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
     """Add `--mapping` and `--dbc`."""
     parser.add_argument(
@@ -62,14 +79,14 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the channel of a recording, and what reading one may cost."""
     parser.add_argument(
         "--log-channel",
-        type=_count,
+        type=count,
         metavar="N",
         help="adapter channel of the recording that is the actuator's, from 1"
         " (default: the mapping's, else the only one)",
     )
     parser.add_argument(
         "--max-frames",
-        type=_count,
+        type=count,
         default=20_000_000,
         metavar="N",
         help="frames that a recording may have (default 20000000, some three hours)",
@@ -105,9 +122,10 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
         " alone do not explain a recording (auto, the default), never, or always",
     )
+    add_tolerance_option(parser)
     parser.add_argument(
         "--seed",
-        type=_seed,
+        type=seed,
         default=0,
         metavar="N",
         help="seed of the search (default 0); the same seed, the same answer",
@@ -166,10 +184,10 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
         default=os.environ.get("CAN_CHANNEL"),
         help="channel as the interface names it (default: CAN_CHANNEL)",
     )
-    group.add_argument("-b", "--bitrate", type=_count, metavar="N", help="bit/s")
+    group.add_argument("-b", "--bitrate", type=count, metavar="N", help="bit/s")
     group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
     group.add_argument(
-        "--data-bitrate", "--data_bitrate", type=_count, metavar="N", help="bit/s of CAN FD data"
+        "--data-bitrate", "--data_bitrate", type=count, metavar="N", help="bit/s of CAN FD data"
     )
     group.add_argument("--app-name", metavar="NAME", help="application name (Vector)")
     group.add_argument(
@@ -186,7 +204,7 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--baud",
-        type=_count,
+        type=count,
         metavar="N",
         default=DEFAULT_BAUD,
         help=f"of the serial link (default {DEFAULT_BAUD})",
@@ -240,7 +258,7 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--simulator-seed",
-        type=_seed,
+        type=seed,
         default=1,
         metavar="N",
         help="seed of the simulated noise (default 1)",
@@ -257,7 +275,9 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    return load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    found = load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    tolerance = getattr(arguments, "tolerance", None)
+    return found if tolerance is None else with_tolerance(found, tolerance)
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
@@ -362,13 +382,23 @@ def positive(text: str) -> float:
     return value
 
 
-def _count(text: str) -> int:
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= MOST_TOLERANCE:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a share, 0 … {MOST_TOLERANCE:g}")
+    return value
+
+
+def count(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
     return int(text)
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:
         raise argparse.ArgumentTypeError(f"{text!r}: a seed is a whole number, 0 … 4294967295")
     return int(text)

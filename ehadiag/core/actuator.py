@@ -12,13 +12,17 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.toml_file import decode_toml, read_toml
 
 __all__ = [
+    "MOST_TOLERANCE",
+    "VARYING",
     "Actuator",
     "Controller",
     "Jack",
     "SecondStage",
     "Servovalve",
+    "Tolerance",
     "default_actuator",
     "load_actuator",
+    "with_tolerance",
 ]
 
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
@@ -111,6 +115,55 @@ class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Volume of both chambers together, m³; of orifices only."""
 
 
+MOST_TOLERANCE = 0.3
+Share = Annotated[float, msgspec.Meta(ge=0, le=MOST_TOLERANCE)]
+
+VARYING = ("GM", "KSF", "KF", "GQF", "CS", "FSS0", "GP", "GQ", "MJ", "CJ", "FDJ0")
+"""Data in which units of one type differ, and of which a test shows what matters (PHY-37)."""
+
+
+class Tolerance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """By what share a unit's data may differ from its file, each evenly within ± so much (PHY-37).
+
+    The ends of the friction scales (FSS1, FDJ1), the stops of spool and jack and the supply have
+    none.
+    """
+
+    all: Share = 0.0
+    """Of each of `VARYING` that is not named."""
+    GM: Share | None = None
+    KSF: Share | None = None
+    KF: Share | None = None
+    JF: Share | None = None
+    CF: Share | None = None
+    XFM: Share | None = None
+    GQF: Share | None = None
+    GPF: Share | None = None
+    AS: Share | None = None
+    MS: Share | None = None
+    CS: Share | None = None
+    FSS0: Share | None = None
+    GP: Share | None = None
+    GQ: Share | None = None
+    CLK: Share | None = None
+    AJ: Share | None = None
+    MJ: Share | None = None
+    CJ: Share | None = None
+    FDJ0: Share | None = None
+
+    def of(self, name: str) -> float:
+        """Return the tolerance of a datum."""
+        own: float | None = getattr(self, name)
+        if own is not None:
+            return own
+        return self.all if name in VARYING else 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Data that have one."""
+        return tuple(name for name in self.__struct_fields__[1:] if self.of(name) > 0.0)
+
+
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One actuator: its name, controller, servovalve, second stage and jack."""
 
@@ -119,6 +172,7 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     servovalve: Servovalve
     jack: Jack
     second_stage: SecondStage = SecondStage()
+    tolerance: Tolerance = Tolerance()
 
 
 def load_actuator(path: Path | str) -> Actuator:
@@ -148,6 +202,11 @@ def default_actuator() -> Actuator:
     """Return the reference actuator, which comes with the package."""
     text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
     return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
+
+
+def with_tolerance(actuator: Actuator, share: float) -> Actuator:
+    """Return the same actuator, the data in which units differ with one tolerance."""
+    return msgspec.structs.replace(actuator, tolerance=Tolerance(all=share))
 
 
 def _checked(actuator: Actuator, source: str) -> Actuator:

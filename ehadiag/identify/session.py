@@ -15,6 +15,7 @@ from ehadiag.identify.estimates import identification
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess
+from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.refine.first_part import (
     CONSIDERED,
@@ -84,6 +85,8 @@ class Session:
         The same seed gives the same answer on the same machine.
     nuisances : Nuisances
         Which effects of the installation are estimated beside the severities.
+    knowledge : Knowledge
+        What is known of the unit; where its data are in doubt they are estimated too, always.
     """
 
     def __init__(
@@ -91,10 +94,12 @@ class Session:
         solver: Solver | None = None,
         seed: int = 0,
         nuisances: Nuisances = Nuisances.AUTO,
+        knowledge: Knowledge = NOTHING,
     ) -> None:
         self.solver = solver or CompactGa()
         self.seed = seed
         self.nuisances = nuisances
+        self.knowledge = knowledge
         self._memory = Memory()
 
     @property
@@ -133,10 +138,11 @@ class Session:
         found = staged_search(self._stages(experiments, start), tell)
         search_s = time.perf_counter() - searched_at
         tell("refinement", 0.0)
-        alone = self.nuisances is Nuisances.NONE
+        doubts = self.knowledge.doubts
+        alone = self.nuisances is Nuisances.NONE and not doubts
         near = resembles(experiments, found.best)
         best: Attempt | None = None
-        if alone or (near and self.nuisances is Nuisances.AUTO):
+        if alone or (near and self.nuisances is Nuisances.AUTO and not doubts):
             best = attempt(experiments, found, self._first_part)
             best = replace(best, evaluations=best.evaluations + found.evaluations)
         freed: Estimated | None = None
@@ -166,7 +172,9 @@ class Session:
             first,
             replace(found, best=severities, cost=freed.refined.cost),
             freed.refined,
-            covariance(freed.refined) + freed.covariance,
+            covariance(freed.refined)
+            + freed.covariance
+            + self.knowledge.spread(freed.refined.parameters, values, experiments[0].constants),
             freed.experiments,
             first.evaluations + before + freed.evaluations,
             freed.starts + (1 if best else 0),
@@ -181,9 +189,12 @@ class Session:
     ) -> Estimated:
         """Estimate with all nuisances free."""
         tell("nuisances", 0.0)
+        effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *nuisances_of(REGISTRY)),
+            (*FAULTS, *OFFSETS, *self.knowledge.beside(effects)),
+            known=self.knowledge.known,
+            joint=self.knowledge.joint,
             considered=CONSIDERED,
             hint=hint,
             seed=self.seed,
@@ -246,10 +257,11 @@ def identify(
     solver: Solver | None = None,
     seed: int = 0,
     nuisances: Nuisances = Nuisances.AUTO,
+    knowledge: Knowledge = NOTHING,
     progress: Progress | None = None,
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
-    return Session(solver, seed, nuisances).finish(experiments, progress)
+    return Session(solver, seed, nuisances, knowledge).finish(experiments, progress)
 
 
 def _timing(begin: float, searched_at: float, search_s: float) -> Timing:

@@ -29,21 +29,27 @@ def covariance(refinement: Refinement) -> NDArray[np.float64]:
     The larger of two, parameter by parameter: the inverse curvature times the reduced sum of
     squares (never below 1), and the sandwich estimate with residuals correlated over some ticks
     (Newey and West, Econometrica 55(3), 1987), which grows with what the model does not explain.
-    A severity that the test does not show has the variance of a uniform density. On top comes what
+    A severity that the test does not show has the variance of a uniform density, or of what was
+    known beforehand. On top comes what
     the considered parameters do: where one of them is off by a deviation the estimate moves in
     proportion (Schmidt, Advances in Control Systems 3, 1966); and `DISCREPANCY_STD`, for what
     either side's integration is off.
     """
     normal = refinement.normal
-    # A weak prior keeps a severity that nothing shows finite: uniform on its range.
-    severities = np.array([item.kind is Kind.FAULT for item in refinement.parameters])
-    prior = np.where(severities, 1.0 / UNIFORM_STD**2, 0.0)
-    inverse = np.linalg.pinv(normal + np.diag(prior), hermitian=True)
+    information = refinement.information
+    if information is None:
+        # A weak prior keeps a severity that nothing shows finite: uniform on its range.
+        severities = np.array([item.kind is Kind.FAULT for item in refinement.parameters])
+        information = np.diag(np.where(severities, 1.0 / UNIFORM_STD**2, 0.0))
+    inverse = np.linalg.pinv(normal + information, hermitian=True)
     count = int(refinement.used.sum())
     squares = float((refinement.residuals[refinement.used] ** 2).sum())
     reduced = squares / max(count - len(normal), 1)
     curved = inverse * max(reduced / EXPECTED_CAPPED, 1.0)
-    sandwich = inverse @ _meat(refinement) @ inverse
+    meat = _meat(refinement)
+    if refinement.information is not None:
+        meat = meat + information  # what was known is like one more sample of each parameter
+    sandwich = inverse @ meat @ inverse
     factor = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(curved), 1e-300), 1.0))
     out = curved * np.outer(factor, factor)
     rows = refinement.jacobian[:, refinement.used]

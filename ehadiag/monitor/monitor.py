@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, NoReturn, TypeVar
 
@@ -19,7 +19,7 @@ from ehadiag.core.recording import CommandMode, Environment
 from ehadiag.model.anchor import Anchor
 from ehadiag.model.control import ControlLaw
 from ehadiag.model.laws import SpoolLaw, drive_law, jack_law
-from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.model.parameters import FAULTS, REGISTRY, Unknowns
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.scalar.transition import spool_tables
 from ehadiag.model.sensors import sensor_law
@@ -114,6 +114,8 @@ class Monitor:
         Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
     offsets : tuple[float, float]
         Constant errors of spool (m) and pressure sensor (Pa).
+    effects : Mapping[str, float] | None
+        Nuisances and errors of data by the registry's names, as last identified, SI; None: none.
     anchor : Anchor
         How the modelled spool is kept on the measured one.
 
@@ -134,13 +136,15 @@ class Monitor:
         shift: float = 1.0,
         noise: tuple[float, float] | None = None,
         offsets: tuple[float, float] = (0.0, 0.0),
+        effects: Mapping[str, float] | None = None,
         anchor: Anchor = ANCHOR,
     ) -> None:
         law = actuator.controller
         tick = 1.0 / law.rate
         noise = noise or (NOISE_LSB * SPOOL.lsb, NOISE_LSB * PRESSURE.lsb)
         values = _checked(faults, noise, offsets, tick)
-        unknowns = Unknowns(FAULTS, (plant_constants(actuator, environment),), {})
+        held = _known(effects or {})
+        unknowns = Unknowns(FAULTS, (plant_constants(actuator, environment),), held)
         constants = unknowns.constants(np.array(values))._replace(OXS=offsets[0], OPD=offsets[1])
         tables = spool_tables(constants, tick)
         self._law = SpoolLaw(*tables.law)
@@ -257,6 +261,18 @@ def _checked(
     if not TICKS_S[0] <= tick <= TICKS_S[1]:
         raise ConfigurationError(f"controller.rate {1.0 / tick:g} Hz: need 10 … 1e5 Hz")
     return values
+
+
+def _known(effects: Mapping[str, float]) -> dict[str, float]:
+    """Effects as plain numbers, checked against the registry."""
+    bounds = {item.name: (item.lower, item.upper) for item in REGISTRY if item not in FAULTS}
+    for name, value in effects.items():
+        if name not in bounds:
+            raise ConfigurationError(f"effect {name!r}: none of the registry's")
+        lower, upper = bounds[name]
+        if not lower <= value <= upper:
+            raise ConfigurationError(f"effect {name} {value:g}: need {lower:g} … {upper:g}")
+    return {name: float(value) for name, value in effects.items()}
 
 
 def _view(array: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -12,6 +12,7 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.explained import excess, is_noise
 from ehadiag.identify.nuisance.prior import (
     ALIAS,
+    Joint,
     Known,
     belief_of,
     beside,
@@ -72,6 +73,7 @@ def estimate(
     free: Sequence[Parameter],
     *,
     known: Mapping[str, Known] | None = None,
+    joint: Joint | None = None,
     considered: Sequence[Considered] = (),
     hint: Mapping[str, float] | None = None,
     budget: int = BUDGET,
@@ -87,6 +89,8 @@ def estimate(
         What is estimated.
     known : mapping, optional
         What is known of some of them beforehand, by name.
+    joint : Joint, optional
+        What is known of some others together.
     considered : sequence of Considered
         What is held, with a tolerance that counts in the interval.
     hint : mapping, optional
@@ -101,7 +105,7 @@ def estimate(
     known = known or {}
     coarse = _free_running(experiments, free)
     model = _scaled(coarse, experiments)
-    first, information = belief_of(model, known), information_of(model, known)
+    first, information = belief_of(model, known, joint), information_of(model, known, joint)
     origins = [first, small_effects(model, first)]
     if hint is not None:
         origins = [beside(model, first, hint), *origins[::-1]]
@@ -119,8 +123,9 @@ def estimate(
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
-    belief = _last_look(fine, model, found, known, seed)
-    refined = _described(fine, belief, settled=found.explained, seed=seed)
+    before = belief_of(fine, known, joint), information_of(fine, known, joint)
+    belief = _last_look(fine, model, found, before, seed)
+    refined = _described(fine, belief, before[1], settled=found.explained, seed=seed)
     return Estimated(
         refined=refined,
         experiments=judged,
@@ -156,19 +161,33 @@ def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -
 
 
 def _last_look(
-    fine: Derivatives, model: Derivatives, found: Found, known: Mapping[str, Known], seed: int
+    fine: Derivatives,
+    model: Derivatives,
+    found: Found,
+    before: tuple[Belief, NDArray[np.float64]],
+    seed: int,
 ) -> Belief:
-    """Optimum by the noise as judged: of the search, or a better one beside it."""
+    """Optimum by the noise as judged: of the search, or a better one beside it.
+
+    before: what was known, and its information.
+    """
     ratio = model.scale / fine.scale
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    again, _ = sharpen(fine, belief_of(fine, known), wider, information_of(fine, known), rng)
+    again, _ = sharpen(fine, before[0], wider, before[1], rng)
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
 
 
-def _described(model: Derivatives, belief: Belief, *, settled: bool, seed: int) -> Refinement:
+def _described(
+    model: Derivatives,
+    belief: Belief,
+    information: NDArray[np.float64],
+    *,
+    settled: bool,
+    seed: int,
+) -> Refinement:
     """Put together what is known at the optimum."""
     linear = linearised(model, belief, np.random.default_rng(seed))
     residuals, considered, anchored, _ = model.at(belief.x)
@@ -188,6 +207,7 @@ def _described(model: Derivatives, belief: Belief, *, settled: bool, seed: int) 
         converged=settled,
         jagged=not settled,
         anchored=anchored,
+        information=information,
     )
 
 

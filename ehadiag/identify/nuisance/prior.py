@@ -17,12 +17,14 @@ from ehadiag.model.parameters import Kind, Parameter
 
 __all__ = [
     "ALIAS",
+    "Joint",
     "Known",
     "belief_of",
     "beside",
     "information_of",
     "nuisances_of",
     "small_effects",
+    "usual",
 ]
 
 ALIAS = "null_bias"
@@ -54,19 +56,42 @@ class Known:
     std: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """What is known of several parameters together: a normal density, in their units.
+
+    Attributes
+    ----------
+    names : tuple of str
+    mean : shape (m,)
+    covariance : shape (m, m)
+        Positive definite.
+    """
+
+    names: tuple[str, ...]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def covariance_among(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Covariance of parameters in this order, 0 of those of which nothing is known."""
+        out = np.zeros((len(names), len(names)))
+        mine = [k for k, name in enumerate(names) if name in self.names]
+        places = [self.names.index(names[k]) for k in mine]
+        out[np.ix_(mine, mine)] = self.covariance[np.ix_(places, places)]
+        return out
+
+
 def nuisances_of(registry: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Nuisances that an identification may free beside the constant errors of the sensors."""
     return tuple(item for item in registry if item.name in BASIC)
 
 
-def belief_of(model: Derivatives, known: Mapping[str, Known]) -> Belief:
+def belief_of(model: Derivatives, known: Mapping[str, Known], joint: Joint | None = None) -> Belief:
     """Belief with which the search begins: what is known, else the usual sizes."""
-    usual = [_usual(item) for item in model.estimated]
-    given = [known.get(item.name) for item in model.estimated]
-    mean = [k.mean if k else u.mean for k, u in zip(given, usual, strict=True)]
-    spread = np.array([k.std if k else u.std for k, u in zip(given, usual, strict=True)])
-    x = np.clip(np.array(mean) / model.scale, model.lower, model.upper)
-    return Belief(x, np.diag((spread / model.scale)[model.curved]))
+    mean, covariance = _density(model, known, joint)
+    x = np.clip(mean, model.lower, model.upper)
+    root = np.linalg.cholesky(covariance[np.ix_(model.curved, model.curved)])
+    return Belief(x, np.asarray(root, dtype=np.float64))
 
 
 def beside(model: Derivatives, belief: Belief, values: Mapping[str, float]) -> Belief:
@@ -87,19 +112,41 @@ def small_effects(model: Derivatives, belief: Belief) -> Belief:
     return Belief(np.clip(x, model.lower, model.upper), belief.root * shares[:, None])
 
 
-def information_of(model: Derivatives, known: Mapping[str, Known]) -> NDArray[np.float64]:
-    """Reciprocal variance of each coordinate: of what is known, and a little of the usual sizes.
+def information_of(
+    model: Derivatives, known: Mapping[str, Known], joint: Joint | None = None
+) -> NDArray[np.float64]:
+    """Inverse covariance of what is known, and a little of the usual sizes, shape (k, k).
 
-    The latter keeps finite what no recording shows, shape (k,).
+    The latter keeps finite what no recording shows. A constant error of a sensor of which nothing
+    is known may have any size.
     """
-    out = np.zeros(len(model.estimated))
-    for k, item in enumerate(model.estimated):
-        if item.adds_to is None or item.name in known:
-            out[k] = (model.scale[k] / known.get(item.name, _usual(item)).std) ** 2
+    _, covariance = _density(model, known, joint)
+    named = {*known, *(joint.names if joint else ())}
+    shown = [
+        k for k, item in enumerate(model.estimated) if item.adds_to is None or item.name in named
+    ]
+    out = np.zeros_like(covariance)
+    out[np.ix_(shown, shown)] = np.linalg.inv(covariance[np.ix_(shown, shown)])
     return out
 
 
-def _usual(item: Parameter) -> Known:
+def _density(
+    model: Derivatives, known: Mapping[str, Known], joint: Joint | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and covariance of all coordinates, in units of the model's scales."""
+    each = [known.get(item.name) or usual(item) for item in model.estimated]
+    mean = np.array([item.mean for item in each])
+    covariance = np.diag([item.std**2 for item in each])
+    if joint is not None:
+        names = [item.name for item in model.estimated]
+        mine = [k for k, name in enumerate(names) if name in joint.names]
+        mean[mine] = [joint.mean[joint.names.index(names[k])] for k in mine]
+        covariance[np.ix_(mine, mine)] = joint.covariance_among([names[k] for k in mine])
+    return mean / model.scale, covariance / np.outer(model.scale, model.scale)
+
+
+def usual(item: Parameter) -> Known:
+    """What is known of a parameter of any unit: its usual size."""
     if item.kind is Kind.FAULT:
         return Known(CENTRE_OF_SEVERITY, SPREAD_OF_SEVERITY)
     if item.lower >= 0.0:

@@ -89,7 +89,7 @@ def search(
     ----------
     known : Belief
         Before the recordings.
-    information : shape (k,)
+    information : shape (k, k)
         See `sharpen`.
     origins : sequence of Belief
         Where every other start begins, in turn; those between begin beside the best so far.

@@ -66,6 +66,8 @@ class Refinement:
         Break-aways make steps in the cost about the optimum: a descent may stop beside it.
     anchored : int
         How often the model was re-anchored at the optimum.
+    information : shape (k, k), optional
+        What was known beforehand: inverse covariance, in units of `scale`.
     """
 
     parameters: tuple[Parameter, ...]
@@ -81,6 +83,7 @@ class Refinement:
     converged: bool
     jagged: bool
     anchored: int
+    information: NDArray[np.float64] | None = None
 
     @property
     def values(self) -> dict[str, float]:

@@ -50,8 +50,8 @@ def sharpen(
         Its mean is what was known before the recording.
     begin : Belief
         Where the search begins.
-    information : shape (k,)
-        What was known of each coordinate: reciprocal variance, 0 where nothing.
+    information : shape (k, k)
+        What was known: inverse covariance, 0 where nothing.
     """
     belief = begin
     for _ in range(MOST_ROUNDS):
@@ -79,8 +79,8 @@ def _round(
     weights = robust_weights(linear).ravel()
     rows = linear.jacobian.reshape(len(belief.x), -1)
     weighed = rows * weights
-    normal = weighed @ rows.T + np.diag(information)
-    gradient = weighed @ linear.residuals.ravel() + information * (linear.x - known.x)
+    normal = weighed @ rows.T + information
+    gradient = weighed @ linear.residuals.ravel() + information @ (linear.x - known.x)
     curved = model.curved
     inverse_root = np.linalg.inv(belief.root)
     held = FREE * np.eye(len(belief.x))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ehadiag.identify.nuisance.estimate import spread_of_optima
 from ehadiag.identify.nuisance.explained import MOST_EXCESS, excess, is_noise
-from ehadiag.identify.nuisance.prior import Known, belief_of, information_of, nuisances_of
+from ehadiag.identify.nuisance.prior import Joint, Known, belief_of, information_of, nuisances_of
 from ehadiag.identify.nuisance.starts import Found, Place, search
 from ehadiag.identify.refine.linearisation import Belief, linearised
 from ehadiag.identify.refine.posterior import sharpen
@@ -153,7 +153,9 @@ def test_a_settled_belief_is_as_wide_as_the_noise_allows():
     for seed in range(8):
         problem = Problem(curved(truth, seed))
         start = Belief(np.array([0.7, 0.6, 0.6, 0.0]), 0.1 * np.eye(3))
-        belief, settled = sharpen(problem, start, start, np.zeros(4), np.random.default_rng(seed))
+        belief, settled = sharpen(
+            problem, start, start, np.zeros((4, 4)), np.random.default_rng(seed)
+        )
         assert settled
         values.append(belief.x[:3])
     spread = np.std(values, axis=0)
@@ -190,8 +192,21 @@ def test_what_is_known_beforehand_replaces_the_usual_sizes():
     place = [item.name for item in problem.estimated].index("FSS")
     assert (usual.x[place], told.x[place]) == (0.4, 0.1)
     assert told.root[place, place] == 0.02
-    assert information_of(problem, {"FSS": Known(0.1, 0.02)})[place] == pytest.approx(2500.0)
-    assert information_of(problem, {})[3] == 0.0, "an offset may have any size"
+    information = information_of(problem, {"FSS": Known(0.1, 0.02)})
+    assert information[place, place] == pytest.approx(2500.0)
+    assert np.all(information_of(problem, {})[3] == 0.0), "an offset may have any size"
+
+
+def test_what_is_known_of_several_together_keeps_their_correlation():
+    problem = Problem(linear()[1])
+    names = tuple(item.name for item in problem.estimated[:2])
+    covariance = np.array([[4e-4, 3.9e-4], [3.9e-4, 4e-4]])
+    joint = Joint(names, np.array([0.2, 0.3]), covariance)
+    belief = belief_of(problem, {}, joint)
+    assert belief.x[:2] == pytest.approx([0.2, 0.3])
+    assert (belief.root @ belief.root.T)[:2, :2] == pytest.approx(covariance)
+    information = information_of(problem, {}, joint)
+    assert information[:2, :2] == pytest.approx(np.linalg.inv(covariance))
 
 
 def test_sensors_offsets_are_always_estimated_and_no_nuisance_of_choice():

@@ -1,0 +1,120 @@
+"""What an actuator file says of the unit beside its data: how far these may be off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.actuator import Actuator
+from ehadiag.identify.nuisance.prior import Joint, Known, usual
+from ehadiag.model.parameters import Parameter, Unknowns, parameter
+from ehadiag.model.plant import PlantConstants
+
+__all__ = ["NOTHING", "PASS_FOR_FAULTS", "Alias", "Knowledge", "datum_name", "knowledge_of"]
+
+MOTOR_GAIN = "torque_motor_gain"
+"""What an error of GM does: as a datum nothing could tell it from this."""
+PASS_FOR_FAULTS = {"GQF": "Kintas", "FSS0": "FSS", "FDJ0": "FDJ"}
+"""Data that do what a severity does, so that no recording tells the two apart."""
+SMALL = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Alias:
+    """A datum that is held, and how far it may be off: the severity is off by as much.
+
+    Attributes
+    ----------
+    datum, fault : Parameter
+    std : float
+        Deviation of the datum, relative.
+    """
+
+    datum: Parameter
+    fault: Parameter
+    std: float
+
+    def shift(self, constants: PlantConstants, severity: float) -> float:
+        """Change of the severity that does what a deviation of the datum does."""
+        unknowns = Unknowns((self.datum, self.fault), (constants,), {})
+        points = np.array([[0.0, severity], [SMALL, severity], [0.0, severity + SMALL]])
+        there, datum, fault = unknowns.candidates(points)[:, 0]
+        place = int(np.argmax(np.abs(fault - there)))
+        return float((datum - there)[place] / (fault - there)[place]) * self.std
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knowledge:
+    """What is known of a unit before a recording of it is seen.
+
+    Attributes
+    ----------
+    free : tuple of Parameter
+        What is estimated because of it, beside severities and nuisances.
+    known : mapping
+        Of each of them alone, by name.
+    joint : Joint, optional
+        Of several together.
+    aliases : tuple of Alias
+    """
+
+    free: tuple[Parameter, ...] = ()
+    known: Mapping[str, Known] = field(default_factory=dict)
+    joint: Joint | None = None
+    aliases: tuple[Alias, ...] = ()
+
+    @property
+    def doubts(self) -> bool:
+        """Whether the data are not to be taken for exact."""
+        return bool(self.free or self.aliases)
+
+    def beside(self, others: Sequence[Parameter]) -> tuple[Parameter, ...]:
+        """Return other parameters and what is free because of this, each once."""
+        mine = {item.name for item in self.free}
+        return (*(item for item in others if item.name not in mine), *self.free)
+
+    def spread(
+        self, parameters: Sequence[Parameter], values: Mapping[str, float], base: PlantConstants
+    ) -> NDArray[np.float64]:
+        """Covariance that the aliases add to that of estimates, SI, shape (k, k)."""
+        out = np.zeros((len(parameters), len(parameters)))
+        names = [item.name for item in parameters]
+        for item in self.aliases:
+            place = names.index(item.fault.name)
+            out[place, place] += item.shift(base, values[item.fault.name]) ** 2
+        return out
+
+
+NOTHING = Knowledge()
+"""The data are exact."""
+
+
+def knowledge_of(actuator: Actuator) -> Knowledge:
+    """What an actuator file says.
+
+    A tolerance is a uniform range: the density before a recording has its deviation, the estimate
+    its bounds (JCGM 100:2008, 4.3.7).
+    """
+    free, known, aliases = [], {}, []
+    for symbol in actuator.tolerance.names:
+        half_width = actuator.tolerance.of(symbol)
+        std = half_width / math.sqrt(3.0)
+        item = parameter(datum_name(symbol))
+        if symbol in PASS_FOR_FAULTS:
+            aliases.append(Alias(item, parameter(PASS_FOR_FAULTS[symbol]), std))
+        elif item.name == MOTOR_GAIN:
+            free.append(item)
+            known[item.name] = Known(0.0, math.hypot(std, usual(item).std))
+        else:
+            free.append(replace(item, lower=-half_width, upper=half_width))
+            known[item.name] = Known(0.0, std)
+    return Knowledge(tuple(free), known, None, tuple(aliases))
+
+
+def datum_name(symbol: str) -> str:
+    """Name of the parameter that is the relative error of a datum."""
+    return MOTOR_GAIN if symbol == "GM" else f"datum_{symbol}"
