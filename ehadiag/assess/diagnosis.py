@@ -12,6 +12,7 @@ from ehadiag.assess.acceptance import (
     objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
+    objections_to_unit,
     out_of_range,
     remarks_on_recording,
 )
@@ -163,6 +164,7 @@ class DiagnosisSession:
             reasons += objections
         if len({recording.serial for recording in recordings} - {None}) > 1:
             reasons.append("the recordings are of actuators with different serial numbers")
+        reasons += objections_to_unit(recordings, self._actuator)
         return experiments, reasons
 
 
