@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +11,11 @@ from rich.table import Table
 from ehadiag.core.printable import printable, valid_text
 
 if TYPE_CHECKING:
-    from ehadiag.calibrate.result import Calibrated, Value
+    from ehadiag.calibration.result import Calibrated, Value
 
-__all__ = ["SCHEMA", "calibration_json", "print_calibration", "text_of_calibration"]
+__all__ = ["SCHEMA", "calibration_json", "print_calibration"]
 
 SCHEMA = "ehadiag.calibration/1"
-WIDTH = 200
 SHOWN_IN = {"A": (1e3, "mA"), "m": (1e6, "µm"), "s": (1e3, "ms"), "1": (1e2, "%")}
 """Factor and unit in which a table shows an effect; data are shown as their file has them."""
 
@@ -80,15 +78,6 @@ def calibration_json(found: Calibrated) -> str:
         "elapsed_s": round(found.elapsed, 3),
     }
     return json.dumps(tree, allow_nan=False)
-
-
-def text_of_calibration(found: Calibrated) -> str:
-    """Return a calibration as plain lines of text, the last one without its end."""
-    console = Console(
-        file=io.StringIO(), width=WIDTH, highlight=False, record=True, force_jupyter=False
-    )
-    print_calibration(found, console)
-    return "\n".join(line.rstrip() for line in console.export_text().splitlines())
 
 
 def print_calibration(found: Calibrated, console: Console) -> None:

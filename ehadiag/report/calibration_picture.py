@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ehadiag.calibrate.result import Calibrated
+from ehadiag.calibration.result import Calibrated
 from ehadiag.core.printable import printable
 from ehadiag.report.picture import Picture, draw_column
 

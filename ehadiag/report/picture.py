@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
-from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.identify.result import Identification
+from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
@@ -90,8 +91,8 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
         5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
     )
     for column, experiment in enumerate(diagnosis.experiments):
-        severities = np.array([item.value for item in found.estimates])
-        constants = Unknowns(FAULTS, (experiment.constants,), {}).constants(severities)
+        unknowns = Unknowns((), (experiment.constants,), _values(diagnosis, found))
+        constants = unknowns.constants(np.empty(0))
         draw_column([axes[column] for axes in grid], experiment, constants)
     estimates = ",  ".join(
         f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
@@ -101,6 +102,18 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
     title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{estimates}"
     figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
     return figure
+
+
+def _values(diagnosis: Diagnosis, found: Identification) -> dict[str, float]:
+    """All that was estimated, by name; effects less what the experiments' constants have."""
+    calibration = diagnosis.actuator.calibration
+    about = calibration.effects if calibration else {}
+    beside = {
+        name: item.value - about.get(name, 0.0)
+        for name, item in found.nuisances.items()
+        if parameter(name) not in OFFSETS
+    }
+    return {**beside, **{item.name: item.value for item in found.estimates}}
 
 
 def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConstants) -> None:

@@ -16,7 +16,7 @@ from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedE
 from ehadiag.core.stored_test import resolve_test
 
 if TYPE_CHECKING:
-    from ehadiag.calibrate.result import Calibrated
+    from ehadiag.calibration.result import Calibrated
     from ehadiag.core.actuator import Actuator
     from ehadiag.core.calibration import Source
     from ehadiag.core.folder import Folder
@@ -145,7 +145,7 @@ def _learn(
     digests: Sequence[str],
 ) -> Calibrated:
     from ehadiag.assess.diagnosis import match_tests  # noqa: PLC0415 - loads numba
-    from ehadiag.calibrate.unit import calibrate, update  # noqa: PLC0415
+    from ehadiag.calibration.unit import calibrate, update  # noqa: PLC0415
 
     tests = options.known_tests(arguments.test)
     default = resolve_test(arguments.test[0]) if len(arguments.test) == 1 else None

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ehadiag.assess.acceptance import objections_to_estimate
-from ehadiag.calibrate.unit import calibrate
+from ehadiag.calibration.unit import calibrate
 from ehadiag.core.actuator import Actuator, default_actuator, with_tolerance
 from ehadiag.core.errors import EhadiagError
 from ehadiag.core.recording import Recording
@@ -62,7 +62,8 @@ def perform_sheet(run: SheetRun) -> dict[str, Any]:
     """Draw a unit, record it, identify, and compare with the truth; fractions of 1."""
     unit, faults = _drawn(run.seed, run.case, run.groups)
     name, state = LINES[run.line]
-    actuator, reasons = default_actuator(), ()
+    actuator = default_actuator()
+    reasons: tuple[str, ...] = ()
     if run.nuisances != Nuisances.NONE.value:
         if state == "tolerance":
             actuator = with_tolerance(actuator, TOLERANCE)
@@ -92,7 +93,15 @@ def perform_sheet(run: SheetRun) -> dict[str, Any]:
 
 def _drawn(seed: int, case: int, groups: tuple[str, ...]) -> tuple[Unit, list[float]]:
     rng = np.random.default_rng([seed, case])
-    unit = random_unit(rng, data=True, serial=case, **dict.fromkeys(groups, True))
+    unit = random_unit(
+        rng,
+        data=True,
+        sensing="sensing" in groups,
+        friction="friction" in groups,
+        orifice="orifice" in groups,
+        strangers="strangers" in groups,
+        serial=case,
+    )
     return unit, rng.uniform(0.0, 1.0, 3).tolist()
 
 

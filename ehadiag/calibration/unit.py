@@ -18,9 +18,9 @@ from ehadiag.assess.acceptance import (
 )
 from ehadiag.assess.diagnosis import match_tests
 from ehadiag.assess.verdict import Levels
-from ehadiag.calibrate.models import Learned, Model, learn, models_of
-from ehadiag.calibrate.packing import Lesson, lesson_of, unit_of, values_of
-from ehadiag.calibrate.result import Calibrated, Severity, Tried
+from ehadiag.calibration.models import Learned, Model, learn, models_of
+from ehadiag.calibration.packing import Lesson, lesson_of, unit_of, values_of
+from ehadiag.calibration.result import Calibrated, Severity, Tried
 from ehadiag.core.actuator import Actuator, Tolerance
 from ehadiag.core.calibration import Source
 from ehadiag.core.recording import Recording

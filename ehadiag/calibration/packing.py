@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.calibrate.result import Value
+from ehadiag.calibration.result import Value
 from ehadiag.core.actuator import Actuator, Tolerance
 from ehadiag.core.calibration import Calibration, Goodness, Source
 from ehadiag.identify.estimates import fit_of

@@ -8,7 +8,7 @@ import pytest
 
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.verdict import Verdict
-from ehadiag.calibrate.unit import calibrate, update
+from ehadiag.calibration.unit import calibrate, update
 from ehadiag.core.actuator import default_actuator, load_actuator
 from ehadiag.core.actuator_file import actuator_toml
 from ehadiag.core.stored_test import bundled_tests
