@@ -12,6 +12,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.assess.verdict import Levels, Verdict
+    from ehadiag.calibration.result import Calibrated
     from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
     from ehadiag.core.errors import (
         BusLostError,
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     )
     from ehadiag.core.recording import CommandMode, Recording, Samples
     from ehadiag.core.stored_test import StoredTest, bundled_tests, load_test
-    from ehadiag.facade.calls import diagnose, read, simulate
+    from ehadiag.facade.calls import calibrate, diagnose, read, save_actuator, simulate
     from ehadiag.facade.result import Result
     from ehadiag.monitor import Monitor, Reading, Tick
     from ehadiag.report.faults import Fault
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Actuator",
     "BusLostError",
+    "Calibrated",
     "CommandMode",
     "ConfigurationError",
     "Diagnosis",
@@ -50,17 +52,20 @@ __all__ = [
     "Verdict",
     "__version__",
     "bundled_tests",
+    "calibrate",
     "default_actuator",
     "diagnose",
     "load_actuator",
     "load_test",
     "read",
+    "save_actuator",
     "simulate",
 ]
 
 _HOMES = {
     "ehadiag.assess.diagnosis": ("Diagnosis",),
     "ehadiag.assess.verdict": ("Levels", "Verdict"),
+    "ehadiag.calibration.result": ("Calibrated",),
     "ehadiag.core.actuator": ("Actuator", "default_actuator", "load_actuator"),
     "ehadiag.core.errors": (
         "BusLostError",
@@ -71,7 +76,7 @@ _HOMES = {
     ),
     "ehadiag.core.recording": ("CommandMode", "Recording", "Samples"),
     "ehadiag.core.stored_test": ("StoredTest", "bundled_tests", "load_test"),
-    "ehadiag.facade.calls": ("diagnose", "read", "simulate"),
+    "ehadiag.facade.calls": ("calibrate", "diagnose", "read", "save_actuator", "simulate"),
     "ehadiag.facade.result": ("Result",),
     "ehadiag.monitor": ("Monitor", "Reading", "Tick"),
     "ehadiag.report.faults": ("Fault",),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ehadiag.core.actuator import Actuator
@@ -18,6 +20,7 @@ __all__ = [
     "objections_to_estimate",
     "objections_to_experiment",
     "objections_to_recording",
+    "objections_to_unit",
     "out_of_range",
     "remarks_on_recording",
 ]
@@ -95,6 +98,18 @@ def objections_to_recording(
         *_unlike_the_test(samples, test, actuator),
         *_gaps(samples, test),
         *out_of_range(recording.environment, samples, actuator),
+    ]
+
+
+def objections_to_unit(recordings: Sequence[Recording], actuator: Actuator) -> list[str]:
+    """Why recordings are not of the unit that an actuator file was calibrated for; else empty."""
+    own = actuator.calibration.serial if actuator.calibration else None
+    others = {item.serial for item in recordings} - {None, own}
+    if own is None or not others:
+        return []
+    return [
+        f"the actuator file is calibrated for serial {own}, the recording is of serial "
+        f"{', '.join(str(serial) for serial in sorted(others, key=str))}"
     ]
 
 

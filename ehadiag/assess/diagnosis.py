@@ -12,6 +12,7 @@ from ehadiag.assess.acceptance import (
     objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
+    objections_to_unit,
     out_of_range,
     remarks_on_recording,
 )
@@ -20,7 +21,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
-from ehadiag.identify.nuisance.knowledge import knowledge_of
+from ehadiag.identify.nuisance.knowledge import PASS_FOR_FAULTS, knowledge_of
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
@@ -143,7 +144,10 @@ class DiagnosisSession:
             reasons=why,
             identification=identification,
             experiments=tuple(experiments) if identification else (),
-            notes=(*_notes(recordings, matched, self._actuator), *_freed(identification)),
+            notes=(
+                *_notes(recordings, matched, self._actuator),
+                *_freed(identification, self._actuator),
+            ),
             elapsed=time.perf_counter() - begin,
         )
 
@@ -163,6 +167,7 @@ class DiagnosisSession:
             reasons += objections
         if len({recording.serial for recording in recordings} - {None}) > 1:
             reasons.append("the recordings are of actuators with different serial numbers")
+        reasons += objections_to_unit(recordings, self._actuator)
         return experiments, reasons
 
 
@@ -243,9 +248,25 @@ def _notes(
     return tuple(dict.fromkeys(note for notes in each for note in notes))
 
 
-def _freed(identification: Identification | None) -> tuple[str, ...]:
-    """What was estimated beside the faults, if anything."""
+def _freed(identification: Identification | None, actuator: Actuator) -> tuple[str, ...]:
+    """What was estimated beside the faults, if anything, and what is known of it."""
     if identification is None or not identification.freed:
         return ()
-    words = ", ".join(parameter(name).short for name in identification.freed)
-    return (f"estimated beside the faults: {words}",)
+    out = []
+    calibration = actuator.calibration
+    learned = calibration.parameters if calibration else ()
+    if calibration is not None:
+        out.append(
+            f"actuator calibrated on {calibration.date} from {len(calibration.recordings)} "
+            "recordings: its data and effects are refined within what is known of them"
+        )
+    words = [parameter(name).short for name in identification.freed if name not in learned]
+    if words:
+        out.append(f"estimated beside the faults: {', '.join(words)}")
+    aliases = [name for name in PASS_FOR_FAULTS if actuator.tolerance.of(name) > 0.0]
+    if aliases and calibration is None:
+        out.append(
+            f"held, with the tolerance in the intervals: {', '.join(aliases)}, which no recording "
+            "tells from a fault"
+        )
+    return tuple(out)

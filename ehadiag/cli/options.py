@@ -29,8 +29,10 @@ __all__ = [
     "add_bus_options",
     "add_diagnosis_options",
     "add_fault_options",
+    "add_json_option",
     "add_log_options",
     "add_mapping_options",
+    "add_seed_option",
     "has_bus",
     "known_tests",
     "need_one_bus",
@@ -123,13 +125,7 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         " alone do not explain a recording (auto, the default), never, or always",
     )
     add_tolerance_option(parser)
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        metavar="N",
-        help="seed of the search (default 0); the same seed, the same answer",
-    )
+    add_seed_option(parser)
     parser.add_argument(
         "--advisory",
         type=float,
@@ -159,6 +155,22 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="NOT TESTED where the identification takes longer, wall clock"
         f" (default {TIME_LIMIT_S:g})",
     )
+    add_json_option(parser)
+
+
+def add_seed_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--seed`."""
+    parser.add_argument(
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help="seed of the search (default 0); the same seed, the same answer",
+    )
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
     parser.add_argument(
         "--json",
         action="store_true",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.report.spent import Spent
 
-__all__ = ["Results", "make_folder"]
+__all__ = ["Results", "make_folder", "matplotlib_alone"]
 
 MAX_RESULT_BYTES = 1 << 20
 
@@ -152,7 +152,7 @@ class Results:
 
     def _draw(self, diagnosis: Diagnosis, name: str) -> None:
         assert self._folder is not None
-        with _matplotlib_alone():
+        with matplotlib_alone():
             from ehadiag.report.picture import draw_diagnosis  # noqa: PLC0415 - matplotlib is slow
         try:
             self._folder.write(name, draw_diagnosis(diagnosis))
@@ -187,7 +187,7 @@ def _same_recording(folder: Folder, name: str, line: str) -> bool:
 
 
 @contextlib.contextmanager
-def _matplotlib_alone() -> Iterator[None]:
+def matplotlib_alone() -> Iterator[None]:
     """Load matplotlib without what others may have laid out for it.
 
     It reads `matplotlibrc` in the working folder, which may be anybody's, and keeps a list of fonts

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from ehadiag.core.calibration import Calibration
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.toml_file import decode_toml, read_toml
 
@@ -165,7 +166,7 @@ class Tolerance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One actuator: its name, controller, servovalve, second stage and jack."""
+    """One actuator: its parts, how far their data may be off, what was learned of the unit."""
 
     name: Name
     controller: Controller
@@ -173,6 +174,8 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     jack: Jack
     second_stage: SecondStage = SecondStage()
     tolerance: Tolerance = Tolerance()
+    calibration: Calibration | None = None
+    """What was learned of this unit; None: the data are those of a type."""
 
 
 def load_actuator(path: Path | str) -> Actuator:
@@ -205,7 +208,30 @@ def default_actuator() -> Actuator:
 
 
 def with_tolerance(actuator: Actuator, share: float) -> Actuator:
-    """Return the same actuator, the data in which units differ with one tolerance."""
+    """Return the same actuator, the data in which units differ with one tolerance.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        Its file's own tolerances do not count.
+    share : float
+        The tolerance, 0 … `MOST_TOLERANCE`.
+
+    Returns
+    -------
+    Actuator
+        As new data.
+
+    Raises
+    ------
+    ConfigurationError
+        The actuator is calibrated: what was found takes the place of tolerances.
+    """
+    if actuator.calibration is not None:
+        raise ConfigurationError(
+            f"tolerance: actuator {actuator.name!r} is calibrated, which says how far its data may"
+            " be off"
+        )
     return msgspec.structs.replace(actuator, tolerance=Tolerance(all=share))
 
 
@@ -215,4 +241,7 @@ def _checked(actuator: Actuator, source: str) -> Actuator:
         raise ConfigurationError(f"{source}: servovalve.FSS1 must be greater than servovalve.FSS0")
     if actuator.jack.FDJ1 <= actuator.jack.FDJ0:
         raise ConfigurationError(f"{source}: jack.FDJ1 must be greater than jack.FDJ0")
+    objection = actuator.calibration.objection() if actuator.calibration else ""
+    if objection:
+        raise ConfigurationError(f"{source}: {objection}")
     return actuator

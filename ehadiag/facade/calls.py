@@ -1,4 +1,4 @@
-"""The three calls of the front door: read recordings, simulate one, diagnose them."""
+"""The calls of the front door: read recordings, simulate one, diagnose, calibrate a unit."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade.compiling import log_if_compiling
@@ -17,13 +18,14 @@ from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
+    from ehadiag.calibration.result import Calibrated
     from ehadiag.core.actuator import Actuator
     from ehadiag.facade.result import Result
     from ehadiag.identify.search.solvers import Solver
     from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
     from firmware_iface.mapping.bus_map import BusMap
 
-__all__ = ["diagnose", "read", "simulate"]
+__all__ = ["calibrate", "diagnose", "read", "save_actuator", "simulate"]
 
 Source: TypeAlias = Recording | PathLike
 """A recording, or the log that it is read from."""
@@ -209,6 +211,94 @@ def diagnose(
         progress=progress,
     )
     return Result(diagnosis, made.name, seed, spent)
+
+
+def calibrate(
+    recordings: Iterable[Source],
+    *,
+    actuator: Actuator | PathLike | None = None,
+    test: StoredTest | PathLike | Iterable[StoredTest | PathLike] | None = None,
+    compare: bool = False,
+    update: bool = False,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+    mapping: BusMap | PathLike | None = None,
+    dbc: PathLike | None = None,
+) -> Calibrated:
+    """Learn a unit from recordings of it as new.
+
+    `diagnose(…, actuator=calibrated.actuator)` then goes by what was learned;
+    `save_actuator` writes it to a file.
+
+    Parameters
+    ----------
+    recordings : Iterable[Source]
+        Recordings or logs of one unit as new, best of both loops; see `read`.
+    actuator : Actuator | PathLike | None
+        Data of its type, or their file; None: the reference actuator.
+    test : StoredTest | PathLike | Iterable[StoredTest | PathLike] | None
+        See `diagnose`.
+    compare : bool
+        Try every model of the unit, also where a simple one explains the recordings.
+    update : bool
+        `actuator` is calibrated: refine it by later recordings of the unit, still healthy.
+    seed : int
+        The same seed gives the same digits on the same machine.
+    progress : Callable[[str, float], None] | None
+        Called with the stage and its share done, 0 … 1.
+    mapping : BusMap | PathLike | None
+        Of logs, see `read`.
+    dbc : PathLike | None
+        Of logs, see `read`.
+
+    Returns
+    -------
+    Calibrated
+        Where it is refused its `actuator` is None, and `reasons` say why.
+
+    Raises
+    ------
+    InputOutputError
+        A log or a file cannot be read.
+    ConfigurationError
+        A file, a name or a value is wrong; nothing to learn from.
+    """
+    start, (tests, default) = the_actuator(actuator), _tests(test)
+    found: list[Recording] = []
+    for item in _several(recordings, Recording):
+        found += [item] if isinstance(item, Recording) else read(item, mapping=mapping, dbc=dbc)
+    if not found:
+        raise ConfigurationError("nothing to learn from: no recording and no log given")
+    from ehadiag.calibration.unit import calibrate as run  # noqa: PLC0415 - loads numba
+    from ehadiag.calibration.unit import update as refine  # noqa: PLC0415
+
+    log_if_compiling()
+    if update:
+        return refine(found, start, tests, default=default, seed=seed, progress=progress)
+    return run(found, start, tests, default=default, compare=compare, seed=seed, progress=progress)
+
+
+def save_actuator(actuator: Actuator, path: PathLike) -> None:
+    """Write an actuator's data, with its calibration, to a file that `load_actuator` reads.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        The data.
+    path : PathLike
+        File to write; one that exists is replaced.
+
+    Raises
+    ------
+    InputOutputError
+        It cannot be written.
+    """
+    from ehadiag.core.actuator_file import actuator_toml  # noqa: PLC0415 - loads tomli_w
+
+    try:
+        Path(path).write_bytes(actuator_toml(actuator))
+    except OSError as error:
+        raise InputOutputError(f"actuator file {path}: {error.strerror or error}") from None
 
 
 def _tests(

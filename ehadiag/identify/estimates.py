@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +35,16 @@ def identification(
     evaluations: int,
     attempts: int,
     timing: Timing,
+    about: Mapping[str, float],
 ) -> Identification:
     """Put together what an identification says.
 
-    spread: covariance of all that was refined, SI.
+    spread: covariance of all that was refined, SI; about: effects that the constants already have.
     """
     deviations = np.sqrt(np.diag(spread)).tolist()
     nuisances = {
         item.name: Nuisance(
-            value=refined.values[item.name],
+            value=refined.values[item.name] + about.get(item.name, 0.0),
             std=std,
             at_bound=not item.lower < refined.values[item.name] < item.upper,
         )

@@ -14,7 +14,8 @@ from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.commanded_current import CurrentTrace, commanded_current
 from ehadiag.identify.noise import QUIET_BLOCK, noise_of_signal
-from ehadiag.model.plant import PlantConstants, plant_constants
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.unit import unit_constants
 
 __all__ = ["Experiment", "build_experiment", "noise_is_judged_early", "share_offsets"]
 
@@ -33,7 +34,7 @@ class Experiment:
 
     test: StoredTest
     constants: PlantConstants
-    """Of the unit as new, at the oil and supply of the test."""
+    """Of the unit as new, at the oil and supply of the test, with its calibrated effects."""
     tick: float
     """s."""
     trace: CurrentTrace
@@ -85,7 +86,7 @@ def build_experiment(
     position = np.where(samples.saturated[3], np.nan, samples.position)
     trace = commanded_current(samples, test, actuator.controller)
     rest = _ticks_at_rest(trace.current)
-    constants = plant_constants(actuator, environment)
+    constants = unit_constants(actuator, environment)
     spool_offset, pressure_offset = _mean(spool[:rest]), _mean(pressure[:rest])
     origin = 0.0
     if constants.FR != 0.0:

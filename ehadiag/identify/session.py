@@ -223,6 +223,7 @@ class Session:
             evaluations=evaluations,
             attempts=attempts,
             timing=timing,
+            about=self.knowledge.about,
         )
 
     def _first(

@@ -20,9 +20,9 @@ from ehadiag.model.anchor import Anchor
 from ehadiag.model.control import ControlLaw
 from ehadiag.model.laws import SpoolLaw, drive_law, jack_law
 from ehadiag.model.parameters import FAULTS, REGISTRY, Unknowns
-from ehadiag.model.plant import plant_constants
 from ehadiag.model.scalar.transition import spool_tables
 from ehadiag.model.sensors import sensor_law
+from ehadiag.model.unit import unit_constants
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
@@ -144,7 +144,7 @@ class Monitor:
         noise = noise or (NOISE_LSB * SPOOL.lsb, NOISE_LSB * PRESSURE.lsb)
         values = _checked(faults, noise, offsets, tick)
         held = _known(effects or {})
-        unknowns = Unknowns(FAULTS, (plant_constants(actuator, environment),), held)
+        unknowns = Unknowns(FAULTS, (unit_constants(actuator, environment),), held)
         constants = unknowns.constants(np.array(values))._replace(OXS=offsets[0], OPD=offsets[1])
         tables = spool_tables(constants, tick)
         self._law = SpoolLaw(*tables.law)

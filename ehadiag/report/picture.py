@@ -17,11 +17,12 @@ from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
-from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
+from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
 
-__all__ = ["Picture", "diagnosis_figure", "draw_diagnosis"]
+__all__ = ["Picture", "diagnosis_figure", "draw_column", "draw_diagnosis"]
 
 MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
 DPI = 110
@@ -90,21 +91,44 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
         5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
     )
     for column, experiment in enumerate(diagnosis.experiments):
-        _draw_column([axes[column] for axes in grid], experiment, found)
-    constants = ",  ".join(
+        unknowns = Unknowns((), (experiment.constants,), _values(diagnosis, found))
+        constants = unknowns.constants(np.empty(0))
+        draw_column([axes[column] for axes in grid], experiment, constants)
+    estimates = ",  ".join(
         f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
         for fault in faults_of(diagnosis).values()
     )
     names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
-    title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}"
+    title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{estimates}"
     figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
     return figure
 
 
-def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:
+def _values(diagnosis: Diagnosis, found: Identification) -> dict[str, float]:
+    """All that was estimated, by name; effects less what the experiments' constants have."""
+    calibration = diagnosis.actuator.calibration
+    about = calibration.effects if calibration else {}
+    beside = {
+        name: item.value - about.get(name, 0.0)
+        for name, item in found.nuisances.items()
+        if parameter(name) not in OFFSETS
+    }
+    return {**beside, **{item.name: item.value for item in found.estimates}}
+
+
+def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConstants) -> None:
+    """Draw what was measured and what the model with these constants does, with the residuals.
+
+    Parameters
+    ----------
+    axes : list[Axes]
+        Five: current, spool, its residual, pressure, its residual.
+    experiment : Experiment
+        The recording.
+    constants : PlantConstants
+        Of the actuator as it was found.
+    """
     time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    severities = np.array([item.value for item in found.estimates])
-    constants = Unknowns(FAULTS, (experiment.constants,), {}).constants(severities)
     model = respond(constants, experiment.trace.current, experiment.tick)
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")

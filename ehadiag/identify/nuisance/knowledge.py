@@ -1,4 +1,4 @@
-"""What an actuator file says of the unit beside its data: how far these may be off."""
+"""What an actuator file says of its data's errors: tolerances, or what a calibration learned."""
 
 from __future__ import annotations
 
@@ -10,17 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.calibration import Calibration
+from ehadiag.core.errors import ConfigurationError
 from ehadiag.identify.nuisance.prior import Joint, Known, usual
-from ehadiag.model.parameters import Parameter, Unknowns, parameter
+from ehadiag.model.parameters import REGISTRY, Kind, Parameter, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
 
-__all__ = ["NOTHING", "PASS_FOR_FAULTS", "Alias", "Knowledge", "datum_name", "knowledge_of"]
+__all__ = [
+    "MOTOR_GAIN",
+    "NOTHING",
+    "PASS_FOR_FAULTS",
+    "Alias",
+    "Knowledge",
+    "covariance_of",
+    "datum_name",
+    "knowledge_of",
+]
 
 MOTOR_GAIN = "torque_motor_gain"
 """What an error of GM does: as a datum nothing could tell it from this."""
 PASS_FOR_FAULTS = {"GQF": "Kintas", "FSS0": "FSS", "FDJ0": "FDJ"}
 """Data that do what a severity does, so that no recording tells the two apart."""
 SMALL = 1e-6
+_NAMES = frozenset(item.name for item in REGISTRY if item.kind is not Kind.FAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +72,16 @@ class Knowledge:
     joint : Joint, optional
         Of several together.
     aliases : tuple of Alias
+    about : mapping
+        Effects that the unit's constants already have, by name, SI: what is free is a deviation
+        from them.
     """
 
     free: tuple[Parameter, ...] = ()
     known: Mapping[str, Known] = field(default_factory=dict)
     joint: Joint | None = None
     aliases: tuple[Alias, ...] = ()
+    about: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def doubts(self) -> bool:
@@ -97,8 +113,15 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
     """What an actuator file says.
 
     A tolerance is a uniform range: the density before a recording has its deviation, the estimate
-    its bounds (JCGM 100:2008, 4.3.7).
+    its bounds (JCGM 100:2008, 4.3.7). A calibration is a normal density of all that it learned.
+
+    Raises
+    ------
+    ConfigurationError
+        A calibration has a parameter that the model does not have.
     """
+    if actuator.calibration is not None:
+        return _calibrated(actuator.calibration)
     free, known, aliases = [], {}, []
     for symbol in actuator.tolerance.names:
         half_width = actuator.tolerance.of(symbol)
@@ -113,6 +136,28 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
             free.append(replace(item, lower=-half_width, upper=half_width))
             known[item.name] = Known(0.0, std)
     return Knowledge(tuple(free), known, None, tuple(aliases))
+
+
+def _calibrated(calibration: Calibration) -> Knowledge:
+    """What a calibration says: of deviations from the values that it found, so about 0."""
+    for name in (*calibration.effects, *calibration.parameters):
+        if name not in _NAMES:
+            raise ConfigurationError(f"actuator file: calibration: no parameter {name!r} is known")
+    free = []
+    for name in calibration.parameters:
+        item, value = parameter(name), calibration.effects.get(name, 0.0)
+        free.append(replace(item, lower=item.lower - value, upper=item.upper - value))
+    joint = Joint(calibration.parameters, np.zeros(len(free)), covariance_of(calibration))
+    return Knowledge(tuple(free), {}, joint, (), calibration.effects)
+
+
+def covariance_of(calibration: Calibration) -> NDArray[np.float64]:
+    """Covariance of a calibration's parameters, SI, shape (k, k)."""
+    lower = np.zeros((len(calibration.std), len(calibration.std)))
+    for k, row in enumerate(calibration.root):
+        lower[k, : k + 1] = row
+    lower *= np.array(calibration.std)[:, None]
+    return np.asarray(lower @ lower.T)
 
 
 def datum_name(symbol: str) -> str:

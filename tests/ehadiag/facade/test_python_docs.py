@@ -19,7 +19,7 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
 
 
 def test_the_page_has_its_examples() -> None:
-    assert len(BLOCKS) == 8
+    assert len(BLOCKS) == 9
     assert all(block.startswith(">>> ") for block in BLOCKS)
 
 

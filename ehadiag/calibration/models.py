@@ -1,0 +1,191 @@
+"""Models that a calibration tries, and the evidence by which it chooses among them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from ehadiag.core.actuator import Actuator, SecondStage
+from ehadiag.identify.experiment import Experiment, share_offsets
+from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.nuisance.prior import Known, nuisances_of
+from ehadiag.identify.nuisance.starts import robust_cost
+from ehadiag.identify.refine.first_part import CONSIDERED
+from ehadiag.identify.spans import lay_out
+from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
+
+__all__ = ["SECOND_STAGES", "Learned", "Model", "learn", "models_of"]
+
+SECOND_STAGES = ("linear",)
+"""Kinds that the monitoring model has, those tried first in front."""
+SMOOTH = 8
+"""Plays of a smooth hysteresis: more of them do the same within the noise."""
+BUDGET = 1600
+DATUM = Known(0.0, 0.05 / math.sqrt(3.0))
+"""A data sheet's usual ±5 %."""
+REACH = 0.1
+"""Relative error of a datum beyond which it is not looked for."""
+DATA = ("KSF", "KF", "GP", "GQ", "CS", "MJ", "CJ")
+"""Data in which units differ; GM is the torque motor's gain among the nuisances."""
+FRICTIONS = ("FSS0", "FDJ0")
+"""Data that pass for a fault: learned where the severities are taken for 0."""
+SENSING = {
+    "filter_time": Known(5e-5, 5e-5),
+    "sampling_lead": Known(5e-5, 5e-5),
+    "spool_gain": Known(0.0, 0.003),
+    "pressure_gain": Known(0.0, 0.003),
+    "load": Known(0.0, 30.0),
+}
+"""What is added where the rest does not explain the recordings: usual sizes (PHY-32 to 36)."""
+NEARLY_NEW = Known(0.02, 0.05)
+"""A severity of a unit that is said to be as new."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """One class of actuator.
+
+    Attributes
+    ----------
+    second_stage : str
+    plays : int
+        Of the hysteresis.
+    sensing : bool
+        Whether errors of the sensors and a load are estimated too.
+    """
+
+    second_stage: str = "linear"
+    plays: int = 1
+    sensing: bool = False
+
+    @property
+    def words(self) -> str:
+        """What it is, for tables."""
+        hysteresis = "one play" if self.plays == 1 else "smooth hysteresis"
+        return f"{self.second_stage} second stage, {hysteresis}" + (
+            ", errors of the sensors" if self.sensing else ""
+        )
+
+    def of(self, actuator: Actuator) -> Actuator:
+        """Return an actuator's data with this class of second stage."""
+        if actuator.second_stage.kind == self.second_stage:
+            return actuator
+        stage: SecondStage = msgspec.structs.replace(actuator.second_stage, kind=self.second_stage)
+        return msgspec.structs.replace(actuator, second_stage=stage)
+
+    @property
+    def known(self) -> dict[str, Known]:
+        """What is known of any unit beforehand."""
+        data = {f"datum_{name}": DATUM for name in (*DATA, *FRICTIONS)}
+        return {**data, **(SENSING if self.sensing else {})}
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What is estimated beside the severities, or the frictions as new in their place."""
+        data = [parameter(f"datum_{name}") for name in DATA]
+        return (
+            *OFFSETS,
+            *nuisances_of(REGISTRY),
+            *(replace(item, lower=-REACH, upper=REACH) for item in data),
+            *(parameter(name) for name in SENSING if self.sensing),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """What recordings say if a model holds.
+
+    Attributes
+    ----------
+    model : Model
+    experiments : list[Experiment]
+        Of its class of actuator.
+    estimated : Estimated
+    criterion : float
+        Bayesian information criterion (Schwarz, Annals of Statistics 6(2), 1978): less is better.
+    """
+
+    model: Model
+    experiments: list[Experiment]
+    estimated: Estimated
+    criterion: float
+
+
+def models_of(start: Actuator, *, compare: bool) -> list[list[Model]]:
+    """Models to try, in rounds: a further round only where the one before does not suffice."""
+    first = start.second_stage.kind
+    kinds = sorted({*SECOND_STAGES, first}, key=lambda kind: kind != first)
+    simple = [Model(kind) for kind in kinds]
+    smooth = [Model(kind, SMOOTH) for kind in kinds]
+    further = [replace(item, sensing=True) for item in (*simple, *smooth)]
+    return [simple, smooth, further] if not compare else [[*simple, *smooth], further]
+
+
+def learn(
+    model: Model,
+    build: Callable[[Actuator], list[Experiment]],
+    start: Actuator,
+    *,
+    new: bool,
+    nearly_new: bool = False,
+    hint: Mapping[str, float] | None = None,
+    seed: int,
+    tell: Callable[[float], None] | None = None,
+) -> Learned:
+    """Estimate all that a model has.
+
+    Parameters
+    ----------
+    model : Model
+        The class of actuator.
+    build : Callable[[Actuator], list[Experiment]]
+        Experiments from an actuator's data.
+    start : Actuator
+        Data of the unit's type.
+    new : bool
+        Take the severities for 0 and estimate the frictions as new; else the severities.
+    nearly_new : bool
+        Look for small severities.
+    hint : Mapping[str, float] | None
+        Values by name beside which the optimum probably lies.
+    seed : int
+        The same seed gives the same answer.
+    tell : Callable[[float], None] | None
+        Called with the share of the budget that is spent.
+
+    Returns
+    -------
+    Learned
+        The optimum, explained or not.
+    """
+    experiments = share_offsets(
+        [
+            replace(item, constants=item.constants._replace(NPL=float(model.plays)))
+            for item in build(model.of(start))
+        ]
+    )
+    others = tuple(parameter(f"datum_{name}") for name in FRICTIONS) if new else FAULTS
+    free = (*others, *model.parameters)
+    small = dict.fromkeys((item.name for item in FAULTS), NEARLY_NEW) if nearly_new else {}
+    found = estimate(
+        experiments,
+        free,
+        known={**model.known, **small},
+        considered=CONSIDERED,
+        hint=hint,
+        budget=BUDGET,
+        seed=seed,
+        tell=tell,
+    )
+    return Learned(model, experiments, found, _criterion(found, len(free)))
+
+
+def _criterion(found: Estimated, count: int) -> float:
+    weight = lay_out(found.experiments).weight
+    there = weight > 0.0
+    cost = float(robust_cost(found.refined.residuals[None])[0])
+    return cost - 2.0 * float(np.log(weight[there]).sum()) + count * math.log(there.sum())
