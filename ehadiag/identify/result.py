@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.parameters import OFFSETS
+from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
+from ehadiag.model.plant import PlantConstants
 
 __all__ = ["Estimate", "Fit", "Identification", "Nuisance", "Timing"]
 
@@ -108,6 +109,18 @@ class Identification:
             if item.name == name:
                 return item
         raise KeyError(name)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All that was estimated, by name, SI."""
+        severities = {item.name: item.value for item in self.estimates}
+        return severities | {name: item.value for name, item in self.nuisances.items()}
+
+    def constants(self, base: PlantConstants) -> PlantConstants:
+        """Constants of the unit as it was found; `base`: as new, at the oil of the day."""
+        values = self.values
+        free = tuple(parameter(name) for name in values)
+        return Unknowns(free, (base,), {}).constants(np.array(list(values.values())))
 
     @property
     def freed(self) -> tuple[str, ...]:

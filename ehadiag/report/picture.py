@@ -17,7 +17,6 @@ from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
-from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
 
@@ -103,19 +102,20 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
 
 def _draw_column(axes: list[Axes], experiment: Experiment, found: Identification) -> None:
     time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    severities = np.array([item.value for item in found.estimates])
-    constants = Unknowns(FAULTS, (experiment.constants,), {}).constants(severities)
-    model = respond(constants, experiment.trace.current, experiment.tick)
+    constants = found.constants(experiment.constants)
+    model = respond(constants, experiment.trace.current, experiment.tick, origin=experiment.origin)
+    spool = constants.OXS + (1.0 + constants.GXS) * model.spool
+    pressure = constants.OPD + (1.0 + constants.GPD) * model.pressure
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
     axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
-    _pair(axes[1], axes[2], time, experiment.spool * 1e3, model.spool * 1e3, "spool, mm", "µm", 1e3)
+    _pair(axes[1], axes[2], time, experiment.spool * 1e3, spool * 1e3, "spool, mm", "µm", 1e3)
     _pair(
         axes[3],
         axes[4],
         time,
         experiment.pressure * 1e-6,
-        model.pressure * 1e-6,
+        pressure * 1e-6,
         "differential pressure, MPa",
         "kPa",
         1e3,
