@@ -155,7 +155,7 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
 def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
     """What the model must not be run with; holds for a running test too."""
     out = []
-    for index, name in ((1, "spool"), (2, "pressure")):
+    for index, name in ((1, "spool"), (2, "pressure"), (3, "position")):
         share = float(np.mean(samples.saturated[index]))
         if share > MOST_SATURATED:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")

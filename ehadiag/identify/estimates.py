@@ -54,6 +54,7 @@ def identification(
     return Identification(
         estimates=estimates_of(first, found, refined, spread),
         nuisances=nuisances,
+        about=about,
         covariance=of_faults(refined, spread),
         fit=fit_of(refined, experiments),
         solver=solver,

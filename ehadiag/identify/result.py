@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.parameters import OFFSETS
+from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
+from ehadiag.model.plant import PlantConstants
 
 __all__ = ["Estimate", "Fit", "Identification", "Nuisance", "Timing"]
 
@@ -82,6 +83,8 @@ class Identification:
     estimates: tuple[Estimate, ...]
     nuisances: Mapping[str, Nuisance]
     """What was estimated beside the severities, by name; all else was held."""
+    about: Mapping[str, float]
+    """Effects that a calibration knew: the constants of the experiments already have them."""
     covariance: NDArray[np.float64]
     """Of the severities, in the order of `estimates`, shape (k, k)."""
     fit: Fit
@@ -108,6 +111,19 @@ class Identification:
             if item.name == name:
                 return item
         raise KeyError(name)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All that was estimated, by name, SI."""
+        severities = {item.name: item.value for item in self.estimates}
+        return severities | {name: item.value for name, item in self.nuisances.items()}
+
+    def constants(self, base: PlantConstants) -> PlantConstants:
+        """Constants of the unit as it was found; `base`: of its experiments, so as new."""
+        about = self.about
+        values = {name: value - about.get(name, 0.0) for name, value in self.values.items()}
+        free = tuple(parameter(name) for name in values)
+        return Unknowns(free, (base,), {}).constants(np.array(list(values.values())))
 
     @property
     def freed(self) -> tuple[str, ...]:

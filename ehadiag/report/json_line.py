@@ -11,6 +11,7 @@ from ehadiag.report.faults import Fault, faults_of
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.assess.position import PositionFit
     from ehadiag.report.spent import Spent
 
 __all__ = ["SCHEMA", "json_line", "source_name", "test_name"]
@@ -53,6 +54,7 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
             for name, fault in faults_of(diagnosis).items()
         },
         "fit": _fit(diagnosis),
+        "positions": [_position(fit) for fit in diagnosis.positions],
         "quality": _quality(diagnosis),
         "solver": {
             "name": found.solver if found else solver,
@@ -111,6 +113,17 @@ def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
         "spool_offset_mm": fit.spool_offset * 1e3,
         "pressure_offset_MPa": fit.pressure_offset * 1e-6,
         "anchored": fit.anchored,
+    }
+
+
+def _position(fit: PositionFit | None) -> dict[str, float] | None:
+    if fit is None:
+        return None
+    return {
+        "gain": fit.gain,
+        "drift_mm_s": fit.drift * 1e3,
+        "rms": fit.rms,
+        "outliers": fit.outliers,
     }
 
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.result import Identification
-from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
@@ -91,8 +89,7 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
         5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
     )
     for column, experiment in enumerate(diagnosis.experiments):
-        unknowns = Unknowns((), (experiment.constants,), _values(diagnosis, found))
-        constants = unknowns.constants(np.empty(0))
+        constants = found.constants(experiment.constants)
         draw_column([axes[column] for axes in grid], experiment, constants)
     estimates = ",  ".join(
         f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
@@ -102,18 +99,6 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
     title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{estimates}"
     figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
     return figure
-
-
-def _values(diagnosis: Diagnosis, found: Identification) -> dict[str, float]:
-    """All that was estimated, by name; effects less what the experiments' constants have."""
-    calibration = diagnosis.actuator.calibration
-    about = calibration.effects if calibration else {}
-    beside = {
-        name: item.value - about.get(name, 0.0)
-        for name, item in found.nuisances.items()
-        if parameter(name) not in OFFSETS
-    }
-    return {**beside, **{item.name: item.value for item in found.estimates}}
 
 
 def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConstants) -> None:
@@ -129,17 +114,19 @@ def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConsta
         Of the actuator as it was found.
     """
     time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    model = respond(constants, experiment.trace.current, experiment.tick)
+    model = respond(constants, experiment.trace.current, experiment.tick, origin=experiment.origin)
+    spool = constants.OXS + (1.0 + constants.GXS) * model.spool
+    pressure = constants.OPD + (1.0 + constants.GPD) * model.pressure
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
     axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
-    _pair(axes[1], axes[2], time, experiment.spool * 1e3, model.spool * 1e3, "spool, mm", "µm", 1e3)
+    _pair(axes[1], axes[2], time, experiment.spool * 1e3, spool * 1e3, "spool, mm", "µm", 1e3)
     _pair(
         axes[3],
         axes[4],
         time,
         experiment.pressure * 1e-6,
-        model.pressure * 1e-6,
+        pressure * 1e-6,
         "differential pressure, MPa",
         "kPa",
         1e3,
