@@ -23,8 +23,10 @@ __all__ = [
     "add_bus_options",
     "add_diagnosis_options",
     "add_fault_options",
+    "add_level_options",
     "add_log_options",
     "add_mapping_options",
+    "add_seed_option",
     "has_bus",
     "known_tests",
     "need_one_bus",
@@ -90,6 +92,35 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_level_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--advisory` and `--limit`."""
+    parser.add_argument(
+        "--advisory",
+        type=float,
+        default=0.25,
+        metavar="K",
+        help="DEGRADED at or above this severity (default 0.25)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=0.75,
+        metavar="K",
+        help="FAULT at or above this severity (default 0.75)",
+    )
+
+
+def add_seed_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--seed`; `what` says what is drawn by it."""
+    parser.add_argument(
+        "--seed",
+        type=_seed,
+        default=0,
+        metavar="N",
+        help=f"{what} (default 0); the same seed, the same answer",
+    )
+
+
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
     """Add solver, seed, levels, time limit and output."""
     parser.add_argument(
@@ -105,27 +136,8 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
         " alone do not explain a recording (auto, the default), never, or always",
     )
-    parser.add_argument(
-        "--seed",
-        type=_seed,
-        default=0,
-        metavar="N",
-        help="seed of the search (default 0); the same seed, the same answer",
-    )
-    parser.add_argument(
-        "--advisory",
-        type=float,
-        default=0.25,
-        metavar="K",
-        help="DEGRADED at or above this severity (default 0.25)",
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=0.75,
-        metavar="K",
-        help="FAULT at or above this severity (default 0.75)",
-    )
+    add_seed_option(parser, "seed of the search")
+    add_level_options(parser)
     parser.add_argument(
         "--rule",
         choices=("interval", "estimate"),
