@@ -30,6 +30,7 @@ __all__ = [
     "add_diagnosis_options",
     "add_fault_options",
     "add_json_option",
+    "add_level_options",
     "add_log_options",
     "add_mapping_options",
     "add_seed_option",
@@ -109,6 +110,35 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_level_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--advisory` and `--limit`."""
+    parser.add_argument(
+        "--advisory",
+        type=float,
+        default=0.25,
+        metavar="K",
+        help="DEGRADED at or above this severity (default 0.25)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=0.75,
+        metavar="K",
+        help="FAULT at or above this severity (default 0.75)",
+    )
+
+
+def add_seed_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--seed`; `what` says what is drawn by it."""
+    parser.add_argument(
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help=f"{what} (default 0); the same seed, the same answer",
+    )
+
+
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
     """Add solver, seed, levels, time limit and output."""
     parser.add_argument(
@@ -125,21 +155,8 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         " alone do not explain a recording (auto, the default), never, or always",
     )
     add_tolerance_option(parser)
-    add_seed_option(parser)
-    parser.add_argument(
-        "--advisory",
-        type=float,
-        default=0.25,
-        metavar="K",
-        help="DEGRADED at or above this severity (default 0.25)",
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=0.75,
-        metavar="K",
-        help="FAULT at or above this severity (default 0.75)",
-    )
+    add_seed_option(parser, "seed of the search")
+    add_level_options(parser)
     parser.add_argument(
         "--rule",
         choices=("interval", "estimate"),
@@ -156,17 +173,6 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         f" (default {TIME_LIMIT_S:g})",
     )
     add_json_option(parser)
-
-
-def add_seed_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--seed`."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        metavar="N",
-        help="seed of the search (default 0); the same seed, the same answer",
-    )
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:

@@ -7,13 +7,13 @@ import contextlib
 import itertools
 import json
 import math
-import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
+from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import emit, rendered, say
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.report.spent import Spent
 
-__all__ = ["Results", "make_folder", "matplotlib_alone"]
+__all__ = ["Results", "make_folder"]
 
 MAX_RESULT_BYTES = 1 << 20
 
@@ -71,6 +71,7 @@ class Results:
         self._arguments = arguments
         self._folder = folder
         self._names: set[str] = set()
+        self._keeper = Keeper(arguments)
         self.stopped = False
         """Whether a signal came while a result was brought out."""
 
@@ -101,6 +102,8 @@ class Results:
             stem = None
             with _said(codes):
                 stem = self._write_json(line, plain_name(name))
+            with _said(codes):
+                self._keeper.keep(diagnosis, line)
             if stem is not None:
                 written.append(f"{stem}.json")
             with _said(codes):
@@ -184,30 +187,3 @@ def _same_recording(folder: Folder, name: str, line: str) -> bool:
         return bool(there["source"] == json.loads(line)["source"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
-
-
-@contextlib.contextmanager
-def matplotlib_alone() -> Iterator[None]:
-    """Load matplotlib without what others may have laid out for it.
-
-    It reads `matplotlibrc` in the working folder, which may be anybody's, and keeps a list of fonts
-    in a folder that need not be safe either.
-    """
-    import tempfile  # noqa: PLC0415
-
-    from ehadiag.core.cache_folder import private_folder  # noqa: PLC0415
-
-    if "matplotlib" in sys.modules:
-        yield
-        return
-    with contextlib.ExitStack() as stack:
-        own = private_folder("matplotlib")
-        if own is None:
-            place = stack.enter_context(tempfile.TemporaryDirectory(prefix="ehadiag-"))
-        else:
-            stack.enter_context(own)
-            place = str(own.path)
-        os.environ.setdefault("MPLCONFIGDIR", place)
-        with contextlib.suppress(OSError):
-            stack.enter_context(contextlib.chdir(place))
-        yield

@@ -9,6 +9,7 @@ from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.acquire import STOPPED, acquire
 from ehadiag.cli.beforehand import refuse_beforehand
+from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import progress_bar, say_if_compiling
 from ehadiag.cli.results import Results, make_folder
@@ -75,6 +76,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_diagnosis_options(parser)
+    add_keeping_options(parser)
     options.add_bus_options(parser)
     options.add_fault_options(parser)
     parser.set_defaults(run=run)

@@ -63,9 +63,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--budget", type=options.count, default=200, metavar="N", help="tests to look at (200)"
     )
-    parser.add_argument(
-        "--seed", type=options.seed, default=0, metavar="N", help="of the search (default 0)"
-    )
+    options.add_seed_option(parser, "seed of the search")
     parser.add_argument("--name", metavar="NAME", help="of the better test (NAME-designed)")
     parser.add_argument(
         "--id",

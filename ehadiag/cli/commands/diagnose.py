@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.deadline import Deadline
+from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
 from ehadiag.cli.output import progress_bar, say, say_if_compiling
 from ehadiag.cli.results import Results, make_folder
@@ -61,6 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_mapping_options(parser)
     options.add_log_options(parser)
     options.add_diagnosis_options(parser)
+    add_keeping_options(parser)
     parser.set_defaults(run=run)
 
 
