@@ -8,10 +8,13 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli.effects import add_effect_options
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+from ehadiag.report.asked import Asked
 
 if TYPE_CHECKING:
     from firmware_iface.logs.budget import Budget
@@ -25,6 +28,8 @@ __all__ = [
     "add_fault_options",
     "add_log_options",
     "add_mapping_options",
+    "add_result_options",
+    "count",
     "has_bus",
     "known_tests",
     "need_one_bus",
@@ -32,6 +37,7 @@ __all__ = [
     "positive",
     "refuse_two_buses",
     "the_actuator",
+    "the_asked",
     "the_budget",
     "the_bus_map",
 ]
@@ -62,14 +68,14 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the channel of a recording, and what reading one may cost."""
     parser.add_argument(
         "--log-channel",
-        type=_count,
+        type=count,
         metavar="N",
         help="adapter channel of the recording that is the actuator's, from 1"
         " (default: the mapping's, else the only one)",
     )
     parser.add_argument(
         "--max-frames",
-        type=_count,
+        type=count,
         default=20_000_000,
         metavar="N",
         help="frames that a recording may have (default 20000000, some three hours)",
@@ -148,6 +154,18 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_result_options(parser: argparse.ArgumentParser) -> None:
+    """Add how a result is written."""
+    parser.add_argument(
+        "--json-version",
+        type=int,
+        choices=(1, 2),
+        default=2,
+        help="of the JSON objects (default 2); 1: without what 2 added, none for unreadable logs",
+    )
+    parser.add_argument("--no-picture", action="store_true", help="draw nothing")
+
+
 def add_bus_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a bus, named as in python-can's own tools."""
     group = parser.add_argument_group("bus", "options as in python-can's tools")
@@ -166,10 +184,10 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
         default=os.environ.get("CAN_CHANNEL"),
         help="channel as the interface names it (default: CAN_CHANNEL)",
     )
-    group.add_argument("-b", "--bitrate", type=_count, metavar="N", help="bit/s")
+    group.add_argument("-b", "--bitrate", type=count, metavar="N", help="bit/s")
     group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
     group.add_argument(
-        "--data-bitrate", "--data_bitrate", type=_count, metavar="N", help="bit/s of CAN FD data"
+        "--data-bitrate", "--data_bitrate", type=count, metavar="N", help="bit/s of CAN FD data"
     )
     group.add_argument("--app-name", metavar="NAME", help="application name (Vector)")
     group.add_argument(
@@ -186,7 +204,7 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--baud",
-        type=_count,
+        type=count,
         metavar="N",
         default=DEFAULT_BAUD,
         help=f"of the serial link (default {DEFAULT_BAUD})",
@@ -282,6 +300,20 @@ def the_budget(arguments: argparse.Namespace) -> Budget:
     )
 
 
+def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
+    """Return the options of a diagnosis, for its JSON result."""
+    return Asked(
+        solver=arguments.solver,
+        seed=arguments.seed,
+        levels=Levels(arguments.advisory, arguments.limit, Rule(arguments.rule)),
+        nuisances=arguments.nuisances,
+        time_limit_s=arguments.time_limit,
+        every=getattr(arguments, "all", False),
+        mapping=bus_map.name,
+        mapping_sha256=fingerprint(bus_map),
+    )
+
+
 def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
     """Return the bundled tests and those of the named files; a file's number wins."""
     tests = {test.id: test for test in bundled_tests().values()}
@@ -362,7 +394,8 @@ def positive(text: str) -> float:
     return value
 
 
-def _count(text: str) -> int:
+def count(text: str) -> int:
+    """Read a whole number above zero."""
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
     return int(text)

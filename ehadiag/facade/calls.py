@@ -187,14 +187,22 @@ def diagnose(
     """
     chosen, (tests, default) = the_actuator(actuator), _tests(test)
     found, begin = [], time.perf_counter()
+    bus_map: BusMap | None = None
     for item in _several(recordings, Recording):
-        found += [item] if isinstance(item, Recording) else read(item, mapping=mapping, dbc=dbc)
+        if isinstance(item, Recording):
+            found.append(item)
+            continue
+        bus_map = bus_map or the_bus_map(mapping, dbc)
+        found += read(item, mapping=bus_map)
     if not found:
         raise ConfigurationError("nothing to diagnose: no recording and no log given")
     spent = Spent(time.perf_counter() - begin)
     from ehadiag.assess.diagnosis import diagnose as run  # noqa: PLC0415 - loads numba
+    from ehadiag.assess.verdict import Levels  # noqa: PLC0415
+    from ehadiag.core.fingerprint import fingerprint  # noqa: PLC0415
     from ehadiag.facade.result import Result  # noqa: PLC0415
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
+    from ehadiag.report.asked import Asked  # noqa: PLC0415
 
     made = make_solver(solver) if isinstance(solver, str) else solver
     log_if_compiling()
@@ -208,7 +216,14 @@ def diagnose(
         seed=seed,
         progress=progress,
     )
-    return Result(diagnosis, made.name, seed, spent)
+    asked = Asked(
+        solver=made.name,
+        seed=seed,
+        levels=levels or Levels(),
+        mapping=None if bus_map is None else bus_map.name,
+        mapping_sha256=None if bus_map is None else fingerprint(bus_map),
+    )
+    return Result(diagnosis, asked, spent)
 
 
 def _tests(

@@ -9,8 +9,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ehadiag.core.errors import NotTestedError
+from ehadiag.report.asked import Asked
 from ehadiag.report.faults import Fault, faults_of
-from ehadiag.report.json_line import json_line, source_name, test_name
+from ehadiag.report.json_line import NEWEST, first_version, json_line, source_name, test_name
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
@@ -32,12 +33,20 @@ class Result:
 
     diagnosis: Diagnosis
     """All that led to the verdict: experiments, covariance, fit, effort."""
-    solver: str
-    """Search that was asked for."""
-    seed: int
-    """Seed that was asked for."""
+    asked: Asked = field(default_factory=Asked)
+    """Options that it was made with."""
     spent: Spent = field(default_factory=Spent)
     """Time spent around the diagnosis."""
+
+    @property
+    def solver(self) -> str:
+        """Search that was asked for."""
+        return self.asked.solver
+
+    @property
+    def seed(self) -> int:
+        """Seed that was asked for."""
+        return self.asked.seed
 
     @property
     def verdict(self) -> Verdict:
@@ -79,9 +88,21 @@ class Result:
         """The progressive faults by name."""
         return MappingProxyType(faults_of(self.diagnosis))
 
-    def to_json(self) -> str:
-        """Return the command line's JSON object (`ehadiag.diagnosis/1`), one line."""
-        return json_line(self.diagnosis, self.spent, self.solver, self.seed)
+    def to_json(self, version: int = NEWEST) -> str:
+        """Return the command line's JSON object, one line.
+
+        Parameters
+        ----------
+        version : int
+            2 for `ehadiag.diagnosis/2`, 1 for `ehadiag.diagnosis/1`.
+
+        Returns
+        -------
+        str
+            Strict JSON without a line end.
+        """
+        line = json_line(self.diagnosis, self.spent, self.asked)
+        return first_version(line) if version == 1 else line
 
     def plot(self) -> Figure:
         """Draw measured against modelled response, one column for each recording.
