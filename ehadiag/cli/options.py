@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli.effects import add_effect_options
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.fingerprint import fingerprint
-from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+from ehadiag.core.stored_test import StoredTest
+from ehadiag.facade import inputs
 from ehadiag.report.asked import Asked
 
 if TYPE_CHECKING:
@@ -61,7 +62,11 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="which signals of a DBC are which channels, TOML (default: the FCC's own bus)",
     )
-    parser.add_argument("--dbc", metavar="FILE", help="DBC to use instead of the mapping's own")
+    parser.add_argument(
+        "--dbc",
+        metavar="FILE",
+        help="DBC to use instead of the mapping's own, or one of the default names",
+    )
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
@@ -275,16 +280,12 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    return load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    return inputs.the_actuator(arguments.actuator or None)
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
-
-    if arguments.dbc and not arguments.mapping:
-        raise ConfigurationError("--dbc: needs --mapping, which names the signals")
-    found = load_map(arguments.mapping, arguments.dbc) if arguments.mapping else default_map()
+    found = inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
     channel = getattr(arguments, "log_channel", None)
     return found if channel is None else replace(found, channel=channel)
 
@@ -314,13 +315,9 @@ def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
     )
 
 
-def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
-    """Return the bundled tests and those of the named files; a file's number wins."""
-    tests = {test.id: test for test in bundled_tests().values()}
-    for name in files:
-        test = resolve_test(name)
-        tests[test.id] = test
-    return tuple(tests.values())
+def known_tests(names: list[str]) -> tuple[StoredTest, ...]:
+    """Return the bundled tests and the named ones; of one number the one named last."""
+    return inputs.the_tests(names)
 
 
 def has_bus(arguments: argparse.Namespace) -> bool:

@@ -12,7 +12,7 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade.compiling import log_if_compiling
-from ehadiag.facade.inputs import PathLike, the_actuator, the_bus_map, the_test, the_tests
+from ehadiag.facade.inputs import PathLike, log_file, the_actuator, the_bus_map, the_test, the_tests
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ehadiag.core.actuator import Actuator
     from ehadiag.facade.result import Result
     from ehadiag.identify.search.solvers import Solver
+    from ehadiag.report.asked import LogFile
     from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
     from firmware_iface.mapping.bus_map import BusMap
 
@@ -188,12 +189,15 @@ def diagnose(
     chosen, (tests, default) = the_actuator(actuator), _tests(test)
     found, begin = [], time.perf_counter()
     bus_map: BusMap | None = None
+    logs: list[LogFile | None] = []
     for item in _several(recordings, Recording):
         if isinstance(item, Recording):
             found.append(item)
+            logs.append(None)
             continue
         bus_map = bus_map or the_bus_map(mapping, dbc)
         found += read(item, mapping=bus_map)
+        logs.append(log_file(item))
     if not found:
         raise ConfigurationError("nothing to diagnose: no recording and no log given")
     spent = Spent(time.perf_counter() - begin)
@@ -223,7 +227,7 @@ def diagnose(
         mapping=None if bus_map is None else bus_map.name,
         mapping_sha256=None if bus_map is None else fingerprint(bus_map),
     )
-    return Result(diagnosis, asked, spent)
+    return Result(diagnosis, asked, spent, tuple(logs))
 
 
 def _tests(

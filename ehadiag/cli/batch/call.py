@@ -143,7 +143,7 @@ def finish(
         results.stopped = True
         found = job.not_tested(recordings, "stopped by the user")
     line = json_line(found, spent, job.asked, files)
-    draw = partial(drawn, found) if can_be_drawn(found) else None
+    draw = partial(drawn, found, job.asked.levels) if can_be_drawn(found) else None
     code = results.deliver(found, line, spent, name, draw)
     if take is not None:
         take(json.loads(line), line)

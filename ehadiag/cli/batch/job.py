@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from ehadiag.cli.deadline import Deadline
 from ehadiag.cli.interrupt import leave_interrupt_to_parent
 from ehadiag.core.errors import EhadiagError, InputOutputError, NotTestedError
+from ehadiag.facade.inputs import log_file
 from ehadiag.report.asked import Asked, LogFile
 from ehadiag.report.spent import Spent
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from firmware_iface.logs.budget import Budget
     from firmware_iface.mapping.bus_map import BusMap
 
-__all__ = ["Finding", "Job", "Reading", "failure", "log_file", "work"]
+__all__ = ["Finding", "Job", "Reading", "failure", "work"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,15 +200,6 @@ def failure(job: Job, log: str, error: str, exit_code: int) -> Finding:
     return Finding(line, Path(log).stem, error, exit_code)
 
 
-def log_file(log: str) -> LogFile | None:
-    """What can be said of a log without reading it; None where there is none."""
-    try:
-        info = os.stat(log)
-    except (OSError, ValueError):
-        return None
-    return LogFile(os.path.abspath(log), info.st_size, info.st_mtime_ns)
-
-
 def _findings(job: Job, log: str) -> tuple[Finding, ...]:
     from ehadiag.report.json_line import json_line  # noqa: PLC0415
 
@@ -217,7 +209,7 @@ def _findings(job: Job, log: str) -> tuple[Finding, ...]:
     for recording, file, suffix in reading.each():
         found = job.diagnose([recording], lambda _stage, _share: None)
         line = json_line(found, spent, job.asked, [file])
-        picture = _picture(found) if job.draw else None
+        picture = _picture(found, job) if job.draw else None
         small = replace(
             found,
             recordings=tuple(replace(item, samples=None) for item in found.recordings),
@@ -228,7 +220,7 @@ def _findings(job: Job, log: str) -> tuple[Finding, ...]:
     return tuple(out)
 
 
-def _picture(diagnosis: Diagnosis) -> bytes | None:
+def _picture(diagnosis: Diagnosis, job: Job) -> bytes | None:
     from ehadiag.cli.drawing import can_be_drawn, drawn  # noqa: PLC0415
 
-    return drawn(diagnosis) if can_be_drawn(diagnosis) else None
+    return drawn(diagnosis, job.asked.levels) if can_be_drawn(diagnosis) else None

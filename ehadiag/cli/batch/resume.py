@@ -8,10 +8,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
-from ehadiag.cli.batch.job import Job, log_file
+from ehadiag.cli.batch.job import Job
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.folder import RESULT_MODE, Folder, create_file
+from ehadiag.facade.inputs import log_file
 from ehadiag.report.origin import configuration, package
 
 __all__ = ["Journal"]

@@ -9,7 +9,6 @@ from functools import partial
 from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.acquire import STOPPED, acquire
-from ehadiag.cli.batch.job import log_file
 from ehadiag.cli.beforehand import refuse_beforehand
 from ehadiag.cli.drawing import can_be_drawn, drawn
 from ehadiag.cli.interrupt import stop_on_signals
@@ -17,6 +16,7 @@ from ehadiag.cli.output import progress_bar, say_if_compiling
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import NotTestedError
 from ehadiag.core.stored_test import resolve_test
+from ehadiag.facade.inputs import log_file
 from ehadiag.report.spent import Spent
 
 __all__ = ["add_parser", "run"]
@@ -137,5 +137,5 @@ def run(arguments: argparse.Namespace) -> int:
     line = json_line(
         result, spent, options.the_asked(arguments, bus_map), [log_file(heard.recording.source)]
     )
-    draw = partial(drawn, result) if can_be_drawn(result) else None
+    draw = partial(drawn, result, levels) if can_be_drawn(result) else None
     return results.deliver(result, line, spent, heard.name, draw)
