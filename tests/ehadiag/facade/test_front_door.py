@@ -181,10 +181,8 @@ def test_what_cannot_be_diagnosed_is_said_in_one_line(tmp_path: Path) -> None:
         ehadiag.diagnose([])
     with pytest.raises(ehadiag.InputOutputError, match=r"nothing\.blf: no such file"):
         ehadiag.diagnose(tmp_path / "nothing.blf")
-    with pytest.raises(
-        ehadiag.ConfigurationError, match="names another bus than the default mapping"
-    ):
-        ehadiag.read(OPEN, dbc=DATA / "eha_fcc.dbc")
+    with pytest.raises(ehadiag.InputOutputError, match=r"DBC file .*nothing\.dbc"):
+        ehadiag.read(OPEN, dbc=tmp_path / "nothing.dbc")
 
 
 def test_a_mapping_as_file_or_object(recording: ehadiag.Recording) -> None:
