@@ -82,7 +82,7 @@ def _run(argv: Sequence[str] | None) -> int:
     _print_whatever_comes()
     code = 0
     try:
-        arguments = _parser().parse_args(argv)
+        arguments = _parsed(argv)
         code = int(arguments.run(arguments))
         sys.stdout.flush()
     except EhadiagError as error:
@@ -100,6 +100,19 @@ def _run(argv: Sequence[str] | None) -> int:
         say("interrupted")
         return INTERRUPTED
     return code
+
+
+def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the command line; more logs may follow the options that follow logs."""
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    logs = getattr(arguments, "logs", None)
+    late = [item for item in rest if item == "-" or not item.startswith("-")]
+    if logs is not None and len(late) == len(rest):
+        logs += late
+    elif rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    return arguments
 
 
 def _print_whatever_comes() -> None:

@@ -8,16 +8,14 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli.effects import add_effect_options
-from ehadiag.core.actuator import (
-    MOST_TOLERANCE,
-    Actuator,
-    default_actuator,
-    load_actuator,
-    with_tolerance,
-)
+from ehadiag.core.actuator import MOST_TOLERANCE, Actuator, with_tolerance
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+from ehadiag.core.fingerprint import fingerprint
+from ehadiag.core.stored_test import StoredTest
+from ehadiag.facade import inputs
+from ehadiag.report.asked import Asked
 
 if TYPE_CHECKING:
     from firmware_iface.logs.budget import Budget
@@ -33,7 +31,9 @@ __all__ = [
     "add_level_options",
     "add_log_options",
     "add_mapping_options",
+    "add_result_options",
     "add_seed_option",
+    "count",
     "has_bus",
     "known_tests",
     "need_one_bus",
@@ -41,6 +41,7 @@ __all__ = [
     "positive",
     "refuse_two_buses",
     "the_actuator",
+    "the_asked",
     "the_budget",
     "the_bus_map",
 ]
@@ -75,7 +76,11 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="which signals of a DBC are which channels, TOML (default: the FCC's own bus)",
     )
-    parser.add_argument("--dbc", metavar="FILE", help="DBC to use instead of the mapping's own")
+    parser.add_argument(
+        "--dbc",
+        metavar="FILE",
+        help="DBC to use instead of the mapping's own, or one of the default names",
+    )
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
@@ -182,6 +187,18 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print one JSON object a line to standard output, nothing else there",
     )
+
+
+def add_result_options(parser: argparse.ArgumentParser) -> None:
+    """Add how a result is written."""
+    parser.add_argument(
+        "--json-version",
+        type=int,
+        choices=(1, 2),
+        default=2,
+        help="of the JSON objects (default 2); 1: without what 2 added, none for unreadable logs",
+    )
+    parser.add_argument("--no-picture", action="store_true", help="draw nothing")
 
 
 def add_bus_options(parser: argparse.ArgumentParser) -> None:
@@ -293,18 +310,14 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    found = load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    found = inputs.the_actuator(arguments.actuator or None)
     tolerance = getattr(arguments, "tolerance", None)
     return found if tolerance is None else with_tolerance(found, tolerance)
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
-
-    if arguments.dbc and not arguments.mapping:
-        raise ConfigurationError("--dbc: needs --mapping, which names the signals")
-    found = load_map(arguments.mapping, arguments.dbc) if arguments.mapping else default_map()
+    found = inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
     channel = getattr(arguments, "log_channel", None)
     return found if channel is None else replace(found, channel=channel)
 
@@ -320,13 +333,23 @@ def the_budget(arguments: argparse.Namespace) -> Budget:
     )
 
 
-def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
-    """Return the bundled tests and those of the named files; a file's number wins."""
-    tests = {test.id: test for test in bundled_tests().values()}
-    for name in files:
-        test = resolve_test(name)
-        tests[test.id] = test
-    return tuple(tests.values())
+def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
+    """Return the options of a diagnosis, for its JSON result."""
+    return Asked(
+        solver=arguments.solver,
+        seed=arguments.seed,
+        levels=Levels(arguments.advisory, arguments.limit, Rule(arguments.rule)),
+        nuisances=arguments.nuisances,
+        time_limit_s=arguments.time_limit,
+        every=getattr(arguments, "all", False),
+        mapping=bus_map.name,
+        mapping_sha256=fingerprint(bus_map),
+    )
+
+
+def known_tests(names: list[str]) -> tuple[StoredTest, ...]:
+    """Return the bundled tests and the named ones; of one number the one named last."""
+    return inputs.the_tests(names)
 
 
 def has_bus(arguments: argparse.Namespace) -> bool:
@@ -411,6 +434,7 @@ def _share(text: str) -> float:
 
 
 def count(text: str) -> int:
+    """Read a whole number above zero."""
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
     return int(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -55,6 +56,8 @@ class Fit:
     spool_noise, pressure_noise: noise of the channels, m and Pa.
     spool_offset, pressure_offset: constant errors of the channels, m and Pa.
     anchored: how often the model had to be put back on the measured spool.
+    spool_rms_uncapped, pressure_rms_uncapped: rms residual in units of the signal's own noise,
+        every residual counted in full: far above the capped one where a few samples are far off.
     """
 
     spool_rms: float
@@ -65,6 +68,8 @@ class Fit:
     spool_offset: float
     pressure_offset: float
     anchored: int
+    spool_rms_uncapped: float = math.nan
+    pressure_rms_uncapped: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
