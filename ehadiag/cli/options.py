@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.effects import add_effect_options
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.find_test import Sought
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ __all__ = [
     "add_fault_options",
     "add_log_options",
     "add_mapping_options",
+    "add_when_options",
     "has_bus",
     "known_tests",
     "need_one_bus",
@@ -34,6 +37,7 @@ __all__ = [
     "the_actuator",
     "the_budget",
     "the_bus_map",
+    "the_sought",
 ]
 
 DEFAULT_BAUD = 921600
@@ -88,6 +92,18 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="time that reading one recording may take (default 900)",
     )
+
+
+def add_when_options(parser: argparse.ArgumentParser) -> None:
+    """Add where in a recording the test lies, for buses that do not say."""
+    for name, what in (("start", "begins"), ("end", "has ended")):
+        parser.add_argument(
+            f"--{name}",
+            type=_instant,
+            metavar="S",
+            help=f"where the test {what}, s from the first sample of the recording, on a bus that"
+            " does not say (default: found by its command or current)",
+        )
 
 
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
@@ -282,6 +298,16 @@ def the_budget(arguments: argparse.Namespace) -> Budget:
     )
 
 
+def the_sought(
+    arguments: argparse.Namespace, tests: Sequence[StoredTest], actuator: Actuator
+) -> Sought:
+    """Return what to look for in a recording whose bus does not say when which test ran."""
+    start, end = arguments.start, arguments.end
+    if start is not None and end is not None and end <= start:
+        raise ConfigurationError(f"--end {end:g}: not after --start {start:g}")
+    return Sought(tuple(tests), actuator.controller, start, end)
+
+
 def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
     """Return the bundled tests and those of the named files; a file's number wins."""
     tests = {test.id: test for test in bundled_tests().values()}
@@ -360,6 +386,11 @@ def positive(text: str) -> float:
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r}: need a number above 0")
     return value
+
+
+def _instant(text: str) -> float:
+    """Read a number from zero on."""
+    return 0.0 if text.strip() in ("0", "0.0") else positive(text)
 
 
 def _count(text: str) -> int:

@@ -9,6 +9,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade.compiling import log_if_compiling
@@ -35,6 +36,7 @@ def read(
     mapping: BusMap | PathLike | None = None,
     dbc: PathLike | None = None,
     every: bool = False,
+    sought: Sought | None = None,
 ) -> list[Recording]:
     """Read the recording of a test from a log.
 
@@ -49,6 +51,9 @@ def read(
         DBC to use instead of the mapping's own.
     every : bool
         All tests in the log in order of time, not only the last complete one.
+    sought : Sought | None
+        What to look for where the bus does not say when which test ran; None: the stored tests
+        on the reference actuator.
 
     Returns
     -------
@@ -65,7 +70,8 @@ def read(
     bus_map = the_bus_map(mapping, dbc)
     from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - slow
 
-    found = read_recordings(os.fspath(path), bus_map)
+    sought = sought or Sought(the_tests(()), the_actuator(None).controller)
+    found = read_recordings(os.fspath(path), bus_map, sought=sought)
     return list(found) if every else [choose(found)]
 
 
@@ -187,8 +193,12 @@ def diagnose(
     """
     chosen, (tests, default) = the_actuator(actuator), _tests(test)
     found, begin = [], time.perf_counter()
+    sought = Sought((default,) if default else tests, chosen.controller)
     for item in _several(recordings, Recording):
-        found += [item] if isinstance(item, Recording) else read(item, mapping=mapping, dbc=dbc)
+        if isinstance(item, Recording):
+            found.append(item)
+        else:
+            found += read(item, mapping=mapping, dbc=dbc, sought=sought)
     if not found:
         raise ConfigurationError("nothing to diagnose: no recording and no log given")
     spent = Spent(time.perf_counter() - begin)

@@ -56,6 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--list", action="store_true", help="list the tests that each log holds, diagnose none"
     )
+    options.add_when_options(parser)
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
@@ -107,10 +108,12 @@ def _list(arguments: argparse.Namespace) -> int:
     from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
 
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
+    tests = options.known_tests(arguments.test)
+    sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
     code = 0
     for log in arguments.logs:
         try:
-            found = iterate_recordings(log, bus_map, budget)
+            found = iterate_recordings(log, bus_map, budget, sought)
             print_list(log, found, as_json=arguments.json)
         except EhadiagError as error:
             say(str(error))
@@ -127,6 +130,9 @@ class _Diagnosis:
         self._tests = options.known_tests(arguments.test)
         only = arguments.test[0] if len(arguments.test) == 1 else None
         self._default = resolve_test(only) if only else None
+        self._sought = options.the_sought(
+            arguments, (self._default,) if self._default else self._tests, self._actuator
+        )
         self._levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
         self._bus_map = options.the_bus_map(arguments)
         self._budget = options.the_budget(arguments)
@@ -144,8 +150,8 @@ class _Diagnosis:
 
         interrupt_on_signals()
         if self._arguments.all:
-            return list(read_recordings(log, self._bus_map, self._budget))
-        return [read_recording(log, self._bus_map, self._budget)]
+            return list(read_recordings(log, self._bus_map, self._budget, self._sought))
+        return [read_recording(log, self._bus_map, self._budget, self._sought)]
 
     def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
         """Diagnose, write and print one result; return its exit code."""
