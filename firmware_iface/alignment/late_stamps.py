@@ -8,8 +8,8 @@ INFOCOM 1999), and a frame is of the latest tick that no frame after it contradi
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,8 @@ __all__ = ["LateStamps", "place_late", "spacing_of"]
 
 BLOCK = 500
 """Frames of which the earliest tells the phase."""
-HORIZON_S_TICKS = 500
-"""Ticks that a burst of late frames lasts at most."""
-BLOCKS_AHEAD = 3
+HORIZON = 500
+"""Frames that a burst of late ones has at most."""
 LAG = 200
 """Frames over which the spacing is measured."""
 FEW_LOST = 0.2
@@ -30,6 +29,10 @@ WHOLE = 0.25
 SURE = 1e-4
 """Chance that all frames of a stretch are late, below which lateness is a loss."""
 SHARE_LATE = 0.95
+EARLY = 0.15
+"""Share of a spacing by which a stamp may be earlier than the earliest ones of its time."""
+ROUGHLY = 0.3
+"""The same where that time is known roughly."""
 
 Ticks = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -102,11 +105,12 @@ def place_late(since: Floats, every: int) -> LateStamps:
     slack = (since - since[0]) / every - index
     phase = _envelope(slack)
     over = slack - phase
-    shift = _settled(np.rint(over).astype(np.int64), 1)
-    late_share = float(np.mean(over - shift > 0.5))
+    whole = np.floor(over + EARLY).astype(np.int64)
+    shift = _settled(whole, 1)
+    late_share = float(np.mean(over - shift > 1.0 - EARLY))
     if late_share > 0.0:
         sure = int(np.ceil(np.log(SURE) / np.log(min(late_share, 0.95))))
-        shift = _settled(np.rint(over).astype(np.int64), max(sure, 1))
+        shift = _settled(whole, max(sure, 1))
     tick = (index.astype(np.int64) + shift) * every
     first = int(tick[0])
     drift = phase * every + first
@@ -118,14 +122,14 @@ def _settled(shift: Ticks, sure: int) -> Ticks:
 
     Of the last `sure` frames nothing proves that they are not late: they keep what was before.
     """
-    out = _least_ahead(shift, max(HORIZON_S_TICKS, sure))
+    out = _least_ahead(shift, max(HORIZON, sure))
     if sure > 1 and len(out) > sure:
         end = len(out) - sure
         out[end:] = np.minimum(out[end:], out[end])
     return out
 
 
-def _least_ahead(values: NDArray[np.int64], horizon: int) -> NDArray[np.int64]:
+def _least_ahead(values: NDArray[Any], horizon: int) -> NDArray[Any]:
     """Least of each value and the `horizon` ones after it, by doubling."""
     out, reach = values.copy(), 1
     while reach <= horizon:
@@ -138,22 +142,17 @@ def _least_ahead(values: NDArray[np.int64], horizon: int) -> NDArray[np.int64]:
 def _envelope(slack: Floats) -> Floats:
     """Slowly drifting phase of the earliest stamps, whole spacings taken off; per frame.
 
-    slack: stamp less index, in spacings.
+    slack: stamp less index, in spacings; it climbs a stair with each lost frame.
     """
     count = len(slack)
     starts = np.arange(0, max(count - BLOCK // 2, 1), BLOCK)
-    bounds = np.append(starts, count)
-    place = np.array([a + int(np.argmin(slack[a:b])) for a, b in itertools.pairwise(bounds)])
-    least = slack[place]
-    if len(place) == 1:
-        return np.full(count, least[0])
-    step = np.diff(least)
-    width = np.diff(place)
-    rate = float(np.median((step - np.rint(step)) / np.maximum(width, 1)))
-    level = least - rate * place
-    for _ in range(BLOCKS_AHEAD):
-        # A block that is late as a whole says nothing that a later one contradicts.
-        level[:-1] = np.where(level[:-1] > level[1:] + 0.5, level[1:], level[:-1])
-    steps = np.diff(level)
-    level = level[0] + np.concatenate(([0.0], np.cumsum(steps - np.rint(steps))))
-    return np.asarray(np.interp(np.arange(count), place, level) + rate * np.arange(count))
+    stairs = _least_ahead(slack, HORIZON)
+    turn = np.add.reduceat(np.exp(2j * np.pi * stairs), starts)
+    level = np.unwrap(np.angle(turn) / (2.0 * np.pi), period=1.0)
+    centre = starts + 0.5 * np.diff(np.append(starts, count))
+    near = np.interp(np.arange(count), centre, level)
+    # The stairs' mean lies above their lower edge by what the short ones are late.
+    over = slack - near
+    late = over - _least_ahead(np.floor(over + ROUGHLY), HORIZON)
+    edge = np.minimum.reduceat(late, starts)
+    return np.asarray(near + np.interp(np.arange(count), centre, edge))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.alignment.gaps import settle_gaps
 from firmware_iface.alignment.late_stamps import LateStamps, place_late, spacing_of
 from firmware_iface.codec.decode import Decoded, DecodedTable
 from firmware_iface.codec.protection import OUTSIDE, unwrap
@@ -190,7 +191,11 @@ def _own_ticks(item: Decoded, tick_ns: int) -> tuple[Ticks, int, tuple[str, ...]
         return np.where(count == OUTSIDE, OUTSIDE, (count - begin) * every), every, notes
     if every >= 1:
         placed = _late(item, every, tick_ns)
-        return placed.tick, every, (_by_time(item, placed.usual, tick_ns),)
+        tick = placed.tick
+        if item.saturated and not item.stream.any():
+            measured = [item.values[role] for role in item.saturated]
+            tick = settle_gaps(tick, placed.late, every, measured)
+        return tick, every, (_by_time(item, placed.usual, tick_ns),)
     since = (item.time_ns - item.time_ns[0]) / tick_ns
     return np.rint(since - _phase(since)).astype(np.int64), 1, (_by_time(item, 0.0, tick_ns),)
 

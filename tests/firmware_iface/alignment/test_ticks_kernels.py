@@ -26,6 +26,8 @@ def item(
         counter=None if counter is None else np.array(counter),
         message=SimpleNamespace(name="M", modulus=modulus, cycle_ns=0),
         stream=np.zeros(len(time_ms), dtype=np.int64),
+        saturated={},
+        values={},
     )
 
 

@@ -40,6 +40,7 @@ def item(
             roles=(SimpleNamespace(name=role),),
         ),
         saturated={"channels.spool": None} if telemetry else {},
+        values={"channels.spool": np.zeros(len(time_ms))},
         stream=np.zeros(len(time_ms), dtype=np.int64),
     )
 
