@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli.effects import add_effect_options
 from ehadiag.core.actuator import MOST_TOLERANCE, Actuator, with_tolerance
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.find_test import Sought
 from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade import inputs
@@ -33,6 +35,7 @@ __all__ = [
     "add_mapping_options",
     "add_result_options",
     "add_seed_option",
+    "add_when_options",
     "count",
     "has_bus",
     "known_tests",
@@ -44,6 +47,7 @@ __all__ = [
     "the_asked",
     "the_budget",
     "the_bus_map",
+    "the_sought",
 ]
 
 DEFAULT_BAUD = 921600
@@ -142,6 +146,18 @@ def add_seed_option(parser: argparse.ArgumentParser, what: str) -> None:
         metavar="N",
         help=f"{what} (default 0); the same seed, the same answer",
     )
+
+
+def add_when_options(parser: argparse.ArgumentParser) -> None:
+    """Add where in a recording the test lies, for buses that do not say."""
+    for name, what in (("start", "begins"), ("end", "has ended")):
+        parser.add_argument(
+            f"--{name}",
+            type=_instant,
+            metavar="S",
+            help=f"where the test {what}, s from the first sample of the recording, on a bus that"
+            " does not say (default: found by its command or current)",
+        )
 
 
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
@@ -347,6 +363,16 @@ def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
     )
 
 
+def the_sought(
+    arguments: argparse.Namespace, tests: Sequence[StoredTest], actuator: Actuator
+) -> Sought:
+    """Return what to look for in a recording whose bus does not say when which test ran."""
+    start, end = arguments.start, arguments.end
+    if start is not None and end is not None and end <= start:
+        raise ConfigurationError(f"--end {end:g}: not after --start {start:g}")
+    return Sought(tuple(tests), actuator.controller, start, end)
+
+
 def known_tests(names: list[str]) -> tuple[StoredTest, ...]:
     """Return the bundled tests and the named ones; of one number the one named last."""
     return inputs.the_tests(names)
@@ -431,6 +457,11 @@ def _share(text: str) -> float:
     if not 0.0 <= value <= MOST_TOLERANCE:
         raise argparse.ArgumentTypeError(f"{text!r}: need a share, 0 … {MOST_TOLERANCE:g}")
     return value
+
+
+def _instant(text: str) -> float:
+    """Read a number from zero on."""
+    return 0.0 if text.strip() in ("0", "0.0") else positive(text)
 
 
 def count(text: str) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade.compiling import log_if_compiling
@@ -38,6 +39,7 @@ def read(
     mapping: BusMap | PathLike | None = None,
     dbc: PathLike | None = None,
     every: bool = False,
+    sought: Sought | None = None,
 ) -> list[Recording]:
     """Read the recording of a test from a log.
 
@@ -52,6 +54,9 @@ def read(
         DBC to use instead of the mapping's own.
     every : bool
         All tests in the log in order of time, not only the last complete one.
+    sought : Sought | None
+        What to look for where the bus does not say when which test ran; None: the stored tests
+        on the reference actuator.
 
     Returns
     -------
@@ -68,7 +73,8 @@ def read(
     bus_map = the_bus_map(mapping, dbc)
     from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - slow
 
-    found = read_recordings(os.fspath(path), bus_map)
+    sought = sought or Sought(the_tests(()), the_actuator(None).controller)
+    found = read_recordings(os.fspath(path), bus_map, sought=sought)
     return list(found) if every else [choose(found)]
 
 
@@ -192,13 +198,14 @@ def diagnose(
     found, begin = [], time.perf_counter()
     bus_map: BusMap | None = None
     logs: list[LogFile | None] = []
+    sought = Sought((default,) if default else tests, chosen.controller)
     for item in _several(recordings, Recording):
         if isinstance(item, Recording):
             found.append(item)
             logs.append(None)
             continue
         bus_map = bus_map or the_bus_map(mapping, dbc)
-        found += read(item, mapping=bus_map)
+        found += read(item, mapping=bus_map, sought=sought)
         logs.append(log_file(item))
     if not found:
         raise ConfigurationError("nothing to diagnose: no recording and no log given")

@@ -19,6 +19,7 @@ from ehadiag.report.spent import Spent
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.core.actuator import Actuator
+    from ehadiag.core.find_test import Sought
     from ehadiag.core.recording import Recording
     from ehadiag.core.stored_test import StoredTest
     from firmware_iface.logs.budget import Budget
@@ -37,6 +38,8 @@ class Job:
     default: StoredTest | None
     """Test of recordings that do not say which they are of."""
     bus_map: BusMap
+    sought: Sought
+    """What to look for where the bus does not say which test ran, and when."""
     budget: Budget
     every: bool
     """Every test of a log, not its last complete one."""
@@ -70,9 +73,9 @@ class Job:
 
         begin = time.perf_counter()
         if self.every:
-            found = read_recordings(log, self.bus_map, self.budget)
+            found = read_recordings(log, self.bus_map, self.budget, self.sought)
         else:
-            found = (read_recording(log, self.bus_map, self.budget),)
+            found = (read_recording(log, self.bus_map, self.budget, self.sought),)
         return Reading(found, log_file(log), time.perf_counter() - begin)
 
     def diagnose(

@@ -57,6 +57,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--list", action="store_true", help="list the tests that each log holds, diagnose none"
     )
+    options.add_when_options(parser)
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
@@ -107,13 +108,16 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
 def _job(arguments: argparse.Namespace) -> Job:
     """Return what all logs of the call have in common."""
     only = arguments.test[0] if len(arguments.test) == 1 else None
-    bus_map = options.the_bus_map(arguments)
+    default = resolve_test(only) if only else None
+    bus_map, actuator = options.the_bus_map(arguments), options.the_actuator(arguments)
+    tests = options.known_tests(arguments.test)
     return Job(
         asked=options.the_asked(arguments, bus_map),
-        actuator=options.the_actuator(arguments),
-        tests=options.known_tests(arguments.test),
-        default=resolve_test(only) if only else None,
+        actuator=actuator,
+        tests=tests,
+        default=default,
         bus_map=bus_map,
+        sought=options.the_sought(arguments, (default,) if default else tests, actuator),
         budget=options.the_budget(arguments),
         every=arguments.all,
         draw=arguments.out is not None and not arguments.no_picture,
@@ -149,12 +153,14 @@ def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
     from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
 
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
+    tests = options.known_tests(arguments.test)
+    sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
     code = 0
     for item in inputs:
         try:
             if item.why:
                 raise InputOutputError(item.why)
-            found = iterate_recordings(item.name, bus_map, budget)
+            found = iterate_recordings(item.name, bus_map, budget, sought)
             print_list(item.name, found, as_json=arguments.json)
         except EhadiagError as error:
             say(str(error))
