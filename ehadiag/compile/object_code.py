@@ -129,6 +129,8 @@ def object_code(
     tables: Mapping[str, Sequence[float]],
     replaced: Mapping[str, Any],
     processor: Processor,
+    *,
+    allowed: frozenset[str] = frozenset(),
 ) -> bytes:
     """Emit an object file with these C functions.
 
@@ -142,6 +144,8 @@ def object_code(
         Functions of one number of the C library, and the kernels that stand for them.
     processor : Processor
         The target.
+    allowed : frozenset[str]
+        What else of the C library the code may call.
 
     Returns
     -------
@@ -161,7 +165,7 @@ def object_code(
     text = _closed(str(main), wanted)
     whole = _parsed(text, machine)
     _optimise(whole, machine)
-    foreign = {item.name for item in whole.functions if item.is_declaration} - RUNTIME
+    foreign = {item.name for item in whole.functions if item.is_declaration} - RUNTIME - allowed
     foreign = {name for name in foreign if not name.startswith("llvm.")}
     if foreign:
         raise RuntimeError(f"kernels that call {', '.join(sorted(foreign))} cannot be exported")

@@ -8,6 +8,7 @@ from pathlib import Path
 from ehadiag.cli import options
 from ehadiag.cli.output import put, say
 from ehadiag.cli.results import make_folder
+from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.printable import printable
 
@@ -25,6 +26,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--target", metavar="NAME", help="computer, see --list")
+    what.add_argument(
+        "--fmu",
+        action="store_true",
+        help="co-simulation units (FMI 2.0 and 3.0) of simulator and monitor, for this computer",
+    )
     what.add_argument("--list", action="store_true", help="list the targets and exit")
     parser.add_argument("--out", metavar="DIR", help="folder to write into")
     parser.add_argument(
@@ -50,14 +56,26 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("export: need --out DIR")
     actuator = options.the_actuator(arguments)
     say("compiling; this may take half a minute")
-    from ehadiag.export.library import SHARED, export_library  # noqa: PLC0415 - loads the compiler
+    names = _units(arguments, actuator) if arguments.fmu else _library(arguments, actuator)
+    for name in names:
+        put(printable(str(Path(arguments.out) / name)))
+    return 0
+
+
+def _units(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
+    from ehadiag.export.fmu import export_fmus  # noqa: PLC0415 - loads the compiler
+
+    with make_folder(arguments.out) as folder:
+        return export_fmus(actuator, folder, hours=arguments.hours)
+
+
+def _library(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
+    from ehadiag.export.library import SHARED, export_library  # noqa: PLC0415
     from ehadiag.export.targets import target  # noqa: PLC0415
 
     chosen = target(arguments.target)
     with make_folder(arguments.out) as folder:
         names = export_library(actuator, chosen, folder, hours=arguments.hours)
-        if chosen.processor.shared and SHARED not in names:
-            say("no C compiler (cc, or what CC names): no shared library, only the static one")
-    for name in names:
-        put(printable(str(Path(arguments.out) / name)))
-    return 0
+    if chosen.processor.shared and SHARED not in names:
+        say("no C compiler (cc, or what CC names): no shared library, only the static one")
+    return names
