@@ -15,6 +15,7 @@ from ehadiag.cli.commands import (
     calibrate,
     design,
     diagnose,
+    export,
     history,
     replay,
     rul,
@@ -145,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     for command in (
-        bit, diagnose, calibrate, sim, tests, design, checkbus, replay, history, rul, warmup,
+        bit, diagnose, calibrate, sim, tests, design, checkbus, replay, history, rul, export, warmup,
     ):  # fmt: skip
         command.add_parser(subparsers)
     return parser
