@@ -146,7 +146,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     for command in (
-        bit, diagnose, calibrate, sim, tests, design, checkbus, replay, history, rul, export, warmup,
+        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, export,
+        warmup,
     ):  # fmt: skip
         command.add_parser(subparsers)
     return parser

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.nuisance.explained import excess, is_noise
+from ehadiag.identify.nuisance.explained import excess, is_hopeless, is_noise
 from ehadiag.identify.nuisance.prior import (
     ALIAS,
     Joint,
@@ -82,6 +82,7 @@ def estimate(
     budget: int = BUDGET,
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
+    give_up: bool = False,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
 
@@ -104,6 +105,8 @@ def estimate(
         The same seed gives the same answer.
     tell : callable, optional
         Called from time to time with the share of the budget that is spent.
+    give_up : bool
+        Whether to stop early where nothing explains the recordings.
     """
     known = known or {}
     coarse = _free_running(experiments, free)
@@ -131,6 +134,7 @@ def estimate(
         budget=budget,
         seed=seed,
         tell=tell,
+        hopeless=is_hopeless if give_up else None,
     )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
