@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.effects import add_effect_options
@@ -18,11 +19,13 @@ from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
 if TYPE_CHECKING:
     from firmware_iface.logs.budget import Budget
     from firmware_iface.mapping.bus_map import BusMap
+    from firmware_iface.signals.columns import ColumnMap
     from firmware_iface.transport.interface import Transport
 
 __all__ = [
     "add_actuator_options",
     "add_bus_options",
+    "add_column_options",
     "add_diagnosis_options",
     "add_fault_options",
     "add_log_options",
@@ -37,6 +40,7 @@ __all__ = [
     "the_actuator",
     "the_budget",
     "the_bus_map",
+    "the_columns",
     "the_sought",
 ]
 
@@ -60,6 +64,23 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         help="which signals of a DBC are which channels, TOML (default: the FCC's own bus)",
     )
     parser.add_argument("--dbc", metavar="FILE", help="DBC to use instead of the mapping's own")
+
+
+def add_column_options(parser: argparse.ArgumentParser) -> None:
+    """Add the columns of decoded signals, and several files of one recording."""
+    parser.add_argument(
+        "--column",
+        action="append",
+        default=[],
+        metavar="ROLE=NAME[:UNIT]",
+        help="column of a recording of decoded signals (CSV, Parquet, MF4), as"
+        " position='Stroke':mm; repeatable (default: the mapping's, else by name)",
+    )
+    parser.add_argument(
+        "--merge",
+        action="store_true",
+        help="the logs are files of one recording: split in time, or one for each bus",
+    )
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
@@ -280,11 +301,39 @@ def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
     from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
 
+    if arguments.mapping and _maps_columns(arguments):
+        return default_map()
     if arguments.dbc and not arguments.mapping:
         raise ConfigurationError("--dbc: needs --mapping, which names the signals")
     found = load_map(arguments.mapping, arguments.dbc) if arguments.mapping else default_map()
     channel = getattr(arguments, "log_channel", None)
     return found if channel is None else replace(found, channel=channel)
+
+
+def the_columns(arguments: argparse.Namespace) -> ColumnMap | None:
+    """Return the meaning of the columns of decoded signals; None where none are named."""
+    from firmware_iface.signals.columns import (  # noqa: PLC0415
+        ColumnMap,
+        load_columns,
+        named_columns,
+    )
+
+    known = load_columns(arguments.mapping) if _maps_columns(arguments) else None
+    if known is None and not arguments.column:
+        return None
+    return named_columns(arguments.column, known or ColumnMap())
+
+
+def _maps_columns(arguments: argparse.Namespace) -> bool:
+    """Whether the mapping file is one of columns."""
+    if not arguments.mapping or not hasattr(arguments, "column"):
+        return False
+    from ehadiag.core.small_file import read_small_file  # noqa: PLC0415
+    from ehadiag.core.toml_file import MAX_BYTES  # noqa: PLC0415
+    from firmware_iface.signals.columns import SCHEMA  # noqa: PLC0415
+
+    text = read_small_file(Path(arguments.mapping), MAX_BYTES, "mapping file")
+    return f'"{SCHEMA}"'.encode() in text
 
 
 def the_budget(arguments: argparse.Namespace) -> Budget:

@@ -60,6 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
+    options.add_column_options(parser)
     options.add_log_options(parser)
     options.add_diagnosis_options(parser)
     parser.set_defaults(run=run)
@@ -74,9 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     codes = [0]
     together: list[Recording] = []
     spent = 0.0
-    for log in arguments.logs:
+    for log in _recordings(arguments):
         if diagnosis.stopped:
-            say(f"stopped by the user: log {log} is not diagnosed")
+            say(f"stopped by the user: log {log[0]} is not diagnosed")
             codes.append(NotTestedError.exit_code)
             continue
         begin = time.perf_counter()
@@ -93,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
             continue
         for number, recording in enumerate(found, start=1):
             suffix = f"-{number}" if len(found) > 1 else ""
-            codes.append(diagnosis.finish([recording], read_s, Path(log).stem + suffix))
+            codes.append(diagnosis.finish([recording], read_s, Path(log[0]).stem + suffix))
     if arguments.joint and max(codes) > 0:
         say("no joint estimate: not all of the logs could be read")
     elif arguments.joint:
@@ -102,19 +103,25 @@ def run(arguments: argparse.Namespace) -> int:
     return max(codes)
 
 
+def _recordings(arguments: argparse.Namespace) -> list[list[str]]:
+    """Files of each recording: one each, or all together."""
+    return [arguments.logs] if arguments.merge else [[log] for log in arguments.logs]
+
+
 def _list(arguments: argparse.Namespace) -> int:
     """Print what the logs hold."""
     from ehadiag.cli.listing import print_list  # noqa: PLC0415
-    from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
+    from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415
 
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
     tests = options.known_tests(arguments.test)
     sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
+    meaning = Meaning(bus_map, options.the_columns(arguments), sought)
     code = 0
-    for log in arguments.logs:
+    for log in _recordings(arguments):
         try:
-            found = iterate_recordings(log, bus_map, budget, sought)
-            print_list(log, found, as_json=arguments.json)
+            found = recorded_tests(log, meaning, budget)
+            print_list(", ".join(log), found, as_json=arguments.json)
         except EhadiagError as error:
             say(str(error))
             code = max(code, error.exit_code)
@@ -135,23 +142,23 @@ class _Diagnosis:
         )
         self._levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
         self._bus_map = options.the_bus_map(arguments)
+        self._columns = options.the_columns(arguments)
         self._budget = options.the_budget(arguments)
         self._results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
         self.stopped = False
         """Whether a signal came: nothing further is diagnosed."""
         say_if_compiling()
 
-    def read(self, log: str) -> list[Recording]:
-        """Read what is to be diagnosed of one log."""
-        from firmware_iface.logs.reader import (  # noqa: PLC0415 - loads cantools
-            read_recording,
-            read_recordings,
-        )
+    def read(self, log: Sequence[str]) -> list[Recording]:
+        """Read what is to be diagnosed of one recording, from one file or several."""
+        from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415
+        from firmware_iface.logs.reader import choose  # noqa: PLC0415 - loads cantools
 
         interrupt_on_signals()
-        if self._arguments.all:
-            return list(read_recordings(log, self._bus_map, self._budget, self._sought))
-        return [read_recording(log, self._bus_map, self._budget, self._sought)]
+        found = recorded_tests(
+            log, Meaning(self._bus_map, self._columns, self._sought), self._budget
+        )
+        return list(found) if self._arguments.all else [choose(found)]
 
     def finish(self, recordings: Sequence[Recording], read_s: float, name: str) -> int:
         """Diagnose, write and print one result; return its exit code."""
