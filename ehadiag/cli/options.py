@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels, Rule
@@ -22,11 +23,13 @@ from ehadiag.report.asked import Asked
 if TYPE_CHECKING:
     from firmware_iface.logs.budget import Budget
     from firmware_iface.mapping.bus_map import BusMap
+    from firmware_iface.signals.columns import ColumnMap
     from firmware_iface.transport.interface import Transport
 
 __all__ = [
     "add_actuator_options",
     "add_bus_options",
+    "add_column_options",
     "add_diagnosis_options",
     "add_fault_options",
     "add_json_option",
@@ -47,6 +50,7 @@ __all__ = [
     "the_asked",
     "the_budget",
     "the_bus_map",
+    "the_columns",
     "the_sought",
 ]
 
@@ -84,6 +88,23 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         "--dbc",
         metavar="FILE",
         help="DBC to use instead of the mapping's own, or one of the default names",
+    )
+
+
+def add_column_options(parser: argparse.ArgumentParser) -> None:
+    """Add the columns of decoded signals, and several files of one recording."""
+    parser.add_argument(
+        "--column",
+        action="append",
+        default=[],
+        metavar="ROLE=NAME[:UNIT]",
+        help="column of a recording of decoded signals (CSV, Parquet, MF4), as"
+        " position='Stroke':mm; repeatable (default: the mapping's, else by name)",
+    )
+    parser.add_argument(
+        "--merge",
+        action="store_true",
+        help="the logs are files of one recording: split in time, or one for each bus",
     )
 
 
@@ -333,9 +354,38 @@ def the_actuator(arguments: argparse.Namespace) -> Actuator:
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    found = inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
+    if arguments.mapping and _maps_columns(arguments):
+        found = inputs.the_bus_map(None, None)
+    else:
+        found = inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
     channel = getattr(arguments, "log_channel", None)
     return found if channel is None else replace(found, channel=channel)
+
+
+def the_columns(arguments: argparse.Namespace) -> ColumnMap | None:
+    """Return the meaning of the columns of decoded signals; None where none are named."""
+    from firmware_iface.signals.columns import (  # noqa: PLC0415
+        ColumnMap,
+        load_columns,
+        named_columns,
+    )
+
+    known = load_columns(arguments.mapping) if _maps_columns(arguments) else None
+    if known is None and not arguments.column:
+        return None
+    return named_columns(arguments.column, known or ColumnMap())
+
+
+def _maps_columns(arguments: argparse.Namespace) -> bool:
+    """Whether the mapping file is one of columns."""
+    if not arguments.mapping or not hasattr(arguments, "column"):
+        return False
+    from ehadiag.core.small_file import read_small_file  # noqa: PLC0415
+    from ehadiag.core.toml_file import MAX_BYTES  # noqa: PLC0415
+    from firmware_iface.signals.columns import SCHEMA  # noqa: PLC0415
+
+    text = read_small_file(Path(arguments.mapping), MAX_BYTES, "mapping file")
+    return f'"{SCHEMA}"'.encode() in text
 
 
 def the_budget(arguments: argparse.Namespace) -> Budget:

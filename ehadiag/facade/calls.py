@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ehadiag.report.asked import LogFile
     from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
     from firmware_iface.mapping.bus_map import BusMap
+    from firmware_iface.signals.columns import ColumnMap
 
 __all__ = ["calibrate", "diagnose", "read", "save_actuator", "simulate"]
 
@@ -40,14 +41,15 @@ def read(
     dbc: PathLike | None = None,
     every: bool = False,
     sought: Sought | None = None,
+    columns: ColumnMap | None = None,
 ) -> list[Recording]:
     """Read the recording of a test from a log.
 
     Parameters
     ----------
     path : PathLike
-        BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); also packed as
-        `.gz`.
+        BLF, ASC, CSV, TRC, candump's `.log`, or MF4 (needs `ehadiag[mf4]`); decoded signals as
+        CSV, Parquet or MF4 (needs `ehadiag[daq]`); also packed as `.gz`.
     mapping : BusMap | PathLike | None
         Which signals of a DBC are which channels; None: the computer's own bus.
     dbc : PathLike | None
@@ -57,6 +59,9 @@ def read(
     sought : Sought | None
         What to look for where the bus does not say when which test ran; None: the stored tests
         on the reference actuator.
+    columns : ColumnMap | None
+        Columns of decoded signals (`firmware_iface.signals.columns.load_columns`); None: by
+        their names.
 
     Returns
     -------
@@ -71,10 +76,11 @@ def read(
         Unknown kind of log; mapping or DBC unfit.
     """
     bus_map = the_bus_map(mapping, dbc)
-    from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - slow
+    from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415 - slow
+    from firmware_iface.logs.reader import choose  # noqa: PLC0415 - slow
 
     sought = sought or Sought(the_tests(()), the_actuator(None).controller)
-    found = read_recordings(os.fspath(path), bus_map, sought=sought)
+    found = recorded_tests([os.fspath(path)], Meaning(bus_map, columns, sought))
     return list(found) if every else [choose(found)]
 
 

@@ -103,8 +103,8 @@ class FrameTable:
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def rows(self, chosen: slice | NDArray[np.bool_]) -> FrameTable:
-        """Some of the rows, in the same order."""
+    def rows(self, chosen: slice | NDArray[np.bool_] | NDArray[np.int64]) -> FrameTable:
+        """Some of the rows; in the same order, or in that of the numbers given."""
         return FrameTable(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
 
     @classmethod

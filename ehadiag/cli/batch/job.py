@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ehadiag.core.stored_test import StoredTest
     from firmware_iface.logs.budget import Budget
     from firmware_iface.mapping.bus_map import BusMap
+    from firmware_iface.signals.columns import ColumnMap
 
 __all__ = ["Finding", "Job", "Reading", "failure", "work"]
 
@@ -38,6 +39,8 @@ class Job:
     default: StoredTest | None
     """Test of recordings that do not say which they are of."""
     bus_map: BusMap
+    columns: ColumnMap | None
+    """Of recordings of decoded signals."""
     sought: Sought
     """What to look for where the bus does not say which test ran, and when."""
     budget: Budget
@@ -46,13 +49,13 @@ class Job:
     draw: bool
     """Whether a picture is wanted."""
 
-    def read(self, log: str) -> Reading:
-        """Read what is to be diagnosed of one log.
+    def read(self, *logs: str) -> Reading:
+        """Read what is to be diagnosed of one recording.
 
         Parameters
         ----------
-        log : str
-            File to read.
+        *logs : str
+            Files to read; several hold one recording.
 
         Returns
         -------
@@ -66,17 +69,18 @@ class Job:
         ConfigurationError
             Its kind is unknown.
         """
-        from firmware_iface.logs.reader import (  # noqa: PLC0415 - loads cantools
-            read_recording,
-            read_recordings,
+        from firmware_iface.logs.any_recording import (  # noqa: PLC0415 - loads cantools
+            Meaning,
+            recorded_tests,
         )
+        from firmware_iface.logs.reader import choose  # noqa: PLC0415
 
         begin = time.perf_counter()
-        if self.every:
-            found = read_recordings(log, self.bus_map, self.budget, self.sought)
-        else:
-            found = (read_recording(log, self.bus_map, self.budget, self.sought),)
-        return Reading(found, log_file(log), time.perf_counter() - begin)
+        meaning = Meaning(self.bus_map, self.columns, self.sought)
+        found = tuple(recorded_tests(logs, meaning, self.budget))
+        if not self.every:
+            found = (choose(found),)
+        return Reading(found, log_file(logs[0]), time.perf_counter() - begin)
 
     def diagnose(
         self, recordings: Sequence[Recording], progress: Callable[[str, float], None]

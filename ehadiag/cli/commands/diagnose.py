@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.cli import options
@@ -61,6 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
+    options.add_column_options(parser)
     options.add_log_options(parser)
     options.add_diagnosis_options(parser)
     add_keeping_options(parser)
@@ -81,9 +83,12 @@ def run(arguments: argparse.Namespace) -> int:
     job = _job(arguments)
     results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
     say_if_compiling()
-    code = _joint(job, results, inputs) if arguments.joint else diagnose_all(
-        arguments, job, results, inputs
-    )  # fmt: skip
+    if arguments.merge:
+        code = _merged(job, results, inputs)
+    elif arguments.joint:
+        code = _joint(job, results, inputs)
+    else:
+        code = diagnose_all(arguments, job, results, inputs)
     keep_signals()
     return code
 
@@ -97,10 +102,12 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         "--cluster": arguments.cluster,
         "--jobs": arguments.jobs,
     }
-    if arguments.joint:
-        for name, value in several.items():
-            if value:
-                raise ConfigurationError(f"{name}: --joint gives one result, and has no use for it")
+    if arguments.joint and arguments.merge:
+        raise ConfigurationError("--merge: with --joint each log is a recording of its own")
+    alone = "--joint" if arguments.joint else "--merge" if arguments.merge else ""
+    for name, value in several.items():
+        if alone and value:
+            raise ConfigurationError(f"{name}: {alone} gives one result, and has no use for it")
     if arguments.cluster and arguments.jobs:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
 
@@ -117,6 +124,7 @@ def _job(arguments: argparse.Namespace) -> Job:
         tests=tests,
         default=default,
         bus_map=bus_map,
+        columns=options.the_columns(arguments),
         sought=options.the_sought(arguments, (default,) if default else tests, actuator),
         budget=options.the_budget(arguments),
         every=arguments.all,
@@ -147,21 +155,40 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
     return finish(job, results, together, files, Spent(spent), "joint")
 
 
+def _merged(job: Job, results: Results, inputs: Sequence[Input]) -> int:
+    """Diagnose one recording that lies in several files."""
+    for item in inputs:
+        if item.why:
+            raise InputOutputError(item.why)
+    reading = job.read(*(item.name for item in inputs))
+    name = Path(inputs[0].name).stem
+    codes = [
+        finish(job, results, [recording], [file], Spent(reading.seconds), name + suffix)
+        for recording, file, suffix in reading.each()
+    ]
+    return max(codes)
+
+
 def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
     """Print what the logs hold."""
     from ehadiag.cli.listing import print_list  # noqa: PLC0415
-    from firmware_iface.logs.reader import iterate_recordings  # noqa: PLC0415
+    from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415
 
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
     tests = options.known_tests(arguments.test)
     sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
+    meaning = Meaning(bus_map, options.the_columns(arguments), sought)
     code = 0
-    for item in inputs:
+    groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
+    for group in groups:
         try:
-            if item.why:
-                raise InputOutputError(item.why)
-            found = iterate_recordings(item.name, bus_map, budget, sought)
-            print_list(item.name, found, as_json=arguments.json)
+            for item in group:
+                if item.why:
+                    raise InputOutputError(item.why)
+            names = [item.name for item in group]
+            print_list(
+                ", ".join(names), recorded_tests(names, meaning, budget), as_json=arguments.json
+            )
         except EhadiagError as error:
             say(str(error))
             code = max(code, error.exit_code)

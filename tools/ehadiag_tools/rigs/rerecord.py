@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from firmware_iface.codec.encode import Encoder
 from firmware_iface.mapping.bus_map import BusMap, default_map
 from firmware_iface.transport.frames import Frame, FrameTable
 
-__all__ = ["Disturbance", "Played", "frames_on", "played"]
+__all__ = ["Disturbance", "Played", "frames_on", "logged", "played"]
 
 START_NS = 1_700_000_000_000_000_000
 REST_S = 0.15
@@ -115,7 +116,7 @@ def frames_on(
 
 
 def _stamps(
-    true: NDArray[np.float64], how: Disturbance, tick_ns: int, rng: np.random.Generator
+    true: NDArray[Any], how: Disturbance, tick_ns: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Time stamps in ticks, of the instants at which frames were sent."""
     out = true + np.abs(rng.normal(0.0, how.jitter_ms * 1e6 / tick_ns, len(true)))
@@ -176,3 +177,42 @@ class _Encoder:
             before = out.get(name, bytes(len(frame.data)))
             out[name] = bytes(a | b for a, b in zip(before, frame.data, strict=True))
         return out
+
+
+def logged(
+    this: Played, how: Disturbance, rate: float, tick_ns: int, seed: int
+) -> dict[str, NDArray[np.float64]]:
+    """What a data-acquisition system with a clock of its own writes of the bus's values.
+
+    Parameters
+    ----------
+    this : Played
+        The recording.
+    how : Disturbance
+        Of the frames on their way to it; its clock is fast by the drift.
+    rate : float
+        Hz.
+    tick_ns : int
+        Control period, ns.
+    seed : int
+        Of the delays.
+
+    Returns
+    -------
+    dict[str, NDArray[np.float64]]
+        Columns: time in s, channels and command in SI, each value held until the next comes.
+    """
+    rng = np.random.default_rng(seed)
+    ticks = this.channels.shape[1]
+    known = np.flatnonzero(~np.isnan(this.channels).any(axis=0))
+    telemetry = _stamps(np.asarray(known + 0.53), how, tick_ns, rng) * tick_ns * 1e-9
+    command = _stamps(np.asarray(np.arange(ticks) + 0.4), how, tick_ns, rng) * tick_ns * 1e-9
+    period = (1.0 + how.drift_ppm * 1e-6) / rate
+    true = np.arange(int(ticks * tick_ns * 1e-9 / period)) * period
+    true = true[true > max(telemetry[0], command[0])]
+    sample = known[np.searchsorted(telemetry, true, side="right") - 1]
+    heard = np.searchsorted(command, true, side="right") - 1
+    channels = dict(zip(("current", "spool", "pressure", "position"), this.channels, strict=True))
+    columns = {"time": np.arange(len(true)) / rate}
+    columns |= {name: values[sample] for name, values in channels.items()}
+    return columns | {f"{this.mode.name.lower()}_command": this.command[heard]}

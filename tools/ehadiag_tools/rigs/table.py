@@ -9,25 +9,31 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis, diagnose
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.find_test import Sought
-from ehadiag.core.recording import CommandMode, Recording
+from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest, bundled_tests
 from ehadiag_tools.rigs.buses import BUSES, ForeignBus
-from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, played
+from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, logged, played
 from firmware_iface.alignment.windows import recordings_of
+from firmware_iface.logs.any_recording import Meaning, recorded_tests
 from firmware_iface.logs.reader import choose, read_recording
+from firmware_iface.mapping.bus_map import default_map
 
 __all__ = ["main", "on_bus"]
 
+DAQ, DAQ_RATE = "daq", 2000.0
+"""Decoded signals at that rate, Hz."""
 NAMES = ("Kintas", "FSS", "FDJ")
 
 
@@ -52,21 +58,43 @@ def on_bus(
     """Play a recording on a bus, and read it there as a log of that bus is read."""
     if recording.samples is None:
         raise ValueError(f"{recording.source}: nothing to play")
-    stored = test.command()
-    step = 0.5e-6 if recording.samples.mode is CommandMode.CURRENT else 2e-6
-    command = np.round(stored / step) * step
-    this = played(recording.samples, command, how.lead_in_s)
+    this = played(recording.samples, _as_sent(test), how.lead_in_s)
     table, bus_map = frames_on(bus, recording, this, how, seed)
     sought = Sought(tuple(bundled_tests().values()), actuator.controller)
     name = f"{Path(recording.source).stem} on {bus.name}"
     return choose(recordings_of([table], bus_map, name, len(table) + 1, sought=sought))
 
 
+def on_daq(
+    recording: Recording, test: StoredTest, how: Disturbance, actuator: Actuator, seed: int
+) -> Recording:
+    """Write a recording as a decoded CSV at 2 kHz, and read it as `diagnose` does."""
+    import pandas  # noqa: PLC0415 - optional, and slow
+
+    if recording.samples is None:
+        raise ValueError(f"{recording.source}: nothing to play")
+    this = played(recording.samples, _as_sent(test), how.lead_in_s)
+    columns = logged(this, how, DAQ_RATE, recording.samples.period_ns, seed)
+    known = recording.environment
+    for name in ("supply_pressure", "return_pressure", "oil_temperature"):
+        columns[name] = np.full(len(columns["time"]), getattr(known, name))
+    sought = Sought(tuple(bundled_tests().values()), actuator.controller)
+    with tempfile.TemporaryDirectory(prefix="ehadiag-") as folder:
+        path = Path(folder) / f"{Path(recording.source).stem}.csv"
+        pandas.DataFrame(columns).to_csv(path, index=False, float_format="%.9g")
+        return choose(recorded_tests([path], Meaning(default_map(), None, sought)))
+
+
+def _as_sent(test: StoredTest) -> NDArray[np.float64]:
+    step = 2e-6 if test.closed_loop else 0.5e-6
+    return np.asarray(np.round(test.command() / step) * step)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="reference recordings and their truth.csv")
-    parser.add_argument("--bus", nargs="*", choices=[item.name for item in BUSES])
+    parser.add_argument("--bus", nargs="*", choices=[*(item.name for item in BUSES), DAQ])
     parser.add_argument("--jitter", nargs="*", type=float, default=[0.0, 0.2, 0.5, 1.0])
     parser.add_argument("--lead-in", nargs="*", type=float, default=[1.7])
     parser.add_argument("--drift", type=float, default=100.0, help="ppm")
@@ -83,7 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     read = {name: read_recording(given.folder / name) for name in names}
     usual = {name: _line(item, actuator, tests, truth[name]) for name, item in read.items()}
     _show("default", "", usual, usual)
-    chosen = [bus for bus in BUSES if not given.bus or bus.name in given.bus]
+    buses: list[ForeignBus | None] = [*BUSES, None]
+    chosen = [bus for bus in buses if not given.bus or _name(bus) in given.bus]
     for bus, jitter, lead in itertools.product(chosen, given.jitter, given.lead_in):
         how = Disturbance(
             jitter, lead, given.drift, given.batch, given.lost, kept=not given.unordered
@@ -92,7 +121,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         begin = time.perf_counter()
         for name in names:
             test = next(item for item in tests.values() if item.id == read[name].test_id)
-            got = on_bus(bus, read[name], test, how, actuator, given.seed)
+            if bus is None:
+                got = on_daq(read[name], test, how, actuator, given.seed)
+            else:
+                got = on_bus(bus, read[name], test, how, actuator, given.seed)
             lines[name] = _line(got, actuator, tests, truth[name])
             if given.verbose:
                 line = lines[name]
@@ -100,10 +132,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 for note in got.quality.notes:
                     print(f"        {note}")
         spent = time.perf_counter() - begin
-        _show(bus.name, f"{jitter:g} ms, {lead:g} s", lines, usual)
+        _show(_name(bus), f"{jitter:g} ms, {lead:g} s", lines, usual)
         if given.verbose:
             print(f"    {spent:.1f} s")
     return 0
+
+
+def _name(bus: ForeignBus | None) -> str:
+    return DAQ if bus is None else bus.name
 
 
 def _truth(folder: Path) -> dict[str, tuple[float, float, float]]:

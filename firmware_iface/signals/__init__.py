@@ -1,0 +1,1 @@
+"""Reads recordings of decoded signals (a data-acquisition system): names, tables, ticks."""

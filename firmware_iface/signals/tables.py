@@ -1,0 +1,278 @@
+"""Reads tables of decoded signals: CSV, Parquet, MF4; each signal with time stamps of its own."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Iterable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+from firmware_iface.logs.budget import Budget
+from firmware_iface.logs.packed import kind_of, unpacked
+from firmware_iface.signals.columns import TIME, ColumnMap, missing, unit_of
+
+__all__ = ["DECODED_SUFFIXES", "Signal", "holds_signals", "joined", "read_signals"]
+
+DECODED_SUFFIXES = (".csv", ".parquet", ".mf4")
+FRAMES_HEADER = "timestamp,arbitration_id"
+"""Begins the CSV log of python-can: frames, not signals."""
+HEADER_BYTES = 1 << 16
+DELIMITERS = ";\t,"
+LEAST_ROWS = 10
+EXTRA = "pip install 'ehadiag[daq]'"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signal:
+    """One signal as recorded.
+
+    Attributes
+    ----------
+    time : NDArray[np.float64]
+        s, ascending, shape (n,).
+    value : NDArray[np.float64]
+        SI, finite, shape (n,).
+    """
+
+    time: NDArray[np.float64]
+    value: NDArray[np.float64]
+
+
+def holds_signals(path: Path | str, *, mapped: bool) -> bool:
+    """Whether a log holds decoded signals rather than frames.
+
+    Parameters
+    ----------
+    path : Path | str
+        The log.
+    mapped : bool
+        Its columns are mapped: an MF4 file is then one of signals.
+
+    Returns
+    -------
+    bool
+        False too where the file cannot be read: its reader says why.
+    """
+    path, kind = Path(path), kind_of(Path(path))
+    if kind == ".parquet":
+        return True
+    if kind == ".mf4":
+        return mapped
+    if kind != ".csv" or not path.is_file():
+        return False
+    try:
+        return bool(header := _head(path)) and not header.startswith(FRAMES_HEADER)
+    except InputOutputError:
+        return False
+
+
+def _head(path: Path) -> str:
+    try:
+        with unpacked(path, 1 << 40) as plain, plain.path.open("rb") as file:
+            text = file.read(HEADER_BYTES)
+    except OSError as error:
+        raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+    return text.decode("utf-8-sig", "replace").lstrip()
+
+
+def read_signals(
+    path: Path | str, columns: ColumnMap, budget: Budget, *, complete: bool = True
+) -> dict[str, Signal]:
+    """Read the signals that have a role.
+
+    Parameters
+    ----------
+    path : Path | str
+        CSV, Parquet or MF4; packed by gzip too.
+    columns : ColumnMap
+        Which column is what.
+    budget : Budget
+        Bytes and rows that reading may cost.
+    complete : bool
+        All channels must be in this one file.
+
+    Returns
+    -------
+    dict[str, Signal]
+        By role, SI.
+
+    Raises
+    ------
+    InputOutputError
+        Missing, unreadable, too large, without a library, without numbers.
+    ConfigurationError
+        A mapped column is missing, a unit is none of its quantity.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+    if size > budget.size:
+        raise InputOutputError(f"log {path}: larger than --max-log-size allows")
+    if size == 0:
+        raise InputOutputError(f"log {path}: the file is empty")
+    with unpacked(path, budget.size) as plain:
+        if kind_of(path) == ".mf4":
+            return _read_mf4(plain.path, path, columns, complete=complete)
+        table, units = _read_table(plain.path, path, budget)
+    return _signals(table, units, columns, path, complete=complete)
+
+
+def _read_table(plain: Path, path: Path, budget: Budget) -> tuple[Any, dict[str, str]]:
+    """Read a data frame, and the units that the file says by column."""
+    try:
+        import pandas  # noqa: PLC0415 - optional, and slow
+    except ImportError:
+        raise InputOutputError(f"log {path}: decoded signals need pandas: {EXTRA}") from None
+    if kind_of(path) == ".parquet":
+        try:
+            return pandas.read_parquet(plain), {}
+        except ImportError:
+            raise InputOutputError(f"log {path}: Parquet needs pyarrow: {EXTRA}") from None
+        except Exception:  # pyarrow raises what it likes, and quotes the file
+            raise InputOutputError(f"log {path}: not a readable Parquet file") from None
+    lines = [line for line in _head(plain).splitlines()[:4] if line.strip()]
+    delimiter = max(DELIMITERS, key=lines[0].count)
+    rows = list(csv.reader(lines, delimiter=delimiter))
+    names = [name.strip() for name in rows[0]]
+    skipped = 1
+    units: dict[str, str] = {}
+    if len(rows) > 1 and not any(_is_number(cell) for cell in rows[1]):
+        skipped = 2
+        units = {name: cell.strip(" []()") for name, cell in zip(names, rows[1], strict=False)}
+    decimal = "," if delimiter != "," and "," in lines[-1] else "."
+    try:
+        table = pandas.read_csv(
+            plain,
+            sep=delimiter,
+            decimal=decimal,
+            skiprows=skipped,
+            header=None,
+            names=names,
+            index_col=False,
+            nrows=budget.frames,
+            skip_blank_lines=True,
+            encoding="utf-8",
+            encoding_errors="replace",
+            on_bad_lines="skip",
+        )
+    except (ValueError, OSError):
+        raise InputOutputError(f"log {path}: not a readable table of signals") from None
+    return table, units
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.strip().replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _signals(
+    table: Any, units: dict[str, str], columns: ColumnMap, path: Path, *, complete: bool
+) -> dict[str, Signal]:
+    import pandas  # noqa: PLC0415 - read by now
+
+    if table.index.name is not None:
+        table = table.reset_index()
+    present = [str(name) for name in table.columns]
+    table.columns = present
+    found = columns.resolve(present, f"log {path}")
+    if complete and (lacking := missing(found, present)):
+        raise ConfigurationError(f"log {path}: {lacking}")
+    if TIME not in found:
+        raise ConfigurationError(
+            f"log {path}: no column of time stamps: name it by --column time=NAME:UNIT"
+        )
+
+    def numbers(role: str) -> NDArray[np.float64]:
+        column = found[role]
+        gain, bias = unit_of(column, units.get(column.column, ""), role, f"log {path}")
+        series = table[column.column]
+        if role == TIME and pandas.api.types.is_datetime64_any_dtype(series):
+            return np.asarray(series.astype("int64"), dtype=np.float64) * 1e-9
+        plain = pandas.to_numeric(series, errors="coerce")
+        return np.asarray(plain, dtype=np.float64) * gain + bias
+
+    time = numbers(TIME)
+    return _checked({role: (time, numbers(role)) for role in found if role != TIME}, path)
+
+
+def _checked(
+    found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], path: Path
+) -> dict[str, Signal]:
+    """In order of time, once for each instant, numbers alone."""
+    out: dict[str, Signal] = {}
+    for role, (time, value) in found.items():
+        known = np.isfinite(time) & np.isfinite(value)
+        at, values = time[known], value[known]
+        order = np.argsort(at, kind="stable")
+        at, values = at[order], values[order]
+        once = np.concatenate([np.diff(at) > 0.0, [True]]) if len(at) else known[:0]
+        if once.sum() >= LEAST_ROWS or role.startswith("environment."):
+            out[role] = Signal(at[once], values[once])
+        elif role.startswith("channels."):
+            raise InputOutputError(f"log {path}: {role} has {int(once.sum())} numbers in all")
+    return out
+
+
+def _read_mf4(plain: Path, path: Path, columns: ColumnMap, *, complete: bool) -> dict[str, Signal]:
+    try:
+        from asammdf import MDF  # noqa: PLC0415 - optional, and slow
+    except ImportError:
+        raise InputOutputError(f"log {path}: MF4 needs asammdf: {EXTRA}") from None
+    try:
+        with closing(MDF(plain)) as file:
+            present = sorted(file.channels_db)
+            found = columns.resolve(present, f"log {path}")
+            if complete and (lacking := missing(found, present)):
+                raise ConfigurationError(f"log {path}: {lacking}")
+            out = {}
+            for role, column in found.items():
+                if role == TIME:
+                    continue
+                got = file.get(column.column)
+                gain, bias = unit_of(column, str(got.unit or ""), role, f"log {path}")
+                values = np.asarray(got.samples, dtype=np.float64) * gain + bias
+                out[role] = (np.asarray(got.timestamps, dtype=np.float64), values)
+    except (ConfigurationError, InputOutputError):
+        raise
+    except Exception:  # asammdf raises what it likes, and quotes the file
+        raise InputOutputError(f"log {path}: not a readable MF4 file of signals") from None
+    return _checked(out, path)
+
+
+def joined(parts: Iterable[dict[str, Signal]]) -> dict[str, Signal]:
+    """Put the files of one recording together: one after another, or beside each other.
+
+    Parameters
+    ----------
+    parts : Iterable[dict[str, Signal]]
+        Signals of each file, by role.
+
+    Returns
+    -------
+    dict[str, Signal]
+        All of them; of one role in order of time.
+    """
+    whole: dict[str, list[Signal]] = {}
+    for role, signal in itertools.chain.from_iterable(part.items() for part in parts):
+        whole.setdefault(role, []).append(signal)
+    out = {}
+    for role, pieces in whole.items():
+        time = np.concatenate([piece.time for piece in pieces])
+        value = np.concatenate([piece.value for piece in pieces])
+        order = np.argsort(time, kind="stable")
+        time, value = time[order], value[order]
+        once = np.concatenate([np.diff(time) > 0.0, [True]])
+        out[role] = Signal(time[once], value[once])
+    return out
