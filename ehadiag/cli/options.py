@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from firmware_iface.transport.interface import Transport
 
 __all__ = [
+    "TEST",
     "add_actuator_options",
     "add_bus_options",
     "add_diagnosis_options",
@@ -43,6 +44,8 @@ __all__ = [
     "the_bus_map",
 ]
 
+TEST = "open|closed|NUMBER|FILE"
+"""How every command lets a test be named."""
 DEFAULT_BAUD = 921600
 TIME_LIMIT_S = 600.0
 """Some ten thousand times what a sound recording takes."""
