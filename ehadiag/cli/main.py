@@ -6,17 +6,19 @@ import argparse
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from ehadiag.cli.commands import (
     bit,
     calibrate,
+    completion,
     design,
     diagnose,
     export,
     history,
+    init,
     replay,
     rul,
     sim,
@@ -24,8 +26,10 @@ from ehadiag.cli.commands import (
     warmup,
 )
 from ehadiag.cli.commands import check_bus as checkbus
+from ehadiag.cli.defaults import NAME, apply_defaults
 from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
 from ehadiag.cli.output import abandon, say
+from ehadiag.cli.verbose import tell_all
 from ehadiag.cli.version import ShowVersions
 from ehadiag.core.errors import EhadiagError, InputOutputError
 from ehadiag.core.printable import printable
@@ -105,14 +109,21 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; more logs may follow the options that follow logs."""
-    parser = _parser()
-    arguments, rest = parser.parse_known_args(argv)
+    parser, commands = _parser_and_commands()
+    given = sys.argv[1:] if argv is None else list(argv)
+    command = next((item for item in given if not item.startswith("-")), "")
+    used = apply_defaults(commands[command], command) if command in commands else []
+    arguments, rest = parser.parse_known_args(given)
     logs = getattr(arguments, "logs", None)
     late = [item for item in rest if item == "-" or not item.startswith("-")]
     if logs is not None and len(late) == len(rest):
         logs += late
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if used and (arguments.verbose or NAME in used):
+        say(f"defaults from {', '.join(used)}")
+    if arguments.verbose:
+        tell_all(arguments)
     return arguments
 
 
@@ -130,7 +141,11 @@ def _fill_closed_streams() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    return _parser_and_commands()[0]
+
+
+def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    parser: argparse.ArgumentParser = _Parser(
         prog="ehadiag",
         description="Diagnosis of electrohydraulic actuators: clogging of the first-stage filter\n"
         "(Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (limit).",
@@ -144,13 +159,18 @@ def _parser() -> argparse.ArgumentParser:
         nargs=0,
         help="print versions, also of libraries, and exit",
     )
-    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    subparsers: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
+        metavar="COMMAND", required=True
+    )
     for command in (
         bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, export,
-        warmup,
+        warmup, init,
     ):  # fmt: skip
         command.add_parser(subparsers)
-    return parser
+    completion.add_parser(subparsers, _parser)
+    for item in subparsers.choices.values():
+        item.add_argument("-v", "--verbose", action="store_true", help="tell more on the way")
+    return parser, subparsers.choices
 
 
 if __name__ == "__main__":

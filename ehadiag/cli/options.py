@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from firmware_iface.transport.interface import Transport
 
 __all__ = [
+    "TEST",
     "add_actuator_options",
     "add_bus_options",
     "add_column_options",
@@ -54,6 +55,8 @@ __all__ = [
     "the_sought",
 ]
 
+TEST = "open|closed|NUMBER|FILE"
+"""How every command lets a test be named."""
 DEFAULT_BAUD = 921600
 TIME_LIMIT_S = 600.0
 """Some ten thousand times what a sound recording takes."""

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import ehadiag
 
-__all__ = ["ShowVersions"]
+__all__ = ["ShowVersions", "versions"]
 
 LIBRARIES = ("numpy", "numba", "python-can")
 
@@ -18,9 +18,14 @@ class ShowVersions(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
         """Print and end; only who asks waits for the look-up."""
-        from importlib.metadata import version  # noqa: PLC0415 - reads a file for each library
-
-        parts = [f"Python {platform.python_version()}"]
-        parts += [f"{name} {version(name)}" for name in LIBRARIES]
-        print(f"ehadiag {ehadiag.__version__} ({', '.join(parts)})")
+        print(versions())
         parser.exit()
+
+
+def versions() -> str:
+    """Return the versions of this package, of Python, and of the libraries that matter."""
+    from importlib.metadata import version  # noqa: PLC0415 - reads a file for each library
+
+    parts = [f"Python {platform.python_version()}"]
+    parts += [f"{name} {version(name)}" for name in LIBRARIES]
+    return f"ehadiag {ehadiag.__version__} ({', '.join(parts)})"

@@ -129,7 +129,7 @@ class Folder:
                 self._place(name),
                 src_dir_fd=self._descriptor,
                 dst_dir_fd=self._descriptor,
-                follow_symlinks=False,
+                follow_symlinks=os.link not in os.supports_follow_symlinks,
             )
         except FileExistsError:
             self.remove(draft)

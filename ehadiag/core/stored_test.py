@@ -193,15 +193,17 @@ def bundled_tests() -> dict[str, StoredTest]:
 
 
 def resolve_test(name: str) -> StoredTest:
-    """Return the bundled test of that name, or read it as a file."""
+    """Return the bundled test of that name or number, or read it as a file."""
     tests = bundled_tests()
     if name in tests:
         return tests[name]
-    if not Path(name).exists() and "/" not in name and not name.endswith(".toml"):
-        raise ConfigurationError(
-            f"test {name!r}: neither a stored test ({', '.join(tests)}) nor a test file"
-        )
-    return load_test(name)
+    if Path(name).exists() or "/" in name or name.endswith(".toml"):
+        return load_test(name)
+    for test in tests.values():
+        if str(test.id) == name:
+            return test
+    known = ", ".join(f"{test.name} or {test.id}" for test in tests.values())
+    raise ConfigurationError(f"test {name!r}: neither a stored test ({known}) nor a test file")
 
 
 def _checked(test: StoredTest, where: str) -> StoredTest:

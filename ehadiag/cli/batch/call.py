@@ -28,6 +28,8 @@ from ehadiag.cli.options import count
 from ehadiag.cli.output import counting_bar, progress_bar, say
 from ehadiag.cli.results import Results
 from ehadiag.core.errors import EhadiagError, InputOutputError, NotTestedError
+from ehadiag.core.stored_test import SAME_RATE
+from ehadiag.facade.compiling import compiling_notice
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
@@ -243,6 +245,7 @@ class _Call:
     def _among(self, jobs: int) -> int:
         """Diagnose in workers; return how many there were."""
         interrupt_on_signals()
+        self._compile_once()
         new = [item for item in self._inputs if not (item.why or self._known(item))]
         with (
             Workers(jobs, self._arguments.cluster) as workers,
@@ -265,6 +268,16 @@ class _Call:
             finally:
                 made.close()
             return workers.count
+
+    def _compile_once(self) -> None:
+        """Fill the cache of kernels, where it is empty, before several workers would do so."""
+        if not compiling_notice():
+            return
+        from ehadiag.identify.warmup import warm_up  # noqa: PLC0415 - loads numba
+
+        for test in {test.rate: test for test in self._job.tests}.values():
+            if abs(test.rate / self._job.actuator.controller.rate - 1.0) <= SAME_RATE:
+                warm_up(self._job.actuator, test)
 
     def _deliver(self, findings: Sequence[Finding]) -> None:
         for found in findings:

@@ -108,6 +108,7 @@ class Journal:
             ):
                 for start, size in self._order:
                     file.write(self._line(start, size).encode() + b"\n")
+                self._file.close()  # Windows replaces no file that is open
         except OSError as error:
             raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
 

@@ -35,8 +35,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--test",
         required=True,
-        metavar="open|closed|FILE",
-        help="stored test by name, or a test file",
+        metavar=options.TEST,
+        help="stored test by name or number, or a test file",
     )
     parser.add_argument(
         "--simulate",

@@ -45,8 +45,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--test",
         action="append",
         default=[],
-        metavar="FILE",
-        help="test (file) that a log may be of, besides the stored ones; repeatable."
+        metavar=options.TEST,
+        help="test that a log may be of, besides the stored ones; repeatable."
         " Given once, it also stands for logs that carry no test number",
     )
     parser.add_argument(

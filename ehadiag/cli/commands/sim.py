@@ -24,8 +24,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--test",
         action="append",
         default=[],
-        metavar="FILE",
-        help="further test file that the computer stores; repeatable",
+        metavar=options.TEST,
+        help="further test that the computer stores; repeatable",
     )
     parser.add_argument(
         "--duration", type=options.positive, metavar="S", help="stop after so many seconds"

@@ -6,6 +6,7 @@ import argparse
 import csv
 import sys
 
+from ehadiag.cli import options
 from ehadiag.cli.output import emit, rendered
 from ehadiag.core.stored_test import UNITS, bundled_tests, resolve_test
 
@@ -20,7 +21,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="List the stored tests; --csv prints time and command of one.",
         allow_abbrev=False,
     )
-    parser.add_argument("--csv", metavar="NAME", help="test (or test file) to print as CSV")
+    parser.add_argument("--csv", metavar=options.TEST, help="test to print as CSV")
     parser.set_defaults(run=run)
 
 

@@ -25,6 +25,11 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "no history of the user's own"))
 
+    for name in [item for item in os.environ if item.startswith("EHADIAG_")]:
+        if name != "EHADIAG_CACHE_DIR":
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "no defaults of the user's own"))
+
     def call(*arguments: object) -> Result:
         capsys.readouterr()
         try:

@@ -6,6 +6,8 @@ import csv
 import gzip
 import io
 import json
+import re
+import shlex
 import shutil
 import sys
 from importlib import resources
@@ -15,7 +17,7 @@ from typing import Any
 import jsonschema
 import pytest
 from cli_result import Run
-from places import LOGS
+from places import LOGS, ROOT
 
 from ehadiag.cli.batch.row import COLUMNS
 from ehadiag.cli.batch.summary import Summary, worst_code
@@ -193,6 +195,25 @@ def test_same_names_of_other_folders_are_not_overwritten(
     assert [path.name for path in written] == ["test-2.json", "test.json"]
     verdicts = [json.loads(path.read_text())["verdict"] for path in written]
     assert verdicts == ["DEGRADED", "HEALTHY"]
+
+
+def test_the_page_works_as_typed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but the cluster, which has a test of its own."""
+    (tmp_path / "recordings").mkdir()
+    for log in (HEALTHY, WORN):
+        shutil.copy(log, tmp_path / "recordings")
+    page = (ROOT / "docs" / "how-to" / "many-recordings.md").read_text()
+    commands = re.findall(r"```sh\n(.*)\n```", page)
+    assert len(commands) == 4
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"recordings/{WORN.name}\n"))
+    for command in commands[:3]:
+        _, _, typed = command.rpartition("| ")
+        program, *arguments = shlex.split(typed)
+        assert program == "ehadiag"
+        assert run(*arguments).code == 10
+    names = ("all.jsonl", "all.csv", "report.xml", "summary.json")
+    assert all(Path(name).stat().st_size for name in names)
+    assert len(Path("all.jsonl").read_text().splitlines()) == 2
 
 
 def test_the_worst_code() -> None:
