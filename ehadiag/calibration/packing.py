@@ -14,7 +14,7 @@ from ehadiag.core.actuator import Actuator, Tolerance
 from ehadiag.core.calibration import Calibration, Goodness, Source
 from ehadiag.identify.estimates import fit_of
 from ehadiag.identify.nuisance.estimate import Estimated
-from ehadiag.identify.nuisance.knowledge import MOTOR_GAIN
+from ehadiag.identify.nuisance.knowledge import MOTOR_GAIN, OF_THE_DAY
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter
 
@@ -58,12 +58,12 @@ class Lesson:
 
 
 def lesson_of(found: Estimated, before: Mapping[str, float]) -> Lesson:
-    """Take out what the unit keeps: no severity, and no offset, which each recording shows.
+    """Take out what the unit keeps: no severity, nor what each recording shows of its day.
 
     before: deviations of what was known beforehand, by name.
     """
     refined = found.refined
-    apart = {item.name for item in (*FAULTS, *OFFSETS)}
+    apart = {*OF_THE_DAY, *(item.name for item in (*FAULTS, *OFFSETS))}
     kept = [k for k, item in enumerate(refined.parameters) if item.name not in apart]
     items = tuple(refined.parameters[k] for k in kept)
     spread = covariance(refined) + found.covariance
