@@ -33,6 +33,8 @@ LONGEST_GAP_S = 0.25
 """Longest span without a sample."""
 LEAST_COMMANDS = 100
 """Command frames that tell at which resolution the control law got its command."""
+LEAST_CURRENTS = 0.4
+"""Share of ticks whose measured current must bear out a stored command that was not recorded."""
 MOST_GUESSED = 0.015
 """Share of ticks in closed loop whose current had to be guessed (docs/reference/bus-faults.md)."""
 LEAST_MISSED_S = 0.01
@@ -115,13 +117,16 @@ def objections_to_unit(recordings: Sequence[Recording], actuator: Actuator) -> l
 
 def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
     out = []
+    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     commands = int(np.isfinite(samples.command).sum())
     if test.closed_loop and commands < LEAST_COMMANDS:
-        out.append(
-            f"{commands or 'no'} command frames in the recording, and closed loop cannot be judged"
-            " without them: record the message with the command too, and name it in the mapping"
-        )
-    elif samples.mode is not (CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT):
+        if np.isfinite(samples.current[: test.ticks]).mean() < LEAST_CURRENTS:
+            out.append(
+                f"{commands or 'no'} command frames in the recording, nor the servovalve current:"
+                " closed loop cannot be judged without: record the message with the command too,"
+                " and name it in the mapping"
+            )
+    elif commands and samples.mode is not mode:
         out.append(
             f"the command is a {samples.mode.name.lower()}, test {test.name!r} needs another"
         )
@@ -155,7 +160,7 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
 def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
     """What the model must not be run with; holds for a running test too."""
     out = []
-    for index, name in ((1, "spool"), (2, "pressure")):
+    for index, name in ((1, "spool"), (2, "pressure"), (3, "position")):
         share = float(np.mean(samples.saturated[index]))
         if share > MOST_SATURATED:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
@@ -237,6 +242,8 @@ def remarks_on_recording(
     if environment.supply_pressure is None or environment.return_pressure is None:
         supply = actuator.servovalve.PSR / 1e6
         out.append(f"no supply pressure on the bus: the actuator file's {supply:g} MPa assumed")
+    if test is not None and test.closed_loop and not np.isfinite(samples.command).any():
+        out.append(f"no command recorded: that of test {test.name!r}, which the current bears out")
     present = np.flatnonzero(np.isfinite(samples.spool))
     if test is not None and len(present):
         first = float(present[0]) / test.rate

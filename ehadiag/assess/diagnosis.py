@@ -16,6 +16,7 @@ from ehadiag.assess.acceptance import (
     out_of_range,
     remarks_on_recording,
 )
+from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
@@ -49,6 +50,8 @@ class Diagnosis:
     """None where the recording could not be identified from."""
     experiments: tuple[Experiment, ...]
     """What was identified from; empty without identification."""
+    positions: tuple[PositionFit | None, ...]
+    """Of each experiment the check of its position sensor; None where there are too few samples."""
     notes: tuple[str, ...]
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
@@ -132,10 +135,12 @@ class DiagnosisSession:
         matched = match_tests(recordings, self._tests, self._default)
         experiments, reasons = self._experiments(recordings, matched)
         identification: Identification | None = None
+        positions: tuple[PositionFit | None, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
         if not reasons:
             identification = self._session.finish(experiments, progress)
-            why = tuple(objections_to_estimate(identification))
+            positions = tuple(position_fit(item, identification) for item in experiments)
+            why = tuple(objections_to_estimate(identification) or _of_positions(positions))
             if not why:
                 verdict, why = judge(identification, self._levels)
         return Diagnosis(
@@ -146,9 +151,11 @@ class DiagnosisSession:
             reasons=why,
             identification=identification,
             experiments=tuple(experiments) if identification else (),
+            positions=positions,
             notes=(
                 *_notes(recordings, matched, self._actuator),
                 *_freed(identification, self._actuator),
+                *_unchecked(positions),
             ),
             elapsed=time.perf_counter() - begin,
         )
@@ -217,6 +224,7 @@ def not_tested(
         reasons=tuple(reasons),
         identification=None,
         experiments=(),
+        positions=(),
         notes=_notes(recordings, tests, actuator),
         elapsed=elapsed,
     )
@@ -248,6 +256,20 @@ def _notes(
         for recording, test in zip(recordings, tests, strict=True)
     )
     return tuple(dict.fromkeys(note for notes in each for note in notes))
+
+
+def _of_positions(positions: Sequence[PositionFit | None]) -> list[str]:
+    """Why the position sensor cannot be believed, each reason once."""
+    return list(
+        dict.fromkeys(why for fit in positions if fit for why in objections_to_position(fit))
+    )
+
+
+def _unchecked(positions: Sequence[PositionFit | None]) -> tuple[str, ...]:
+    """Whether the position sensor went unchecked."""
+    if None not in positions:
+        return ()
+    return ("too few samples of the jack position: its sensor is not checked",)
 
 
 def _freed(identification: Identification | None, actuator: Actuator) -> tuple[str, ...]:

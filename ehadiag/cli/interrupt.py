@@ -18,6 +18,7 @@ __all__ = [
     "ignore_signals",
     "interrupt_on_signals",
     "keep_signals",
+    "leave_interrupt_to_parent",
     "signals_restored",
     "stop_on_signals",
 ]
@@ -60,6 +61,12 @@ def ignore_signals() -> None:
     """Let nothing change the exit code any more; for the end of the process."""
     for number in _numbers():
         signal.signal(number, signal.SIG_IGN)
+
+
+def leave_interrupt_to_parent() -> None:
+    """Ignore Ctrl-C in a worker process: it reaches all of them, and the parent deals with it."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.output import emit, put, rendered
+from ehadiag.core.dates import start_text
 from ehadiag.core.printable import printable, valid_text
 
 if TYPE_CHECKING:
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 __all__ = ["print_list"]
 
 SCHEMA = "ehadiag.tests/1"
-DATED_NS = 10**17
-"""Stamps beyond are times of day, those before it seconds since a log without a date began."""
 COLUMNS = ("no.", "test", "start", "length s", "outcome", "serial", "channel", "remarks")
 
 
@@ -59,22 +57,10 @@ def _row(item: Recording, number: int) -> dict[str, Any]:
     return {
         "number": number,
         "test": item.test_id,
-        "start": _start(item.start_ns),
+        "start": start_text(item.start_ns),
         "length_s": None if item.samples is None else round(item.duration, 3),
         "outcome": outcome,
         "serial": item.serial,
         "channel": item.channel,
         "remarks": list(item.quality.refused),
     }
-
-
-def _start(time_ns: int | None) -> str | None:
-    if time_ns is None:
-        return None
-    if time_ns < DATED_NS:
-        return f"{time_ns * 1e-9:.3f} s"
-    try:
-        moment = datetime.fromtimestamp(time_ns / 1e9, UTC)
-    except (OverflowError, ValueError, OSError):
-        return f"{time_ns * 1e-9:.3f} s"
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

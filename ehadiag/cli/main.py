@@ -10,7 +10,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from ehadiag.cli.commands import bit, calibrate, diagnose, replay, sim, tests, warmup
+from ehadiag.cli.commands import (
+    bit,
+    calibrate,
+    design,
+    diagnose,
+    export,
+    history,
+    replay,
+    rul,
+    sim,
+    tests,
+    warmup,
+)
 from ehadiag.cli.commands import check_bus as checkbus
 from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
 from ehadiag.cli.output import abandon, say
@@ -71,7 +83,7 @@ def _run(argv: Sequence[str] | None) -> int:
     _print_whatever_comes()
     code = 0
     try:
-        arguments = _parser().parse_args(argv)
+        arguments = _parsed(argv)
         code = int(arguments.run(arguments))
         sys.stdout.flush()
     except EhadiagError as error:
@@ -89,6 +101,19 @@ def _run(argv: Sequence[str] | None) -> int:
         say("interrupted")
         return INTERRUPTED
     return code
+
+
+def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the command line; more logs may follow the options that follow logs."""
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    logs = getattr(arguments, "logs", None)
+    late = [item for item in rest if item == "-" or not item.startswith("-")]
+    if logs is not None and len(late) == len(rest):
+        logs += late
+    elif rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    return arguments
 
 
 def _print_whatever_comes() -> None:
@@ -120,7 +145,10 @@ def _parser() -> argparse.ArgumentParser:
         help="print versions, also of libraries, and exit",
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
-    for command in (bit, diagnose, calibrate, sim, tests, checkbus, replay, warmup):
+    for command in (
+        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, export,
+        warmup,
+    ):  # fmt: skip
         command.add_parser(subparsers)
     return parser
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 import argparse
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli.effects import add_effect_options
-from ehadiag.core.actuator import (
-    MOST_TOLERANCE,
-    Actuator,
-    default_actuator,
-    load_actuator,
-    with_tolerance,
-)
+from ehadiag.core.actuator import MOST_TOLERANCE, Actuator, with_tolerance
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+from ehadiag.core.find_test import Sought
+from ehadiag.core.fingerprint import fingerprint
+from ehadiag.core.stored_test import StoredTest
+from ehadiag.facade import inputs
+from ehadiag.report.asked import Asked
 
 if TYPE_CHECKING:
     from firmware_iface.logs.budget import Budget
@@ -30,9 +30,13 @@ __all__ = [
     "add_diagnosis_options",
     "add_fault_options",
     "add_json_option",
+    "add_level_options",
     "add_log_options",
     "add_mapping_options",
+    "add_result_options",
     "add_seed_option",
+    "add_when_options",
+    "count",
     "has_bus",
     "known_tests",
     "need_one_bus",
@@ -40,8 +44,10 @@ __all__ = [
     "positive",
     "refuse_two_buses",
     "the_actuator",
+    "the_asked",
     "the_budget",
     "the_bus_map",
+    "the_sought",
 ]
 
 DEFAULT_BAUD = 921600
@@ -56,6 +62,17 @@ def add_actuator_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_tolerance_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--tolerance`."""
+    parser.add_argument(
+        "--tolerance",
+        type=_share,
+        metavar="SHARE",
+        help="each datum of the actuator file may be off by this share, 0 … 0.3"
+        " (default: as the file says)",
+    )
+
+
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
     """Add `--mapping` and `--dbc`."""
     parser.add_argument(
@@ -63,21 +80,25 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="which signals of a DBC are which channels, TOML (default: the FCC's own bus)",
     )
-    parser.add_argument("--dbc", metavar="FILE", help="DBC to use instead of the mapping's own")
+    parser.add_argument(
+        "--dbc",
+        metavar="FILE",
+        help="DBC to use instead of the mapping's own, or one of the default names",
+    )
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add the channel of a recording, and what reading one may cost."""
     parser.add_argument(
         "--log-channel",
-        type=_count,
+        type=count,
         metavar="N",
         help="adapter channel of the recording that is the actuator's, from 1"
         " (default: the mapping's, else the only one)",
     )
     parser.add_argument(
         "--max-frames",
-        type=_count,
+        type=count,
         default=20_000_000,
         metavar="N",
         help="frames that a recording may have (default 20000000, some three hours)",
@@ -98,6 +119,47 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_level_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--advisory` and `--limit`."""
+    parser.add_argument(
+        "--advisory",
+        type=float,
+        default=0.25,
+        metavar="K",
+        help="DEGRADED at or above this severity (default 0.25)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=0.75,
+        metavar="K",
+        help="FAULT at or above this severity (default 0.75)",
+    )
+
+
+def add_seed_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--seed`; `what` says what is drawn by it."""
+    parser.add_argument(
+        "--seed",
+        type=seed,
+        default=0,
+        metavar="N",
+        help=f"{what} (default 0); the same seed, the same answer",
+    )
+
+
+def add_when_options(parser: argparse.ArgumentParser) -> None:
+    """Add where in a recording the test lies, for buses that do not say."""
+    for name, what in (("start", "begins"), ("end", "has ended")):
+        parser.add_argument(
+            f"--{name}",
+            type=_instant,
+            metavar="S",
+            help=f"where the test {what}, s from the first sample of the recording, on a bus that"
+            " does not say (default: found by its command or current)",
+        )
+
+
 def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
     """Add solver, seed, levels, time limit and output."""
     parser.add_argument(
@@ -113,28 +175,9 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
         help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
         " alone do not explain a recording (auto, the default), never, or always",
     )
-    parser.add_argument(
-        "--tolerance",
-        type=_share,
-        metavar="SHARE",
-        help="each datum of the actuator file may be off by this share, 0 … 0.3"
-        " (default: as the file says)",
-    )
-    add_seed_option(parser)
-    parser.add_argument(
-        "--advisory",
-        type=float,
-        default=0.25,
-        metavar="K",
-        help="DEGRADED at or above this severity (default 0.25)",
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=0.75,
-        metavar="K",
-        help="FAULT at or above this severity (default 0.75)",
-    )
+    add_tolerance_option(parser)
+    add_seed_option(parser, "seed of the search")
+    add_level_options(parser)
     parser.add_argument(
         "--rule",
         choices=("interval", "estimate"),
@@ -153,17 +196,6 @@ def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
     add_json_option(parser)
 
 
-def add_seed_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--seed`."""
-    parser.add_argument(
-        "--seed",
-        type=_seed,
-        default=0,
-        metavar="N",
-        help="seed of the search (default 0); the same seed, the same answer",
-    )
-
-
 def add_json_option(parser: argparse.ArgumentParser) -> None:
     """Add `--json`."""
     parser.add_argument(
@@ -171,6 +203,18 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print one JSON object a line to standard output, nothing else there",
     )
+
+
+def add_result_options(parser: argparse.ArgumentParser) -> None:
+    """Add how a result is written."""
+    parser.add_argument(
+        "--json-version",
+        type=int,
+        choices=(1, 2),
+        default=2,
+        help="of the JSON objects (default 2); 1: without what 2 added, none for unreadable logs",
+    )
+    parser.add_argument("--no-picture", action="store_true", help="draw nothing")
 
 
 def add_bus_options(parser: argparse.ArgumentParser) -> None:
@@ -191,10 +235,10 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
         default=os.environ.get("CAN_CHANNEL"),
         help="channel as the interface names it (default: CAN_CHANNEL)",
     )
-    group.add_argument("-b", "--bitrate", type=_count, metavar="N", help="bit/s")
+    group.add_argument("-b", "--bitrate", type=count, metavar="N", help="bit/s")
     group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
     group.add_argument(
-        "--data-bitrate", "--data_bitrate", type=_count, metavar="N", help="bit/s of CAN FD data"
+        "--data-bitrate", "--data_bitrate", type=count, metavar="N", help="bit/s of CAN FD data"
     )
     group.add_argument("--app-name", metavar="NAME", help="application name (Vector)")
     group.add_argument(
@@ -211,7 +255,7 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--baud",
-        type=_count,
+        type=count,
         metavar="N",
         default=DEFAULT_BAUD,
         help=f"of the serial link (default {DEFAULT_BAUD})",
@@ -265,7 +309,7 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--simulator-seed",
-        type=_seed,
+        type=seed,
         default=1,
         metavar="N",
         help="seed of the simulated noise (default 1)",
@@ -282,18 +326,14 @@ def add_fault_options(parser: argparse.ArgumentParser) -> None:
 
 def the_actuator(arguments: argparse.Namespace) -> Actuator:
     """Return the actuator that was asked for."""
-    found = load_actuator(arguments.actuator) if arguments.actuator else default_actuator()
+    found = inputs.the_actuator(arguments.actuator or None)
     tolerance = getattr(arguments, "tolerance", None)
     return found if tolerance is None else with_tolerance(found, tolerance)
 
 
 def the_bus_map(arguments: argparse.Namespace) -> BusMap:
     """Return the meaning of the bus's frames."""
-    from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
-
-    if arguments.dbc and not arguments.mapping:
-        raise ConfigurationError("--dbc: needs --mapping, which names the signals")
-    found = load_map(arguments.mapping, arguments.dbc) if arguments.mapping else default_map()
+    found = inputs.the_bus_map(arguments.mapping or None, arguments.dbc or None)
     channel = getattr(arguments, "log_channel", None)
     return found if channel is None else replace(found, channel=channel)
 
@@ -309,13 +349,33 @@ def the_budget(arguments: argparse.Namespace) -> Budget:
     )
 
 
-def known_tests(files: list[str]) -> tuple[StoredTest, ...]:
-    """Return the bundled tests and those of the named files; a file's number wins."""
-    tests = {test.id: test for test in bundled_tests().values()}
-    for name in files:
-        test = resolve_test(name)
-        tests[test.id] = test
-    return tuple(tests.values())
+def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
+    """Return the options of a diagnosis, for its JSON result."""
+    return Asked(
+        solver=arguments.solver,
+        seed=arguments.seed,
+        levels=Levels(arguments.advisory, arguments.limit, Rule(arguments.rule)),
+        nuisances=arguments.nuisances,
+        time_limit_s=arguments.time_limit,
+        every=getattr(arguments, "all", False),
+        mapping=bus_map.name,
+        mapping_sha256=fingerprint(bus_map),
+    )
+
+
+def the_sought(
+    arguments: argparse.Namespace, tests: Sequence[StoredTest], actuator: Actuator
+) -> Sought:
+    """Return what to look for in a recording whose bus does not say when which test ran."""
+    start, end = arguments.start, arguments.end
+    if start is not None and end is not None and end <= start:
+        raise ConfigurationError(f"--end {end:g}: not after --start {start:g}")
+    return Sought(tuple(tests), actuator.controller, start, end)
+
+
+def known_tests(names: list[str]) -> tuple[StoredTest, ...]:
+    """Return the bundled tests and the named ones; of one number the one named last."""
+    return inputs.the_tests(names)
 
 
 def has_bus(arguments: argparse.Namespace) -> bool:
@@ -399,13 +459,19 @@ def _share(text: str) -> float:
     return value
 
 
-def _count(text: str) -> int:
+def _instant(text: str) -> float:
+    """Read a number from zero on."""
+    return 0.0 if text.strip() in ("0", "0.0") else positive(text)
+
+
+def count(text: str) -> int:
+    """Read a whole number above zero."""
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
     return int(text)
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:
         raise argparse.ArgumentTypeError(f"{text!r}: a seed is a whole number, 0 … 4294967295")
     return int(text)

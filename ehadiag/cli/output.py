@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "abandon",
+    "counting_bar",
     "damage",
     "emit",
     "progress_bar",
@@ -132,6 +133,39 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
     with Progress(*columns, console=terminal, transient=True) as display:
         task = display.add_task("", total=1.0)
         yield lambda stage, share: display.update(task, description=stage, completed=share)
+
+
+@contextmanager
+def counting_bar(total: int) -> Iterator[Callable[[], None]]:
+    """Show how many of so many are done, and how fast, on standard error, if a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import (  # noqa: PLC0415
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    terminal = Console(file=cast("TextIO", _Forgiving(sys.stderr)))
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(),
+        TextColumn("{task.fields[rate]}", markup=False),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=terminal, transient=True) as display:
+        task = display.add_task("", total=total, rate="")
+
+        def tell() -> None:
+            speed = display.tasks[0].speed
+            rate = "" if speed is None else f"{speed:.1f} recordings/s"
+            display.update(task, advance=1, rate=rate)
+
+        yield tell
 
 
 class _Forgiving:

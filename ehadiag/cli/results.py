@@ -6,15 +6,13 @@ import argparse
 import contextlib
 import itertools
 import json
-import math
-import os
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
-from ehadiag.cli.output import emit, rendered, say
+from ehadiag.cli.output import emit, put, rendered, say
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import plain_name
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.report.spent import Spent
 
-__all__ = ["Results", "make_folder", "matplotlib_alone"]
+__all__ = ["Results", "make_folder"]
 
 MAX_RESULT_BYTES = 1 << 20
 
@@ -71,6 +69,7 @@ class Results:
         self._arguments = arguments
         self._folder = folder
         self._names: set[str] = set()
+        self._keeper = Keeper(arguments)
         self.stopped = False
         """Whether a signal came while a result was brought out."""
 
@@ -83,40 +82,73 @@ class Results:
 
             rendered(lambda _: None)
 
-    def deliver(self, diagnosis: Diagnosis, spent: Spent, name: str) -> int:
+    def deliver(
+        self,
+        diagnosis: Diagnosis,
+        line: str,
+        spent: Spent,
+        name: str,
+        draw: Callable[[], bytes] | None,
+    ) -> int:
         """Write and print one result; return its exit code.
 
         That is the verdict's, or 3 where something could not be written and 3 is more. From here on
         signals do not change it: the first leaves the picture out, the second what is not out yet.
 
-        name: of the files, without suffix; made safe, and numbered where it is taken.
+        line: JSON object. name: of the files, without suffix; made safe, and numbered where it is
+        taken. draw: makes the picture; None: there is none.
         """
-        from ehadiag.report.json_line import json_line  # noqa: PLC0415
-
         came = keep_signals()
         codes = [int(diagnosis.verdict)]
-        line = json_line(diagnosis, spent, self._arguments.solver, self._arguments.seed)
         with contextlib.suppress(KeyboardInterrupt):
             written = []
             stem = None
             with _said(codes):
-                stem = self._write_json(line, plain_name(name))
+                stem = self._write_json(self._said_as(line), plain_name(name))
+            with _said(codes):
+                self._keeper.keep(diagnosis, line)
             if stem is not None:
                 written.append(f"{stem}.json")
             with _said(codes):
                 self._print(diagnosis, line, spent)
-            if stem is not None and _can_be_drawn(diagnosis) and not came.is_set():
+            if stem is not None and draw is not None and self.pictures and not came.is_set():
                 with _said(codes):
-                    self._draw(diagnosis, f"{stem}.png")
+                    self._draw(draw, f"{stem}.png")
                     written.append(f"{stem}.png")
             if self._folder is not None and written:
                 say("wrote " + ", ".join(str(self._folder.path / item) for item in written))
         self.stopped = self.stopped or came.is_set()
         return max(codes)
 
+    def refuse(self, line: str, error: str) -> None:
+        """Say what is wrong with an input, and print its object; `ehadiag.diagnosis/1` has none."""
+        say(error)
+        if self._arguments.json and self._arguments.json_version > 1:
+            emit(line + "\n")
+
+    def repeat(self, line: str, tree: dict[str, Any]) -> None:
+        """Print a result that an earlier call found: its object, or one line."""
+        if self._arguments.json:
+            emit(self._said_as(line) + "\n")
+        else:
+            put(
+                f"{tree['verdict'].replace('_', ' ')}  {tree['source']}  (found by an earlier call)"
+            )
+
+    @property
+    def pictures(self) -> bool:
+        """Whether pictures are wanted."""
+        return self._folder is not None and not self._arguments.no_picture
+
+    def _said_as(self, line: str) -> str:
+        """Return the object in the version that was asked for."""
+        from ehadiag.report.json_line import first_version  # noqa: PLC0415
+
+        return first_version(line) if self._arguments.json_version == 1 else line
+
     def _print(self, diagnosis: Diagnosis, line: str, spent: Spent) -> None:
         if self._arguments.json:
-            emit(line + "\n")
+            emit(self._said_as(line) + "\n")
             return
         from ehadiag.report.table import print_diagnosis  # noqa: PLC0415
 
@@ -150,21 +182,14 @@ class Results:
             return stem
         raise AssertionError("numbers have no end")
 
-    def _draw(self, diagnosis: Diagnosis, name: str) -> None:
+    def _draw(self, draw: Callable[[], bytes], name: str) -> None:
         assert self._folder is not None
-        with matplotlib_alone():
-            from ehadiag.report.picture import draw_diagnosis  # noqa: PLC0415 - matplotlib is slow
+        content = draw()
         try:
-            self._folder.write(name, draw_diagnosis(diagnosis))
+            self._folder.write(name, content)
         except OSError as error:
             place = self._folder.path / name
             raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
-
-
-def _can_be_drawn(diagnosis: Diagnosis) -> bool:
-    """Whether there is a modelled response, of numbers."""
-    found = diagnosis.identification
-    return found is not None and all(math.isfinite(item.value) for item in found.estimates)
 
 
 @contextlib.contextmanager
@@ -178,36 +203,22 @@ def _said(codes: list[int]) -> Iterator[None]:
 
 
 def _same_recording(folder: Folder, name: str, line: str) -> bool:
-    """Whether a file is the result of the same recording, of an earlier call."""
+    """Whether a file is the result of the same recording, of an earlier call.
+
+    The same name is not enough: logs of two folders may have one. What was read and what it held
+    must be the same too.
+    """
     try:
-        there = json.loads(folder.read(name, MAX_RESULT_BYTES))
-        return bool(there["source"] == json.loads(line)["source"])
+        there, here = json.loads(folder.read(name, MAX_RESULT_BYTES)), json.loads(line)
+        if "recordings" in there and "recordings" in here:
+            return [_identity(item) for item in there["recordings"]] == [
+                _identity(item) for item in here["recordings"]
+            ]
+        return all(there[key] == here[key] for key in ("source", "test", "serial", "quality"))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
 
 
-@contextlib.contextmanager
-def matplotlib_alone() -> Iterator[None]:
-    """Load matplotlib without what others may have laid out for it.
-
-    It reads `matplotlibrc` in the working folder, which may be anybody's, and keeps a list of fonts
-    in a folder that need not be safe either.
-    """
-    import tempfile  # noqa: PLC0415
-
-    from ehadiag.core.cache_folder import private_folder  # noqa: PLC0415
-
-    if "matplotlib" in sys.modules:
-        yield
-        return
-    with contextlib.ExitStack() as stack:
-        own = private_folder("matplotlib")
-        if own is None:
-            place = stack.enter_context(tempfile.TemporaryDirectory(prefix="ehadiag-"))
-        else:
-            stack.enter_context(own)
-            place = str(own.path)
-        os.environ.setdefault("MPLCONFIGDIR", place)
-        with contextlib.suppress(OSError):
-            stack.enter_context(contextlib.chdir(place))
-        yield
+def _identity(recording: dict[str, Any]) -> tuple[object, ...]:
+    """What tells one recording of the JSON object from others."""
+    return tuple(recording[key] for key in ("source", "date", "serial", "log"))

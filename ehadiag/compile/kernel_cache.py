@@ -27,7 +27,7 @@ from numba.core.runtime import rtsys
 from ehadiag.core.cache_folder import private_folder, tell
 from ehadiag.core.folder import Folder
 
-__all__ = ["KernelCache", "cache_folder", "kept_kernels"]
+__all__ = ["KernelCache", "cache_folder", "kept_kernels", "source_hash"]
 
 KERNEL_FOLDERS = (
     "ehadiag/compile",
@@ -45,7 +45,7 @@ MAX_BYTES = 64 << 20
 @cache
 def cache_folder() -> Folder | None:
     """Folder of compiled kernels, opened once; None where nothing can be kept."""
-    return private_folder(f"kernels-{_digest()}")
+    return private_folder(f"kernels-{source_hash()}")
 
 
 def kept_kernels() -> list[str]:
@@ -55,7 +55,7 @@ def kept_kernels() -> list[str]:
 
 
 @cache
-def _digest() -> str:
+def source_hash() -> str:
     """Hash of compiler versions and of every kernel source that is installed."""
     digest = hashlib.sha256()
     for part in (sys.version, np.__version__, numba.__version__, llvmlite.__version__):

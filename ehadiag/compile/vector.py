@@ -37,8 +37,10 @@ __all__ = [
     "magnitude",
     "most",
     "packed",
+    "root",
     "store",
     "where",
+    "with_sign",
 ]
 
 WIDTH = 8
@@ -89,6 +91,16 @@ def most(a: Any, b: Any) -> Vector:
 def magnitude(a: Any) -> Vector:
     """Absolute value, lane by lane."""
     return np.abs(a)
+
+
+def root(a: Any) -> Vector:
+    """Square root, lane by lane."""
+    return np.sqrt(a)
+
+
+def with_sign(size: Any, sign: Any) -> Vector:
+    """Numbers of one vector with the signs of another, lane by lane."""
+    return np.copysign(size, sign)
 
 
 def anywhere(mask: Mask) -> bool:
@@ -240,22 +252,29 @@ def _neg(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
     return builder.fneg(arguments[0], flags=FLAGS)
 
 
-@type_callable(magnitude)
-def _typed_magnitude(_context: Any) -> Any:
-    return lambda a: _VECTOR if a is _VECTOR else None
+def _of_each(function: Any, name: str) -> None:
+    """Let kernels apply a function of the processor to a vector or a number."""
+
+    @type_callable(function)
+    def _typed_of_each(_context: Any) -> Any:
+        return lambda a: _VECTOR if a is _VECTOR else None
+
+    @lower_builtin(function, _VECTOR)
+    def _lowered_of_each(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return _intrinsic(builder, f"llvm.{name}.v{WIDTH}f64", arguments[0])
+
+    _of_numbers(function, lambda b, x: _intrinsic(b, f"llvm.{name}.f64", x), 1)
 
 
-@lower_builtin(magnitude, _VECTOR)
-def _magnitude(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-    return _fabs(builder, arguments[0], f"llvm.fabs.v{WIDTH}f64")
+def _intrinsic(builder: Any, name: str, *values: Any) -> Any:
+    kind = ir.FunctionType(values[0].type, [value.type for value in values])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
 
 
-def _fabs(builder: Any, value: Any, name: str) -> Any:
-    kind = ir.FunctionType(value.type, [value.type])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
-
-
-_of_numbers(magnitude, lambda b, x: _fabs(b, x, "llvm.fabs.f64"), 1)
+_of_each(magnitude, "fabs")
+_of_each(root, "sqrt")
+_binary(with_sign, _VECTOR, lambda b, x, y: _intrinsic(b, f"llvm.copysign.v{WIDTH}f64", x, y))
+_of_numbers(with_sign, lambda b, x, y: _intrinsic(b, "llvm.copysign.f64", x, y), 2)
 
 
 @type_callable(where)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 
 __all__ = [
     "BY_DESCRIPTOR",
@@ -106,6 +106,20 @@ class Folder:
         draft = self._draft(content, synced)
         self._settle(draft, name, synced)
 
+    @contextlib.contextmanager
+    def drafted(self, name: str) -> Iterator[BinaryIO]:
+        """Give a file to write that gets its name when the block ends; by an exception, never."""
+        draft = self._draft_name()
+        try:
+            with open(self.create(draft), "wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+        except BaseException:
+            self.remove(draft)
+            raise
+        self._settle(draft, name, synced=True)
+
     def write_new(self, name: str, content: bytes) -> None:
         """Write a file whole; FileExistsError if there is one of this name already."""
         draft = self._draft(content, synced=True)
@@ -154,9 +168,13 @@ class Folder:
     def _open(self, name: str, flags: int) -> int:
         return os.open(self._place(name), flags, self._mode, dir_fd=self._descriptor)
 
+    @staticmethod
+    def _draft_name() -> str:
+        return f".ehadiag-{os.urandom(8).hex()}.part"
+
     def _draft(self, content: bytes, synced: bool) -> str:
         """Write a temporary file beside the one that it will be."""
-        name = f".ehadiag-{os.urandom(8).hex()}.part"
+        name = self._draft_name()
         try:
             with open(self.create(name), "wb") as file:
                 file.write(content)

@@ -25,6 +25,7 @@ __all__ = [
     "StoredTest",
     "Window",
     "bundled_tests",
+    "encode_test",
     "load_test",
     "resolve_test",
 ]
@@ -172,6 +173,11 @@ def load_test(path: Path | str) -> StoredTest:
         Not TOML, a key unknown or missing, times out of order, windows outside.
     """
     return _checked(read_toml(Path(path), StoredTest, "test file"), f"test file {path}")
+
+
+def encode_test(test: StoredTest) -> bytes:
+    """Return a test as the content of a test file, which `load_test` reads back."""
+    return msgspec.toml.encode(test)
 
 
 def bundled_tests() -> dict[str, StoredTest]:

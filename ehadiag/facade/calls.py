@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade.compiling import log_if_compiling
-from ehadiag.facade.inputs import PathLike, the_actuator, the_bus_map, the_test, the_tests
+from ehadiag.facade.inputs import PathLike, log_file, the_actuator, the_bus_map, the_test, the_tests
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ehadiag.core.actuator import Actuator
     from ehadiag.facade.result import Result
     from ehadiag.identify.search.solvers import Solver
+    from ehadiag.report.asked import LogFile
     from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
     from firmware_iface.mapping.bus_map import BusMap
 
@@ -37,6 +39,7 @@ def read(
     mapping: BusMap | PathLike | None = None,
     dbc: PathLike | None = None,
     every: bool = False,
+    sought: Sought | None = None,
 ) -> list[Recording]:
     """Read the recording of a test from a log.
 
@@ -51,6 +54,9 @@ def read(
         DBC to use instead of the mapping's own.
     every : bool
         All tests in the log in order of time, not only the last complete one.
+    sought : Sought | None
+        What to look for where the bus does not say when which test ran; None: the stored tests
+        on the reference actuator.
 
     Returns
     -------
@@ -67,7 +73,8 @@ def read(
     bus_map = the_bus_map(mapping, dbc)
     from firmware_iface.logs.reader import choose, read_recordings  # noqa: PLC0415 - slow
 
-    found = read_recordings(os.fspath(path), bus_map)
+    sought = sought or Sought(the_tests(()), the_actuator(None).controller)
+    found = read_recordings(os.fspath(path), bus_map, sought=sought)
     return list(found) if every else [choose(found)]
 
 
@@ -189,14 +196,26 @@ def diagnose(
     """
     chosen, (tests, default) = the_actuator(actuator), _tests(test)
     found, begin = [], time.perf_counter()
+    bus_map: BusMap | None = None
+    logs: list[LogFile | None] = []
+    sought = Sought((default,) if default else tests, chosen.controller)
     for item in _several(recordings, Recording):
-        found += [item] if isinstance(item, Recording) else read(item, mapping=mapping, dbc=dbc)
+        if isinstance(item, Recording):
+            found.append(item)
+            logs.append(None)
+            continue
+        bus_map = bus_map or the_bus_map(mapping, dbc)
+        found += read(item, mapping=bus_map, sought=sought)
+        logs.append(log_file(item))
     if not found:
         raise ConfigurationError("nothing to diagnose: no recording and no log given")
     spent = Spent(time.perf_counter() - begin)
     from ehadiag.assess.diagnosis import diagnose as run  # noqa: PLC0415 - loads numba
+    from ehadiag.assess.verdict import Levels  # noqa: PLC0415
+    from ehadiag.core.fingerprint import fingerprint  # noqa: PLC0415
     from ehadiag.facade.result import Result  # noqa: PLC0415
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
+    from ehadiag.report.asked import Asked  # noqa: PLC0415
 
     made = make_solver(solver) if isinstance(solver, str) else solver
     log_if_compiling()
@@ -210,7 +229,14 @@ def diagnose(
         seed=seed,
         progress=progress,
     )
-    return Result(diagnosis, made.name, seed, spent)
+    asked = Asked(
+        solver=made.name,
+        seed=seed,
+        levels=levels or Levels(),
+        mapping=None if bus_map is None else bus_map.name,
+        mapping_sha256=None if bus_map is None else fingerprint(bus_map),
+    )
+    return Result(diagnosis, asked, spent, tuple(logs))
 
 
 def calibrate(

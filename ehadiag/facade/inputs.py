@@ -9,13 +9,23 @@ from typing import TYPE_CHECKING, TypeAlias
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import StoredTest, bundled_tests, resolve_test
+from ehadiag.report.asked import LogFile
 
 if TYPE_CHECKING:
     from firmware_iface.mapping.bus_map import BusMap
 
-__all__ = ["PathLike", "the_actuator", "the_bus_map", "the_test", "the_tests"]
+__all__ = ["PathLike", "log_file", "the_actuator", "the_bus_map", "the_test", "the_tests"]
 
 PathLike: TypeAlias = str | os.PathLike[str]
+
+
+def log_file(log: PathLike) -> LogFile | None:
+    """What can be said of a log without reading it; None where there is none."""
+    try:
+        info = os.stat(log)
+    except (OSError, ValueError):
+        return None
+    return LogFile(os.path.abspath(os.fspath(log)), info.st_size, info.st_mtime_ns)
 
 
 def the_actuator(given: Actuator | PathLike | None) -> Actuator:
@@ -47,7 +57,8 @@ def the_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusM
     mapping : BusMap | PathLike | None
         The meaning itself, or a mapping file.
     dbc : PathLike | None
-        DBC to use instead of the mapping file's own.
+        DBC to use instead of the mapping file's own; without a mapping file, one with the default
+        names.
 
     Returns
     -------
@@ -57,12 +68,15 @@ def the_bus_map(mapping: BusMap | PathLike | None, dbc: PathLike | None) -> BusM
     Raises
     ------
     ConfigurationError
-        A DBC without a mapping file that names its signals.
+        A DBC beside a meaning, or one of other names without a mapping file.
     """
     from firmware_iface.mapping.bus_map import default_map, load_map  # noqa: PLC0415
 
+    other = None if dbc is None else os.fspath(dbc)
     if isinstance(mapping, str | os.PathLike):
-        return load_map(os.fspath(mapping), None if dbc is None else os.fspath(dbc))
-    if dbc is not None:
-        raise ConfigurationError("dbc: needs a mapping file, which names the signals")
-    return default_map() if mapping is None else mapping
+        return load_map(os.fspath(mapping), other)
+    if mapping is None:
+        return default_map(other)
+    if other is not None:
+        raise ConfigurationError("dbc: the meaning of the frames is given already")
+    return mapping

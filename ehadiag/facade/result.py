@@ -9,8 +9,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ehadiag.core.errors import NotTestedError
+from ehadiag.report.asked import Asked, LogFile
 from ehadiag.report.faults import Fault, faults_of
-from ehadiag.report.json_line import json_line, source_name, test_name
+from ehadiag.report.json_line import NEWEST, first_version, json_line, source_name, test_name
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
@@ -32,12 +33,22 @@ class Result:
 
     diagnosis: Diagnosis
     """All that led to the verdict: experiments, covariance, fit, effort."""
-    solver: str
-    """Search that was asked for."""
-    seed: int
-    """Seed that was asked for."""
+    asked: Asked = field(default_factory=Asked)
+    """Options that it was made with."""
     spent: Spent = field(default_factory=Spent)
     """Time spent around the diagnosis."""
+    logs: tuple[LogFile | None, ...] = ()
+    """Log of each recording; None where the recording was given."""
+
+    @property
+    def solver(self) -> str:
+        """Search that was asked for."""
+        return self.asked.solver
+
+    @property
+    def seed(self) -> int:
+        """Seed that was asked for."""
+        return self.asked.seed
 
     @property
     def verdict(self) -> Verdict:
@@ -79,12 +90,26 @@ class Result:
         """The progressive faults by name."""
         return MappingProxyType(faults_of(self.diagnosis))
 
-    def to_json(self) -> str:
-        """Return the command line's JSON object (`ehadiag.diagnosis/1`), one line."""
-        return json_line(self.diagnosis, self.spent, self.solver, self.seed)
+    def to_json(self, version: int = NEWEST) -> str:
+        """Return the command line's JSON object, one line.
+
+        Parameters
+        ----------
+        version : int
+            2 for `ehadiag.diagnosis/2`, 1 for `ehadiag.diagnosis/1`.
+
+        Returns
+        -------
+        str
+            Strict JSON without a line end.
+        """
+        line = json_line(self.diagnosis, self.spent, self.asked, self.logs)
+        return first_version(line) if version == 1 else line
 
     def plot(self) -> Figure:
         """Draw measured against modelled response, one column for each recording.
+
+        Without an estimate: against what is expected of a unit as new.
 
         Returns
         -------
@@ -94,13 +119,16 @@ class Result:
         Raises
         ------
         NotTestedError
-            Nothing was identified, so there is no modelled response.
+            There are no samples.
         """
-        if not self.identified:
-            raise NotTestedError(f"{self.source}: nothing to plot: {'; '.join(self.reasons)}")
-        from ehadiag.report.picture import diagnosis_figure  # noqa: PLC0415 - matplotlib is slow
+        from ehadiag.report.picture import (  # noqa: PLC0415 - matplotlib is slow
+            can_be_drawn,
+            diagnosis_figure,
+        )
 
-        return diagnosis_figure(self.diagnosis)
+        if not can_be_drawn(self.diagnosis):
+            raise NotTestedError(f"{self.source}: nothing to plot: {'; '.join(self.reasons)}")
+        return diagnosis_figure(self.diagnosis, self.asked.levels)
 
     def __str__(self) -> str:
         """Return the command line's table."""

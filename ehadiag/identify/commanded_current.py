@@ -65,7 +65,7 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     command_deviation = float(deviation.max()) if deviation.size else 0.0
     command = np.where(known, samples.command, _as_sent(stored, samples.command[known]))
     guessed = 0.0
-    if samples.mode is CommandMode.CURRENT:
+    if not test.closed_loop:
         current = np.clip(command, -controller.IM, controller.IM)
     else:
         seen, unknown = _positions_seen(command, samples, controller)

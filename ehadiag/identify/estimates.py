@@ -54,6 +54,7 @@ def identification(
     return Identification(
         estimates=estimates_of(first, found, refined, spread),
         nuisances=nuisances,
+        about=about,
         covariance=of_faults(refined, spread),
         fit=fit_of(refined, experiments),
         solver=solver,
@@ -115,6 +116,8 @@ def fit_of(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
         spool_offset=first.spool_offset + values["spool_offset"],
         pressure_offset=first.pressure_offset + values["pressure_offset"],
         anchored=refined.anchored,
+        spool_rms_uncapped=_rms(refined, SPOOL_ROW, np.inf),
+        pressure_rms_uncapped=_rms(refined, PRESSURE_ROW, np.inf),
     )
 
 
@@ -124,7 +127,7 @@ def outliers(refined: Refinement) -> float:
     return float(np.mean(refined.residuals[present] ** 2 >= CAP)) if present.any() else 1.0
 
 
-def _rms(refined: Refinement, row: int) -> float:
+def _rms(refined: Refinement, row: int, cap: float = CAP) -> float:
     """Rms residual of a signal, squares capped; NaN without a sample."""
     residuals = refined.residuals[row, refined.weighted[row]]
-    return float(np.sqrt(np.mean(np.minimum(residuals**2, CAP)))) if residuals.size else np.nan
+    return float(np.sqrt(np.mean(np.minimum(residuals**2, cap)))) if residuals.size else np.nan

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.parameters import OFFSETS
+from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
+from ehadiag.model.plant import PlantConstants
 
 __all__ = ["Estimate", "Fit", "Identification", "Nuisance", "Timing"]
 
@@ -54,6 +56,8 @@ class Fit:
     spool_noise, pressure_noise: noise of the channels, m and Pa.
     spool_offset, pressure_offset: constant errors of the channels, m and Pa.
     anchored: how often the model had to be put back on the measured spool.
+    spool_rms_uncapped, pressure_rms_uncapped: rms residual in units of the signal's own noise,
+        every residual counted in full: far above the capped one where a few samples are far off.
     """
 
     spool_rms: float
@@ -64,6 +68,8 @@ class Fit:
     spool_offset: float
     pressure_offset: float
     anchored: int
+    spool_rms_uncapped: float = math.nan
+    pressure_rms_uncapped: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +88,8 @@ class Identification:
     estimates: tuple[Estimate, ...]
     nuisances: Mapping[str, Nuisance]
     """What was estimated beside the severities, by name; all else was held."""
+    about: Mapping[str, float]
+    """Effects that a calibration knew: the constants of the experiments already have them."""
     covariance: NDArray[np.float64]
     """Of the severities, in the order of `estimates`, shape (k, k)."""
     fit: Fit
@@ -108,6 +116,19 @@ class Identification:
             if item.name == name:
                 return item
         raise KeyError(name)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All that was estimated, by name, SI."""
+        severities = {item.name: item.value for item in self.estimates}
+        return severities | {name: item.value for name, item in self.nuisances.items()}
+
+    def constants(self, base: PlantConstants) -> PlantConstants:
+        """Constants of the unit as it was found; `base`: of its experiments, so as new."""
+        about = self.about
+        values = {name: value - about.get(name, 0.0) for name, value in self.values.items()}
+        free = tuple(parameter(name) for name in values)
+        return Unknowns(free, (base,), {}).constants(np.array(list(values.values())))
 
     @property
     def freed(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.estimates import identification
+from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess
@@ -55,6 +55,9 @@ from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
 __all__ = ["Nuisances", "Session", "identify"]
 
 
+BEYOND_RESCUE = 0.05
+"""Share of residuals beyond three deviations after a refinement from which on no further search is
+made: 0.04 at most on a textbook's actuator after the search before."""
 LASTING = 1.2
 """Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
 1.15 at most in 80 recordings of units without any."""
@@ -150,10 +153,11 @@ class Session:
             hint = best.refined.values if best else named(found.best)
             freed = self._freed(experiments, hint if near else None, tell)
         if best is not None and (freed is None or _is_poorer(freed, best)):
-            best = rescued(
-                experiments, best, self._first_part, self.solver, self.seed, tell,
-                time.perf_counter,
-            )  # fmt: skip
+            if near and outliers(best.refined) <= BEYOND_RESCUE:
+                best = rescued(
+                    experiments, best, self._first_part, self.solver, self.seed, tell,
+                    time.perf_counter,
+                )  # fmt: skip
             return self._said(
                 first,
                 best.found,
@@ -212,6 +216,7 @@ class Session:
             hint=hint,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
+            give_up=True,
         )
 
     def _said(

@@ -1,4 +1,4 @@
-"""Loads, or compiles, every kernel that an identification runs."""
+"""Loads, or compiles, every kernel that a diagnosis runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from ehadiag.core.stored_test import Line, StoredTest, Windows
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.search.solvers import CompactGa
 from ehadiag.identify.session import identify
+from ehadiag.model.scalar.response import respond
 
 __all__ = ["warm_up"]
 
@@ -42,3 +43,4 @@ def warm_up(actuator: Actuator, test: StoredTest) -> None:
     )
     experiment = build_experiment(samples, Environment(), silence, actuator)
     identify([experiment], solver=CompactGa(budget=20))
+    respond(experiment.constants, experiment.trace.current, experiment.tick)

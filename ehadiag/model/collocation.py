@@ -12,11 +12,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ehadiag.compile.vector import packed
-from ehadiag.model.laws import JackLaw
+from ehadiag.compile.vector import most, packed
+from ehadiag.model.laws import JackLaw, creeping
 
-__all__ = ["C1", "C2", "radau_pressures", "radau_velocity"]
+__all__ = ["C1", "C2", "creeping_pressures", "radau_pressures", "radau_velocity"]
 
+REPETITIONS = 3
 ROOT = math.sqrt(6.0)
 C1, C2 = (4.0 - ROOT) / 10.0, (4.0 + ROOT) / 10.0
 """Where the stages of a step stand in it, beside its end."""
@@ -34,14 +35,14 @@ A31, A32, A33 = (16.0 - ROOT) / 36.0, (16.0 + ROOT) / 36.0, 1.0 / 9.0
 
 
 @packed
-def radau_pressures(
+def _solved(
     j: JackLaw, h: float, load: Any, velocity: Any,
-    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any, g1: Any, g2: Any, g3: Any,
 ) -> Any:  # fmt: skip
     """Pressures (Pa) at the three stages of a step of `h` seconds of the moving jack.
 
     load: external and friction force at its start, N; x1, x2, x3: spool at the three stages, m;
-    e1, e2, e3: `resistance` there. Numbers or vectors of them.
+    e1, e2, e3: `resistance` there; g1, g2, g3: more force there, N. Numbers or vectors of them.
     """
     k = h * j.by_mass
     thrust, drag = k * j.area, k * j.viscosity
@@ -55,6 +56,10 @@ def radau_pressures(
     m11, m12, m13 = e1 + A11 * f1, A12 * f2, A13 * f3
     m21, m22, m23 = A21 * f1, e2 + A22 * f2, A23 * f3
     m31, m32, m33 = A31 * f1, A32 * f2, e3 + A33 * f3
+    if g1 is not None:
+        z1 = z1 + k * (A11 * g1 + A12 * g2 + A13 * g3)
+        z2 = z2 + k * (A21 * g1 + A22 * g2 + A23 * g3)
+        z3 = z3 + k * (A31 * g1 + A32 * g2 + A33 * g3)
     # Cramer's rule, the unknowns one by one.
     minor = m11 * m22 - m12 * m21
     below = m31 * (m12 * m23 - m13 * m22) - m32 * (m11 * m23 - m13 * m21) + m33 * minor
@@ -69,10 +74,43 @@ def radau_pressures(
 
 
 @packed
+def radau_pressures(
+    j: JackLaw, h: float, load: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+) -> Any:  # fmt: skip
+    """Pressures (Pa) at the three stages, Stribeck's friction left out: see `radau_velocity`."""
+    return _solved(j, h, load, velocity, x1, x2, x3, e1, e2, e3, None, None, None)
+
+
+@packed
+def creeping_pressures(
+    j: JackLaw, h: float, load: Any, d: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+) -> Any:  # fmt: skip
+    """Pressures (Pa) at the three stages, Stribeck's friction included.
+
+    Arguments as of `radau_velocity`; d: direction of the motion. What the oil resists is far more
+    than what friction gains by velocity, so that a few repetitions find it.
+    """
+    g = d * creeping(j, velocity * d)
+    p1, p2, p3 = _solved(j, h, load, velocity, x1, x2, x3, e1, e2, e3, g, g, g)
+    for _ in range(REPETITIONS):
+        g1 = d * creeping(j, most((j.flow * x1 - e1 * p1) * d, x1 * 0.0))
+        g2 = d * creeping(j, most((j.flow * x2 - e2 * p2) * d, x1 * 0.0))
+        g3 = d * creeping(j, most((j.flow * x3 - e3 * p3) * d, x1 * 0.0))
+        p1, p2, p3 = _solved(j, h, load, velocity, x1, x2, x3, e1, e2, e3, g1, g2, g3)
+    return p1, p2, p3
+
+
+@packed
 def radau_velocity(
     j: JackLaw, h: float, load: Any, velocity: Any,
     x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
 ) -> Any:  # fmt: skip
-    """Velocity (m/s) of the moving jack after a step, see `radau_pressures`."""
+    """Velocity (m/s) of the moving jack after a step of `h` seconds, Stribeck's friction left out.
+
+    load: external and dynamic friction force at its start, N; x1, x2, x3: spool at the three
+    stages, m; e1, e2, e3: `resistance` there. Numbers or vectors of them.
+    """
     p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)[2]
     return j.flow * x3 - e3 * p3

@@ -58,6 +58,18 @@ DATA: tuple[Parameter, ...] = (
     _datum("CJ", "jack viscous coefficient"),
     _datum("FDJ0", "jack friction as new", "FDJ"),
     Parameter(
+        name="bulk_modulus",
+        symbol="dβ",
+        unit="1",
+        lower=-0.9,
+        upper=1.0,
+        kind=Kind.DATUM,
+        scale=0.1,
+        short="bulk modulus",
+        meaning="relative error of the actuator file's β, the oil's bulk modulus; of orifices only",
+        changes=lambda c, value: {"OIL": c.OIL * (1.0 + value)},
+    ),
+    Parameter(
         name="oil_viscosity",
         symbol="dν",
         unit="1",

@@ -1,4 +1,4 @@
-"""Jack and surface over a piece of the spool's path: one algorithm for all kernels.
+"""Jack with a linear second stage over a piece of the spool's path: one algorithm for all kernels.
 
 A piece is cut into steps of the collocation (`ehadiag.model.collocation`). Stops and starts are
 located inside of it.
@@ -7,24 +7,25 @@ located inside of it.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from ehadiag.compile.kernels import bare_kernel, inlined
 from ehadiag.compile.vector import packed
-from ehadiag.model.collocation import C1, C2, radau_pressures, radau_velocity
+from ehadiag.model.collocation import C1, C2, creeping_pressures, radau_pressures, radau_velocity
+from ehadiag.model.jack_state import JackState, Piece, Probe, place_on, sense
 from ehadiag.model.laws import JackLaw, excess, pressure, resistance
-from ehadiag.model.sensors import LATE, SensorLaw, followed, following, sensing, through_stages
+from ehadiag.model.sensors import through_stages
 
-__all__ = ["JackState", "Piece", "Probe", "jack_piece", "jack_rest", "jack_tick"]
+__all__ = ["limited", "linear_piece", "sensed_linear_piece", "still_pressure"]
 
 FINE_TRAVEL = 3.0e-6
 FINE_RATIO = 0.3
 """Spool travel within a step (m, or share of the distance from the middle)."""
 FRESH_DECAY = 3.0
 """Decay (power of e) of the jack's velocity within a step, where it starts or stops."""
+CREEPING, FINE_FADE = 10.0, 0.5
+"""Velocity at which a jack no longer creeps, and its change within a step before; shares of the
+Stribeck velocity."""
 MOST_STEPS = 32
 ITERATIONS = 30
 SHORTEST = 1e-6
@@ -35,85 +36,37 @@ SLOWEST = 1e-12
 """Velocity that counts as none, m/s."""
 
 
-class JackState(NamedTuple):
-    """Jack between two pieces.
-
-    Attributes
-    ----------
-    place: m.
-    velocity: m/s.
-    direction: of its motion, +1 or -1; 0 at rest.
-    fresh: not 0 if it has just started or stopped.
-    lagged: differential pressure behind the filter, Pa.
-    seen: the same when it was sampled last, Pa.
-    """
-
-    place: float
-    velocity: float
-    direction: float
-    fresh: float
-    lagged: float
-    seen: float
-
-
-class Piece(NamedTuple):
-    """Piece of the spool's path, a cubic.
-
-    Attributes
-    ----------
-    span: duration, s.
-    x0, x1: spool at its ends, m.
-    rise0, rise1: slopes there times `span`, m.
-    """
-
-    span: float
-    x0: float
-    x1: float
-    rise0: float
-    rise1: float
-
-
-class Probe(NamedTuple):
-    """How the sensor of pressure looks at a piece.
-
-    Attributes
-    ----------
-    lag: of the filter before its converter, s.
-    due: from the start of the piece to the instant of sampling, s; none of this piece if negative
-        or beyond it.
-    """
-
-    lag: float
-    due: float
-
-
-@packed
-def _place(p: Piece, q: float) -> float:
-    """Spool at the share q of a piece, m."""
-    r = 1.0 - q
-    return p.x0 + q * q * (3.0 - 2.0 * q) * (p.x1 - p.x0) + q * r * (r * p.rise0 - q * p.rise1)
-
-
 @packed
 def _velocity(
-    j: JackLaw, p: Piece, load: float, velocity: float, begin: float, end: float
-) -> float:
-    """Velocity of the moving jack at the share `end` of a piece, `velocity` at `begin`, m/s."""
-    step = end - begin
-    first, second, third = (
-        _place(p, begin + C1 * step),
-        _place(p, begin + C2 * step),
-        _place(p, end),
-    )
-    return radau_velocity(
-        j, step * p.span, load, velocity, first, second, third,
-        resistance(j, first), resistance(j, second), resistance(j, third),
-    )  # fmt: skip
+    creeps: bool, j: JackLaw, p: Piece, load: float, d: float, velocity: float,
+    begin: float, end: float,
+) -> float:  # fmt: skip
+    """Velocity of the moving jack at the share `end` of a piece, `velocity` at `begin`, m/s.
+
+    creeps: whether friction may have Stribeck's part; a constant where this is compiled.
+    """
+    h = (end - begin) * p.span
+    x1, x2 = place_on(p, begin + C1 * (end - begin)), place_on(p, begin + C2 * (end - begin))
+    x3 = place_on(p, end)
+    e1, e2, e3 = resistance(j, x1), resistance(j, x2), resistance(j, x3)
+    if creeps and j.extra > 0.0:
+        return _creeping_velocity(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
+    return radau_velocity(j, h, load, velocity, x1, x2, x3, e1, e2, e3)
+
+
+@bare_kernel
+def _creeping_velocity(
+    j: JackLaw, h: float, load: float, d: float, velocity: float,
+    x1: float, x2: float, x3: float, e1: float, e2: float, e3: float,
+) -> float:  # fmt: skip
+    """With Stribeck's friction; apart, so that the plain one stays small."""
+    p3 = creeping_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)[2]
+    return j.flow * x3 - e3 * p3
 
 
 @packed
 def _stop(
-    j: JackLaw, p: Piece, load: float, velocity: float, d: float, later: float,
+    creeps: bool, j: JackLaw, p: Piece, load: float, velocity: float, d: float, later: float,
     begin: float, end: float,
 ) -> float:  # fmt: skip
     """Share of a piece at which the jack stops, `velocity` at `begin`, `later` at `end`.
@@ -125,7 +78,7 @@ def _stop(
     share = at_newest / (at_newest - at_other)
     for _ in range(ITERATIONS):
         q = newest + share * (other - newest)
-        value = _velocity(j, p, load, velocity, begin, q) * d
+        value = _velocity(creeps, j, p, load, d, velocity, begin, q) * d
         if (value > 0.0) == (at_newest > 0.0):
             oldest, at_oldest = newest, at_newest
         else:
@@ -155,13 +108,13 @@ def _break_away(j: JackLaw, p: Piece, hold: float, d: float, begin: float, end: 
     It does so at `end`; regula falsi of the Illinois kind.
     """
     low, high = begin, end
-    at_low = excess(j, _place(p, low), hold) * d
-    at_high = excess(j, _place(p, high), hold) * d
+    at_low = excess(j, place_on(p, low), hold) * d
+    at_high = excess(j, place_on(p, high), hold) * d
     if at_low >= 0.0:
         return low
     for _ in range(ITERATIONS):
         q = low + (high - low) * at_low / (at_low - at_high)
-        x = _place(p, q)
+        x = place_on(p, q)
         value = excess(j, x, hold) * d
         if value < 0.0:
             low, at_low = q, value
@@ -178,11 +131,17 @@ def _break_away(j: JackLaw, p: Piece, hold: float, d: float, begin: float, end: 
 
 
 @packed
-def _steps(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> int:
+def _steps(creeps: bool, j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> int:
     """Into how many steps a piece is cut."""
     near = min(abs(p.x0), abs(p.x1)) if p.x0 * p.x1 > 0.0 else 0.0
-    wanted = (stop - begin) * abs(p.x1 - p.x0) / max(FINE_TRAVEL, FINE_RATIO * near)
-    if state.direction == 0.0 or state.fresh != 0.0:
+    travel, fine = (stop - begin) * abs(p.x1 - p.x0), max(FINE_TRAVEL, FINE_RATIO * near)
+    if creeps and j.by_stribeck > 0.0 and near * j.flow * j.by_stribeck < CREEPING:
+        fine = min(fine, FINE_FADE / (j.flow * j.by_stribeck))
+    slides = state.direction != 0.0 and state.fresh == 0.0
+    if slides and travel < fine:
+        return 1  # most pieces: no division
+    wanted = travel / fine
+    if not slides:
         # The collocation is slow to forget what a start or a stop leaves.
         rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
         wanted = max(wanted, (stop - begin) * p.span * rate / FRESH_DECAY)
@@ -190,88 +149,86 @@ def _steps(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) ->
 
 
 @packed
-def _limited(j: JackLaw, p12: float) -> float:
+def limited(j: JackLaw, p12: float) -> float:
     """Pressure within what the supply allows, Pa."""
     return min(max(p12, -j.supply), j.supply)
 
 
 @packed
-def _still_pressure(j: JackLaw, x: float) -> float:
+def still_pressure(j: JackLaw, x: float) -> float:
     """Pressure beside a resting jack, Pa."""
-    return _limited(j, pressure(j, x, 0.0))
+    return limited(j, pressure(j, x, 0.0))
 
 
 @bare_kernel
 def _sensed(
-    j: JackLaw, probe: Probe, p: Piece, load: float, velocity: float,
-    moving: bool, begin: float, end: float, lagged: float, seen: float,
+    j: JackLaw, probe: Probe, p: Piece, load: float, d: float, velocity: float,
+    begin: float, end: float, lagged: float, seen: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Pressure behind the filter at the share `end` of a piece, and when it was sampled, Pa.
 
     lagged, seen: before; velocity: of the jack at `begin`, m/s.
     """
     step = end - begin
-    x0, x1 = _place(p, begin), _place(p, begin + C1 * step)
-    x2, x3 = _place(p, begin + C2 * step), _place(p, end)
-    if moving:
-        p1, p2, p3 = radau_pressures(
-            j, step * p.span, load, velocity, x1, x2, x3,
-            resistance(j, x1), resistance(j, x2), resistance(j, x3),
-        )  # fmt: skip
+    x0, x1 = place_on(p, begin), place_on(p, begin + C1 * step)
+    x2, x3 = place_on(p, begin + C2 * step), place_on(p, end)
+    if d != 0.0:
+        h, e1, e2, e3 = step * p.span, resistance(j, x1), resistance(j, x2), resistance(j, x3)
+        if j.extra > 0.0:
+            p1, p2, p3 = creeping_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
+        else:
+            p1, p2, p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)
         cubic = through_stages(
-            _limited(j, pressure(j, x0, velocity)),
-            _limited(j, p1), _limited(j, p2), _limited(j, p3),
+            limited(j, pressure(j, x0, velocity)),
+            limited(j, p1), limited(j, p2), limited(j, p3),
         )  # fmt: skip
     else:
         cubic = through_stages(
-            _still_pressure(j, x0), _still_pressure(j, x1),
-            _still_pressure(j, x2), _still_pressure(j, x3),
+            still_pressure(j, x0), still_pressure(j, x1),
+            still_pressure(j, x2), still_pressure(j, x3),
         )  # fmt: skip
-    span, upto = step * p.span, probe.due - begin * p.span
-    if 0.0 < upto <= LATE * span:
-        seen = followed(following(probe.lag, span, upto), lagged, cubic)
-    return followed(following(probe.lag, span, span), lagged, cubic), seen
+    return sense(probe, cubic, begin * p.span, step * p.span, lagged, seen)
 
 
 def _pieces(senses: bool) -> Any:
-    """Compiled `jack_piece`, with or without the sensor of pressure."""
+    """Compiled jack over a piece; senses: with the sensor of pressure and Stribeck's friction."""
 
-    @bare_kernel
+    @(bare_kernel if senses else inlined)
     def piece(
         j: JackLaw, probe: Probe, p: Piece, begin: float, stop: float, state: JackState
     ) -> JackState:
-        place, velocity, d, fresh, lagged, seen = state
+        place, velocity, d, fresh, p12, lagged, seen = state
         if d == 0.0:
-            x, load = _place(p, stop), j.spring * place
+            x, load = place_on(p, stop), j.spring * place
             if excess(j, x, load + j.static) <= 0.0 <= excess(j, x, load - j.static):
                 if senses:
-                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, begin, stop, lagged, seen)
-                return JackState(place, velocity, 0.0, 0.0, lagged, seen)
-        steps = _steps(j, p, begin, stop, state)
+                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, begin, stop, lagged, seen)
+                return JackState(place, velocity, 0.0, 0.0, p12, lagged, seen)
+        steps = _steps(senses, j, p, begin, stop, state)
         q, step, fresh = begin, 1, 0.0
         while step <= steps:
-            end = begin + (stop - begin) * step / steps
+            end = stop if step == steps else begin + (stop - begin) * step / steps
             spring = j.spring * place
             if d == 0.0:
-                x = _place(p, end)
+                x = place_on(p, end)
                 up, down = excess(j, x, spring + j.static), excess(j, x, spring - j.static)
                 if (up <= 0.0 and down >= 0.0) or (
                     abs(place) >= j.stroke and place * (up + down) > 0.0
                 ):
                     if senses:
-                        lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, q, end, lagged, seen)
+                        lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, q, end, lagged, seen)
                     q, step = end, step + 1
                     continue
                 d = 1.0 if up > 0.0 else -1.0
                 away = _break_away(j, p, spring + j.static * d, d, q, end)
                 if senses and away > q:
-                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, False, q, away, lagged, seen)
+                    lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, q, away, lagged, seen)
                 q, velocity, fresh = away, 0.0, 1.0
             load = j.load + spring + d * j.friction
-            later = _velocity(j, p, load, velocity, q, end)
+            later = _velocity(senses, j, p, load, d, velocity, q, end)
             if later * d > 0.0:
                 if senses and end > q:
-                    lagged, seen = _sensed(j, probe, p, load, velocity, True, q, end, lagged, seen)
+                    lagged, seen = _sensed(j, probe, p, load, d, velocity, q, end, lagged, seen)
                 place += 0.5 * (end - q) * p.span * (velocity + later)
                 velocity = later
                 if abs(place) >= j.stroke and place * velocity > 0.0:
@@ -279,74 +236,38 @@ def _pieces(senses: bool) -> Any:
                     velocity, d = 0.0, 0.0
                 q, step = end, step + 1
                 continue
-            stopped = _stop(j, p, load, velocity, d, later, q, end) if velocity != 0.0 else end
+            stopped = (
+                _stop(senses, j, p, load, velocity, d, later, q, end) if velocity != 0.0 else end
+            )
             if senses and stopped > q:
                 lagged, seen = _sensed(
-                    j, probe, p, load, velocity, velocity != 0.0, q, stopped, lagged, seen
+                    j,
+                    probe,
+                    p,
+                    load,
+                    d if velocity != 0.0 else 0.0,
+                    velocity,
+                    q,
+                    stopped,
+                    lagged,
+                    seen,
                 )
             place += 0.5 * (stopped - q) * p.span * velocity
             q, velocity, d, fresh = stopped, 0.0, 0.0, 1.0
             if end - q < SHORTEST:
                 q, step = end, step + 1
-        return JackState(place, velocity, d, fresh, lagged, seen)
+        return JackState(place, velocity, d, fresh, p12, lagged, seen)
 
     return piece
 
 
-_piece, _sensed_piece = _pieces(False), _pieces(True)
+sensed_linear_piece = _pieces(True)
+"""Compiled: jack over the shares begin … stop of a piece, with what the plain one leaves out."""
+_bare_piece = _pieces(False)
+NO_PROBE = Probe(0.0, 0.0)
 
 
 @inlined
-def jack_piece(
-    j: JackLaw, probe: Probe, senses: bool, p: Piece, begin: float, stop: float, state: JackState
-) -> JackState:
-    """Jack over the shares begin … stop of a piece of the spool's path.
-
-    senses: whether the pressure is to be followed as its sensor sees it.
-    """
-    if senses:
-        return _sensed_piece(j, probe, p, begin, stop, state)
-    return _piece(j, probe, p, begin, stop, state)
-
-
-@inlined
-def jack_rest(j: JackLaw, place: float, spool: float) -> JackState:
-    """Jack at rest, jack and spool at these positions, m."""
-    p12 = _still_pressure(j, spool)
-    return JackState(place, 0.0, 0.0, 0.0, p12, p12)
-
-
-@inlined
-def jack_tick(
-    j: JackLaw,
-    sensor: SensorLaw,
-    tick: float,
-    nodes: NDArray[np.float64],
-    first: int,
-    end: int,
-    state: JackState,
-    spool: float,
-) -> tuple[float, JackState, float]:
-    """Second stage and jack over the spool's path of one tick.
-
-    Parameters
-    ----------
-    tick: s.
-    nodes, first, end: the path, rows first … end - 1, see `ehadiag.model.scalar.spool_tick`.
-    spool: position before the tick, m.
-
-    Returns
-    -------
-    Differential pressure when it is sampled (Pa), jack and spool at the end of the tick. Jumps of
-    the path are the caller's.
-    """
-    due, senses = tick - min(sensor.lead, tick), sensing(sensor)
-    for node in range(first, end):
-        span, x1 = nodes[node, 0], nodes[node, 1]
-        piece = Piece(span, spool, x1, span * nodes[node, 2], span * nodes[node, 3])
-        state = jack_piece(j, Probe(sensor.lag, due), senses, piece, 0.0, 1.0, state)
-        due -= span
-        spool = x1
-    if senses:
-        return state.seen, state, spool
-    return _limited(j, pressure(j, spool, state.velocity)), state, spool
+def linear_piece(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> JackState:
+    """Jack over the shares begin … stop of a piece, its pressure as it is at the end."""
+    return _bare_piece(j, NO_PROBE, p, begin, stop, state)

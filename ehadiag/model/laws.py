@@ -17,8 +17,10 @@ __all__ = [
     "DriveLaw",
     "JackLaw",
     "SpoolLaw",
+    "creeping",
     "drive_law",
     "excess",
+    "faded",
     "flapper_held",
     "jack_law",
     "opening",
@@ -35,6 +37,12 @@ STATIC_SHARE_SPOOL = 0.5
 """Dynamic over static dry friction of the spool (PHY-14)."""
 STATIC_RATIO_JACK = 2.0
 """Static over dynamic dry friction of the jack (PHY-15)."""
+SLOWEST_STRIBECK = 1e-5
+"""Stribeck velocity below which it is not felt, m/s."""
+MOST_FADED = 40.0
+BEND, FINE_BEND = 0.05e-6, 0.5e-9
+"""Bend of the spool's path (m) that the jack does not feel: with a linear second stage, which
+follows the spool at once, and with one that stores what flows."""
 
 
 class DriveLaw(NamedTuple):
@@ -81,6 +89,7 @@ class SpoolLaw(NamedTuple):
     breakaway: flapper deflection that overcomes the static friction, m.
     flapper_stop, stroke: of flapper and spool, m.
     backlash: half-width of the play between spool and feedback wire, m.
+    bend: of the spool's path that the second stage does not feel, m.
     ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper beside a resting
         spool; rate 0 where it does not ring.
     """
@@ -96,6 +105,7 @@ class SpoolLaw(NamedTuple):
     flapper_stop: float
     stroke: float
     backlash: float
+    bend: float
     ring_damping: float
     ring_rate: float
 
@@ -118,6 +128,7 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.XFM,
         c.XSM,
         c.BKL,
+        FINE_BEND if c.OIL > 0.0 else BEND,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
@@ -163,11 +174,16 @@ class JackLaw(NamedTuple):
     area, viscosity: of the jack, m² and N s/m.
     by_mass: reciprocal of its mass, 1/kg.
     supply: supply minus return pressure, Pa.
+    by_supply: its reciprocal, 1/Pa.
+    oil: rise of the pressure by the jack's travel where the oil yields, 2 β AJ / V, Pa/m; 0: it
+        does not, and the second stage is linear.
     stroke: m.
     load: external with the jack in its middle, N.
     spring: what it gains by the jack's travel, N/m.
     friction: dry friction of the moving jack, N.
     static: of the resting one, N.
+    extra: friction that a creeping jack has and a fast one has not, N; 0 without Stribeck's effect.
+    by_stribeck: reciprocal of the velocity over which that fades, s/m.
     """
 
     flow: Any
@@ -178,11 +194,15 @@ class JackLaw(NamedTuple):
     viscosity: Any
     by_mass: Any
     supply: Any
+    by_supply: Any
+    oil: Any
     stroke: Any
     load: Any
     spring: Any
     friction: Any
     static: Any
+    extra: Any
+    by_stribeck: Any
 
 
 @inlined
@@ -197,12 +217,32 @@ def jack_law(c: PlantConstants) -> JackLaw:
         c.CJ,
         1.0 / c.MJ,
         c.PSR,
+        1.0 / c.PSR,
+        c.OIL * c.AJ,
         c.XJM,
         c.FR,
         c.KA,
         c.FDJ,
         STATIC_RATIO_JACK * c.FDJ,
+        (STATIC_RATIO_JACK - 1.0) * c.FDJ if c.VSJ > 0.0 else 0.0,
+        1.0 / max(c.VSJ, SLOWEST_STRIBECK) if c.VSJ > 0.0 else 0.0,
     )
+
+
+@packed
+def faded(z: Any) -> Any:
+    """exp(-z) of z from 0 on, of numbers or vectors, to 1e-9: series and squarings."""
+    y = least(z, MOST_FADED) * (1.0 / 64.0)
+    out = 1.0 - y * (1.0 - y / 2.0 * (1.0 - y / 3.0 * (1.0 - y / 4.0 * (1.0 - y / 5.0))))
+    for _ in range(6):
+        out = out * out
+    return out
+
+
+@packed
+def creeping(j: JackLaw, speed: Any) -> Any:
+    """Friction that a jack at a speed (m/s) has beside that of a fast one, N (PHY-31)."""
+    return j.extra * faded(speed * j.by_stribeck)
 
 
 @packed

@@ -142,6 +142,18 @@ NUISANCES: tuple[Parameter, ...] = (
         changes=lambda c, value: {"BKL": c.BKL + value},
     ),
     Parameter(
+        name="jack_stribeck",
+        symbol="vSJ",
+        unit="m/s",
+        lower=0.0,
+        upper=0.2,
+        kind=Kind.NUISANCE,
+        scale=0.01,
+        short="jack Stribeck velocity",
+        meaning="velocity over which the jack's friction falls from static to dynamic",
+        changes=lambda c, value: {"VSJ": c.VSJ + value},
+    ),
+    Parameter(
         name="load",
         symbol="FR",
         unit="N",

@@ -18,6 +18,7 @@ from ehadiag.model.data_errors import DATA
 from ehadiag.model.nuisances import NUISANCES
 from ehadiag.model.parameter import Kind, Parameter
 from ehadiag.model.plant import FIELDS, PlantConstants, Value, plant_row
+from ehadiag.model.severity import clogged, worn
 
 __all__ = [
     "FAULTS",
@@ -30,9 +31,6 @@ __all__ = [
     "parameter",
 ]
 
-CLOGGED = 0.8
-"""Share of the first stage's flow gain that is lost at the limit of damage (PHY-13)."""
-
 FAULTS: tuple[Parameter, ...] = (
     Parameter(
         name="Kintas",
@@ -44,7 +42,7 @@ FAULTS: tuple[Parameter, ...] = (
         scale=1.0,
         short="filter clogging",
         meaning="clogging of the valve's first-stage filter",
-        changes=lambda c, value: {"GQF": c.GQF * (1.0 - CLOGGED * value)},
+        changes=lambda c, value: {"GQF": clogged(c.GQF, value)},
     ),
     Parameter(
         name="FSS",
@@ -56,7 +54,7 @@ FAULTS: tuple[Parameter, ...] = (
         scale=1.0,
         short="spool friction",
         meaning="dry friction between spool and sleeve",
-        changes=lambda c, value: {"FSS": c.FSS + value * (c.FSS1 - c.FSS)},
+        changes=lambda c, value: {"FSS": worn(c.FSS, c.FSS1, value)},
     ),
     Parameter(
         name="FDJ",
@@ -68,7 +66,7 @@ FAULTS: tuple[Parameter, ...] = (
         scale=1.0,
         short="jack friction",
         meaning="dry friction between jack and cylinder",
-        changes=lambda c, value: {"FDJ": c.FDJ + value * (c.FDJ1 - c.FDJ)},
+        changes=lambda c, value: {"FDJ": worn(c.FDJ, c.FDJ1, value)},
     ),
 )
 """The progressive faults of the paper (PHY-13 to PHY-15)."""

@@ -90,6 +90,9 @@ class PlantConstants(NamedTuple):
     """Flow gain, m²/s."""
     CLK: Value
     """Leakage, m³/(s Pa)."""
+    OIL: Value
+    """Rise of the differential pressure by a flow into the chambers, 2 β / V, Pa/m³; 0: of a linear
+    second stage, whose oil does not yield."""
     AJ: Value
     """Active area of the jack, m²."""
     MJ: Value
@@ -102,6 +105,8 @@ class PlantConstants(NamedTuple):
     """Dynamic dry friction of the jack, N."""
     FDJ1: Value
     """Dynamic dry friction of the jack at the limit of damage, N."""
+    VSJ: Value
+    """Stribeck velocity of the jack's friction, m/s; 0: moving, it is the dynamic one."""
     FR: Value
     """External load, N."""
     KA: Value
@@ -156,7 +161,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
     40 degC and its `PSR`. Viscous coefficients scale with the relative viscosity, the leakage with
     its inverse (PHY-19).
     """
-    valve, jack = actuator.servovalve, actuator.jack
+    valve, stage, jack = actuator.servovalve, actuator.second_stage, actuator.jack
     viscosity, supply = 1.0, valve.PSR
     if environment is not None:
         if environment.oil_temperature is not None:
@@ -187,12 +192,14 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         GP=valve.GP,
         GQ=valve.GQ,
         CLK=valve.CLK / viscosity,
+        OIL=2.0 * stage.beta / stage.volume if stage.kind == "orifice" else 0.0,
         AJ=jack.AJ,
         MJ=jack.MJ,
         CJ=jack.CJ * viscosity,
         XJM=jack.XJM,
         FDJ=jack.FDJ0,
         FDJ1=jack.FDJ1,
+        VSJ=0.0,
         FR=jack.FR,
         KA=0.0,
         OXS=0.0,

@@ -15,10 +15,10 @@ from ehadiag.compile.address import array_at
 from ehadiag.compile.kernels import brief_kernel, inlined, inlined_exact
 from ehadiag.model.anchor import re_anchored
 from ehadiag.model.control import ControlLaw, ControlState, control
-from ehadiag.model.jack import jack_tick
 from ehadiag.model.scalar.drive import drive
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, sensed_path, spool_tick
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
+from ehadiag.model.second_stage import jack_tick
 from ehadiag.model.spool_events import SpoolState
 from ehadiag.monitor.layout import (
     CUSUM,

@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 from ehadiag.compile.rows import packer, unpacker
 from ehadiag.model.control import ControlLaw, ControlState
-from ehadiag.model.jack import JackState
+from ehadiag.model.jack_state import JackState
 from ehadiag.model.laws import DriveLaw, JackLaw, SpoolLaw
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import FINEST

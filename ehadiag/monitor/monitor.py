@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, NoReturn, TypeVar
 
@@ -13,32 +13,22 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.address import entry_point
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CURRENT, POSITION, PRESSURE, SPOOL
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import CommandMode, Environment
 from ehadiag.model.anchor import Anchor
-from ehadiag.model.control import ControlLaw
-from ehadiag.model.laws import SpoolLaw, drive_law, jack_law
-from ehadiag.model.parameters import FAULTS, Unknowns
-from ehadiag.model.scalar.transition import spool_tables
-from ehadiag.model.sensors import sensor_law
+from ehadiag.model.parameters import FAULTS, REGISTRY, Unknowns
 from ehadiag.model.unit import unit_constants
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
+from ehadiag.monitor.plan import ANCHOR, NOISE, monitor_plan
+from ehadiag.monitor.prepare import Unit, prepare, rest
 
 __all__ = ["Monitor", "Reading", "Tick"]
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
-NOISE_LSB = math.sqrt(0.5**2 + 1.0 / 12.0)
-"""Noise of a channel (PHY-22), its converter's rounding included."""
-ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
-RESIDUAL_LIMIT = 4.0
-"""Noise; a residual beyond counts no more: one break-away at another tick gives no alarm."""
-DEVIATION_LSB = 4.0
-"""A lost command did not go on as it was where the measured current is further off."""
 TICKS_S = (1e-5, 0.1)
 ALARMS = np.array([[[n & 1, n & 2], [n & 4, n & 8]] for n in range(16)], dtype=np.bool_)
 """What `push_tick` returns, taken apart: rows spool and pressure, columns upper and lower sum."""
@@ -114,6 +104,8 @@ class Monitor:
         Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
     offsets : tuple[float, float]
         Constant errors of spool (m) and pressure sensor (Pa).
+    effects : Mapping[str, float] | None
+        Nuisances and errors of data by the registry's names, as last identified, SI; None: none.
     anchor : Anchor
         How the modelled spool is kept on the measured one.
 
@@ -134,51 +126,25 @@ class Monitor:
         shift: float = 1.0,
         noise: tuple[float, float] | None = None,
         offsets: tuple[float, float] = (0.0, 0.0),
+        effects: Mapping[str, float] | None = None,
         anchor: Anchor = ANCHOR,
     ) -> None:
         law = actuator.controller
         tick = 1.0 / law.rate
-        noise = noise or (NOISE_LSB * SPOOL.lsb, NOISE_LSB * PRESSURE.lsb)
+        noise = noise or NOISE
         values = _checked(faults, noise, offsets, tick)
-        unknowns = Unknowns(FAULTS, (unit_constants(actuator, environment),), {})
-        constants = unknowns.constants(np.array(values))._replace(OXS=offsets[0], OPD=offsets[1])
-        tables = spool_tables(constants, tick)
-        self._law = SpoolLaw(*tables.law)
+        base = unit_constants(actuator, environment)
+        constants = Unknowns((), (base,), _known(effects or {})).constants(np.empty(0))
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
-        settings = layout.Settings(
-            plays=constants.NPL,
-            closed=float(mode is CommandMode.POSITION),
-            invertible=float(
-                law.GAP * POSITION.lsb > 6.0 * CURRENT.lsb and not law.GAI and not law.GAD
-            ),
-            linear=law.IM - 3.0 * CURRENT.lsb,
-            code_position=POSITION.lsb,
-            anchor_gain=anchor.gain,
-            anchor_small=anchor.small,
-            anchor_large=anchor.large,
-            spool_weight=1.0 / noise[0],
-            pressure_weight=1.0 / noise[1],
-            reference=self.design.reference,
-            threshold=self.design.threshold,
-            limit=RESIDUAL_LIMIT,
-            deviation=DEVIATION_LSB * CURRENT.lsb,
-        )
-        control = ControlLaw(law.IM, law.GAP, law.GAI, law.GAD, tick)
+        plan = monitor_plan(actuator, constants, self.design, noise, anchor)
+        closed = float(mode is CommandMode.POSITION)
+        start = Unit(*values, *offsets, 1.0, float(constants.PSR), closed)
+        unit = np.array(start, dtype=np.float64)
         p = np.zeros(layout.SIZE)
-        p[: layout.STATE] = [
-            *drive_law(constants),
-            *tables.law,
-            *jack_law(constants),
-            *sensor_law(constants),
-            *control,
-            *settings,
-        ]
-        p[layout.SLIDE : layout.LOOSE] = tables.moving.ravel()
-        p[layout.LOOSE : layout.RING] = tables.loose.ravel()
-        p[layout.RING : layout.DECAY] = tables.stuck.ravel()
-        p[layout.DECAY : layout.NODES] = tables.decay
         self._memory, self._address = p, p.ctypes.data
+        if prepare(self._address, plan.ctypes.data, unit.ctypes.data) != 0:
+            raise ConfigurationError(f"supply pressure {constants.PSR:g} Pa: need more than 0")
         self._push = entry_point(push_tick, types.intp, types.UniTuple(types.float64, 5))
         self._alarms = 0
         self._alarmed = np.zeros((2, 2), dtype=np.bool_)
@@ -230,14 +196,8 @@ class Monitor:
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""
-        p, law = self._memory, self._law
-        p[layout.STATE : layout.TABLES] = 0.0
         self._alarms, self._alarmed[:] = 0, False
-        xs = min(max(spool, -law.stroke), law.stroke)
-        xf = min(max(-law.ratio * xs, -law.breakaway), law.breakaway)
-        rest = layout.Moving(xf, 0.0, xs, 0.0, xs, 0.0, 0.0, 0.0, xs, xs)
-        p[layout.MOVING : layout.JACK] = rest
-        p[layout.FOLLOWED : layout.PREDICTED] = layout.Followed(math.nan, 0.0, 0.0, 0.0)
+        rest(self._address, spool)
 
 
 def _checked(
@@ -245,7 +205,7 @@ def _checked(
     noise: tuple[float, float],
     offsets: tuple[float, float],
     tick: float,
-) -> tuple[float, ...]:
+) -> tuple[float, float, float]:
     values = tuple(float(value) for value in faults)
     if len(values) != len(FAULTS) or not all(0.0 <= value <= 1.0 for value in values):
         names = ", ".join(item.name for item in FAULTS)
@@ -256,7 +216,19 @@ def _checked(
         raise ConfigurationError(f"offsets {offsets}: need two numbers, m and Pa")
     if not TICKS_S[0] <= tick <= TICKS_S[1]:
         raise ConfigurationError(f"controller.rate {1.0 / tick:g} Hz: need 10 … 1e5 Hz")
-    return values
+    return values[0], values[1], values[2]
+
+
+def _known(effects: Mapping[str, float]) -> dict[str, float]:
+    """Effects as plain numbers, checked against the registry."""
+    bounds = {item.name: (item.lower, item.upper) for item in REGISTRY if item not in FAULTS}
+    for name, value in effects.items():
+        if name not in bounds:
+            raise ConfigurationError(f"effect {name!r}: none of the registry's")
+        lower, upper = bounds[name]
+        if not lower <= value <= upper:
+            raise ConfigurationError(f"effect {name} {value:g}: need {lower:g} … {upper:g}")
+    return {name: float(value) for name, value in effects.items()}
 
 
 def _view(array: NDArray[Scalar]) -> NDArray[Scalar]:

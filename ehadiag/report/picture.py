@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import math
+import textwrap
 import warnings
 from pathlib import Path
 
@@ -14,18 +16,22 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
+from ehadiag.assess.verdict import Levels
+from ehadiag.core.dates import date_text
 from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.result import Identification
-from ehadiag.model.parameters import OFFSETS, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
+from ehadiag.report.picture_untested import draw_untested
 
-__all__ = ["Picture", "diagnosis_figure", "draw_column", "draw_diagnosis"]
+__all__ = ["Picture", "can_be_drawn", "diagnosis_figure", "draw_column", "draw_diagnosis"]
 
 MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
 DPI = 110
+LETTERS = 110
+"""Of a line of the title, for each column."""
+MOST_REASONS = 3
 
 
 class Picture(Figure):
@@ -40,36 +46,29 @@ class Picture(Figure):
     _repr_png_ = png
 
 
-def draw_diagnosis(diagnosis: Diagnosis) -> bytes:
-    """Return the picture of a diagnosis as a PNG.
+def can_be_drawn(diagnosis: Diagnosis) -> bool:
+    """Whether there is anything to draw: samples, be there an estimate or not."""
+    return any(item.samples is not None and item.samples.ticks for item in diagnosis.recordings)
 
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        What was found.
 
-    Returns
-    -------
-    bytes
-        The file's content.
-
-    Raises
-    ------
-    ValueError
-        Nothing was identified.
-    """
+def draw_diagnosis(diagnosis: Diagnosis, levels: Levels | None = None) -> bytes:
+    """Return the picture of a diagnosis as a PNG; see `diagnosis_figure`."""
     with matplotlib.rc_context(matplotlib.rcParamsDefault), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # in names of others
-        return diagnosis_figure(diagnosis).png()
+        return diagnosis_figure(diagnosis, levels).png()
 
 
-def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
+def diagnosis_figure(diagnosis: Diagnosis, levels: Levels | None = None) -> Picture:
     """Draw one column for each recording: current, spool, pressure, and their residuals.
+
+    Without an estimate: what was measured, beside it what was expected (`draw_untested`).
 
     Parameters
     ----------
     diagnosis : Diagnosis
         What was found.
+    levels : Levels | None
+        By which it was judged; None: not told.
 
     Returns
     -------
@@ -79,41 +78,52 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
     Raises
     ------
     ValueError
-        Nothing was identified, so there is no modelled response to draw.
+        There are no samples to draw.
     """
+    if not can_be_drawn(diagnosis):
+        raise ValueError("no samples, so there is nothing to draw")
     found = diagnosis.identification
-    if found is None:
-        raise ValueError("nothing was identified, so there is no modelled response to draw")
-    columns = len(diagnosis.experiments)
+    columns = len(diagnosis.recordings)
     figure = Picture(figsize=(9.5 * columns, 9.0), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(
-        5, columns, sharex="col", squeeze=False, gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]}
-    )
-    for column, experiment in enumerate(diagnosis.experiments):
-        unknowns = Unknowns((), (experiment.constants,), _values(diagnosis, found))
-        constants = unknowns.constants(np.empty(0))
-        draw_column([axes[column] for axes in grid], experiment, constants)
-    estimates = ",  ".join(
-        f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
-        for fault in faults_of(diagnosis).values()
-    )
-    names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
-    title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{estimates}"
+    if found is None or not all(math.isfinite(item.value) for item in found.estimates):
+        draw_untested(figure, diagnosis)
+    else:
+        grid = figure.subplots(
+            5, columns, sharex="col", squeeze=False,
+            gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]},
+        )  # fmt: skip
+        for column, experiment in enumerate(diagnosis.experiments):
+            constants = found.constants(experiment.constants)
+            draw_column([axes[column] for axes in grid], experiment, constants)
+    title = "\n".join(_title(diagnosis, levels))
     figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
     return figure
 
 
-def _values(diagnosis: Diagnosis, found: Identification) -> dict[str, float]:
-    """All that was estimated, by name; effects less what the experiments' constants have."""
-    calibration = diagnosis.actuator.calibration
-    about = calibration.effects if calibration else {}
-    beside = {
-        name: item.value - about.get(name, 0.0)
-        for name, item in found.nuisances.items()
-        if parameter(name) not in OFFSETS
-    }
-    return {**beside, **{item.name: item.value for item in found.estimates}}
+def _title(diagnosis: Diagnosis, levels: Levels | None) -> list[str]:
+    """Verdict, estimates, reasons; of which unit, when, by which levels."""
+    names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
+    lines = [f"{diagnosis.verdict.name.replace('_', ' ')}: {names}"]
+    if diagnosis.identification is not None:
+        lines.append(
+            ",  ".join(
+                f"{item.name} {item.value:.5f} ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
+                for item in faults_of(diagnosis).values()
+            )
+        )
+    width = LETTERS * len(diagnosis.recordings)
+    for reason in diagnosis.reasons[:MOST_REASONS]:
+        lines += textwrap.wrap(printable(reason), width)[:MOST_REASONS]
+    about = [f"actuator {printable(diagnosis.actuator.name)}"]
+    about += [f"serial {item.serial}" for item in diagnosis.recordings if item.serial is not None][
+        :1
+    ]
+    dates = [date_text(item.start_ns) for item in diagnosis.recordings]
+    about += [date for date in dates if date is not None][:1]
+    if levels is not None:
+        about.append(f"DEGRADED from {levels.advisory:g}, FAULT from {levels.limit:g}")
+    return [*lines, ",  ".join(about)]
 
 
 def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConstants) -> None:
@@ -129,17 +139,19 @@ def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConsta
         Of the actuator as it was found.
     """
     time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    model = respond(constants, experiment.trace.current, experiment.tick)
+    model = respond(constants, experiment.trace.current, experiment.tick, origin=experiment.origin)
+    spool = constants.OXS + (1.0 + constants.GXS) * model.spool
+    pressure = constants.OPD + (1.0 + constants.GPD) * model.pressure
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
     axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
-    _pair(axes[1], axes[2], time, experiment.spool * 1e3, model.spool * 1e3, "spool, mm", "µm", 1e3)
+    _pair(axes[1], axes[2], time, experiment.spool * 1e3, spool * 1e3, "spool, mm", "µm", 1e3)
     _pair(
         axes[3],
         axes[4],
         time,
         experiment.pressure * 1e-6,
-        model.pressure * 1e-6,
+        pressure * 1e-6,
         "differential pressure, MPa",
         "kPa",
         1e3,

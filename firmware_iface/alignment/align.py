@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.find_test import Sought, found_tests, rows_of_samples
 from ehadiag.core.recording import (
     CommandMode,
     Environment,
@@ -35,6 +36,8 @@ from firmware_iface.transport.frames import FrameTable
 __all__ = ["assemble"]
 
 STUCK_FRAMES = 20
+LOOKED_BESIDE = 100
+"""Ticks around a test, as the status tells it, in which its command is looked for."""
 MARGIN = 1000
 """Rows around a test in which late frames of messages without a counter are looked for."""
 
@@ -52,6 +55,7 @@ def assemble(
     *,
     channels: frozenset[int] | None = None,
     unsaid_is_test: bool = True,
+    sought: Sought | None = None,
 ) -> tuple[Recording, ...]:
     """All tests in a frame table, at least one recording (without samples if none ran).
 
@@ -69,6 +73,9 @@ def assemble(
         Adapter channels on which the actuator's frames came so far; None: in this table.
     unsaid_is_test : bool
         Take frames without command and status for one test.
+    sought : Sought | None
+        What to look for where the bus does not say when which test ran; None: nothing, all that
+        is recorded is then one test.
 
     Returns
     -------
@@ -93,10 +100,40 @@ def assemble(
         notes += axis.notes
     episodes = find_episodes(decoded, axis, status, bus_map, unsaid_is_test=unsaid_is_test)
     bounds = _Bounds.of(axis) if axis is not None else None
-    return tuple(
-        _recording(item, decoded, conflicts, bounds, bus_map, source, notes, len(table))
-        for item in episodes
+    looked_for = sought if axis is not None and not _says_when(decoded, axis, bus_map) else None
+    margin = LOOKED_BESIDE if looked_for is not None else 0
+    found: list[Recording] = []
+    for item in episodes:
+        one = _recording(
+            item, decoded, conflicts, bounds, bus_map, source, notes, len(table), margin
+        )
+        found += [one] if looked_for is None else _looked_for(one, item, looked_for, margin)
+    return tuple(found)
+
+
+def _says_when(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> bool:
+    """Whether commands carry the test's number, or counters tell to which tick a status belongs."""
+    command = bus_map.find("command.test_id")
+    if command is not None and len(decoded.messages[command[0].name].row):
+        return True
+    status = bus_map.find("status.test_id")
+    return bool(axis.turn) and status is not None and len(decoded.messages[status[0].name].row) > 0
+
+
+def _looked_for(
+    one: Recording, episode: Episode, sought: Sought, margin: int
+) -> tuple[Recording, ...]:
+    """The tests in a stretch of samples that is wider by a margin than what the status said."""
+    if one.samples is None:
+        return (one,)
+    known = tuple(test for test in sought.tests if one.test_id in (None, test.id))
+    found = found_tests(
+        one, replace(sought, tests=known), within=one.test_id is not None, before=margin
     )
+    if found[0].samples is one.samples:
+        cut = rows_of_samples(one.samples, margin, margin, episode.ticks)
+        return tuple(replace(item, samples=cut, start_ns=_start_ns(cut)) for item in found)
+    return found
 
 
 def _undecoded(source: str, notes: tuple[str, ...], why: str) -> Recording:
@@ -121,13 +158,15 @@ def _recording(
     source: str,
     notes: tuple[str, ...],
     rows: int,
+    beside: int = 0,
 ) -> Recording:
     begin, end = bounds.rows(episode, rows) if bounds is not None else (0, rows)
     axis = bounds.axis if bounds is not None else None
     extra: list[str] = []
     samples = None
     if axis is not None and episode.ticks > 0:
-        grid = _Grid(episode, decoded, axis, bus_map, max(begin - MARGIN, 0), end + MARGIN)
+        wide = replace(episode, first=episode.first - beside, ticks=episode.ticks + 2 * beside)
+        grid = _Grid(wide, decoded, axis, bus_map, max(begin - MARGIN, 0), end + MARGIN)
         samples, extra = _samples(grid)
     elif axis is not None:
         extra = ["no test in the recording"]

@@ -1,4 +1,4 @@
-"""Assigns frames to control ticks: by their counters, or by host time where there are none."""
+"""Assigns frames to control ticks: by their counters, or by time stamps where there are none."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_iface.alignment.gaps import settle_gaps
+from firmware_iface.alignment.late_stamps import LateStamps, place_late, spacing_of
 from firmware_iface.codec.decode import Decoded, DecodedTable
 from firmware_iface.codec.protection import OUTSIDE, unwrap
 
@@ -17,6 +19,11 @@ PHASE_BLOCK = 500
 """Frames over which the phase of a stream against the tick grid is averaged."""
 SAME_TIME = 0.1
 """Phase, in ticks, below which a command and its telemetry count as simultaneous."""
+
+EARLIEST = 0.05
+"""Quantile of delays at which a stamp is on time."""
+WORTH_SAYING = 0.05
+"""Delay of stamps, in ticks, that is told."""
 
 Ticks = NDArray[np.int64]
 
@@ -182,17 +189,36 @@ def _own_ticks(item: Decoded, tick_ns: int) -> tuple[Ticks, int, tuple[str, ...]
         )
         begin = int(count[count != OUTSIDE][0])
         return np.where(count == OUTSIDE, OUTSIDE, (count - begin) * every), every, notes
-    note = f"{item.message.name}: no counter to place samples by; host time stamps do"
+    if every >= 1:
+        placed = _late(item, every, tick_ns)
+        tick = placed.tick
+        if item.saturated and not item.stream.any():
+            measured = [item.values[role] for role in item.saturated]
+            tick = settle_gaps(tick, placed.late, every, measured)
+        return tick, every, (_by_time(item, placed.usual, tick_ns),)
     since = (item.time_ns - item.time_ns[0]) / tick_ns
-    return _settle(np.rint(since - _phase(since)).astype(np.int64), every), max(every, 1), (note,)
+    return np.rint(since - _phase(since)).astype(np.int64), 1, (_by_time(item, 0.0, tick_ns),)
+
+
+def _late(item: Decoded, every: int, tick_ns: int) -> LateStamps:
+    return place_late((item.time_ns - item.time_ns[0]) / tick_ns, every)
+
+
+def _by_time(item: Decoded, late: float, tick_ns: int) -> str:
+    note = f"{item.message.name}: no counter to place samples by; host time stamps do"
+    if late < WORTH_SAYING:
+        return note
+    return f"{note} (late by up to {late * tick_ns / 1e6:.1f} ms, their order places them)"
 
 
 def _frame_spacing(item: Decoded, tick_ns: int) -> int:
     """Ticks between two frames; 0 where several share a tick."""
+    if item.counter is None:
+        since = (item.time_ns - item.time_ns[0]) / tick_ns
+        return spacing_of(since, item.message.cycle_ns / tick_ns)
     steps = np.diff(item.time_ns) / tick_ns
-    if item.counter is not None:
-        counts = np.diff(item.counter) % item.message.modulus
-        steps = steps[counts == 1] if np.any(counts == 1) else steps
+    counts = np.diff(item.counter) % item.message.modulus
+    steps = steps[counts == 1] if np.any(counts == 1) else steps
     return int(np.rint(np.median(steps))) if np.median(steps) < 1e6 else 1
 
 
@@ -230,8 +256,14 @@ def _with_others(
         reference = replace(
             axis, row=anchor.row[sound], tick=own[sound], time_ns=anchor.time_ns[sound]
         )
+    clock = _Clock.of(anchor, tick_ns) if anchor.counter is None and not axis.turn else None
     for name, item in messages.items():
         if name in ticks or len(item.row) == 0:
+            continue
+        if clock is not None:
+            ticks[name], every[name], said = clock.place(item, tick_ns)
+            notes += said
+            rows[name] = item.row
             continue
         fraction, _ = reference.at(item.row, item.time_ns, tick_ns)
         phase = _phase(fraction)
@@ -253,3 +285,41 @@ def _with_others(
             notes.append(f"{name}: no counter to place samples by; host time stamps do")
         rows[name] = item.row
     return replace(axis, ticks=ticks, rows=rows, every=every, notes=tuple(notes))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Clock:
+    """The computer's clock as the earliest stamps of a message without a counter tell it.
+
+    Attributes
+    ----------
+    time_ns : NDArray[np.int64]
+        Host time, ascending.
+    phase : NDArray[np.float64]
+        Ticks since the first frame, less the tick that an unhindered frame of then is of.
+    """
+
+    time_ns: NDArray[np.int64]
+    phase: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, anchor: Decoded, tick_ns: int) -> _Clock | None:
+        """Clock of the message that defines the axis; None where several share a tick."""
+        if len(anchor.row) < 2 or (every := _frame_spacing(anchor, tick_ns)) < 1:
+            return None
+        phase = _late(anchor, every, tick_ns).phase
+        return cls(np.maximum.accumulate(anchor.time_ns), phase)
+
+    def place(self, item: Decoded, tick_ns: int) -> tuple[Ticks, int, tuple[str, ...]]:
+        """Ticks of another message's frames, the ticks between two of them, and notes.
+
+        A message is sent at the same instant of each of its ticks: a command before the telemetry
+        of its tick by less than a tick, other telemetry by the nearest.
+        """
+        alone, spacing, notes = _own_ticks(item, tick_ns)
+        sound = alone != OUTSIDE
+        phase = np.interp(item.time_ns, self.time_ns, self.phase)
+        away = (item.time_ns - self.time_ns[0]) / tick_ns - phase - alone
+        shift = float(np.quantile(away[sound], EARLIEST))
+        whole = np.rint(shift) if item.saturated else np.ceil(shift - SAME_TIME)
+        return np.where(sound, alone + int(whole), OUTSIDE), spacing, notes

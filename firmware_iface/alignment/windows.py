@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import BitState, Recording
 from firmware_iface.alignment.align import assemble
 from firmware_iface.codec.channel import channels_in
@@ -31,6 +32,7 @@ def recordings_of(
     source: str,
     held: int,
     least: int = WINDOW,
+    sought: Sought | None = None,
 ) -> Iterator[Recording]:
     """Tests of a stream of frames in order of time; one recording without samples if there is none.
 
@@ -46,13 +48,15 @@ def recordings_of(
         Frames that a window may have at most; a test beyond that is cut, and said to be.
     least : int
         Frames from which on a window is closed where no test runs.
+    sought : Sought | None
+        What to look for where the bus does not say when which test ran.
 
     Yields
     ------
     Recording
         Each test as soon as it is complete.
     """
-    reading = _Reading(bus_map, source)
+    reading = _Reading(bus_map, source, sought)
     empty: Recording | None = None
     found = False
     for window, cut in _windows(tables, reading, held, least):
@@ -98,8 +102,9 @@ def _windows(
 class _Reading:
     """What is known of a recording from the windows read so far."""
 
-    def __init__(self, bus_map: BusMap, source: str) -> None:
+    def __init__(self, bus_map: BusMap, source: str, sought: Sought | None = None) -> None:
         self._map = bus_map
+        self._sought = sought
         self._source = source
         self._told = False
         self._channels: frozenset[int] = frozenset()
@@ -123,6 +128,7 @@ class _Reading:
             notes,
             channels=self._channels,
             unsaid_is_test=not self._told,
+            sought=self._sought,
         )
 
     def quiet_row(self, window: FrameTable) -> int:

@@ -31,6 +31,8 @@ BLOCK = 50_000
 """Frames that a block of a text log has."""
 LARGEST_MF4 = 128 << 20
 """Bytes. Its library holds all of a file's frames in memory, and more than once."""
+NOT_FRAMES = {"CSV": " of frames, as python-can writes them; are these decoded signals?"}
+"""What a kind of log is often taken for."""
 COUNTED_FROM_0 = (".asc",)
 """Kinds whose channel numbers python-can lowers by one."""
 
@@ -133,7 +135,9 @@ class LogReader:
             yield from self._messages(dated=False)
         if self._trouble and not self._spending.frames:
             kind = self._suffix[1:].upper()
-            raise InputOutputError(f"log {self.path}: not a readable {kind} log")
+            raise InputOutputError(
+                f"log {self.path}: not a readable {kind} log{NOT_FRAMES.get(kind, '')}"
+            )
 
     def _candump(self) -> Iterator[FrameTable]:
         """Read candump's lines; interfaces are channels, from 1 in the order in which they come."""

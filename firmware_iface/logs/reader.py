@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ehadiag.core.errors import InputOutputError
+from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import BitState, Recording
 from firmware_iface.alignment.windows import recordings_of
 from firmware_iface.logs.blocks import SUFFIXES, LogReader
@@ -29,7 +30,10 @@ MOST_NAMED = 3
 
 
 def iterate_recordings(
-    path: Path | str, bus_map: BusMap | None = None, budget: Budget | None = None
+    path: Path | str,
+    bus_map: BusMap | None = None,
+    budget: Budget | None = None,
+    sought: Sought | None = None,
 ) -> Iterator[Recording]:
     """Read a log and give its tests in order of time, each as soon as it is complete.
 
@@ -44,6 +48,8 @@ def iterate_recordings(
         Which message and signal plays which role.
     budget : Budget | None
         Bytes, frames and seconds that reading may cost; None: the default.
+    sought : Sought | None
+        What to look for where the bus does not say when which test ran.
 
     Yields
     ------
@@ -59,26 +65,33 @@ def iterate_recordings(
     """
     budget = budget or Budget()
     reader = LogReader(path, budget)
-    for recording in recordings_of(reader, bus_map or default_map(), str(path), budget.held):
+    tests = recordings_of(reader, bus_map or default_map(), str(path), budget.held, sought=sought)
+    for recording in tests:
         yield _with_notes(recording, reader.notes)
 
 
 def read_recordings(
-    path: Path | str, bus_map: BusMap | None = None, budget: Budget | None = None
+    path: Path | str,
+    bus_map: BusMap | None = None,
+    budget: Budget | None = None,
+    sought: Sought | None = None,
 ) -> tuple[Recording, ...]:
     """Read all tests in a log, in order of time; see `iterate_recordings`."""
-    return tuple(iterate_recordings(path, bus_map, budget))
+    return tuple(iterate_recordings(path, bus_map, budget, sought))
 
 
 def read_recording(
-    path: Path | str, bus_map: BusMap | None = None, budget: Budget | None = None
+    path: Path | str,
+    bus_map: BusMap | None = None,
+    budget: Budget | None = None,
+    sought: Sought | None = None,
 ) -> Recording:
     """Read the last complete test of a log; the last one begun if none was completed.
 
     Its notes say what was passed over. Where tests lie on several adapter channels and none was
     chosen, it is refused.
     """
-    return choose(iterate_recordings(path, bus_map, budget))
+    return choose(iterate_recordings(path, bus_map, budget, sought))
 
 
 def choose(recordings: Iterable[Recording]) -> Recording:

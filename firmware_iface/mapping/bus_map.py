@@ -112,13 +112,40 @@ class BusMap:
         return None
 
 
-def default_map() -> BusMap:
-    """Return the default bus (BUS-2, `data/eha_fcc.dbc`)."""
+def default_map(dbc: Path | str | None = None) -> BusMap:
+    """Return the default bus (BUS-2, `data/eha_fcc.dbc`), or that of a DBC of the same names.
+
+    Parameters
+    ----------
+    dbc : Path | str | None
+        DBC to use instead of the one that comes with the package.
+
+    Returns
+    -------
+    BusMap
+        The map, checked.
+
+    Raises
+    ------
+    InputOutputError
+        The DBC cannot be read.
+    ConfigurationError
+        Not a DBC, or one of other names than the default mapping's.
+    """
     folder = resources.files("firmware_iface").joinpath("data")
     where = "bundled mapping eha_fcc.toml"
     tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)
-    text = folder.joinpath(tree.dbc).read_bytes()
-    return resolve(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
+    if dbc is None:
+        text = folder.joinpath(tree.dbc).read_bytes()
+        return resolve(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
+    found = recall_dbc(read_small_file(Path(dbc), MAX_DBC_BYTES, "DBC file"), str(dbc))
+    try:
+        return resolve(tree, found, where, str(dbc))
+    except ConfigurationError as error:
+        raise ConfigurationError(
+            f"DBC file {dbc}: names another bus than the default mapping ({error}): name a mapping"
+            " file, --mapping"
+        ) from None
 
 
 def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
@@ -149,7 +176,8 @@ def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
         inside = PurePosixPath(tree.dbc)
         if inside.is_absolute() or ".." in inside.parts or "\\" in tree.dbc or "\0" in tree.dbc:
             raise ConfigurationError(
-                f"mapping file {path}: dbc must be a path in the mapping's folder, not {tree.dbc!r}"
+                f"mapping file {path}: dbc must be a path in the mapping's folder, not"
+                f" {tree.dbc!r}; name a DBC elsewhere by --dbc"
             )
         dbc = path.parent / inside
     text = read_small_file(Path(dbc), MAX_DBC_BYTES, "DBC file")

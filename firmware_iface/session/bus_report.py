@@ -288,7 +288,7 @@ def _unsaid(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:
     """What the mapping does not name of the command, and the bus does not say of oil and supply."""
     if not frames:
         return ()
-    commands = "no command is mapped: a test in closed loop cannot be judged without"
+    commands = "no command is mapped: the measured current has to bear out that of a stored test"
     unmapped = () if any(_commands(item.message) for item in messages.values()) else (commands,)
     said = {
         name

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 
 from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.acquire import STOPPED, acquire
 from ehadiag.cli.beforehand import refuse_beforehand
+from ehadiag.cli.drawing import can_be_drawn, drawn
+from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import progress_bar, say_if_compiling
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import NotTestedError
 from ehadiag.core.stored_test import resolve_test
+from ehadiag.facade.inputs import log_file
 from ehadiag.report.spent import Spent
 
 __all__ = ["add_parser", "run"]
@@ -75,6 +79,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_diagnosis_options(parser)
+    add_keeping_options(parser)
+    options.add_result_options(parser)
     options.add_bus_options(parser)
     options.add_fault_options(parser)
     parser.set_defaults(run=run)
@@ -96,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
     from ehadiag.identify.session import Nuisances  # noqa: PLC0415
     from ehadiag.identify.warmup import warm_up  # noqa: PLC0415
+    from ehadiag.report.json_line import json_line  # noqa: PLC0415
 
     # Before the test: a verdict must not wait for the compiler.
     warm_up(actuator, test)
@@ -129,4 +136,8 @@ def run(arguments: argparse.Namespace) -> int:
         result = not_tested(recordings, [test], actuator, [why])
     ended_at = heard.ended_at
     spent = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
-    return results.deliver(result, spent, heard.name)
+    line = json_line(
+        result, spent, options.the_asked(arguments, bus_map), [log_file(heard.recording.source)]
+    )
+    draw = partial(drawn, result, levels) if can_be_drawn(result) else None
+    return results.deliver(result, line, spent, heard.name, draw)

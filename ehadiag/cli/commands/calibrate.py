@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
+from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import emit, progress_bar, rendered, say, say_if_compiling
-from ehadiag.cli.results import make_folder, matplotlib_alone
+from ehadiag.cli.results import make_folder
 from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError
 from ehadiag.core.stored_test import resolve_test
 
@@ -62,7 +63,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_log_options(parser)
-    options.add_seed_option(parser)
+    options.add_seed_option(parser, "seed of the search")
     options.add_json_option(parser)
     parser.set_defaults(run=run)
 

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.nuisance.explained import excess, is_noise
-from ehadiag.identify.nuisance.linearisation import Belief, linearised
-from ehadiag.identify.nuisance.posterior import sharpen
+from ehadiag.identify.nuisance.explained import excess, is_hopeless, is_noise
 from ehadiag.identify.nuisance.prior import (
     ALIAS,
     Joint,
@@ -24,7 +22,10 @@ from ehadiag.identify.nuisance.prior import (
 from ehadiag.identify.nuisance.starts import Found, robust_cost, search
 from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives, capped
 from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.refine.linearisation import Belief, linearised
+from ehadiag.identify.refine.posterior import sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
+from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
 from ehadiag.model.simd.model import SimdModel
 
@@ -34,6 +35,8 @@ BUDGET = 1600
 """Runs of the model after which no further start is made."""
 LOOK = 3.0
 """Spread of the last look, with the noise as judged, in spreads of the search's end."""
+RELAXED = 100.0
+"""Weight of the spool over the pressure while the spool is explained first."""
 CLEAR = 1.0
 """Scatter about the linear model, in variances of the noise, from which a row tells nothing."""
 
@@ -79,6 +82,7 @@ def estimate(
     budget: int = BUDGET,
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
+    give_up: bool = False,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
 
@@ -101,6 +105,8 @@ def estimate(
         The same seed gives the same answer.
     tell : callable, optional
         Called from time to time with the share of the budget that is spent.
+    give_up : bool
+        Whether to stop early where nothing explains the recordings.
     """
     known = known or {}
     coarse = _free_running(experiments, free)
@@ -109,6 +115,15 @@ def estimate(
     origins = [first, small_effects(model, first)]
     if hint is not None:
         origins = [beside(model, first, hint), *origins[::-1]]
+    guide: Derivatives | None = None
+    if any(item.constants.OIL > 0.0 for item in experiments):
+        guide = _spool_guide(experiments, free, coarse.levels)
+        guided = search(
+            guide, first, information, origins, _spool_is_noise, budget=budget // 2, seed=seed
+        )
+        there = guided.belief.x * guide.scale
+        names = [item.name for item in guide.estimated]
+        origins = [beside(model, first, dict(zip(names, there.tolist(), strict=True))), *origins]
     found = search(
         model,
         first,
@@ -119,6 +134,7 @@ def estimate(
         budget=budget,
         seed=seed,
         tell=tell,
+        hopeless=is_hopeless if give_up else None,
     )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
@@ -133,7 +149,7 @@ def estimate(
         explained=is_noise(refined.residuals),
         excess=excess(refined.residuals),
         starts=found.starts,
-        evaluations=model.evaluations + fine.evaluations,
+        evaluations=sum(item.evaluations for item in (guide, model, fine) if item),
     )
 
 
@@ -151,6 +167,26 @@ def _scaled(
 ) -> Derivatives:
     """Coordinates scaled by the noise."""
     return Derivatives(model, experiments[0].noise, considered)
+
+
+def _spool_guide(
+    experiments: Sequence[Experiment], free: Sequence[Parameter], levels: NDArray[np.int64]
+) -> Derivatives:
+    """Model that shows where to begin where the oil stores the pressure: it goes by the spool.
+
+    Compressible oil remembers what the spool did for tenths of a second and rings, so that far from
+    the optimum the pressure says little and leads the search astray; the spool, which does not feel
+    it, is explained first.
+    """
+    relaxed = [
+        item.with_noise((item.spool_noise, RELAXED * item.pressure_noise, item.position_noise))
+        for item in experiments
+    ]
+    return Derivatives(_free_running(relaxed, free, levels), experiments[0].noise)
+
+
+def _spool_is_noise(residuals: NDArray[np.float64]) -> bool:
+    return is_noise(residuals[SPOOL_ROW : SPOOL_ROW + 1])
 
 
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.noise import relative_noise
-from ehadiag.identify.nuisance.posterior import TAIL
+from ehadiag.identify.refine.posterior import TAIL
 
-__all__ = ["MOST_EXCESS", "excess", "is_noise"]
+__all__ = ["MOST_EXCESS", "excess", "is_hopeless", "is_noise"]
 
 EXPECTED = 0.8618
 """Mean of Cauchy's cost for a standard normal residual, TAIL² E ln(1 + (r/TAIL)²)."""
@@ -16,6 +16,11 @@ MOST_EXCESS = 1.16
 """1.02 to 1.15 at the optimum of 80 simulated tests: rounding makes some noise that lasts."""
 MOST_OUTLIERS = 0.01
 """Share of residuals beyond three deviations."""
+
+
+HOPELESS = (0.4, 0.1)
+"""Share of residuals beyond three deviations after one start, and after two, from which on no more
+is looked for: below 0.01 after the first one on 11 in 12 units that a later one explained."""
 
 
 def excess(residuals: NDArray[np.float64]) -> float:
@@ -39,6 +44,15 @@ def excess(residuals: NDArray[np.float64]) -> float:
 
 def is_noise(residuals: NDArray[np.float64]) -> bool:
     """Whether nothing is left to explain."""
+    return _outliers(residuals) <= MOST_OUTLIERS and excess(residuals) <= MOST_EXCESS
+
+
+def is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
+    """Whether so much is left after so many starts that further ones will not explain it."""
+    return _outliers(residuals) > HOPELESS[min(starts, len(HOPELESS)) - 1]
+
+
+def _outliers(residuals: NDArray[np.float64]) -> float:
+    """Share of residuals beyond three deviations."""
     known = residuals != 0.0
-    outliers = float(np.mean(residuals[known] ** 2 >= TAIL**2)) if known.any() else 1.0
-    return outliers <= MOST_OUTLIERS and excess(residuals) <= MOST_EXCESS
+    return float(np.mean(residuals[known] ** 2 >= TAIL**2)) if known.any() else 1.0

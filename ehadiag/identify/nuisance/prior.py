@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.nuisance.linearisation import Belief
 from ehadiag.identify.refine.derivatives import Derivatives
+from ehadiag.identify.refine.linearisation import Belief
 from ehadiag.model.parameters import Kind, Parameter
 
 __all__ = [

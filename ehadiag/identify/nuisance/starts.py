@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.nuisance.linearisation import BLOCK, Belief
-from ehadiag.identify.nuisance.posterior import TAIL, sharpen
 from ehadiag.identify.refine.derivatives import Derivatives
+from ehadiag.identify.refine.linearisation import BLOCK, Belief
+from ehadiag.identify.refine.posterior import TAIL, sharpen
 
 __all__ = ["Found", "Place", "robust_cost", "search"]
 
@@ -82,6 +82,7 @@ def search(
     budget: int = 1600,
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
+    hopeless: Callable[[NDArray[np.float64], int], bool] | None = None,
 ) -> Found:
     """Search until the residuals are explained, or the budget is spent.
 
@@ -102,6 +103,8 @@ def search(
         Runs of the model after which no further start is made.
     tell : callable, optional
         Called after each start with the share of the budget that is spent.
+    hopeless : callable, optional
+        Of the best residuals and the number of starts: whether further ones will not help.
     """
     until = model.evaluations + budget
     best: Found | None = None
@@ -119,6 +122,8 @@ def search(
         places.append(Place(belief.x, cost))
         if best is None or cost < best.cost:
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
+        if hopeless is not None and hopeless(best.residuals, len(places)):
+            break
         if tell is not None:
             tell(min(1.0 - (until - model.evaluations) / budget, 1.0))
     return replace(best, places=tuple(places))

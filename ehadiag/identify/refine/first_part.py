@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives
+from ehadiag.identify.refine.derivatives import Considered, Derivatives, capped
 from ehadiag.identify.refine.least_squares import Refinement, describe, median_offsets, refine
-from ehadiag.identify.search.objective import Objective
-from ehadiag.identify.search.solvers import CompactGa
+from ehadiag.identify.refine.linearisation import Belief
+from ehadiag.identify.refine.posterior import sharpen
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
@@ -31,9 +31,8 @@ __all__ = [
     "residuals_at",
 ]
 
-POLISH = CompactGa(budget=800, virtual_population=70.0, tolerance=1e-7)
 POLISH_REACH = 6.0
-"""Deviations, of each severity, over which the polish begins to draw."""
+"""Deviations, of each severity, over which the polish begins to look."""
 POLISH_SPREAD = (2e-4, 2e-3)
 """Severities: out of a narrow basin, which looks well known, and not further than is shown."""
 FREE_LEVEL = 2
@@ -118,24 +117,27 @@ def _polish(
 ) -> Refinement:
     """Search the neighbourhood where steps in the cost may have held up the descent.
 
-    The seed is fixed: the answer depends on the recording, not on the search before.
+    A belief as wide as the steps is sharpened until the noise stops it; its mean is taken where
+    the cost is lower. The seed is fixed: the answer depends on the recording, not on the search
+    before.
     """
-    offsets = {item.name: best.values[item.name] for item in OFFSETS}
-    unknowns = unknowns_of(experiments, FAULTS).holding(offsets)
     batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
-    model = SimdModel(batch, unknowns, levels=levels)
-    objective = Objective(model, cap=CAP)
-    searched = [k for k, item in enumerate(best.parameters) if item in FAULTS]
-    start = best.x[searched] * best.scale[searched]
-    deviation = np.sqrt(np.diag(np.linalg.pinv(best.normal, hermitian=True)))[searched]
-    spread = np.clip(POLISH_REACH * deviation, *POLISH_SPREAD)
-    at_start = float(objective(start[None, :])[0])
-    found = POLISH.minimise(objective, start, spread, seed=0)
-    chosen = found.best if found.cost < at_start else start
-    severities = {item.name: float(value) for item, value in zip(FAULTS, chosen, strict=True)}
-    derivatives = anchored_derivatives(experiments, spans, levels=levels)
-    other = describe(derivatives, {**offsets, **severities}, converged=best.converged)
-    return replace(other, evaluations=other.evaluations + found.evaluations)
+    model = Derivatives(
+        SimdModel(batch, unknowns_of(experiments), levels=levels), experiments[0].noise
+    )
+    x, curved = best.x * best.scale / model.scale, model.curved
+    deviation = np.sqrt(np.diag(np.linalg.pinv(best.normal, hermitian=True))) * best.scale
+    spread = np.clip(POLISH_REACH * deviation[curved], *POLISH_SPREAD) / model.scale[curved]
+    begin = Belief(x, np.diag(spread))
+    nothing_known = np.zeros(len(x))
+    found, _ = sharpen(model, begin, begin, nothing_known, np.random.default_rng(0))
+    costs = [capped(run) for run in model.many(np.vstack([x, found.x]))]
+    chosen = (x if costs[0] <= costs[1] else found.x) * model.scale
+    values = {item.name: float(value) for item, value in zip(best.parameters, chosen, strict=True)}
+    other = describe(
+        anchored_derivatives(experiments, spans, levels=levels), values, converged=best.converged
+    )
+    return replace(other, evaluations=other.evaluations + model.evaluations)
 
 
 def _refine(

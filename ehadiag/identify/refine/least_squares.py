@@ -9,7 +9,7 @@ severities; being constant they are told apart from the faults, which act alike 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,7 +106,7 @@ def refine(model: Derivatives, start: Mapping[str, float]) -> Refinement:
     converged = False
     for _ in range(ITERATIONS):
         cautious = max(MORE * damping, CAUTIOUS_DAMPING)
-        trials = [_stepped(model, slope, damping), _stepped(model, slope, cautious)]
+        trials = _stepped(model, slope, (damping, cautious))
         size = float(np.abs(trials[0] - slope.x)[model.curved].max())
         if size < CONVERGED:
             converged = True
@@ -129,13 +129,23 @@ def refine(model: Derivatives, start: Mapping[str, float]) -> Refinement:
     return _described(model, bowl.x, bowl.slope, converged=converged, jagged=not bowl.smooth)
 
 
-def _stepped(model: Derivatives, slope: Slope, damping: float) -> NDArray[np.float64]:
-    """Point that a damped Gauss-Newton step leads to, within the bounds."""
+def _stepped(
+    model: Derivatives, slope: Slope, dampings: Sequence[float]
+) -> list[NDArray[np.float64]]:
+    """Points that damped Gauss-Newton steps lead to, within the bounds."""
     x, used = slope.x, slope.used
     rows = slope.jacobian[:, used]
-    normal = rows @ rows.T
-    normal += np.diag(damping * np.diag(normal) + 1e-12)
-    return bounded_step(x, normal, rows @ slope.residuals[used], model.lower, model.upper)
+    normal, gradient = rows @ rows.T, rows @ slope.residuals[used]
+    return [
+        bounded_step(
+            x,
+            normal + np.diag(damping * np.diag(normal) + 1e-12),
+            gradient,
+            model.lower,
+            model.upper,
+        )
+        for damping in dampings
+    ]
 
 
 def describe(model: Derivatives, start: Mapping[str, float], *, converged: bool) -> Refinement:

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
-from ehadiag.model.jack import JackState, jack_rest, jack_tick
+from ehadiag.model.jack_state import JackState
 from ehadiag.model.laws import jack_law
 from ehadiag.model.plant import PlantConstants
+from ehadiag.model.second_stage import jack_rest, jack_tick
 from ehadiag.model.sensors import sensor_law
 
 __all__ = ["jack_response"]
@@ -53,7 +54,8 @@ def jack_response(
         if math.isfinite(move):
             jack = JackState(
                 min(max(jack.place + move, -law.stroke), law.stroke),
-                jack.velocity, jack.direction, jack.fresh, jack.lagged, jack.seen,
+                jack.velocity, jack.direction, jack.fresh,
+                jack.pressure, jack.lagged, jack.seen,
             )  # fmt: skip
         spool += nodes[end - 1, 4]
         first = end

@@ -50,8 +50,8 @@ NODE_COLUMNS = 5
 LAST = WHOLE - (WHOLE >> BASE)
 """Start of the last ordinary step: pressure at the end of a tick hangs on the last piece most."""
 LAST_BEND = 0.002e-6
-BEND = 0.05e-6
-"""A node is written where the path bends away from its chord by about this much, m."""
+"""A node is written where the path bends away from its chord by `SpoolLaw.bend`, at the end of a
+tick by this much, m."""
 
 
 @inlined
@@ -125,13 +125,13 @@ def _slide_clamped(t: SpoolLaw, h: float, fade: float, s: SpoolState) -> SpoolSt
 
 
 @inlined
-def _node_wanted(event: int, done: int, bend: float) -> bool:
+def _node_wanted(t: SpoolLaw, event: int, done: int, bend: float) -> bool:
     """Whether the path is to have a node here."""
     if event > NOTHING or done == WHOLE:
         return True
     if done & ((WHOLE >> NODE_LEVEL) - 1) != 0:
         return False
-    return bend > BEND or (done == LAST and bend > LAST_BEND)
+    return bend > t.bend or (done == LAST and bend > LAST_BEND)
 
 
 @inlined
@@ -206,7 +206,7 @@ def spool_tick(
         since += WHOLE >> level
         slowest, fastest = min(slowest, end), max(fastest, end)
         span = tick * since / WHOLE
-        wanted = _node_wanted(event, done, 0.125 * (fastest - slowest) * span)
+        wanted = _node_wanted(t, event, done, 0.125 * (fastest - slowest) * span)
         if wanted and (done == WHOLE or count < full):
             nodes[count, 0] = span
             nodes[count, 1] = s.xs

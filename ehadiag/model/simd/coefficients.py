@@ -164,7 +164,8 @@ def tabulate(
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
 ) -> tuple[bool, bool]:
-    """Coefficients of all lanes; returns whether any has backlash, and a filter or a lead.
+    """Coefficients of all lanes; returns whether any has backlash, and a filter, a lead or
+    Stribeck's friction of the jack.
 
     Parameters
     ----------
@@ -177,12 +178,12 @@ def tabulate(
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
-    any_backlash = any_filter = False
+    any_backlash = any_other = False
     for i in range(LANES):
         c = plant_of(candidates[i])
         t = _laws(c, i, coefficients)
         any_backlash = any_backlash or t.backlash > 0.0
-        any_filter = any_filter or sensing(sensor_law(c))
+        any_other = any_other or sensing(sensor_law(c)) or c.VSJ > 0.0
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
         rates[4 * LANES + i], rates[5 * LANES + i] = stiffness, friction
@@ -203,7 +204,7 @@ def tabulate(
                 moving[place + WIDTH] = math.exp(-time * rate)
     _, whole = _powers(ring, 2, tick, STUCK_ROWS, stuck)
     _copy(whole, coefficients, REST * LANES)
-    if any_filter:
+    if any_other:
         for i in range(LANES):
             _filter(sensor_law(plant_of(candidates[i])), tick, i, coefficients)
     if any_backlash:
@@ -214,4 +215,4 @@ def tabulate(
             for level in range(len(SHIFTS)):
                 place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH
                 loose[place : place + WIDTH] = moving[place : place + WIDTH]
-    return any_backlash, any_filter
+    return any_backlash, any_other

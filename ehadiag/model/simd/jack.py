@@ -24,7 +24,8 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.collocation import C1, C2, radau_pressures, radau_velocity
+from ehadiag.model.collocation import C1, C2, creeping_pressures, radau_pressures, radau_velocity
+from ehadiag.model.jack import CREEPING, FINE_FADE
 from ehadiag.model.laws import JackLaw, opening, pressure, resistance
 from ehadiag.model.sensors import followed, through_stages
 from ehadiag.model.simd.layout import (
@@ -40,6 +41,7 @@ from ehadiag.model.simd.layout import (
     NODES,
     PLACE,
     POSITION,
+    PRESSURE,
     PRESSURE_SEEN,
     SENSING,
     SENSING_ROWS,
@@ -51,8 +53,14 @@ from ehadiag.model.simd.layout import (
 )
 
 __all__ = [
+    "END",
+    "MIDDLE",
+    "STAGE_NUMBERS",
+    "START",
     "follow_lanes",
+    "follow_pressure",
     "jack_lanes",
+    "place_at",
     "positions",
     "pressures",
     "rest_jacks",
@@ -67,15 +75,15 @@ CORNER_TRAVEL = 4.0e-6
 
 
 def _stages() -> NDArray[np.float64]:
-    """Where stages and start of a step stand on the spool's path, shape (5, 16, 4, 5), flat.
+    """Where stages, start and middle of steps stand on the spool's path, shape (5, 16, 5, 5), flat.
 
     For a tick cut into 1, 2, 4, 8 or 16 steps, and each step: the node before, and Hermite's
     weights of place before and after and of slope (by the length of the tick) before and after.
     """
-    out = np.zeros((MOST_HALVINGS + 1, 1 << MOST_HALVINGS, 4, 5))
+    out = np.zeros((MOST_HALVINGS + 1, 1 << MOST_HALVINGS, 5, 5))
     for level in range(MOST_HALVINGS + 1):
         for step in range(1 << level):
-            for stage, share in enumerate((C1, C2, 1.0, 0.0)):
+            for stage, share in enumerate((C1, C2, 1.0, 0.0, 0.5)):
                 where = (step + share) / (1 << level) * NODES
                 node = min(int(where), NODES - 1)
                 u = where - node
@@ -90,10 +98,14 @@ def _stages() -> NDArray[np.float64]:
 
 
 STAGES = _stages()
+STAGE_NUMBERS = 25
+"""Numbers of a step."""
+END, START, MIDDLE = 10, 15, 20
+"""Where those of its end, start and middle begin; the other stages' stand before them."""
 
 
 @packed
-def _place(path: NDArray[np.float64], o: int, k: int, tick: float) -> Vector:
+def place_at(path: NDArray[np.float64], o: int, k: int, tick: float) -> Vector:
     """Spool at the stage whose place in STAGES is `k`, lanes from `o`."""
     a = int(STAGES[k]) * LANES + o
     b = a + LANES
@@ -116,6 +128,15 @@ def _sense(
 ) -> None:  # fmt: skip
     """Follow the pressure of these lanes through their filters, from start and stages of a step."""
     cubic = through_stages(_limited(j, p0), _limited(j, p1), _limited(j, p2), _limited(j, p3))
+    follow_pressure(cubic, these, level, step, o, state, coefficients)
+
+
+@packed
+def follow_pressure(
+    cubic: Any, these: Mask, level: int, step: int, o: int,
+    state: NDArray[np.float64], coefficients: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Follow the pressure of these lanes, cubics over a step, through their filters."""
     place = level * SENSING_ROWS * LANES + o
     before, seen = load(state, LAGGED * LANES + o), load(state, PRESSURE_SEEN * LANES + o)
     sampled = load(coefficients, (SENSING + SENSING_ROWS - 1) * LANES + place) == step * 1.0
@@ -140,12 +161,12 @@ def _lanes(senses: bool) -> Any:
     ) -> bool:
         any_busy = False
         h = tick / (1 << level)
-        k = ((level << MOST_HALVINGS) + step) * 20
+        k = ((level << MOST_HALVINGS) + step) * STAGE_NUMBERS
         for o in range(0, end, WIDTH):
             j = jack_laws(coefficients, o)
             place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
             d = load(state, JACK_DIRECTION * LANES + o)
-            x3 = _place(path, o, k + 10, tick)
+            x3 = place_at(path, o, k + END, tick)
             e3 = resistance(j, x3)
             # At rest: the force of the second stage, times e, against what holds.
             force = j.load + j.spring * place
@@ -157,9 +178,9 @@ def _lanes(senses: bool) -> Any:
             fine = done | rests
             if senses and anywhere(rests):
                 x0, x1, x2 = (
-                    _place(path, o, k + 15, tick),
-                    _place(path, o, k, tick),
-                    _place(path, o, k + 5, tick),
+                    place_at(path, o, k + START, tick),
+                    place_at(path, o, k, tick),
+                    place_at(path, o, k + 5, tick),
                 )
                 _sense(
                     j, rests, level, step, o,
@@ -167,12 +188,20 @@ def _lanes(senses: bool) -> Any:
                     pressure(j, x3, 0.0), state, coefficients,
                 )  # fmt: skip
             if anywhere(d != 0.0):
-                x1 = _place(path, o, k, tick)
-                x2 = _place(path, o, k + 5, tick)
-                later = radau_velocity(
-                    j, h, force + d * j.friction, velocity, x1, x2, x3,
-                    resistance(j, x1), resistance(j, x2), e3,
-                )  # fmt: skip
+                creeps = senses and anywhere(j.extra > 0.0)
+                x1 = place_at(path, o, k, tick)
+                x2 = place_at(path, o, k + 5, tick)
+                e1, e2, pull = resistance(j, x1), resistance(j, x2), force + d * j.friction
+                if senses:
+                    if creeps:
+                        p1, p2, p3 = creeping_pressures(
+                            j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
+                        )
+                    else:
+                        p1, p2, p3 = radau_pressures(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
+                    later = j.flow * x3 - e3 * p3
+                else:
+                    later = radau_velocity(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
                 moved = place + 0.5 * h * (velocity + later)
                 slides = (later * d > 0.0) & (magnitude(moved) < j.stroke)
                 # What the collocation does not follow: a fresh start, a fast way past the closed
@@ -185,17 +214,16 @@ def _lanes(senses: bool) -> Any:
                     & (most(opening(j, x1), opening(j, x3)) > j.corner)
                     & (travel > CORNER_TRAVEL)
                 )
+                if creeps:
+                    fade = j.flow * j.by_stribeck
+                    coarse = coarse | ((near * fade < CREEPING) & (travel * fade > FINE_FADE))
                 slides = slides & ~coarse & (load(state, FRESH * LANES + o) == 0.0)
                 slides = slides & ~done
                 store(state, JACK * LANES + o, where(slides, moved, place))
                 store(state, JACK_VELOCITY * LANES + o, where(slides, later, velocity))
                 fine = fine | slides
                 if senses and anywhere(slides):
-                    p1, p2, p3 = radau_pressures(
-                        j, h, force + d * j.friction, velocity, x1, x2, x3,
-                        resistance(j, x1), resistance(j, x2), e3,
-                    )  # fmt: skip
-                    p0 = pressure(j, _place(path, o, k + 15, tick), velocity)
+                    p0 = pressure(j, place_at(path, o, k + START, tick), velocity)
                     _sense(j, slides, level, step, o, p0, p1, p2, p3, state, coefficients)
             store(state, BUSY * LANES + o, where(fine, 0.0, 1.0))
             if anywhere(~fine):
@@ -214,20 +242,23 @@ and left as they were; returns whether there are any."""
 @packed
 def pressures(
     end: int,
-    senses: bool,
+    kept: bool,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """Differential pressure of all lanes as it is sampled in a tick, into the state."""
+    """Differential pressure of all lanes as it is sampled in a tick, into the state.
+
+    kept: whether any lane has it in the state, stored in the oil or behind a filter.
+    """
     for o in range(0, end, WIDTH):
         j = jack_laws(coefficients, o)
         x = load(path, (PLACE + NODES) * LANES + o)
         p12 = _limited(j, pressure(j, x, load(state, JACK_VELOCITY * LANES + o)))
-        if senses:
+        if kept:
             law = sensor_laws(coefficients, o)
-            plain = law.lag + law.lead == 0.0
-            p12 = where(plain, p12, load(state, PRESSURE_SEEN * LANES + o))
+            p12 = where(j.oil > 0.0, load(state, PRESSURE * LANES + o), p12)
+            p12 = where(law.lag + law.lead > 0.0, load(state, PRESSURE_SEEN * LANES + o), p12)
         store(state, PRESSURE_SEEN * LANES + o, p12)
 
 
@@ -268,4 +299,6 @@ def rest_jacks(
     for o in range(0, end, WIDTH):
         j = jack_laws(coefficients, o)
         store(state, JACK * LANES + o, place)
-        store(state, LAGGED * LANES + o, _limited(j, pressure(j, j.load * 0.0 + origin, 0.0)))
+        p12 = _limited(j, pressure(j, j.load * 0.0 + origin, 0.0))
+        store(state, LAGGED * LANES + o, p12)
+        store(state, PRESSURE * LANES + o, p12)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, inlined
-from ehadiag.model.jack import JackState, Piece, Probe, jack_piece
+from ehadiag.model.jack_state import JackState, Piece, Probe
+from ehadiag.model.second_stage import jack_piece
 from ehadiag.model.sensors import sensing
 from ehadiag.model.simd.layout import (
     BUSY,
@@ -19,6 +20,7 @@ from ehadiag.model.simd.layout import (
     LAGGED,
     LANES,
     NODES,
+    PRESSURE,
     PRESSURE_SEEN,
     SLOPE,
     jack_law_of_lane,
@@ -36,6 +38,7 @@ def lane_jack(state: NDArray[np.float64], i: int) -> JackState:
         state[JACK_VELOCITY * LANES + i],
         state[JACK_DIRECTION * LANES + i],
         state[FRESH * LANES + i],
+        state[PRESSURE * LANES + i],
         state[LAGGED * LANES + i],
         state[PRESSURE_SEEN * LANES + i],
     )
@@ -48,6 +51,7 @@ def keep_lane_jack(jack: JackState, state: NDArray[np.float64], i: int) -> None:
     state[JACK_VELOCITY * LANES + i] = jack.velocity
     state[JACK_DIRECTION * LANES + i] = jack.direction
     state[FRESH * LANES + i] = jack.fresh
+    state[PRESSURE * LANES + i] = jack.pressure
     state[LAGGED * LANES + i] = jack.lagged
     state[PRESSURE_SEEN * LANES + i] = jack.seen
 

@@ -25,7 +25,14 @@ __all__ = ["SimdModel", "processors"]
 
 
 def processors() -> int:
-    """Processors that this process may use."""
+    """Processors that this process may use; at most `EHADIAG_THREADS`, where that is set."""
+    told = os.environ.get("EHADIAG_THREADS", "")
+    if told.isascii() and told.isdigit() and int(told) > 0:
+        return min(_there(), int(told))
+    return _there()
+
+
+def _there() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

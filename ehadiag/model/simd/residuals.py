@@ -45,6 +45,7 @@ from ehadiag.model.simd.layout import (
     STATE_ROWS,
     sensor_laws,
 )
+from ehadiag.model.simd.orifice import orifice_level, orifice_tick, sensed_orifice_tick
 from ehadiag.model.simd.spool import (
     anchor_lanes,
     deflect_lanes,
@@ -75,6 +76,8 @@ TRAVEL = 0.15
 CROSSING = 5.0e-6
 """Travel (m) past the closed orifice from which the jack takes eight steps, four times that:
 sixteen."""
+CACHE_LINE = 64
+"""Bytes; as many as a vector of lanes has."""
 
 
 class Scratch(NamedTuple):
@@ -135,24 +138,31 @@ def scratch_for(levels: NDArray[np.int64]) -> Scratch:
     """Scratch with the jack's steps; those below 0 are found by the first block that is run."""
     return Scratch(
         levels=levels,
-        state=np.zeros(STATE_ROWS * LANES),
-        path=np.zeros(PATH_ROWS * LANES + SCRATCH_SIZE),
-        coefficients=np.zeros(COEFFICIENT_ROWS * LANES),
-        moving=np.zeros(MOVING_SIZE),
-        loose=np.zeros(MOVING_SIZE),
-        stuck=np.zeros(STUCK_SIZE),
+        state=_aligned(STATE_ROWS * LANES),
+        path=_aligned(PATH_ROWS * LANES + SCRATCH_SIZE),
+        coefficients=_aligned(COEFFICIENT_ROWS * LANES),
+        moving=_aligned(MOVING_SIZE),
+        loose=_aligned(MOVING_SIZE),
+        stuck=_aligned(STUCK_SIZE),
         rows=np.zeros((LANES, FIELDS)),
-        sums=np.zeros(LANES),
-        sample=np.zeros(LANES),
+        sums=_aligned(LANES),
+        sample=_aligned(LANES),
         no_costs=np.zeros(0),
         uncounted=np.zeros(0, dtype=np.int64),
         no_residuals=np.zeros((0, 0, 0)),
     )
 
 
+def _aligned(size: int) -> NDArray[np.float64]:
+    """Zeros that begin where a line of the cache does: a vector that straddles two takes longer."""
+    raw = np.zeros(size + WIDTH)
+    first = -raw.ctypes.data % CACHE_LINE // raw.itemsize
+    return raw[first : first + size]
+
+
 def scratch_beside(work: Scratch) -> Scratch:
     """Scratch of another thread, with the same steps of the jack."""
-    return Scratch._make(part.copy() for part in work)
+    return scratch_for(work.levels.copy())
 
 
 @packed
@@ -219,19 +229,29 @@ def _jack_tick(
 
 
 @bare_kernel
-def _sensed_jack_tick(
+def _other_jack_tick(
     count: int,
     end: int,
+    orifice: bool,
+    senses: bool,
     tick: float,
     level: int,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
 ) -> None:
-    """The same, with the pressure as the filter before its converter has it."""
-    for step in range(1 << level):
-        if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
-            jack_events(count, level, step, tick, state, path, coefficients)
+    """The same of an orifice stage, or with the pressure as the filter before its converter has it.
+
+    Apart from the plain one, so that this stays as it is.
+    """
+    if orifice and senses:
+        sensed_orifice_tick(count, end, tick, level, state, path, coefficients)
+    elif orifice:
+        orifice_tick(count, end, tick, level, state, path, coefficients)
+    else:
+        for step in range(1 << level):
+            if sensed_jack_lanes(end, level, step, tick, state, path, coefficients):
+                jack_events(count, level, step, tick, state, path, coefficients)
 
 
 @merged
@@ -265,6 +285,7 @@ def _block(
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
+        orifice = plant_of(rows[0]).OIL > 0.0
         state[PLAYS * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
             drive_lanes(end, current[k], plays, state, coefficients)
@@ -289,14 +310,16 @@ def _block(
                 for i in range(wanted):
                     out[i, SPOOL_ROW, k] = sample[i]
             if levels[k] < 0:
-                levels[k] = _level(path)
+                levels[k] = orifice_level(tick, coefficients) if orifice else _level(path)
             if k <= last:  # nothing depends on the jack but pressure and position
-                if senses:
-                    _sensed_jack_tick(count, end, tick, levels[k], state, path, coefficients)
+                if senses or orifice:
+                    _other_jack_tick(
+                        count, end, orifice, senses, tick, levels[k], state, path, coefficients
+                    )
                 else:
                     _jack_tick(count, end, tick, levels[k], state, path, coefficients)
             if weight[PRESSURE_ROW, k] != 0.0 and math.isfinite(pressure[k]):
-                pressures(end, senses, state, path, coefficients)
+                pressures(end, senses or orifice, state, path, coefficients)
                 _hold_against(
                     end, pressure[k], weight[PRESSURE_ROW, k], cap, PRESSURE_SEEN, PRESSURE_ROW,
                     state, coefficients, sample, sums,

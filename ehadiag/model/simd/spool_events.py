@@ -23,9 +23,10 @@ from ehadiag.compile.vector import (
     packed,
     store,
 )
-from ehadiag.model.jack import Piece, Probe, jack_piece
+from ehadiag.model.jack_state import Piece, Probe
 from ehadiag.model.laws import SpoolLaw, play, slide_base, steady_rate, still_flapper
 from ehadiag.model.scalar.transition import FINEST
+from ehadiag.model.second_stage import jack_piece
 from ehadiag.model.sensors import sensing
 from ehadiag.model.simd.coefficients import MOVING_ROWS, SHIFTS, STUCK_ROWS
 from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack

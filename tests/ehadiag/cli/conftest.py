@@ -21,8 +21,9 @@ def _compiled() -> None:
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `ehadiag` in an empty folder, without a bus in the environment."""
     monkeypatch.chdir(tmp_path)
-    for name in ("CAN_INTERFACE", "CAN_CHANNEL"):
+    for name in ("CAN_INTERFACE", "CAN_CHANNEL", "EHADIAG_HISTORY"):
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "no history of the user's own"))
 
     def call(*arguments: object) -> Result:
         capsys.readouterr()

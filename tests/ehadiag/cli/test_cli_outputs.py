@@ -56,7 +56,7 @@ def test_full_standard_output(option: str, tmp_path: Path, environment: dict[str
         f'$EHADIAG diagnose {option} --out o "$1" "$2" > /dev/full',
         tmp_path, environment, HEALTHY, WORN,
     )  # fmt: skip
-    assert done.returncode == 10
+    assert done.returncode == 3  # of one of the two: worse than the other's 10
     first, *others = lines(done.stderr)
     assert first == "standard output: No space left on device"
     assert [line.split()[0] for line in others] == ["wrote", "wrote"]

@@ -134,15 +134,24 @@ def test_notes_of_joint_recordings_are_said_once(recording: Recording) -> None:
     assert len(joint.notes) == 2
 
 
-def test_closed_loop_without_command_frames_says_what_to_record(run: Run, tmp_path: Path) -> None:
+def test_closed_loop_without_command_frames_is_borne_out_by_the_current(
+    run: Run, tmp_path: Path
+) -> None:
     path = rewritten("paper-closed-1.blf", tmp_path, COMMAND)
-    (found,) = run("diagnose", "--json", path).objects
-    assert found["verdict"] == "NOT_TESTED"
-    (reason,) = found["reasons"]
-    assert reason == (
-        "no command frames in the recording, and closed loop cannot be judged without them: "
-        "record the message with the command too, and name it in the mapping"
-    )
+    came = run("diagnose", "--json", path)
+    assert came.code == 10
+    (found,) = came.objects
+    assert any("which the current bears out" in note for note in found["quality"]["notes"])
+
+
+def test_closed_loop_without_command_and_current_says_what_to_record(recording: Recording) -> None:
+    whole = read_recording(LOGS / "paper-closed-1.blf")
+    assert whole.samples is not None
+    nothing = np.full(whole.samples.ticks, np.nan)
+    bare = replace(whole, samples=replace(whole.samples, command=nothing, current=nothing))
+    came = diagnosis_of(bare)
+    assert came.verdict is Verdict.NOT_TESTED
+    assert "record the message with the command too" in came.reasons[0]
 
 
 def test_open_loop_needs_no_command_frames(run: Run, tmp_path: Path) -> None:

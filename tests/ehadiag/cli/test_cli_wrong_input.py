@@ -57,9 +57,11 @@ def test_what_is_no_log(
 @pytest.mark.parametrize("name", ["folder.blf", "folder"])
 def test_folder_for_a_log(name: str, run: Run, tmp_path: Path) -> None:
     (tmp_path / name).mkdir()
-    for command in (["diagnose"], ["check-bus", "--log"]):
-        result = run(*command, name)
-        assert (result.code, result.message) == (3, f"ehadiag: log {name}: not a file")
+    result = run("check-bus", "--log", name)
+    assert (result.code, result.message) == (3, f"ehadiag: log {name}: not a file")
+    result = run("diagnose", name)
+    assert result.code == 3
+    assert result.message.startswith(f"ehadiag: folder {name}: no recording in it")
 
 
 def test_log_without_telemetry(run: Run, tmp_path: Path) -> None:
@@ -189,7 +191,7 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
         (["--test", "open", "--simulate", "--record", "a.txt"], 2, "recording a.txt: suffix"),
         (["--test", "open", "--simulate", "--record", "no/a.blf"], 3, "no/a.blf: No such file"),
         (["--test", "open", "--simulate", "--out", "file"], 3, "output folder file: "),
-        (["--test", "open", "--simulate", "--dbc", "x.dbc"], 2, "--dbc: needs --mapping"),
+        (["--test", "open", "--simulate", "--dbc", "x.dbc"], 3, "DBC file x.dbc: No such file"),
         (["--test", "open", "--simulate", "--mapping", "m.toml"], 3, "m.toml"),
         (["--test", "open", "--simul"], 2, "unrecognized arguments: --simul"),
     ],

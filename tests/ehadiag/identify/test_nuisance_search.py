@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from ehadiag.identify.nuisance.estimate import spread_of_optima
 from ehadiag.identify.nuisance.explained import MOST_EXCESS, excess, is_noise
-from ehadiag.identify.nuisance.linearisation import Belief, linearised
-from ehadiag.identify.nuisance.posterior import sharpen
 from ehadiag.identify.nuisance.prior import Joint, Known, belief_of, information_of, nuisances_of
 from ehadiag.identify.nuisance.starts import Found, Place, search
+from ehadiag.identify.refine.linearisation import Belief, linearised
+from ehadiag.identify.refine.posterior import sharpen
 from ehadiag.model.parameters import FAULTS, REGISTRY, parameter
 
 SAMPLES = 400

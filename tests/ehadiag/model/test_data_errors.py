@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -70,9 +71,12 @@ def test_probes_that_err_are_put_right():
 
 @pytest.mark.parametrize("item", DATA, ids=lambda item: item.name)
 def test_each_datum_changes_the_model(item):
-    base = plant_constants(default_actuator())
-    assert constants_with({item.name: 0.0}) == base
-    assert constants_with({item.name: item.scale}) != base
+    actuator = default_actuator()
+    stage = msgspec.structs.replace(actuator.second_stage, kind="orifice")
+    base = plant_constants(msgspec.structs.replace(actuator, second_stage=stage))
+    unknowns = Unknowns((item,), (base,), {})
+    assert unknowns.constants(np.zeros(1)) == base
+    assert unknowns.constants(np.array([item.scale])) != base
 
 
 def test_the_limit_of_damage_has_no_tolerance():

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from ehadiag.core.channels import POSITION
-from ehadiag.model.jack import JackState, Piece, Probe, jack_piece
+from ehadiag.model.jack_state import JackState, Piece, Probe
 from ehadiag.model.laws import jack_law, resistance
+from ehadiag.model.second_stage import jack_piece
 from ehadiag_tools.damaged import damaged_unit
 
 SPAN = 1e-3
@@ -67,7 +68,7 @@ def exactly(piece, state, begin=0.0, stop=1.0):
 
 
 def jack(place, velocity, direction, fresh):
-    return JackState(place, velocity, direction, fresh, 0.0, 0.0)
+    return JackState(place, velocity, direction, fresh, 0.0, 0.0, 0.0)
 
 
 def over(piece, begin, stop, state):

@@ -24,8 +24,10 @@ def item(
         row=first_row + np.arange(len(time_ms)),
         time_ns=np.rint(np.array(time_ms) * MS).astype(np.int64),
         counter=None if counter is None else np.array(counter),
-        message=SimpleNamespace(name="M", modulus=modulus),
+        message=SimpleNamespace(name="M", modulus=modulus, cycle_ns=0),
         stream=np.zeros(len(time_ms), dtype=np.int64),
+        saturated={},
+        values={},
     )
 
 
@@ -107,7 +109,7 @@ def test_a_frame_out_of_line_has_no_tick() -> None:
 
 
 def test_without_a_counter_time_places_frames_and_says_so() -> None:
-    time = [0.0, *(k + 0.3 for k in range(1, 200))]
+    time = [0.3, *(float(k) for k in range(1, 200))]
     alone, every, notes = ticks._own_ticks(item(time), MS)
     assert alone.tolist() == list(range(200))
     assert every == 1

@@ -108,7 +108,7 @@ def test_a_mapping_without_a_command_is_told(encoder, bus_map):
     report = report_bus(table, replace(bus_map, messages=messages))
     assert report.problems == ()
     assert report.remarks == (
-        "no command is mapped: a test in closed loop cannot be judged without",
+        "no command is mapped: the measured current has to bear out that of a stored test",
     )
 
 

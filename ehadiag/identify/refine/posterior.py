@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.nuisance.linearisation import Belief, Linearised, linearised
 from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
+from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
 
 __all__ = ["TAIL", "robust_weights", "sharpen"]
 

@@ -1,0 +1,102 @@
+"""Which recordings a command line names: files, folders, patterns, a list on standard input."""
+
+from __future__ import annotations
+
+import glob
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ehadiag.core.errors import ConfigurationError
+
+__all__ = ["Input", "expand"]
+
+STANDARD_INPUT = "-"
+MOST_LIST_BYTES = 64 << 20
+"""A list of a hundred thousand long names is a tenth of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """One recording to diagnose."""
+
+    name: str
+    """As it was named, or as it was found."""
+    why: str = ""
+    """Why there is none; empty for a recording."""
+
+
+def expand(names: Iterable[str]) -> list[Input]:
+    """Return the recordings that arguments stand for, in their order and as often as named.
+
+    A folder stands for all recordings in it and below, in the order of their names; a pattern
+    (`*`, `?`, `[…]`, `**`), where there is no file of that name, for what it matches; `-` for the
+    names on standard input, one a line, or ended by null characters.
+
+    Parameters
+    ----------
+    names : Iterable[str]
+        Arguments of the command.
+
+    Returns
+    -------
+    list[Input]
+        What stands for nothing is there too, with the reason.
+
+    Raises
+    ------
+    ConfigurationError
+        The list on standard input is longer than any list of names.
+    """
+    return [item for name in names for item in _expanded(name)]
+
+
+def _expanded(name: str) -> Iterator[Input]:
+    if name == STANDARD_INPUT:
+        for line in _listed():
+            yield from _found(line)
+    else:
+        yield from _found(name)
+
+
+def _found(name: str) -> Iterator[Input]:
+    if os.path.isdir(name):
+        yield from _in_folder(name)
+    elif glob.has_magic(name) and not os.path.lexists(name):
+        matches = sorted(glob.glob(name, recursive=True))
+        for match in matches:
+            yield from _in_folder(match) if os.path.isdir(match) else iter([Input(match)])
+        if not matches:
+            yield Input(name, f"pattern {name}: matches no file")
+    else:
+        yield Input(name)
+
+
+def _in_folder(folder: str) -> Iterator[Input]:
+    from firmware_iface.logs.blocks import SUFFIXES  # noqa: PLC0415 - loads numpy
+    from firmware_iface.logs.packed import kind_of  # noqa: PLC0415
+
+    inside = sorted(
+        os.path.join(place, name)
+        for place, _, names in os.walk(folder)
+        for name in names
+        if not name.startswith(".") and kind_of(Path(name)) in SUFFIXES
+    )
+    if not inside:
+        yield Input(folder, f"folder {folder}: no recording in it ({', '.join(sorted(SUFFIXES))})")
+    yield from map(Input, inside)
+
+
+def _listed() -> list[str]:
+    """Names on standard input."""
+    stream = getattr(sys.stdin, "buffer", None)
+    if stream is None:  # a text put in its place
+        content = sys.stdin.read(MOST_LIST_BYTES + 1)
+    else:
+        content = os.fsdecode(stream.read(MOST_LIST_BYTES + 1))
+    if len(content) > MOST_LIST_BYTES:
+        raise ConfigurationError(f"standard input: more than {MOST_LIST_BYTES} bytes of names")
+    lines = content.split("\0") if "\0" in content else content.splitlines()
+    return [line for line in lines if line.strip()]

@@ -1,0 +1,189 @@
+"""The JSON-lines file of a call's results, which a later call can go on with."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from ehadiag.cli.batch.job import Job
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.fingerprint import fingerprint
+from ehadiag.core.folder import RESULT_MODE, Folder, create_file
+from ehadiag.facade.inputs import log_file
+from ehadiag.report.origin import configuration, package
+
+__all__ = ["Journal"]
+
+MAX_LINE = 1 << 20
+Key = tuple[str, int, int]
+"""Path, size and time of the last change of a log."""
+
+
+class Journal:
+    """Results on the disk, one object a line, each there before the next is come to.
+
+    With an earlier call's file, its results stand for the logs that have not changed since; logs
+    that could not be read are tried again. When the call ends, the file has one call's results
+    in the order of the inputs; until then, new ones are added at its end.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    job : Job
+        What is wanted: results of other options are no results of this call.
+    resume : bool
+        Whether the file may be there already.
+
+    Raises
+    ------
+    InputOutputError
+        The file is there and nobody wants to go on with it; it cannot be read or written.
+    ConfigurationError
+        It holds something else, or results of other options or of another version.
+    """
+
+    def __init__(self, name: str, job: Job, *, resume: bool) -> None:
+        self._name = name
+        self._path = Path(name)
+        self._own = {
+            "configuration": json.loads(json.dumps(configuration(job.asked))),
+            "actuator_sha256": fingerprint(job.actuator),
+        }
+        """What the results of this call have in common."""
+        self._known: dict[Key, list[tuple[int, int]]] = {}
+        self._order: list[tuple[int, int]] = []
+        try:
+            self._file = self._open(resume)
+        except FileExistsError:
+            raise InputOutputError(
+                f"results {name}: there is such a file; go on with it by --resume, or name another"
+            ) from None
+        except OSError as error:
+            raise InputOutputError(f"results {name}: {error.strerror or error}") from None
+
+    def found(self, log: str) -> list[str]:
+        """Return the objects of a log that an earlier call diagnosed; none where it must be now."""
+        now = log_file(log)
+        if now is None:
+            return []
+        places = self._known.get((now.path, now.size, now.modified_ns), [])
+        return [self._line(at, size) for at, size in places]
+
+    def add(self, line: str, *, reused: bool) -> None:
+        """Write a result down, or take note of where one that was there already has its place."""
+        content = line.encode() + b"\n"
+        if reused:
+            log = json.loads(line)["recordings"][0]["log"]
+            places = self._known[log["path"], log["bytes"], log["modified_ns"]]
+            self._order.append(places[log["result"] - 1])
+            return
+        try:
+            self._file.seek(0, os.SEEK_END)
+            at = self._file.tell()
+            self._file.write(content)
+            self._file.flush()
+        except OSError as error:
+            raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
+        self._order.append((at, len(content)))
+
+    def settle(self) -> None:
+        """Bring the file into the order of the inputs, where it is not: each once as named."""
+        at = 0
+        for start, size in self._order:
+            if start != at:
+                break
+            at += size
+        else:
+            self._file.seek(0, os.SEEK_END)
+            if at == self._file.tell():
+                return
+        try:
+            with (
+                Folder.at(self._path.parent, RESULT_MODE, follow=True) as folder,
+                folder.drafted(self._path.name) as file,
+            ):
+                for start, size in self._order:
+                    file.write(self._line(start, size).encode() + b"\n")
+        except OSError as error:
+            raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def _open(self, resume: bool) -> BinaryIO:
+        if not (resume and os.path.lexists(self._path)):
+            return os.fdopen(create_file(self._path), "r+b")
+        if self._path.is_symlink() or not self._path.is_file():
+            raise InputOutputError(f"results {self._name}: not a regular file")
+        file = self._path.open("r+b")
+        try:
+            self._index(file)
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def _index(self, file: BinaryIO) -> None:
+        """Find what an earlier call left; what it had only begun to write is cut off."""
+        at, number = 0, 0
+        groups: dict[Key, list[tuple[int, int]]] = {}
+        while line := file.readline(MAX_LINE):
+            number += 1
+            if not line.endswith(b"\n"):
+                if len(line) == MAX_LINE:
+                    raise ConfigurationError(f"results {self._name}: line {number} is none of ours")
+                file.truncate(at)
+                break
+            tree = self._checked(line, number)
+            if tree["error"] is None and len(tree["recordings"]) == 1:
+                self._remember(groups, tree["recordings"][0]["log"], (at, len(line)))
+            at += len(line)
+
+    def _remember(
+        self, groups: dict[Key, list[tuple[int, int]]], log: Any, place: tuple[int, int]
+    ) -> None:
+        if log is None:
+            return
+        key = (log["path"], log["bytes"], log["modified_ns"])
+        if log["result"] == 1:
+            groups[key] = []
+        groups.setdefault(key, []).append(place)
+        if len(groups[key]) == log["results"]:
+            self._known[key] = groups[key]
+
+    def _checked(self, line: bytes, number: int) -> dict[str, Any]:
+        """Return an earlier result; ConfigurationError where it is none that can stand beside."""
+        try:
+            tree: dict[str, Any] = json.loads(line)
+            own = {key: tree[key] for key in self._own}
+            version = tree["package"]["version"]
+            known = tree["schema"] == "ehadiag.diagnosis/2" and "recordings" in tree
+            bool(tree["error"])
+        except (ValueError, KeyError, TypeError, RecursionError):
+            known = False
+        if not known:
+            raise ConfigurationError(
+                f"results {self._name}: line {number} is no object ehadiag.diagnosis/2"
+            )
+        if own != self._own or version != package()["version"]:
+            raise ConfigurationError(
+                f"results {self._name}: line {number} was found with other options, another "
+                "actuator or another version; name another file"
+            )
+        return tree
+
+    def _line(self, at: int, size: int) -> str:
+        self._file.seek(at)
+        return self._file.read(size).decode().rstrip("\n")

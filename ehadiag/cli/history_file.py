@@ -1,0 +1,175 @@
+"""Which health history a command works with, and keeping diagnoses in it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+
+if TYPE_CHECKING:
+    from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.history.records import Usage
+    from ehadiag.history.store import History
+
+__all__ = [
+    "Keeper",
+    "add_history_file",
+    "add_keeping_options",
+    "add_usage_options",
+    "history_place",
+    "open_history",
+    "the_usage",
+]
+
+VARIABLE = "EHADIAG_HISTORY"
+
+
+def add_history_file(parser: argparse.ArgumentParser, *, again: bool = False) -> None:
+    """Add `--history`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of a command, or of a verb of one.
+    again : bool
+        The command has it already: without it here what was said there holds.
+    """
+    parser.add_argument(
+        "--history",
+        metavar="FILE",
+        default=argparse.SUPPRESS if again else None,
+        help=f"health history, SQLite (default: {VARIABLE}, else the user's own once"
+        " `ehadiag history init` was called)",
+    )
+
+
+def add_usage_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--hours` and `--cycles`."""
+    for name, what in (("hours", "operating hours"), ("cycles", "cycles")):
+        parser.add_argument(
+            f"--{name}",
+            type=_not_negative,
+            metavar="N",
+            help=f"{what} of the unit since it was new, for the health history",
+        )
+
+
+def add_keeping_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of commands that append their diagnoses to a history."""
+    add_history_file(parser)
+    parser.add_argument(
+        "--no-history", action="store_true", help="append nothing to any health history"
+    )
+    add_usage_options(parser)
+
+
+def the_usage(arguments: argparse.Namespace) -> Usage:
+    """Return the hours and cycles that were named."""
+    from ehadiag.history.records import Usage  # noqa: PLC0415
+
+    return Usage(arguments.hours, arguments.cycles)
+
+
+def history_place(arguments: argparse.Namespace) -> Path | None:
+    """Return the file that was named, else the user's own if there is one."""
+    named = arguments.history or os.environ.get(VARIABLE)
+    if named:
+        return Path(named)
+    from ehadiag.history.place import own_history  # noqa: PLC0415
+
+    own = own_history()
+    return own if own is not None and own.exists() else None
+
+
+def open_history(arguments: argparse.Namespace) -> History:
+    """Open the history that there is; ConfigurationError where there is none."""
+    place = history_place(arguments)
+    if place is None:
+        raise ConfigurationError(
+            f"no health history: name one by --history or {VARIABLE}, or begin one by"
+            " ehadiag history init"
+        )
+    from ehadiag.history.store import History  # noqa: PLC0415
+
+    return History(place)
+
+
+class Keeper:
+    """Appends the diagnoses of one call to the history, where there is one.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        The parsed command line.
+
+    Raises
+    ------
+    ConfigurationError
+        Hours or cycles without a history; the file is none.
+    InputOutputError
+        The history cannot be opened.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self.place = self._place()
+        """Of the history; None: nothing is kept."""
+        if self.place is not None:
+            # Said before a test begins or a log is read.
+            self._open().close()
+        elif arguments.hours is not None or arguments.cycles is not None:
+            raise ConfigurationError(
+                "--hours, --cycles: no health history to keep them in: name one by --history, or"
+                " begin one by ehadiag history init"
+            )
+
+    def keep(self, diagnosis: Diagnosis, line: str) -> None:
+        """Append a diagnosis; InputOutputError where it cannot be, and then nothing of it is.
+
+        line: its JSON result.
+        """
+        if self.place is None:
+            return
+        from ehadiag import __version__  # noqa: PLC0415
+        from ehadiag.history.keep import entry_of  # noqa: PLC0415
+
+        usage = the_usage(self._arguments)
+        entry = entry_of(diagnosis, line, usage, __version__, simulated=self._simulated)
+        try:
+            with self._open() as history:
+                history.append(entry)
+        except ConfigurationError as error:  # exchanged since the call began
+            raise InputOutputError(str(error)) from None
+
+    @property
+    def _simulated(self) -> bool:
+        return bool(getattr(self._arguments, "simulate", False))
+
+    def _place(self) -> Path | None:
+        if self._arguments.no_history:
+            if self._arguments.history:
+                raise ConfigurationError("--history and --no-history exclude each other")
+            return None
+        if self._simulated and not self._arguments.history:
+            return None  # a simulated unit is none of the fleet's unless somebody wants it there
+        return history_place(self._arguments)
+
+    def _open(self) -> History:
+        from ehadiag.history.store import History  # noqa: PLC0415
+
+        assert self.place is not None
+        return History(self.place, create=True)
+
+
+def _not_negative(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a number of at least 0")
+    return value

@@ -1,0 +1,1 @@
+"""What a test can tell of an actuator, and a better test within given limits."""

@@ -1,0 +1,232 @@
+"""A static library with its header, example, CMake file and manifest, for one target."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib import metadata, resources
+from string import Template
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from ehadiag.compile.kernel_cache import source_hash
+from ehadiag.compile.object_code import (
+    Function,
+    Numbers,
+    Pointer,
+    Table,
+    object_code,
+    tool_versions,
+)
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.errors import InputOutputError
+from ehadiag.core.folder import Folder
+from ehadiag.core.printable import plain_name
+from ehadiag.export.archive import archive
+from ehadiag.export.arm_attributes import either_convention
+from ehadiag.export.linking import c_compiler, link_shared
+from ehadiag.export.targets import Target
+from ehadiag.model.exponential import exponential, exponential_less_one
+from ehadiag.model.plant import plant_constants
+from ehadiag.monitor import layout
+from ehadiag.monitor.cusum import CusumDesign, design_cusum
+from ehadiag.monitor.kernel import push_tick
+from ehadiag.monitor.plan import monitor_plan
+from ehadiag.monitor.prepare import prepare, rest
+
+__all__ = [
+    "HEADER",
+    "LIBRARY",
+    "MANIFEST",
+    "OWN_FUNCTIONS",
+    "SHARED",
+    "export_library",
+    "manifest",
+    "template",
+    "write",
+]
+
+LIBRARY: Final = "libeha.a"
+HEADER: Final = "eha_monitor.h"
+SHARED: Final = "libeha.so"
+MANIFEST: Final = "manifest.json"
+SCHEMA: Final = "ehadiag.export/1"
+OWN_FUNCTIONS: Final[Mapping[str, Any]] = {"exp": exponential, "expm1": exponential_less_one}
+"""What stands for functions of the C library, whose last digit differs from one to the next."""
+PLAN: Final = "eha_plan"
+
+MONITOR: Final = (
+    Function("eha_monitor_init", prepare, (Pointer(), Table(PLAN), Pointer())),
+    Function("eha_monitor_reset", rest, (Pointer(), Numbers(1))),
+    Function("eha_monitor_push", push_tick, (Pointer(), Numbers(5))),
+)
+
+
+def export_library(
+    actuator: Actuator, target: Target, folder: Folder, *, hours: float = 100.0, shift: float = 1.0
+) -> list[str]:
+    """Write a library of the streaming monitor for a target into a folder.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        Whose data are in the library as constants.
+    target : Target
+        For what computer.
+    folder : Folder
+        Where to write; files of these names are replaced.
+    hours : float
+        Mean time between false alarms, h.
+    shift : float
+        Of the mean, in units of noise, that the sums are to find soonest.
+
+    Returns
+    -------
+    list[str]
+        Names of the files.
+
+    Raises
+    ------
+    ConfigurationError
+        A number out of its range.
+    InputOutputError
+        The folder cannot be written.
+    """
+    design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
+    plan = monitor_plan(actuator, plant_constants(actuator), design)
+    code = either_convention(
+        object_code(MONITOR, {PLAN: plan.tolist()}, OWN_FUNCTIONS, target.processor)
+    )
+    library = archive("eha.o", code, [item.name for item in MONITOR])
+    names = {"version": metadata.version("ehadiag"), "target": target.name}
+    files = {
+        LIBRARY: library,
+        HEADER: _header(actuator, target, design, hours, names),
+        "CMakeLists.txt": template("CMakeLists.txt.in", flags=";".join(target.flags), **names),
+        "example.c": template("example.c"),
+    }
+    compiler = c_compiler() if target.processor.shared else None
+    if compiler is not None:
+        # Objects alone: what is exported has no C part.
+        files[SHARED] = link_shared(compiler, SHARED, {"eha.o": code}, ["-nostartfiles"])
+        files["eha.pc"] = template("eha.pc.in", **names)
+    files[MANIFEST] = manifest(
+        files,
+        target=target.name,
+        processor={
+            "triple": target.processor.triple or "of this computer",
+            "cpu": target.processor.cpu,
+            "features": target.processor.features,
+            "fused": target.processor.fused,
+        },
+        compiler_flags=list(target.flags),
+        options={"actuator": actuator.name, "hours": hours, "shift": shift},
+        plan=_digest(plan),
+        functions=[item.name for item in MONITOR],
+        monitor_bytes=layout.SIZE * layout.NUMBER,
+        object_bytes=len(code),
+    )
+    write(folder, files)
+    return list(files)
+
+
+def _header(
+    actuator: Actuator,
+    target: Target,
+    design: CusumDesign,
+    hours: float,
+    names: Mapping[str, str],
+) -> bytes:
+    held = 3 + 2 + 4
+    return template(
+        f"{HEADER}.in",
+        meaning=target.meaning,
+        # A comment must not be ended by a name.
+        actuator=plain_name(actuator.name),
+        tick_us=f"{1e6 / actuator.controller.rate:g}",
+        reference=f"{design.reference:g}",
+        threshold=f"{design.threshold:.4g}",
+        hours=f"{hours:g}",
+        supply=repr(float(plant_constants(actuator).PSR)),
+        bytes=str(layout.SIZE * layout.NUMBER),
+        before=str(layout.PREDICTED),
+        behind=str(layout.SIZE - layout.PREDICTED - held),
+        **names,
+    )
+
+
+def _digest(plan: NDArray[Any]) -> str:
+    return hashlib.sha256(plan.astype("<f8").tobytes()).hexdigest()
+
+
+def template(name: str, **values: str) -> bytes:
+    """Fill in a text of the package.
+
+    Parameters
+    ----------
+    name : str
+        Of its file; the names of those with places to fill end in `.in`.
+    **values : str
+        What to fill in.
+
+    Returns
+    -------
+    bytes
+        The text.
+    """
+    text = resources.files("ehadiag").joinpath("data", "export", name).read_text("utf-8")
+    if name.endswith(".in"):
+        text = Template(text).substitute(values)
+    return text.encode()
+
+
+def manifest(files: Mapping[str, bytes], **facts: Any) -> bytes:
+    """Say in JSON of what an export was made, and what it holds.
+
+    Parameters
+    ----------
+    files : Mapping[str, bytes]
+        By name.
+    **facts : Any
+        Further members.
+
+    Returns
+    -------
+    bytes
+        The text.
+    """
+    content = {
+        "schema": SCHEMA,
+        "versions": {"ehadiag": metadata.version("ehadiag"), **tool_versions()},
+        "kernel_sources": source_hash(),
+        **facts,
+        "files": {
+            name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+            for name, data in files.items()
+        },
+    }
+    return (json.dumps(content, indent=2) + "\n").encode()
+
+
+def write(folder: Folder, files: Mapping[str, bytes]) -> None:
+    """Write files into a folder.
+
+    Parameters
+    ----------
+    folder : Folder
+        The folder, open.
+    files : Mapping[str, bytes]
+        By name.
+
+    Raises
+    ------
+    InputOutputError
+        It cannot be written.
+    """
+    for name, data in files.items():
+        try:
+            folder.write(name, data)
+        except OSError as error:
+            raise InputOutputError(f"{folder.path / name}: {error.strerror or error}") from None

@@ -1,0 +1,184 @@
+"""Tables of the history file, step by step from the first version to today's.
+
+`PRAGMA user_version` is the number of steps that a file has gone through. A step that was ever
+released is never changed: what is new is a further step. Triggers refuse to change or delete a row,
+and to put another in its place.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Mapping, Sequence
+
+from ehadiag.core.errors import ConfigurationError
+
+__all__ = ["APPLICATION_ID", "STEPS", "migrate", "version_of"]
+
+APPLICATION_ID = 0x45484148
+"""'EHAH' in the file's head: what tells a history from other SQLite files."""
+APPEND_ONLY = "a history is only ever appended to"
+
+FIRST = """
+CREATE TABLE diagnosis (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    appended TEXT NOT NULL,      -- UTC, ISO 8601
+    tested TEXT,                 -- UTC, ISO 8601
+    actuator TEXT NOT NULL,
+    serial INTEGER,
+    test TEXT,
+    verdict TEXT NOT NULL,
+    reasons TEXT NOT NULL,       -- JSON list
+    hours REAL,
+    cycles REAL,
+    covariance TEXT,             -- JSON matrix, in the order of severity.place
+    version TEXT NOT NULL,
+    simulated INTEGER NOT NULL,
+    result TEXT NOT NULL         -- JSON result
+);
+CREATE INDEX diagnosis_of_unit ON diagnosis (serial);
+CREATE TABLE source (
+    diagnosis INTEGER NOT NULL REFERENCES diagnosis (id),
+    place INTEGER NOT NULL,
+    path TEXT NOT NULL,
+    sha256 TEXT,
+    samples TEXT,
+    PRIMARY KEY (diagnosis, place)
+);
+CREATE TABLE severity (
+    diagnosis INTEGER NOT NULL REFERENCES diagnosis (id),
+    place INTEGER NOT NULL,
+    name TEXT NOT NULL,
+    estimate REAL,
+    std REAL,
+    low REAL,
+    high REAL,
+    at_bound INTEGER NOT NULL,
+    shown INTEGER NOT NULL,
+    PRIMARY KEY (diagnosis, place)
+);
+CREATE TABLE effect (
+    diagnosis INTEGER NOT NULL REFERENCES diagnosis (id),
+    place INTEGER NOT NULL,
+    name TEXT NOT NULL,
+    value REAL,
+    std REAL,
+    at_bound INTEGER NOT NULL,
+    PRIMARY KEY (diagnosis, place)
+);
+CREATE TABLE event (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    appended TEXT NOT NULL,
+    done TEXT NOT NULL,
+    serial INTEGER NOT NULL,
+    actuator TEXT,
+    hours REAL,
+    cycles REAL,
+    text TEXT NOT NULL,
+    resets TEXT NOT NULL         -- JSON list
+);
+"""
+
+
+def _guards(tables: Mapping[str, Sequence[str]]) -> str:
+    """Triggers that keep the rows of tables, named with their keys."""
+    out = []
+    for table, key in tables.items():
+        same = " AND ".join(f"{column} = NEW.{column}" for column in key)
+        for what, when in (
+            ("UPDATE", ""),
+            ("DELETE", ""),
+            # INSERT OR REPLACE deletes without asking the triggers of DELETE.
+            ("INSERT", f"WHEN EXISTS (SELECT 1 FROM {table} WHERE {same})"),
+        ):
+            out.append(
+                f"CREATE TRIGGER {table}_no_{what.lower()} BEFORE {what} ON {table} {when} "
+                f"BEGIN SELECT RAISE(ABORT, '{APPEND_ONLY}'); END;"
+            )
+    return "\n".join(out)
+
+
+_PARTS = ("diagnosis", "place")
+_KEYS = {"diagnosis": ("id",), "event": ("id",)} | dict.fromkeys(
+    ("source", "severity", "effect"), _PARTS
+)
+STEPS: tuple[str, ...] = (FIRST + _guards(_KEYS),)
+"""SQL of each step, in order."""
+
+
+def version_of(connection: sqlite3.Connection) -> int:
+    """Steps that a file has gone through; 0: an empty file.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+        The open file.
+
+    Returns
+    -------
+    int
+        Its `user_version`.
+
+    Raises
+    ------
+    ConfigurationError
+        The file is another program's.
+    """
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (tables,) = connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+    if tables and application != APPLICATION_ID:
+        raise ConfigurationError("is an SQLite file of another program: name another file")
+    return int(version)
+
+
+def migrate(connection: sqlite3.Connection, steps: Sequence[str] = STEPS) -> None:
+    """Bring a file to today's tables, whole or not at all; the rows that it has stay as they are.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+        The open file, in autocommit mode.
+    steps : Sequence[str]
+        SQL of each step.
+
+    Raises
+    ------
+    ConfigurationError
+        The file is another program's, or a later version's.
+    """
+    if _refuse_later(version_of(connection), steps) == len(steps):
+        return
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        # Another process may have been quicker.
+        done = _refuse_later(version_of(connection), steps)
+        for step in steps[done:]:
+            for statement in _statements(step):
+                connection.execute(statement)
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {len(steps)}")
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def _refuse_later(version: int, steps: Sequence[str]) -> int:
+    if version > len(steps):
+        raise ConfigurationError(
+            f"has version {version} of the tables, this program knows up to {len(steps)}:"
+            " use a later ehadiag"
+        )
+    return version
+
+
+def _statements(script: str) -> list[str]:
+    """Split a script: `executescript` would end the transaction."""
+    out, begun = [], ""
+    for line in script.splitlines():
+        begun += line + "\n"
+        if sqlite3.complete_statement(begun):
+            out.append(begun)
+            begun = ""
+    return out

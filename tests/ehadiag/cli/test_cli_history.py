@@ -1,0 +1,178 @@
+"""`ehadiag history`, and diagnoses that are appended to it."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_result import Result, Run
+from places import LOGS
+
+HEALTHY = LOGS / "healthy-open.blf"
+WORN = LOGS / "paper-open-4.blf"
+GOOD = ("--history", "good")
+
+
+def listed(run: Run, *arguments: object) -> list[dict[str, Any]]:
+    return run("history", "list", "--json", "--history", "h.sqlite", *arguments).objects
+
+
+def test_diagnoses_are_appended(run: Run) -> None:
+    options = ("--json", "--history", "h.sqlite")
+    first = run("diagnose", *options, "--hours", 120, HEALTHY)
+    run("diagnose", *options, "--cycles", 40, WORN)
+    one, two = listed(run)
+    assert (one["hours"], one["cycles"], two["hours"], two["cycles"]) == (120, None, None, 40)
+    assert (one["verdict"], two["verdict"]) == ("HEALTHY", "DEGRADED")
+    shown = json.loads(run("history", "show", "1", "--history", "h.sqlite").out)
+    assert shown["result"] == first.objects[0]
+    assert shown["recordings"][0]["path"] == str(HEALTHY)
+    assert len(shown["covariance"]) == len(shown["covariance"][0]) == 3
+    for name, fault in first.objects[0]["faults"].items():
+        assert shown["severities"][name]["estimate"] == fault["estimate"]
+
+
+def test_the_file_is_named_before_or_after_the_verb_or_by_the_environment(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run("diagnose", "--history", "h.sqlite", HEALTHY).code == 0
+    after = run("history", "list", "--history", "h.sqlite")
+    assert after.code == 0
+    assert run("history", "--history", "h.sqlite", "list") == after
+    monkeypatch.setenv("EHADIAG_HISTORY", "h.sqlite")
+    assert run("history", "list") == after
+
+
+def test_the_users_own_history_is_kept_once_it_was_begun(run: Run) -> None:
+    assert "no health history" in run("history", "list").message
+    assert run("history", "list").code == 2
+    assert run("diagnose", HEALTHY).code == 0
+    assert "begun" in run("history", "init").out
+    assert run("diagnose", HEALTHY).code == 0
+    assert run("diagnose", "--no-history", WORN).code == 10
+    assert len(run("history", "list", "--json").objects) == 1
+    assert "was there already" in run("history", "init").out
+
+
+def test_a_simulated_unit_goes_into_a_named_history_only(run: Run) -> None:
+    bit = ("bit", "--simulate", "--fast", "--json", "--test", "open", "--serial-number", 9)
+    run("history", "init")
+    assert run(*bit).code == 0
+    assert run("history", "list", "--json").objects == []
+    assert run(*bit, "--history", "h.sqlite", "--hours", 3).code == 0
+    (found,) = listed(run)
+    assert (found["serial"], found["hours"]) == (9, 3)
+    assert json.loads(run("history", "show", 1, "--history", "h.sqlite").out)["simulated"]
+
+
+def test_the_same_recording_counts_once_in_any_packing(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "copy.blf.gz").write_bytes(gzip.compress(WORN.read_bytes()))
+    shutil.copy(WORN, tmp_path / "other-name.blf")
+    logs = (WORN, "copy.blf.gz", "other-name.blf", HEALTHY)
+    run("diagnose", "--history", "h.sqlite", *logs)
+    assert len(listed(run)) == 2
+    assert len(listed(run, "--all")) == 4
+
+
+def test_what_a_test_recorded_is_the_same_when_its_recording_is_diagnosed(
+    run: Run, tmp_path: Path
+) -> None:
+    run(
+        "bit",
+        "--simulate",
+        "--fast",
+        "--test",
+        "open",
+        "--history",
+        "h.sqlite",
+        "--record",
+        "a.blf",
+    )
+    run("diagnose", "--history", "h.sqlite", tmp_path / "a.blf")
+    assert len(listed(run)) == 1
+    assert len(listed(run, "--all")) == 2
+
+
+def test_what_was_not_tested_is_kept_too(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "half.blf").write_bytes(HEALTHY.read_bytes()[:60_000])
+    assert run("diagnose", "--history", "h.sqlite", "half.blf").code == 30
+    (found,) = listed(run)
+    assert found["verdict"] == "NOT_TESTED"
+    assert found["severities"] == {}
+    assert run("history", "export", "--history", "h.sqlite").code == 0
+
+
+def test_events_are_listed_with_the_diagnoses(run: Run) -> None:
+    history = ("--history", "h.sqlite")
+    run("diagnose", *history, HEALTHY)
+    event = run(
+        "history", "event", "--serial", 1, "filter\x1b[31m changed", "--hours", 30,
+        "--resets", "Kintas", "--when", "2026-03-01", *history,
+    )  # fmt: skip
+    assert event.code == 0
+    assert "\x1b" not in event.out
+    found = listed(run)[-1]
+    assert (found["kind"], found["hours"], found["resets"]) == ("event", 30, ["Kintas"])
+    assert found["when"] == "2026-03-01T00:00:00.000Z"
+    table = run("history", "list", *history).out
+    assert "filter\\x1b[31m changed (begins anew: Kintas)" in table
+
+
+def test_export_is_csv(run: Run) -> None:
+    run("diagnose", "--history", "h.sqlite", "--hours", 5, WORN)
+    text = run("history", "export", "--history", "h.sqlite").out
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert [row["severity"] for row in rows] == ["Kintas", "FSS", "FDJ"]
+    assert float(rows[2]["estimate"]) == pytest.approx(0.6, abs=2e-3)
+    run("history", "export", "--history", "h.sqlite", "--out", "h.csv")
+    assert Path("h.csv").read_bytes().decode().replace("\r\n", "\n") == text.replace("\r\n", "\n")
+
+
+def test_plot_draws_a_picture(run: Run) -> None:
+    history = ("--history", "h.sqlite")
+    for hours, log in ((10, HEALTHY), (200, WORN)):
+        run("diagnose", *history, "--hours", hours, log)
+    run("history", "event", "--serial", 1, "$oiled", "--hours", 100, *history)
+    assert run("history", "plot", *history, "--serial", 1, "--out", "h.png").code == 0
+    assert Path("h.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("diagnose", "--hours", "5", HEALTHY), 2, "no health history to keep them in"),
+        (("diagnose", "--hours", "-5", HEALTHY), 2, "at least 0"),
+        (("diagnose", "--history", "h", "--no-history", HEALTHY), 2, "exclude each other"),
+        (("diagnose", "--history", "no/such/h", HEALTHY), 3, "no such folder"),
+        (("diagnose", "--history", "h.blf", HEALTHY), 3, "not an SQLite file"),
+        (("bit", "--test", "open", "--simulate", "--fast", "--history", "h.blf"), 3, "not an SQL"),
+        (("history", "list", "--history", "none"), 2, "begin one by ehadiag history init"),
+        (("history", "show", "5", *GOOD), 2, "has no diagnosis 5"),
+        (
+            ("history", "plot", "--serial", "5", "--out", "x.png", *GOOD),
+            2,
+            "serial 5",
+        ),
+        (
+            ("history", "event", "--serial", "5", "a", "--resets", "x", *GOOD),
+            2,
+            "FSS",
+        ),
+        (("history", "event", "--serial", "5", "a", "--when", "x", *GOOD), 2, "8601"),
+        (("history", "export", "--out", "no/x.csv", *GOOD), 3, "No such file"),
+    ],
+)
+def test_wrong_usage_is_one_line(
+    run: Run, arguments: tuple[object, ...], code: int, said: str
+) -> None:
+    shutil.copy(HEALTHY, "h.blf")
+    assert run("history", "init", *GOOD).code == 0
+    found: Result = run(*arguments)
+    assert said in found.message
+    assert found.code == code

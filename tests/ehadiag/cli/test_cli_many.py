@@ -1,0 +1,219 @@
+"""Many recordings in one call: names, order, workers, files of results, resumption."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import shutil
+import sys
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from cli_result import Run
+from places import LOGS
+
+from ehadiag.cli.batch.row import COLUMNS
+from ehadiag.cli.batch.summary import Summary, worst_code
+
+HEALTHY = LOGS / "healthy-open.blf"
+WORN = LOGS / "paper-open-4.blf"
+
+
+def valid(tree: dict[str, Any]) -> bool:
+    schema = resources.files("ehadiag").joinpath("data/schemas/diagnosis-2.json").read_text()
+    jsonschema.Draft202012Validator(json.loads(schema)).validate(tree)
+    return True
+
+
+def without_times(tree: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in tree.items() if key != "timing_s"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two recordings, one of them packed, something broken, and what is no recording."""
+    place = tmp_path / "rig"
+    (place / "b").mkdir(parents=True)
+    shutil.copy(HEALTHY, place / "a.blf")
+    (place / "b" / "c.blf.gz").write_bytes(gzip.compress(WORN.read_bytes()))
+    (place / "b" / "d.blf").write_bytes(b"no recording")
+    (place / "b" / "notes.txt").write_text("nothing")
+    (place / ".hidden.blf").write_bytes(b"")
+    return place
+
+
+def test_folder_pattern_and_list_in_order_and_as_often_as_named(
+    folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("rig/a.blf\nrig/none.blf\n"))
+    result = run("diagnose", "rig", "--json", "--summary", "s.json", "rig/b/*.gz", "-", "no*.blf")
+    assert [(item["source"], item["verdict"]) for item in result.objects] == [
+        ("rig/a.blf", "HEALTHY"),
+        ("rig/b/c.blf.gz", "DEGRADED"),
+        ("rig/b/d.blf", None),
+        ("rig/b/c.blf.gz", "DEGRADED"),
+        ("rig/a.blf", "HEALTHY"),
+        ("rig/none.blf", None),
+        ("no*.blf", None),
+    ]
+    assert all(valid(item) for item in result.objects)
+    assert result.objects[2]["error"]["log"]["bytes"] == len(b"no recording")
+    assert "no*.blf: matches no file" in result.objects[6]["error"]["text"]
+    assert result.code == 3
+    told = json.loads(Path("s.json").read_text())
+    assert told["verdicts"] == {"HEALTHY": 2, "DEGRADED": 2, "FAULT": 0, "NOT_TESTED": 0}
+    assert (told["failed"], told["exit_code"], told["worst"][0]["fault"]) == (3, 3, "FSS")
+    assert [item["source"] for item in told["failures"]] == [
+        "rig/b/d.blf", "rig/none.blf", "no*.blf",
+    ]  # fmt: skip
+    assert "7 recordings in" in result.err
+
+
+def test_an_empty_folder_and_an_empty_list_are_said(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "empty").mkdir()
+    result = run("diagnose", "empty")
+    assert result.code == 3
+    assert "folder empty: no recording in it" in result.message
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
+    result = run("diagnose", "-")
+    assert result.code == 2
+    assert "no recording named" in result.message
+
+
+def test_workers_give_what_one_process_gives(folder: Path, run: Run) -> None:
+    here = run("diagnose", "--json", "--jobs", 1, "--out", "one", "rig")
+    there = run("diagnose", "--json", "--jobs", 2, "--out", "two", "rig")
+    assert list(map(without_times, here.objects)) == list(map(without_times, there.objects))
+    assert here.code == there.code == 3
+    names = sorted(path.name for path in Path("one").iterdir())
+    assert names == ["a.json", "a.png", "c.blf.json", "c.blf.png"]
+    for path in Path("one").glob("*.png"):
+        assert path.read_bytes() == (Path("two") / path.name).read_bytes()
+
+
+def test_tables_and_report_are_read_by_others(folder: Path, run: Run) -> None:
+    import junitparser
+    import pandas
+
+    result = run(
+        "diagnose", "rig", "--json", "--results", "r.csv", "--results", "r.parquet",
+        "--results", "r.jsonl", "--junit", "r.xml",
+    )  # fmt: skip
+    objects = result.objects
+    assert [json.loads(line) for line in Path("r.jsonl").read_text().splitlines()] == objects
+    with Path("r.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == list(COLUMNS)
+    assert [row["verdict"] for row in rows] == ["HEALTHY", "DEGRADED", ""]
+    assert float(rows[1]["FSS"]) == objects[1]["faults"]["FSS"]["estimate"]
+    table = pandas.read_parquet("r.parquet")
+    assert list(table["FSS"][:2]) == [item["faults"]["FSS"]["estimate"] for item in objects[:2]]
+    assert table["error"][2] == objects[2]["error"]["text"]
+    (suite,) = junitparser.JUnitXml.fromfile("r.xml")
+    assert (suite.tests, suite.failures, suite.errors, suite.skipped) == (3, 1, 1, 0)
+
+
+def test_a_call_goes_on_where_another_stopped(folder: Path, run: Run) -> None:
+    first = run("diagnose", "--json", "--resume", "r.jsonl", "rig/a.blf", "rig/b/d.blf")
+    whole = Path("r.jsonl").read_bytes()
+    Path("r.jsonl").write_bytes(whole + b'{"schema": "ehadiag.dia')  # a power cut
+    shutil.copy(HEALTHY, folder / "b" / "d.blf")
+    names = ("rig/b/c.blf.gz", "rig/a.blf", "rig/b/d.blf", "rig/a.blf")
+    again = run("diagnose", "--json", "--resume", "r.jsonl", "--summary", "s.json", *names)
+    assert [item["source"] for item in again.objects] == list(names)
+    assert again.objects[1] == again.objects[3] == first.objects[0]
+    assert again.objects[2]["verdict"] == "HEALTHY"
+    assert json.loads(Path("s.json").read_text())["reused"] == 2
+    lines = Path("r.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines] == again.objects
+    assert again.code == 10
+
+
+def test_results_of_other_options_are_not_taken(folder: Path, run: Run) -> None:
+    run("diagnose", "--resume", "r.jsonl", "rig/a.blf")
+    before = Path("r.jsonl").read_bytes()
+    result = run("diagnose", "--resume", "r.jsonl", "--seed", 1, "rig/a.blf")
+    assert result.code == 2
+    assert "found with other options" in result.message
+    result = run("diagnose", "--results", "r.jsonl", "rig/a.blf")
+    assert result.code == 3
+    assert "--resume" in result.err
+    assert Path("r.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["--results", "r.txt"], "need a name in .jsonl, .csv or .parquet"),
+        (["--joint", "--summary", "s.json"], "--joint gives one result"),
+        (["--cluster", "tcp://127.0.0.1:1", "--jobs", 2], "a cluster has its own number"),
+    ],
+)
+def test_wrong_options(arguments: list[object], why: str, run: Run) -> None:
+    result = run("diagnose", *arguments, HEALTHY)
+    assert result.code == 2
+    assert why in result.message
+
+
+def test_a_report_that_cannot_be_written_keeps_the_verdict(run: Run) -> None:
+    result = run("diagnose", "--json", "--summary", "none/s.json", HEALTHY)
+    assert result.objects[0]["verdict"] == "HEALTHY"
+    assert result.code == 3
+    assert "summary none/s.json" in result.message
+
+
+def test_the_first_version_on_request(run: Run) -> None:
+    new = run("diagnose", "--json", HEALTHY, "missing.blf").objects
+    old = run("diagnose", "--json", "--json-version", 1, HEALTHY, "missing.blf").objects
+    assert [item["schema"] for item in old] == ["ehadiag.diagnosis/1"]
+    assert len(new) == 2
+    assert set(old[0]) < set(new[0])
+    for key in set(old[0]) - {"schema", "timing_s", "fit"}:
+        assert old[0][key] == new[0][key]
+    assert set(old[0]["fit"]) < set(new[0]["fit"])
+
+
+def test_same_names_of_other_folders_are_not_overwritten(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, log in (("x", HEALTHY), ("y", WORN)):
+        (tmp_path / name).mkdir()
+        shutil.copy(log, tmp_path / name / "test.blf")
+        monkeypatch.chdir(tmp_path / name)
+        for _ in range(2):
+            run("diagnose", "--out", tmp_path / "out", "--no-picture", "test.blf")
+    written = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in written] == ["test-2.json", "test.json"]
+    verdicts = [json.loads(path.read_text())["verdict"] for path in written]
+    assert verdicts == ["DEGRADED", "HEALTHY"]
+
+
+def test_the_worst_code() -> None:
+    assert worst_code({0, 10, 30, 3, 20}) == 20
+    assert worst_code({0, 10, 30, 2}) == 3
+    assert worst_code({0, 10, 30}) == 30
+    assert worst_code(set()) == 0
+
+
+def test_a_summary_does_not_grow() -> None:
+    summary = Summary(1000)
+    for number in range(1000):
+        summary.take(
+            {
+                "error": {"text": "no"} if number % 2 else None,
+                "verdict": "FAULT",
+                "source": f"{number}.blf",
+                "serial": number // 4,
+                "faults": {"FSS": {"estimate": number / 1000, "interval95": [0.0, 1.0]}},
+            }
+        )
+    tree = summary.tree(20, 1)
+    assert len(tree["failures"]) == 100
+    assert [item["serial"] for item in tree["worst"]] == list(range(249, 239, -1))

@@ -1,0 +1,146 @@
+"""Co-simulation units in FMPy, against the simulator and the monitor of the package."""
+
+import math
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from places import LOGS
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.folder import RESULT_MODE, Folder
+from ehadiag.core.recording import CommandMode
+from ehadiag.export.fmu import export_fmus
+from ehadiag.monitor import Monitor
+from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant.simulator import Plant
+from ehadiag_tools.onboard.replay import ticks_of, unit_of
+from firmware_iface.logs.reader import read_recording
+
+fmpy = pytest.importorskip("fmpy")
+TICK = 1e-3
+SEVERITIES = (0.3, 0.4, 0.2)
+NAMES = [f"eha_{model}_fmi{n}" for model in ("actuator", "monitor") for n in (2, 3)]
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="units are written for Linux"),
+    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here"),
+]
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory):
+    out = tmp_path_factory.mktemp("units")
+    with Folder.at(out, RESULT_MODE) as folder:
+        export_fmus(default_actuator(), folder)
+    return out
+
+
+class Running:
+    """A unit in FMPy's hands, stepped by hand."""
+
+    def __init__(self, path, place, parameters):
+        told = fmpy.read_model_description(path)
+        self._where = {item.name: item.valueReference for item in told.modelVariables}
+        three = told.fmiVersion == "3.0"
+        from fmpy.fmi2 import FMU2Slave
+        from fmpy.fmi3 import FMU3Slave
+
+        self.fmu = (FMU3Slave if three else FMU2Slave)(
+            guid=told.guid if not three else told.instantiationToken,
+            unzipDirectory=fmpy.extract(path, place),
+            modelIdentifier=told.coSimulation.modelIdentifier,
+            instanceName="one",
+        )
+        self._get = self.fmu.getFloat64 if three else self.fmu.getReal
+        self._set = self.fmu.setFloat64 if three else self.fmu.setReal
+        self.fmu.instantiate()
+        self.put(parameters)
+        if not three:
+            self.fmu.setupExperiment(startTime=0.0)
+        self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
+        self._time = 0.0
+
+    def put(self, values):
+        self._set([self._where[name] for name in values], list(values.values()))
+
+    def read(self, *names):
+        return np.array(self._get([self._where[name] for name in names]))
+
+    def step(self, step=TICK):
+        self.fmu.doStep(currentCommunicationPoint=self._time, communicationStepSize=step)
+        self._time += step
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_fmpy_finds_nothing_wrong(units, name):
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(str(units / f"{name}.fmu")) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_library_of_python_is_loaded(units, name, tmp_path):
+    place = fmpy.extract(str(units / f"{name}.fmu"), tmp_path)
+    (library,) = tmp_path.rglob("*.so")
+    loaded = subprocess.run(["ldd", library], capture_output=True, text=True, check=True).stdout
+    assert "python" not in loaded
+    assert place
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_actuator_is_the_simulator(units, version, tmp_path):
+    effects = Effects(hysteresis=0.02, plays=4, null_bias=1e-4, oil_temperature=25.0, load=300.0)
+    plant = Plant(default_actuator(), Faults(*SEVERITIES), effects, Sensors(noise_lsb=0.0))
+    parameters = dict(zip(("Kintas", "FSS", "FDJ"), SEVERITIES, strict=True))
+    parameters |= {"hysteresis": 0.02, "plays": 4.0, "null_bias": 1e-4}
+    parameters |= {"oil_temperature": 25.0, "load": 300.0, "closed": 1.0}
+    unit = Running(str(units / f"eha_actuator_fmi{version}.fmu"), tmp_path, parameters)
+    names = ("true_current", "true_spool", "true_pressure", "true_position")
+    for k in range(200):
+        command = 0.004 * math.sin(0.04 * k)
+        unit.put({"command": command})
+        unit.step()
+        plant.tick(command, CommandMode.POSITION)
+        np.testing.assert_allclose(unit.read(*names), plant.truth, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_monitor_has_the_digits_of_the_package(units, version, tmp_path):
+    recording = read_recording(LOGS / "paper-closed-1.blf")
+    start = unit_of(recording, SEVERITIES)
+    unit = Running(str(units / f"eha_monitor_fmi{version}.fmu"), tmp_path, start._asdict())
+    monitor = Monitor(
+        default_actuator(), SEVERITIES, recording.environment, mode=recording.samples.mode
+    )
+    inputs = ("command", "current", "spool", "pressure", "position")
+    names = ("predicted_spool", "residual_spool", "pressure_upper")
+    for row in ticks_of(recording)[:300].tolist():
+        unit.put(dict(zip(inputs, row, strict=True)))
+        unit.step()
+        reading = monitor.push(tuple(row))
+        own = reading.predicted[0], reading.residual[0], reading.cusum[1, 0]
+        assert np.array(own).tobytes() == unit.read(*names).tobytes()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_what_cannot_be_is_refused(units, version, tmp_path):
+    path = str(units / f"eha_actuator_fmi{version}.fmu")
+    with pytest.raises(Exception, match="fmi"):
+        Running(path, tmp_path / "a", {"Kintas": 1.5})
+    unit = Running(path, tmp_path / "b", {})
+    with pytest.raises(Exception, match="fmi"):
+        unit.step(0.4 * TICK)
+    with pytest.raises(Exception, match="fmi"):
+        unit.put({"Kintas": 0.5})
+
+
+def test_without_a_compiler_it_says_so(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(ConfigurationError, match="no C compiler"):
+        export_fmus(default_actuator(), None)

@@ -1,0 +1,179 @@
+"""Exported libraries: bit for bit the package's own monitor, on this computer and in emulators."""
+
+import hashlib
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from exported import Loaded, exported, object_of
+from places import LOGS
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.errors import ConfigurationError
+from ehadiag.export.library import export_library
+from ehadiag.export.targets import TARGETS, target
+from ehadiag.monitor import Monitor
+from ehadiag.monitor.layout import CUSUM, PREDICTED, SIZE
+from ehadiag_tools.onboard.emulators import EMULATED, missing
+from ehadiag_tools.onboard.replay import own_lines, replayed, ticks_of, unit_of
+from firmware_iface.logs.reader import read_recording
+
+SEVERITIES = (0.3, 0.4, 0.2)
+WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+COMPILER = shutil.which("cc")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return tmp_path_factory.mktemp("exports")
+
+
+@pytest.fixture(scope="module")
+def loaded(place):
+    return Loaded(object_of((exported("host", place) / "libeha.a").read_bytes()))
+
+
+def started(loaded, unit, numbers):
+    start = np.array(unit, dtype=np.float64)
+    return loaded.function("eha_monitor_init", 2)(numbers.ctypes.data, start.ctypes.data)
+
+
+@pytest.mark.parametrize("log", ["paper-closed-1.blf", "lossy-open.blf"])
+def test_the_host_has_the_digits_of_the_package(loaded, log):
+    recording = read_recording(LOGS / log)
+    ticks = ticks_of(recording)
+    monitor = Monitor(
+        default_actuator(), SEVERITIES, recording.environment, mode=recording.samples.mode
+    )
+    numbers = np.zeros(SIZE)
+    assert started(loaded, unit_of(recording, SEVERITIES), numbers) == 0
+    push = loaded.function("eha_monitor_push", 2)
+    seen = numbers[PREDICTED : CUSUM + 4]
+    for tick in ticks:
+        alarms = push(numbers.ctypes.data, tick.ctypes.data)
+        reading = monitor.push(tuple(tick.tolist()))
+        own = np.concatenate([reading.predicted, reading.residual, reading.cusum.ravel()])
+        assert own.tobytes() == seen.tobytes()
+        assert alarms == int(reading.alarmed.ravel() @ np.array([1, 2, 4, 8]))
+
+
+@pytest.mark.parametrize("index", range(8))
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_number_that_cannot_be_is_refused_and_nothing_written(loaded, index, wrong):
+    unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
+    unit[index] = wrong
+    numbers = np.full(SIZE, 3.0)
+    assert started(loaded, unit, numbers) == 1
+    assert (numbers == 3.0).all()
+
+
+@pytest.mark.parametrize(("index", "wrong"), [(0, -0.01), (1, 1.01), (5, 0.0), (6, -1.0)])
+def test_a_number_out_of_its_range_is_refused(loaded, index, wrong):
+    unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
+    unit[index] = wrong
+    assert started(loaded, unit, np.zeros(SIZE)) == 1
+
+
+def test_reset_begins_anew(loaded):
+    unit = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 20e6, 0.0]
+    one, two = np.zeros(SIZE), np.zeros(SIZE)
+    push, reset = (
+        loaded.function("eha_monitor_push", 2),
+        loaded.function("eha_monitor_reset", 2),
+    )
+    tick, spool = np.array([5e-3, 5e-3, 1e-5, 1e5, 0.0]), np.array([2e-5])
+    for numbers in (one, two):
+        assert started(loaded, unit, numbers) == 0
+    for _ in range(40):
+        push(one.ctypes.data, tick.ctypes.data)
+    for numbers in (one, two):
+        reset(numbers.ctypes.data, spool.ctypes.data)
+        push(numbers.ctypes.data, tick.ctypes.data)
+    assert one[:CUSUM].tobytes() == two[:CUSUM].tobytes()
+
+
+def test_the_manifest_tells_what_was_written(place):
+    out = exported("host", place)
+    told = json.loads((out / "manifest.json").read_text())
+    assert told["target"] == "host"
+    for name, facts in told["files"].items():
+        content = (out / name).read_bytes()
+        assert facts == {
+            "bytes": len(content),
+            "sha256": hashlib.sha256(content).hexdigest(),
+        }
+
+
+def test_an_unknown_target_is_named():
+    with pytest.raises(ConfigurationError, match="'pdp11': need one of host"):
+        target("pdp11")
+
+
+def test_every_target_can_be_emulated():
+    assert [item.target for item in EMULATED] == [item.name for item in TARGETS]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("emulator", EMULATED, ids=lambda item: item.target)
+def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
+    absent = missing(emulator)
+    if absent:
+        pytest.skip(f"not installed: {', '.join(absent)}")
+    recording = read_recording(LOGS / "paper-closed-1.blf")
+    ticks, unit = ticks_of(recording)[:600], unit_of(recording, SEVERITIES)
+    if target(emulator.target).processor.fused:
+        expected = own_lines(recording, SEVERITIES, ticks)
+    else:
+        host = next(item for item in EMULATED if item.target == "host-unfused")
+        reference = exported("host-unfused", place)
+        expected = replayed(host, reference, unit, ticks, tmp_path).lines
+    replay = replayed(emulator, exported(emulator.target, place), unit, ticks, tmp_path)
+    assert replay.lines == expected
+    assert 0 < replay.push_stack <= 2048
+    assert 0 < replay.init_stack <= 2048
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+@pytest.mark.parametrize("options", [[], ["-fsanitize=address,undefined"]], ids=["plain", "sane"])
+def test_the_example_is_compiled_without_a_warning_and_runs(place, tmp_path, options):
+    out = exported("host", place)
+    made = tmp_path / "example"
+    subprocess.run(
+        [COMPILER, *WARNINGS, *options, out / "example.c", out / "libeha.a", "-lm", "-o", made],
+        check=True,
+    )
+    done = subprocess.run([made], capture_output=True, text=True, check=True)
+    assert done.stdout == "alarms 0, spool 0 m, residual 0\n"
+
+
+@pytest.mark.skipif(COMPILER is None or not shutil.which("pkg-config"), reason="no compiler here")
+def test_the_shared_library_is_found_by_pkg_config(place, tmp_path):
+    out = exported("host", place)
+    flags = subprocess.run(
+        ["pkg-config", "--cflags", "--libs", "eha"],
+        capture_output=True, text=True, check=True, env={"PKG_CONFIG_PATH": str(out)},
+    ).stdout.split()  # fmt: skip
+    made = tmp_path / "example"
+    subprocess.run([COMPILER, out / "example.c", *flags, "-o", made], check=True)
+    done = subprocess.run(
+        [made], capture_output=True, text=True, check=True, env={"LD_LIBRARY_PATH": str(out)}
+    )
+    assert done.stdout.startswith("alarms 0")
+
+
+@pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck here")
+def test_cppcheck_finds_nothing(place):
+    out = exported("host", place)
+    done = subprocess.run(
+        ["cppcheck", "--std=c99", "--enable=warning,style,portability", "--error-exitcode=1",
+         "--quiet", out / "example.c"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_number_of_hours_that_no_threshold_gives(place):
+    with pytest.raises(ConfigurationError, match="hours"):
+        export_library(default_actuator(), target("host"), None, hours=1e9)

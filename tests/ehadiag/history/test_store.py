@@ -1,0 +1,206 @@
+"""The history file: what is appended comes back, and nothing is ever changed."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from history_cases import an_entry, an_event
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.history.records import Usage
+from ehadiag.history.schema import STEPS, migrate
+from ehadiag.history.store import History
+
+WRITERS, EACH = 8, 10
+
+
+def fill(path: Path, serial: int, number: int) -> None:
+    for hours in range(number):
+        with History(path, create=True) as history:
+            history.append(an_entry(serial, float(hours)))
+
+
+def test_what_is_appended_comes_back(tmp_path: Path) -> None:
+    entry, event = an_entry(7, 12.5, samples="ab"), an_event(hours=20.0, resets=("Kintas",))
+    with History(tmp_path / "h", create=True) as history:
+        assert history.append(entry) == 1
+        assert history.append(an_entry(8)) == 2
+        assert history.append_event(event) == 1
+    with History(tmp_path / "h") as history:
+        assert history.entries(7) == [replace(entry, number=1)]
+        assert [item.serial for item in history.entries()] == [7, 8]
+        assert history.events(7) == [replace(event, number=1)]
+        assert history.events(8) == []
+
+
+@settings(max_examples=10)
+@given(text=st.text(st.characters(codec="utf-8")), serial=st.integers(0, 65535))
+def test_any_text_comes_back(text: str, serial: int) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "?a=%20#.sqlite")
+        with History(path, create=True) as history:
+            history.append(an_entry(serial, actuator=text, reasons=(text,)))
+            (found,) = history.entries()
+        assert path.exists()
+    assert (found.actuator, found.reasons, found.serial) == (text, (text,), serial)
+
+
+@pytest.mark.parametrize("table", ["diagnosis", "source", "severity", "effect", "event"])
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE {} SET rowid = rowid",
+        "DELETE FROM {}",
+        "INSERT OR REPLACE INTO {0} SELECT * FROM {0}",
+    ],
+)
+def test_nothing_is_changed_in_place(tmp_path: Path, table: str, statement: str) -> None:
+    with History(tmp_path / "h", create=True) as history:
+        history.append(an_entry(samples="ab"))
+        history.append_event(an_event())
+    connection = sqlite3.connect(tmp_path / "h")
+    with pytest.raises(sqlite3.IntegrityError, match="only ever appended to"):
+        connection.execute(statement.format(table))
+    connection.close()
+
+
+def test_it_waits_for_the_disk(tmp_path: Path) -> None:
+    with History(tmp_path / "h", create=True) as history:
+        (synchronous,) = history._connection.execute("PRAGMA synchronous").fetchone()
+        (journal,) = history._connection.execute("PRAGMA journal_mode").fetchone()
+    assert (synchronous, journal) == (2, "wal")
+
+
+def test_eight_writers_lose_nothing(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork" if os.name == "posix" else "spawn")
+    path = tmp_path / "h"
+    writers = [context.Process(target=fill, args=(path, i, EACH)) for i in range(WRITERS)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert [writer.exitcode for writer in writers] == [0] * WRITERS
+    with History(path) as history:
+        for serial in range(WRITERS):
+            hours = [item.usage.hours for item in history.entries(serial)]
+            assert hours == list(map(float, range(EACH)))
+
+
+def test_what_was_said_to_be_appended_survives_a_kill(tmp_path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path; from history_cases import an_entry\n"
+        "from ehadiag.history.store import History\n"
+        "for n in range(100000):\n"
+        "    with History(Path(sys.argv[1]), create=True) as history:\n"
+        "        print(history.append(an_entry(1, float(n))), flush=True)\n"
+    )
+    last = 0
+    for wait in (0.0, 0.013, 0.031, 0.057):
+        child = subprocess.Popen(
+            [sys.executable, "-c", script, str(tmp_path / "h")],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        assert child.stdout is not None
+        said = [int(child.stdout.readline())]
+        time.sleep(wait)
+        child.send_signal(signal.SIGKILL)
+        said += [int(line) for line in child.stdout.read().split("\n")[:-1]]
+        child.wait()
+        child.stdout.close()
+        last = max(said)
+        with History(tmp_path / "h") as history:
+            numbers = [item.number for item in history.entries()]
+        assert set(said) <= set(numbers)
+        assert numbers == sorted(numbers)
+        assert len(numbers) - last in (0, 1)  # one may have been done and not told
+    connection = sqlite3.connect(tmp_path / "h")
+    assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    connection.close()
+
+
+def test_a_full_disk_leaves_what_there_was(tiny_disk: Path) -> None:
+    kept = 0
+    with pytest.raises(InputOutputError) as told:  # noqa: PT012 - which one fails is the disk's
+        for _ in range(100):
+            with History(tiny_disk / "h", create=True) as history:
+                history.append(an_entry(result="x" * 2000))
+                kept += 1
+    assert "\n" not in str(told.value)
+    assert "disk" in str(told.value)
+    connection = sqlite3.connect(f"file:{tiny_disk / 'h'}?mode=ro", uri=True)
+    if kept:
+        assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        assert connection.execute("SELECT COUNT(*) FROM diagnosis").fetchone() == (kept,)
+    connection.close()
+
+
+def test_a_step_of_the_tables_keeps_the_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with History(tmp_path / "h", create=True) as history:
+        history.append(an_entry())
+    steps = (*STEPS, "ALTER TABLE diagnosis ADD COLUMN further TEXT;\nCREATE TABLE t (a);\n")
+    connection = sqlite3.connect(tmp_path / "h", isolation_level=None)
+    migrate(connection, steps)
+    migrate(connection, steps)
+    assert connection.execute("PRAGMA user_version").fetchone() == (len(steps),)
+    assert connection.execute("SELECT further FROM diagnosis").fetchall() == [(None,)]
+    connection.close()
+    with pytest.raises(ConfigurationError, match="use a later ehadiag"):
+        History(tmp_path / "h")
+
+
+def test_a_step_that_fails_changes_nothing(tmp_path: Path) -> None:
+    with History(tmp_path / "h", create=True) as history:
+        history.append(an_entry())
+    connection = sqlite3.connect(tmp_path / "h", isolation_level=None)
+    with pytest.raises(sqlite3.OperationalError):
+        migrate(connection, (*STEPS, "CREATE TABLE t (a);\nCREATE TABLE t (a);\n"))
+    connection.close()
+    with History(tmp_path / "h") as history:
+        assert len(history.entries()) == 1
+
+
+@pytest.mark.parametrize(
+    "content", [b"not a database at all " * 50, b"SQLite format 3\0" + b"x" * 900]
+)
+def test_a_file_of_another_kind_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "h").write_bytes(content)
+    with pytest.raises(InputOutputError, match="not an SQLite file"):
+        History(tmp_path / "h", create=True)
+    assert (tmp_path / "h").read_bytes() == content
+
+
+def test_another_programs_database_is_refused(tmp_path: Path) -> None:
+    connection = sqlite3.connect(tmp_path / "h")
+    connection.execute("CREATE TABLE mail (a)")
+    connection.close()
+    with pytest.raises(ConfigurationError, match="another program"):
+        History(tmp_path / "h", create=True)
+
+
+def test_no_file_is_no_history(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="ehadiag history init"):
+        History(tmp_path / "h")
+    assert not (tmp_path / "h").exists()
+
+
+@pytest.mark.parametrize("hours", [-1.0, float("nan"), float("inf")])
+def test_hours_are_numbers(hours: float) -> None:
+    with pytest.raises(ConfigurationError, match="hours"):
+        Usage(hours)

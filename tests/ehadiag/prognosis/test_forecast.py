@@ -1,0 +1,138 @@
+"""Remaining life: numbers, why there is none, and alarms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from history_cases import an_entry, an_event
+
+from ehadiag.prognosis.forecast import Forecast, forecast, learn_fleet
+from ehadiag.prognosis.lives import Life
+from ehadiag.prognosis.unit import prognosis_of
+
+RATE = 2.5e-4
+NOISE = 2e-4
+
+
+def worn(serial: int, number: int = 20, rate: float = RATE, jump: float = 0.0) -> Life:
+    rng = np.random.default_rng(serial)
+    age = 100.0 * np.arange(1.0, number + 1)
+    path = np.cumsum(rng.gamma(6.0, 100.0 * rate / 6.0, number))
+    path[number // 2 :] += jump
+    return Life(serial, age, path + NOISE * rng.standard_normal(number), np.full(number, NOISE), 0)
+
+
+FLEET = learn_fleet([worn(serial, 28) for serial in range(10, 22)], 2000.0)
+ALONE = learn_fleet([], 2000.0)
+
+
+def of(life: Life, fleet=FLEET, levels=(0.25, 0.75)) -> Forecast:  # type: ignore[no-untyped-def]
+    return forecast("FSS", "hours", life, fleet, levels)
+
+
+@pytest.mark.parametrize("fleet", [FLEET, ALONE], ids=["fleet", "alone"])
+def test_a_worn_unit_gets_numbers(fleet) -> None:  # type: ignore[no-untyped-def]
+    life = worn(1)
+    advisory, limit = of(life, fleet).remaining
+    assert (advisory.low, advisory.median, advisory.high) == (0.0, 0.0, 0.0)
+    assert limit.low is not None
+    assert limit.median is not None
+    assert limit.high is not None
+    true = (0.75 - life.value[-1]) / RATE
+    assert limit.low < limit.median < limit.high
+    assert 0.5 * true < limit.median < 2.0 * true
+
+
+def test_a_fleet_narrows_the_interval() -> None:
+    life = worn(1, 8)
+    widths = []
+    for fleet in (FLEET, ALONE):
+        left = of(life, fleet).remaining[1]
+        if left.high is None or left.low is None:
+            assert fleet is ALONE
+            return
+        widths.append(left.high - left.low)
+    assert widths[0] < widths[1]
+
+
+def test_steady_growth_without_a_fall_is_told_from_a_wandering_one() -> None:
+    assert of(worn(1)).process == "gamma"
+    age = 100.0 * np.arange(1.0, 31.0)
+    rng = np.random.default_rng(3)
+    path = np.cumsum(RATE * 100 + 0.03 * rng.standard_normal(30))
+    assert of(Life(1, age, path, np.full(30, NOISE), 0.0), ALONE).process == "Wiener"
+
+
+def test_the_same_seed_gives_the_same_digits() -> None:
+    assert of(worn(1)) == of(worn(1))
+
+
+@pytest.mark.parametrize(
+    ("life", "why"),
+    [
+        (worn(1, 2), "2 diagnoses of the unit, needs 3"),
+        (worn(1, 0), "no diagnoses of the unit"),
+        (worn(1, 20, rate=1e-9), "show no growth beyond their noise"),
+    ],
+)
+def test_what_cannot_carry_a_number_gets_none_and_a_reason(life: Life, why: str) -> None:
+    for left in of(life).remaining:
+        assert left.median is left.low is left.high is None
+        assert why in left.why
+
+
+@pytest.mark.parametrize("fleet", [FLEET, ALONE], ids=["fleet", "alone"])
+def test_a_jump_is_an_alarm(fleet) -> None:  # type: ignore[no-untyped-def]
+    found = of(worn(1, 20, jump=0.4), fleet, (0.95,))
+    assert "between 1000 and 1100 hours: no wear explains such a change" in found.alarm
+    assert found.remaining[0].median is None
+
+
+def test_a_fall_without_an_event_is_an_alarm() -> None:
+    found = of(worn(1, 20, jump=-0.2), FLEET, (0.75,))
+    assert "no wear falls" in found.alarm
+
+
+def test_ordinary_wear_raises_no_alarm() -> None:
+    assert [of(worn(serial)).alarm for serial in range(30, 38)] == [""] * 8
+
+
+def test_a_filter_change_begins_a_new_life() -> None:
+    first = [an_entry(7, 100.0 * n, (0.03 * n, 0.02 * n, 0.0)) for n in range(1, 16)]
+    second = [an_entry(7, 1500.0 + 100 * n, (0.03 * n, 0.3 + 0.02 * n, 0.0)) for n in range(1, 11)]
+    entries = [*first, *second]
+    found = prognosis_of(7, entries, [an_event(hours=1500.0)], (0.25, 0.75))
+    kintas, fss, fdj = found.forecasts
+    assert kintas.diagnoses == 10
+    assert kintas.fleet == 1
+    assert fss.diagnoses == 25
+    assert fss.alarm == kintas.alarm == ""
+    left = kintas.remaining[1]
+    assert left.low is not None
+    assert left.high is not None
+    assert left.low < 1500.0 < left.high * 1.2
+    assert "no growth" in fdj.remaining[1].why
+    # Nobody wrote the change down.
+    silent = prognosis_of(7, entries, [], (0.25, 0.75)).forecasts[0]
+    assert "append it as an event" in silent.alarm
+
+
+def test_simulated_units_are_no_fleet_of_real_ones() -> None:
+    mine = [an_entry(7, 100.0 * n, (0.03 * n, 0.1, 0.1)) for n in range(1, 9)]
+    others = [
+        an_entry(8, 100.0 * n, (0.03 * n, 0.1, 0.1), simulated=True) for n in range(1, 9)
+    ]  # fmt: skip
+    assert prognosis_of(7, [*mine, *others], [], (0.25, 0.75)).forecasts[0].fleet == 0
+
+
+def test_cycles_stand_for_hours_where_only_they_are_said() -> None:
+    from ehadiag.history.records import Usage
+
+    rows = [an_entry(7, None, (0.03 * n, 0.1, 0.1), usage=Usage(None, n)) for n in range(1, 9)]
+    assert prognosis_of(7, rows, [], (0.25, 0.75)).unit == "cycles"
+
+
+def test_a_unit_that_nobody_knows_has_no_numbers() -> None:
+    found = prognosis_of(99, [], [], (0.25, 0.75))
+    assert found.actuator is None
+    assert all(left.median is None for item in found.forecasts for left in item.remaining)

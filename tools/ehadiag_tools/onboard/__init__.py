@@ -1,0 +1,1 @@
+"""Exported libraries run on this computer and in emulators, and compared bit by bit."""

@@ -1,0 +1,129 @@
+"""Replays a recording through the monitor of an export and compares it with the package's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.recording import CommandMode, Recording
+from ehadiag.model.plant import plant_constants, relative_viscosity
+from ehadiag.monitor import Monitor
+from ehadiag.monitor.prepare import Unit
+from ehadiag_tools.onboard.emulators import Emulator, run_program
+
+__all__ = ["Replay", "own_lines", "replayed", "ticks_of", "unit_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What an exported monitor printed.
+
+    Attributes
+    ----------
+    lines : list[str]
+        Alarms and numbers of each tick.
+    init_stack : int
+        Bytes of stack that its start took.
+    push_stack : int
+        The most that a push took.
+    """
+
+    lines: list[str]
+    init_stack: int
+    push_stack: int
+
+
+def ticks_of(recording: Recording) -> NDArray[np.float64]:
+    """Ticks of a recording as a monitor takes them.
+
+    Parameters
+    ----------
+    recording : Recording
+        With samples.
+
+    Returns
+    -------
+    NDArray[np.float64]
+        Shape (n, 5).
+    """
+    s = recording.samples
+    assert s is not None
+    return np.column_stack([s.command, s.current, s.spool, s.pressure, s.position])
+
+
+def unit_of(recording: Recording, faults: Sequence[float]) -> Unit:
+    """Return what a monitor is told of the unit on a recording."""
+    environment, samples = recording.environment, recording.samples
+    constants = plant_constants(default_actuator(), environment)
+    degc = None if environment is None else environment.oil_temperature
+    closed = samples is not None and samples.mode is CommandMode.POSITION
+    viscosity = 1.0 if degc is None else relative_viscosity(degc)
+    a, b, c = faults
+    return Unit(a, b, c, 0.0, 0.0, viscosity, constants.PSR, float(closed))
+
+
+def own_lines(
+    recording: Recording, faults: Sequence[float], ticks: NDArray[np.float64]
+) -> list[str]:
+    """What the package's own monitor makes of ticks, as `replay.c` prints it."""
+    assert recording.samples is not None
+    monitor = Monitor(
+        default_actuator(), faults, recording.environment, mode=recording.samples.mode
+    )
+    lines = []
+    for row in ticks.tolist():
+        reading = monitor.push(tuple(row))
+        alarms = int(reading.alarmed.ravel() @ np.array([1, 2, 4, 8]))
+        numbers = (*reading.predicted, *reading.residual, *reading.cusum.ravel())
+        lines.append(" ".join([str(alarms), *(f"{bits:016x}" for bits in _bits(numbers))]))
+    return lines
+
+
+def replayed(
+    emulator: Emulator, export: Path, unit: Unit, ticks: NDArray[np.float64], work: Path
+) -> Replay:
+    """Replay ticks through an export on its target.
+
+    Parameters
+    ----------
+    emulator : Emulator
+        The target's.
+    export : Path
+        Folder of the export.
+    unit : Unit
+        What the monitor is told.
+    ticks : NDArray[np.float64]
+        Shape (n, 5).
+    work : Path
+        Folder for what is made.
+
+    Returns
+    -------
+    Replay
+        What was printed.
+    """
+    rows = ",\n".join("{" + _words(row) + "}" for row in ticks)
+    text = (
+        "#include <stdint.h>\n"
+        f"static const uint64_t unit_bits[{len(unit)}] = {{{_words(unit)}}};\n"
+        f"static const uint64_t tick_bits[{len(ticks)}][5] = {{\n{rows}\n}};\n"
+    )
+    (work / "ticks.h").write_text(text)
+    said = run_program(emulator, export, "replay.c", work).splitlines()
+    lines = [line.removeprefix("tick ").strip() for line in said if line.startswith("tick ")]
+    stacks = {line.split()[0]: int(line.split()[-1]) for line in said if " stack " in line}
+    return Replay(lines, stacks["init"], stacks["push"])
+
+
+def _bits(numbers: Sequence[float] | NDArray[np.float64]) -> list[int]:
+    values: list[int] = np.asarray(numbers, dtype=np.float64).view(np.uint64).tolist()
+    return values
+
+
+def _words(numbers: Sequence[float] | NDArray[np.float64]) -> str:
+    return ", ".join(f"0x{bits:x}u" for bits in _bits(numbers))

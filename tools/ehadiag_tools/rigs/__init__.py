@@ -1,0 +1,1 @@
+"""Re-records the reference recordings on foreign buses, and diagnoses them there."""

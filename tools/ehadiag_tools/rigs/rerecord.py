@@ -1,0 +1,178 @@
+"""Plays a recording again on another bus: other messages, late time stamps, idle time before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.channels import CHANNELS
+from ehadiag.core.recording import BitState, CommandMode, Recording, Samples
+from ehadiag_tools.rigs.buses import ForeignBus
+from firmware_iface.codec.encode import Encoder
+from firmware_iface.mapping.bus_map import BusMap, default_map
+from firmware_iface.transport.frames import Frame, FrameTable
+
+__all__ = ["Disturbance", "Played", "frames_on", "played"]
+
+START_NS = 1_700_000_000_000_000_000
+REST_S = 0.15
+"""Beginning of each test in which nothing moves; it is what lies before and after the test too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """What the bus, its adapter and the host's clock do to the time stamps.
+
+    Attributes
+    ----------
+    jitter_ms : float
+        Deviation of a half-normal delay of each frame; a message's frames keep their order.
+    lead_in_s : float
+        Idle time before the test.
+    drift_ppm : float
+        Rate by which the host's clock is fast.
+    batch_ms : float
+        Period at whose end an adapter stamps all that came; 0: each frame alone.
+    lost : float
+        Share of the frames that are lost.
+    kept : bool
+        Whether the log keeps the order of arrival; False: it is sorted by the stamps, which
+        then are each late by themselves.
+    """
+
+    jitter_ms: float = 0.0
+    lead_in_s: float = 0.0
+    drift_ppm: float = 0.0
+    batch_ms: float = 0.0
+    lost: float = 0.0
+    kept: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Played:
+    """A recording with idle time about it.
+
+    Attributes
+    ----------
+    channels : NDArray[np.float64]
+        Current, spool, pressure, position, SI, NaN where lost, shape (4, ticks).
+    command : NDArray[np.float64]
+        A or m, shape (ticks,).
+    mode : CommandMode
+        What the command is.
+    begin : int
+        First tick of the test.
+    end : int
+        One past its last tick.
+    """
+
+    channels: NDArray[np.float64]
+    command: NDArray[np.float64]
+    mode: CommandMode
+    begin: int
+    end: int
+
+
+def played(samples: Samples, command: NDArray[np.float64], lead_in_s: float) -> Played:
+    """Put idle time before and after a test, made of its own rest."""
+    rest = round(REST_S * 1e9 / samples.period_ns)
+    channels = np.stack([samples.current, samples.spool, samples.pressure, samples.position])
+    before = round(lead_in_s * 1e9 / samples.period_ns)
+    around = np.concatenate(
+        [np.resize(np.arange(rest), before), np.arange(samples.ticks), np.arange(rest)]
+    )
+    idle = np.concatenate([np.zeros(before), command, np.zeros(rest)])
+    return Played(channels[:, around], idle, samples.mode, before, before + samples.ticks)
+
+
+def frames_on(
+    bus: ForeignBus, recording: Recording, this: Played, how: Disturbance, seed: int
+) -> tuple[FrameTable, BusMap]:
+    """Frames of a recording on a bus, in order of arrival, and what they mean."""
+    bus_map, rng = bus.bus_map(), np.random.default_rng(seed)
+    tick_ns = default_map().tick_ns
+    sent: dict[str, list[tuple[float, bytes]]] = {name: [] for name in bus.messages}
+    encoder = _Encoder(bus_map, recording)
+    for tick in range(this.channels.shape[1]):
+        payloads = encoder.tick(this, tick)
+        for name, data in payloads.items():
+            item = bus.messages[name]
+            if tick % item.every == 0 and (how.lost == 0.0 or rng.random() >= how.lost):
+                sent[name].append((tick + item.at, data))
+    rows: list[tuple[float, int, Frame]] = []
+    for name, items in sent.items():
+        message = bus_map.messages[name]
+        true = np.array([at for at, _ in items])
+        stamp = _stamps(true, how, tick_ns, rng)
+        for order, (late, (_, data)) in enumerate(zip(stamp, items, strict=True)):
+            time_ns = START_NS + round(late * (1.0 + how.drift_ppm * 1e-6) * tick_ns)
+            frame = Frame(time_ns, message.can_id, data, message.extended, message.fd)
+            rows.append((late, order, frame))
+    rows.sort(key=lambda row: row[:2])
+    return FrameTable.from_frames(frame for _, _, frame in rows), bus_map
+
+
+def _stamps(
+    true: NDArray[np.float64], how: Disturbance, tick_ns: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Time stamps in ticks, of the instants at which frames were sent."""
+    out = true + np.abs(rng.normal(0.0, how.jitter_ms * 1e6 / tick_ns, len(true)))
+    if how.kept:
+        out = np.maximum.accumulate(out)
+    if how.batch_ms:
+        period = how.batch_ms * 1e6 / tick_ns
+        out = np.ceil(out / period) * period
+    return out
+
+
+class _Encoder:
+    """Payloads of each message in each tick."""
+
+    def __init__(self, bus_map: BusMap, recording: Recording) -> None:
+        self._encoder = Encoder(bus_map)
+        self._map = bus_map
+        self._recording = recording
+        messages = bus_map.messages.values()
+        self._names = {(item.can_id, item.extended): item.name for item in messages}
+        self._has = {
+            section: any(role.name.startswith(section) for item in messages for role in item.roles)
+            for section in ("command", "environment", "status")
+        }
+
+    def tick(self, this: Played, tick: int) -> dict[str, bytes]:
+        """Payload of each message, the parts of one message put together."""
+        inside = this.begin <= tick < this.end
+        values = this.channels[:, tick]
+        frames: list[Frame] = []
+        if not np.isnan(values).any():
+            codes = [
+                int(channel.encode(value)) for channel, value in zip(CHANNELS, values, strict=True)
+            ]
+            frames += self._encoder.telemetry(codes, 0)
+        if self._has["command"]:
+            frames += self._encoder.command(this.mode, float(this.command[tick]), 0, 0)
+        if self._has["environment"]:
+            known = self._recording.environment
+            frames += self._encoder.environment(
+                known.supply_pressure or 0.0,
+                known.return_pressure or 0.0,
+                known.oil_temperature or 0.0,
+                0,
+            )
+        if self._has["status"]:
+            state = BitState.RUNNING if inside else BitState.IDLE
+            elapsed = (tick - this.begin) * 1e-3 if inside else 0.0
+            number = (self._recording.test_id or 0) if inside else 0
+            if tick >= this.end:
+                state, number = BitState.COMPLETE, self._recording.test_id or 0
+                elapsed = (this.end - this.begin) * 1e-3
+            serial = self._recording.serial or 0
+            frames += self._encoder.status(state, 0, number, elapsed, serial, 0)
+        out: dict[str, bytes] = {}
+        for frame in frames:
+            name = self._names[frame.can_id, frame.extended]
+            before = out.get(name, bytes(len(frame.data)))
+            out[name] = bytes(a | b for a, b in zip(before, frame.data, strict=True))
+        return out

@@ -1,0 +1,143 @@
+"""Diagnoses the reference recordings on foreign buses beside the default one: verdicts, errors.
+
+tools/foreign_buses tests/data/logs
+tools/foreign_buses --bus psi29 --jitter 0 1 --lead-in 0 10 tests/data/logs
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ehadiag.assess.diagnosis import Diagnosis, diagnose
+from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.core.find_test import Sought
+from ehadiag.core.recording import CommandMode, Recording
+from ehadiag.core.stored_test import StoredTest, bundled_tests
+from ehadiag_tools.rigs.buses import BUSES, ForeignBus
+from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, played
+from firmware_iface.alignment.windows import recordings_of
+from firmware_iface.logs.reader import choose, read_recording
+
+__all__ = ["main", "on_bus"]
+
+NAMES = ("Kintas", "FSS", "FDJ")
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What became of one recording."""
+
+    verdict: str
+    error: float
+    """Largest difference of an estimate from the truth, 1."""
+    why: str
+
+
+def on_bus(
+    bus: ForeignBus,
+    recording: Recording,
+    test: StoredTest,
+    how: Disturbance,
+    actuator: Actuator,
+    seed: int,
+) -> Recording:
+    """Play a recording on a bus, and read it there as a log of that bus is read."""
+    if recording.samples is None:
+        raise ValueError(f"{recording.source}: nothing to play")
+    stored = test.command()
+    step = 0.5e-6 if recording.samples.mode is CommandMode.CURRENT else 2e-6
+    command = np.round(stored / step) * step
+    this = played(recording.samples, command, how.lead_in_s)
+    table, bus_map = frames_on(bus, recording, this, how, seed)
+    sought = Sought(tuple(bundled_tests().values()), actuator.controller)
+    name = f"{Path(recording.source).stem} on {bus.name}"
+    return choose(recordings_of([table], bus_map, name, len(table) + 1, sought=sought))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="reference recordings and their truth.csv")
+    parser.add_argument("--bus", nargs="*", choices=[item.name for item in BUSES])
+    parser.add_argument("--jitter", nargs="*", type=float, default=[0.0, 0.2, 0.5, 1.0])
+    parser.add_argument("--lead-in", nargs="*", type=float, default=[1.7])
+    parser.add_argument("--drift", type=float, default=100.0, help="ppm")
+    parser.add_argument("--batch", type=float, default=0.0, help="ms")
+    parser.add_argument("--lost", type=float, default=0.0, help="share of the frames")
+    parser.add_argument("--unordered", action="store_true", help="log sorted by its stamps")
+    parser.add_argument("--only", nargs="*", help="recordings by name")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("-v", "--verbose", action="store_true", help="a line a recording")
+    given = parser.parse_args(arguments)
+    actuator, tests = default_actuator(), bundled_tests()
+    truth = _truth(given.folder)
+    names = [name for name in truth if not given.only or Path(name).stem in given.only]
+    read = {name: read_recording(given.folder / name) for name in names}
+    usual = {name: _line(item, actuator, tests, truth[name]) for name, item in read.items()}
+    _show("default", "", usual, usual)
+    chosen = [bus for bus in BUSES if not given.bus or bus.name in given.bus]
+    for bus, jitter, lead in itertools.product(chosen, given.jitter, given.lead_in):
+        how = Disturbance(
+            jitter, lead, given.drift, given.batch, given.lost, kept=not given.unordered
+        )
+        lines = {}
+        begin = time.perf_counter()
+        for name in names:
+            test = next(item for item in tests.values() if item.id == read[name].test_id)
+            got = on_bus(bus, read[name], test, how, actuator, given.seed)
+            lines[name] = _line(got, actuator, tests, truth[name])
+            if given.verbose:
+                line = lines[name]
+                print(f"    {name:<24}{line.verdict:<12}{100 * line.error:8.2f} %  {line.why}")
+                for note in got.quality.notes:
+                    print(f"        {note}")
+        spent = time.perf_counter() - begin
+        _show(bus.name, f"{jitter:g} ms, {lead:g} s", lines, usual)
+        if given.verbose:
+            print(f"    {spent:.1f} s")
+    return 0
+
+
+def _truth(folder: Path) -> dict[str, tuple[float, float, float]]:
+    with (folder / "truth.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {
+        row["file"]: (float(row["Kintas"]), float(row["FSS"]), float(row["FDJ"])) for row in rows
+    }
+
+
+def _line(
+    recording: Recording,
+    actuator: Actuator,
+    tests: dict[str, StoredTest],
+    truth: tuple[float, float, float],
+) -> Line:
+    result = diagnose([recording], actuator, tests.values())
+    return Line(result.verdict.name, _error(result, truth), "; ".join(result.reasons))
+
+
+def _error(result: Diagnosis, truth: tuple[float, float, float]) -> float:
+    if result.identification is None:
+        return float("nan")
+    found = {item.name: item.value for item in result.identification.estimates}
+    return max(abs(found[name] - value) for name, value in zip(NAMES, truth, strict=True))
+
+
+def _show(bus: str, how: str, lines: dict[str, Line], usual: dict[str, Line]) -> None:
+    """One line: verdicts that agree with the default bus, mean and greatest error."""
+    same = sum(line.verdict == usual[name].verdict for name, line in lines.items())
+    errors = np.array([line.error for line in lines.values()])
+    known = errors[np.isfinite(errors)]
+    mean, most = (100 * known.mean(), 100 * known.max()) if len(known) else (np.nan, np.nan)
+    print(
+        f"{bus:<10}{how:<16}{same:>3} of {len(lines)} verdicts{mean:>9.2f} %{most:>9.2f} %",
+        flush=True,
+    )
