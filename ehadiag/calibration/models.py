@@ -18,7 +18,15 @@ from ehadiag.identify.refine.first_part import CONSIDERED
 from ehadiag.identify.spans import lay_out
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
-__all__ = ["SECOND_STAGES", "Learned", "Model", "learn", "models_of"]
+__all__ = [
+    "SECOND_STAGES",
+    "SMOOTH",
+    "Learned",
+    "Model",
+    "further_models",
+    "learn",
+    "simple_models",
+]
 
 SECOND_STAGES = ("linear", "orifice")
 """Kinds that the monitoring model has."""
@@ -120,14 +128,16 @@ class Learned:
     criterion: float
 
 
-def models_of(start: Actuator, *, compare: bool) -> list[list[Model]]:
-    """Models to try, in rounds: a further round only where the one before does not suffice."""
+def simple_models(start: Actuator) -> list[Model]:
+    """Models of either second stage with one play, that of the start file first."""
     first = start.second_stage.kind
-    kinds = sorted({*SECOND_STAGES, first}, key=lambda kind: kind != first)
-    simple = [Model(kind) for kind in kinds]
-    smooth = [Model(kind, SMOOTH) for kind in kinds]
-    further = [replace(item, sensing=True) for item in (*simple, *smooth)]
-    return [simple, smooth, further] if not compare else [[*simple, *smooth], further]
+    return [Model(kind) for kind in sorted({*SECOND_STAGES, first}, key=lambda kind: kind != first)]
+
+
+def further_models(best: Model) -> list[Model]:
+    """Models to try where a second stage with one play does not explain the recordings."""
+    stage = best.second_stage
+    return [Model(stage, SMOOTH), Model(stage, sensing=True), Model(stage, SMOOTH, sensing=True)]
 
 
 def learn(

@@ -18,7 +18,14 @@ from ehadiag.assess.acceptance import (
 )
 from ehadiag.assess.diagnosis import match_tests
 from ehadiag.assess.verdict import Levels
-from ehadiag.calibration.models import Learned, Model, learn, models_of
+from ehadiag.calibration.models import (
+    SMOOTH,
+    Learned,
+    Model,
+    further_models,
+    learn,
+    simple_models,
+)
 from ehadiag.calibration.packing import Lesson, lesson_of, unit_of, values_of
 from ehadiag.calibration.result import Calibrated, Severity, Tried
 from ehadiag.core.actuator import Actuator, Tolerance
@@ -80,7 +87,8 @@ def calibrate(
     sources : Sequence[Source] | None
         What the file says of each recording; its name and test unless given.
     compare : bool
-        Try every model, also where a simple one explains the recordings.
+        Try both second stages, each with one play and with a smooth hysteresis, also where the
+        first explains the recordings.
     seed : int
         The same seed gives the same answer.
     progress : Progress | None
@@ -101,7 +109,7 @@ def calibrate(
         ]
     if reasons:
         return session.refused(reasons)
-    tried = session.tried(models_of(plain, compare=compare))
+    tried = session.tried(compare=compare)
     best = min(tried, key=lambda item: item.criterion)
     reasons = session.unexplained(best) or _not_as_new(best.estimated)
     if reasons:
@@ -225,18 +233,29 @@ class _Session:
         assert recording.samples is not None
         return build_experiment(recording.samples, recording.environment, test, actuator)
 
-    def tried(self, rounds: Sequence[Sequence[Model]]) -> list[Learned]:
-        """Learn with the models of each round, until one explains the recordings."""
+    def tried(self, *, compare: bool) -> list[Learned]:
+        """Learn with one model after the other until one explains the recordings.
+
+        compare: either second stage with one play and with a smooth hysteresis, in any case.
+        """
+        models = simple_models(self._start)
+        if compare:
+            models += [replace(item, plays=SMOOTH) for item in models]
         out: list[Learned] = []
-        for models in rounds:
-            for model in models:
-                found = self._learn(model, nearly_new=True)
-                if not found.estimated.explained and not out:
-                    # The unit may be worn, or the search have stopped beside the optimum.
-                    found = min(found, self._learn(model), key=lambda item: item.criterion)
-                out.append(found)
+        for model in models:
+            found = self._learn(model, nearly_new=True)
+            if not found.estimated.explained and not out:
+                # The unit may be worn, or the search have stopped beside the optimum.
+                found = min(found, self._learn(model), key=lambda item: item.criterion)
+            out.append(found)
+            if found.estimated.explained and not compare:
+                break
+        best = min(out, key=lambda item: item.criterion).model
+        for model in further_models(best):
             if any(item.estimated.explained for item in out):
                 break
+            if all(item.model != model for item in out):
+                out.append(self._learn(model, nearly_new=True))
         return out
 
     def learned_as_new(self, best: Learned) -> Learned:
