@@ -22,7 +22,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
-from ehadiag.identify.nuisance.knowledge import PASS_FOR_FAULTS, knowledge_of
+from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, knowledge_of
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
@@ -31,6 +31,8 @@ from ehadiag.model.parameters import parameter
 
 __all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
 
+CHANGED = 6.0
+"""Deviations of a calibration beyond which an effect has changed since."""
 LEAST_SHARE = 0.75
 """Share of samples without which nothing is worked out of a running test."""
 
@@ -277,11 +279,20 @@ def _freed(identification: Identification | None, actuator: Actuator) -> tuple[s
     out = []
     calibration = actuator.calibration
     learned = calibration.parameters if calibration else ()
+    stds = dict(zip(learned, calibration.std, strict=True)) if calibration else {}
     if calibration is not None:
         out.append(
             f"actuator calibrated on {calibration.date} from {len(calibration.recordings)} "
             "recordings: its data and effects are refined within what is known of them"
         )
+        out += [
+            f"{parameter(name).short} has changed since: {value:.4g} then, "
+            f"{identification.nuisances[name].value:.4g} {parameter(name).unit} now"
+            for name, value in calibration.effects.items()
+            if name in identification.nuisances
+            and abs(identification.nuisances[name].value - value) > CHANGED * stds[name]
+        ]
+    learned = (*learned, *OF_THE_DAY)
     words = [parameter(name).short for name in identification.freed if name not in learned]
     if words:
         out.append(f"estimated beside the faults: {', '.join(words)}")

@@ -18,10 +18,18 @@ from ehadiag.identify.refine.first_part import CONSIDERED
 from ehadiag.identify.spans import lay_out
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
-__all__ = ["SECOND_STAGES", "Learned", "Model", "learn", "models_of"]
+__all__ = [
+    "SECOND_STAGES",
+    "SMOOTH",
+    "Learned",
+    "Model",
+    "further_models",
+    "learn",
+    "simple_models",
+]
 
-SECOND_STAGES = ("linear",)
-"""Kinds that the monitoring model has, those tried first in front."""
+SECOND_STAGES = ("linear", "orifice")
+"""Kinds that the monitoring model has."""
 SMOOTH = 8
 """Plays of a smooth hysteresis: more of them do the same within the noise."""
 BUDGET = 1600
@@ -39,8 +47,11 @@ SENSING = {
     "spool_gain": Known(0.0, 0.003),
     "pressure_gain": Known(0.0, 0.003),
     "load": Known(0.0, 30.0),
+    "jack_stribeck": Known(5e-3, 5e-3),
 }
 """What is added where the rest does not explain the recordings: usual sizes (PHY-32 to 36)."""
+OIL = {"bulk_modulus": Known(0.0, 0.15)}
+"""Of an orifice stage: entrained air lowers the bulk modulus (PHY-39)."""
 NEARLY_NEW = Known(0.02, 0.05)
 """A severity of a unit that is said to be as new."""
 
@@ -81,7 +92,8 @@ class Model:
     def known(self) -> dict[str, Known]:
         """What is known of any unit beforehand."""
         data = {f"datum_{name}": DATUM for name in (*DATA, *FRICTIONS)}
-        return {**data, **(SENSING if self.sensing else {})}
+        oil = OIL if self.second_stage == "orifice" else {}
+        return {**data, **oil, **(SENSING if self.sensing else {})}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -91,6 +103,7 @@ class Model:
             *OFFSETS,
             *nuisances_of(REGISTRY),
             *(replace(item, lower=-REACH, upper=REACH) for item in data),
+            *(parameter(name) for name in OIL if self.second_stage == "orifice"),
             *(parameter(name) for name in SENSING if self.sensing),
         )
 
@@ -115,14 +128,16 @@ class Learned:
     criterion: float
 
 
-def models_of(start: Actuator, *, compare: bool) -> list[list[Model]]:
-    """Models to try, in rounds: a further round only where the one before does not suffice."""
+def simple_models(start: Actuator) -> list[Model]:
+    """Models of either second stage with one play, that of the start file first."""
     first = start.second_stage.kind
-    kinds = sorted({*SECOND_STAGES, first}, key=lambda kind: kind != first)
-    simple = [Model(kind) for kind in kinds]
-    smooth = [Model(kind, SMOOTH) for kind in kinds]
-    further = [replace(item, sensing=True) for item in (*simple, *smooth)]
-    return [simple, smooth, further] if not compare else [[*simple, *smooth], further]
+    return [Model(kind) for kind in sorted({*SECOND_STAGES, first}, key=lambda kind: kind != first)]
+
+
+def further_models(best: Model) -> list[Model]:
+    """Models to try where a second stage with one play does not explain the recordings."""
+    stage = best.second_stage
+    return [Model(stage, SMOOTH), Model(stage, sensing=True), Model(stage, SMOOTH, sensing=True)]
 
 
 def learn(

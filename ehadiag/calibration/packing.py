@@ -14,12 +14,14 @@ from ehadiag.core.actuator import Actuator, Tolerance
 from ehadiag.core.calibration import Calibration, Goodness, Source
 from ehadiag.identify.estimates import fit_of
 from ehadiag.identify.nuisance.estimate import Estimated
-from ehadiag.identify.nuisance.knowledge import MOTOR_GAIN
+from ehadiag.identify.nuisance.knowledge import MOTOR_GAIN, OF_THE_DAY
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter
 
 __all__ = ["Lesson", "lesson_of", "unit_of", "values_of"]
 
+OTHER_SYMBOLS = {MOTOR_GAIN: "GM", "bulk_modulus": "beta"}
+"""Keys of data whose parameter has another name."""
 SHOWN = 0.7
 """Of the deviation known beforehand: what has become no narrower was not shown."""
 HARDLY = "the recordings hardly show it: little is known but its usual size"
@@ -58,12 +60,12 @@ class Lesson:
 
 
 def lesson_of(found: Estimated, before: Mapping[str, float]) -> Lesson:
-    """Take out what the unit keeps: no severity, and no offset, which each recording shows.
+    """Take out what the unit keeps: no severity, nor what each recording shows of its day.
 
     before: deviations of what was known beforehand, by name.
     """
     refined = found.refined
-    apart = {item.name for item in (*FAULTS, *OFFSETS)}
+    apart = {*OF_THE_DAY, *(item.name for item in (*FAULTS, *OFFSETS))}
     kept = [k for k, item in enumerate(refined.parameters) if item.name not in apart]
     items = tuple(refined.parameters[k] for k in kept)
     spread = covariance(refined) + found.covariance
@@ -131,6 +133,7 @@ def unit_of(
         start,
         servovalve=_changed(start.servovalve, changes),
         jack=_changed(start.jack, changes),
+        second_stage=_changed(start.second_stage, changes),
         tolerance=Tolerance(),
         calibration=calibration,
     )
@@ -164,14 +167,14 @@ def values_of(start: Actuator, unit: Actuator, lesson: Lesson) -> tuple[Value, .
 
 def _symbol(item: Parameter) -> str | None:
     """Key of the datum that a parameter is the relative error of."""
-    if item.name == MOTOR_GAIN:
-        return "GM"
+    if item.name in OTHER_SYMBOLS:
+        return OTHER_SYMBOLS[item.name]
     return item.name.removeprefix("datum_") if item.name.startswith("datum_") else None
 
 
 def _datum(actuator: Actuator, symbol: str) -> float:
-    part = actuator.servovalve if hasattr(actuator.servovalve, symbol) else actuator.jack
-    return float(getattr(part, symbol))
+    parts = (actuator.servovalve, actuator.jack, actuator.second_stage)
+    return float(next(getattr(part, symbol) for part in parts if hasattr(part, symbol)))
 
 
 def _changed(part: msgspec.Struct, factors: Mapping[str, float]) -> msgspec.Struct:

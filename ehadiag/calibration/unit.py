@@ -18,7 +18,14 @@ from ehadiag.assess.acceptance import (
 )
 from ehadiag.assess.diagnosis import match_tests
 from ehadiag.assess.verdict import Levels
-from ehadiag.calibration.models import Learned, Model, learn, models_of
+from ehadiag.calibration.models import (
+    SMOOTH,
+    Learned,
+    Model,
+    further_models,
+    learn,
+    simple_models,
+)
 from ehadiag.calibration.packing import Lesson, lesson_of, unit_of, values_of
 from ehadiag.calibration.result import Calibrated, Severity, Tried
 from ehadiag.core.actuator import Actuator, Tolerance
@@ -40,6 +47,10 @@ AS_NEW = 0.05
 """Severity above which a unit is not as new."""
 SURE = 2.0
 """Deviations by which a severity must be beyond it, or stay below twice of it."""
+MOST_SEARCHES = 4
+"""For what is kept, until two have come to the same place."""
+ALIKE = 30.0
+"""Cost by which searches that came to the same place differ."""
 LEAST_RECORDINGS = 2
 """One alone has nothing to be checked against."""
 
@@ -76,7 +87,8 @@ def calibrate(
     sources : Sequence[Source] | None
         What the file says of each recording; its name and test unless given.
     compare : bool
-        Try every model, also where a simple one explains the recordings.
+        Try both second stages, each with one play and with a smooth hysteresis, also where the
+        first explains the recordings.
     seed : int
         The same seed gives the same answer.
     progress : Progress | None
@@ -97,7 +109,7 @@ def calibrate(
         ]
     if reasons:
         return session.refused(reasons)
-    tried = session.tried(models_of(plain, compare=compare))
+    tried = session.tried(compare=compare)
     best = min(tried, key=lambda item: item.criterion)
     reasons = session.unexplained(best) or _not_as_new(best.estimated)
     if reasons:
@@ -158,6 +170,7 @@ def update(
     found = estimate(
         experiments,
         (*FAULTS, *OFFSETS, *knowledge.free),
+        known=knowledge.known,
         joint=knowledge.joint,
         considered=CONSIDERED,
         hint=dict.fromkeys((item.name for item in FAULTS), 0.02),
@@ -220,23 +233,46 @@ class _Session:
         assert recording.samples is not None
         return build_experiment(recording.samples, recording.environment, test, actuator)
 
-    def tried(self, rounds: Sequence[Sequence[Model]]) -> list[Learned]:
-        """Learn with the models of each round, until one explains the recordings."""
+    def tried(self, *, compare: bool) -> list[Learned]:
+        """Learn with one model after the other until one explains the recordings.
+
+        compare: either second stage with one play and with a smooth hysteresis, in any case.
+        """
+        models = simple_models(self._start)
+        if compare:
+            models += [replace(item, plays=SMOOTH) for item in models]
         out: list[Learned] = []
-        for models in rounds:
-            for model in models:
-                found = self._learn(model, nearly_new=True)
-                if not found.estimated.explained and not out:
-                    # The unit may be worn, or the search have stopped beside the optimum.
-                    found = min(found, self._learn(model), key=lambda item: item.criterion)
-                out.append(found)
+        for model in models:
+            found = self._learn(model, nearly_new=True)
+            if not found.estimated.explained and not out:
+                # The unit may be worn, or the search have stopped beside the optimum.
+                found = min(found, self._learn(model), key=lambda item: item.criterion)
+            out.append(found)
+            if found.estimated.explained and not compare:
+                break
+        best = min(out, key=lambda item: item.criterion).model
+        for model in further_models(best):
             if any(item.estimated.explained for item in out):
                 break
+            if all(item.model != model for item in out):
+                out.append(self._learn(model, nearly_new=True))
         return out
 
     def learned_as_new(self, best: Learned) -> Learned:
-        """Learn once more, the severities taken for 0 and the frictions as new in their place."""
-        return self._learn(best.model, new=True, hint=best.estimated.refined.values)
+        """Learn once more, the severities taken for 0 and the frictions as new in their place.
+
+        Residuals like noise are no proof of the best optimum, and what is learned here is believed
+        ever after: the best of several searches is taken.
+        """
+        hint = best.estimated.refined.values
+        found = [self._learn(best.model, new=True, hint=hint)]
+        for turn in range(1, MOST_SEARCHES):
+            around = None if turn % 2 else hint
+            found.append(self._learn(best.model, new=True, hint=around, turn=turn))
+            found.sort(key=lambda item: item.criterion)
+            if found[1].criterion - found[0].criterion < ALIKE:
+                break
+        return found[0]
 
     def _learn(
         self,
@@ -246,6 +282,7 @@ class _Session:
         nearly_new: bool = False,
         hint: Mapping[str, float] | None = None,
         build: Callable[[Actuator], list[Experiment]] | None = None,
+        turn: int = 0,
     ) -> Learned:
         found = learn(
             model,
@@ -254,7 +291,7 @@ class _Session:
             new=new,
             nearly_new=nearly_new,
             hint=hint,
-            seed=self._seed,
+            seed=self._seed + turn,
             tell=lambda share: self.tell(model.words, share),
         )
         self._evaluations += found.estimated.evaluations

@@ -271,7 +271,7 @@ def calibrate(
     test : StoredTest | PathLike | Iterable[StoredTest | PathLike] | None
         See `diagnose`.
     compare : bool
-        Try every model of the unit, also where a simple one explains the recordings.
+        Try both second stages, each with one play and with a smooth hysteresis.
     update : bool
         `actuator` is calibrated: refine it by later recordings of the unit, still healthy.
     seed : int

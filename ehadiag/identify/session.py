@@ -193,12 +193,25 @@ class Session:
     ) -> Estimated:
         """Estimate with all nuisances free."""
         tell("nuisances", 0.0)
+        found = self._estimated(experiments, self.knowledge, hint, tell)
+        if self.knowledge.joint is None or found.explained:
+            return found
+        loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
+        return min(found, loose, key=lambda item: item.excess)
+
+    def _estimated(
+        self,
+        experiments: Sequence[Experiment],
+        knowledge: Knowledge,
+        hint: Mapping[str, float] | None,
+        tell: Progress,
+    ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *self.knowledge.beside(effects)),
-            known=self.knowledge.known,
-            joint=self.knowledge.joint,
+            (*FAULTS, *OFFSETS, *knowledge.beside(effects)),
+            known=knowledge.known,
+            joint=knowledge.joint,
             considered=CONSIDERED,
             hint=hint,
             seed=self.seed,

@@ -19,6 +19,7 @@ from ehadiag.model.plant import PlantConstants
 __all__ = [
     "MOTOR_GAIN",
     "NOTHING",
+    "OF_THE_DAY",
     "PASS_FOR_FAULTS",
     "Alias",
     "Knowledge",
@@ -31,6 +32,13 @@ MOTOR_GAIN = "torque_motor_gain"
 """What an error of GM does: as a datum nothing could tell it from this."""
 PASS_FOR_FAULTS = {"GQF": "Kintas", "FSS0": "FSS", "FDJ0": "FDJ"}
 """Data that do what a severity does, so that no recording tells the two apart."""
+OF_THE_DAY = {
+    "oil_viscosity": Known(0.0, 0.038),
+    "supply_pressure": Known(0.0, 0.058e6),
+}
+"""What no calibration can keep: a probe 2 K (3.3 % of viscosity each) or 0.1 MPa off, evenly."""
+LOOSE = 0.3
+"""Share of its usual deviation by which an effect may have changed since the calibration."""
 SMALL = 1e-6
 _NAMES = frozenset(item.name for item in REGISTRY if item.kind is not Kind.FAULT)
 
@@ -82,6 +90,18 @@ class Knowledge:
     joint: Joint | None = None
     aliases: tuple[Alias, ...] = ()
     about: Mapping[str, float] = field(default_factory=dict)
+
+    def loosened(self) -> Knowledge:
+        """Return what is left of it where the unit's effects have changed since."""
+        if self.joint is None:
+            return self
+        names = self.joint.names
+        extra = [
+            0.0 if name.startswith("datum_") else LOOSE * usual(parameter(name)).std
+            for name in names
+        ]
+        covariance = self.joint.covariance + np.diag(np.square(extra))
+        return replace(self, joint=Joint(names, self.joint.mean, covariance))
 
     @property
     def doubts(self) -> bool:
@@ -148,7 +168,8 @@ def _calibrated(calibration: Calibration) -> Knowledge:
         item, value = parameter(name), calibration.effects.get(name, 0.0)
         free.append(replace(item, lower=item.lower - value, upper=item.upper - value))
     joint = Joint(calibration.parameters, np.zeros(len(free)), covariance_of(calibration))
-    return Knowledge(tuple(free), {}, joint, (), calibration.effects)
+    free += [parameter(name) for name in OF_THE_DAY]
+    return Knowledge(tuple(free), OF_THE_DAY, joint, (), calibration.effects)
 
 
 def covariance_of(calibration: Calibration) -> NDArray[np.float64]:
