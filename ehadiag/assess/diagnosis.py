@@ -15,6 +15,13 @@ from ehadiag.assess.acceptance import (
     out_of_range,
     remarks_on_recording,
 )
+from ehadiag.assess.other_faults import (
+    OtherFault,
+    degraded_by,
+    notes_on_other_faults,
+    other_faults,
+)
+from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
@@ -48,6 +55,8 @@ class Diagnosis:
     """What was identified from; empty without identification."""
     positions: tuple[PositionFit | None, ...]
     """Of each experiment the check of its position sensor; None where there are too few samples."""
+    other: tuple[OtherFault, ...]
+    """Effects of the unit that were estimated and have a limit of their own."""
     notes: tuple[str, ...]
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
@@ -117,6 +126,8 @@ class DiagnosisSession:
             return
         if out_of_range(recording.environment, samples, self._actuator):
             return
+        if objections_to_actuator(self._actuator):
+            return
         experiment = build_experiment(samples, recording.environment, test, self._actuator)
         for values in (experiment.spool, experiment.pressure):
             if np.isfinite(values).mean() < LEAST_SHARE:
@@ -132,13 +143,15 @@ class DiagnosisSession:
         experiments, reasons = self._experiments(recordings, matched)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
+        others: tuple[OtherFault, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
         if not reasons:
             identification = self._session.finish(experiments, progress)
             positions = tuple(position_fit(item, identification) for item in experiments)
+            others = other_faults(identification, self._actuator)
             why = tuple(objections_to_estimate(identification) or _of_positions(positions))
             if not why:
-                verdict, why = judge(identification, self._levels)
+                verdict, why = degraded_by(others, *judge(identification, self._levels))
         return Diagnosis(
             recordings=tuple(recordings),
             tests=matched,
@@ -148,10 +161,12 @@ class DiagnosisSession:
             identification=identification,
             experiments=tuple(experiments) if identification else (),
             positions=positions,
+            other=others,
             notes=(
                 *_notes(recordings, matched, self._actuator),
                 *_freed(identification),
                 *_unchecked(positions),
+                *notes_on_other_faults(others),
             ),
             elapsed=time.perf_counter() - begin,
         )
@@ -160,7 +175,7 @@ class DiagnosisSession:
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]
     ) -> tuple[list[Experiment], list[str]]:
         """What is identified from, and why that cannot be."""
-        reasons, experiments = [], []
+        reasons, experiments = objections_to_actuator(self._actuator), []
         for recording, test in zip(recordings, matched, strict=True):
             objections = objections_to_recording(recording, test, self._actuator)
             if not objections and test is not None and recording.samples is not None:
@@ -220,6 +235,7 @@ def not_tested(
         identification=None,
         experiments=(),
         positions=(),
+        other=(),
         notes=_notes(recordings, tests, actuator),
         elapsed=elapsed,
     )

@@ -15,6 +15,7 @@ __all__ = [
     "Actuator",
     "Controller",
     "Jack",
+    "Limits",
     "SecondStage",
     "Servovalve",
     "default_actuator",
@@ -111,14 +112,28 @@ class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Volume of both chambers together, m³; of orifices only."""
 
 
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Sizes, of either sign, beyond which an effect of the unit is a fault of its own."""
+
+    null_bias: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.03
+    """Of rated current."""
+    hysteresis: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.06
+    """Full width over rated current."""
+    backlash: Annotated[float, msgspec.Meta(gt=0, le=1e-3)] = 8e-6
+    """Half-width, m."""
+    torque_motor_gain: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.1
+    """Relative change."""
+
+
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One actuator: its name, controller, servovalve, second stage and jack."""
+    """One actuator: its name, controller, servovalve, second stage, jack and limits."""
 
     name: Name
     controller: Controller
     servovalve: Servovalve
     jack: Jack
     second_stage: SecondStage = SecondStage()
+    limits: Limits = Limits()
 
 
 def load_actuator(path: Path | str) -> Actuator:

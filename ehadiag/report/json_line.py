@@ -11,6 +11,7 @@ from ehadiag.report.faults import Fault, faults_of
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.assess.other_faults import OtherFault
     from ehadiag.assess.position import PositionFit
     from ehadiag.report.spent import Spent
 
@@ -53,6 +54,7 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
             name: _fault(fault, identified=found is not None)
             for name, fault in faults_of(diagnosis).items()
         },
+        "other": [_other(item) for item in diagnosis.other],
         "fit": _fit(diagnosis),
         "positions": [_position(fit) for fit in diagnosis.positions],
         "quality": _quality(diagnosis),
@@ -113,6 +115,18 @@ def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
         "spool_offset_mm": fit.spool_offset * 1e3,
         "pressure_offset_MPa": fit.pressure_offset * 1e-6,
         "anchored": fit.anchored,
+    }
+
+
+def _other(item: OtherFault) -> dict[str, Any]:
+    return {
+        "name": item.name,
+        "value": item.value,
+        "unit": item.unit,
+        "std": item.std,
+        "interval95": list(item.interval95),
+        "limit": item.limit,
+        "beyond": item.beyond,
     }
 
 

@@ -94,8 +94,14 @@ def diagnosis_figure(diagnosis: Diagnosis) -> Picture:
         f"{fault.name} {fault.value:.5f} ({fault.interval[0]:.5f} … {fault.interval[1]:.5f})"
         for fault in faults_of(diagnosis).values()
     )
+    others = ",  ".join(
+        f"{item.meaning} {item.shown(item.value):.3g} {item.shown_unit}"
+        + (" beyond its limit" if item.beyond else "")
+        for item in diagnosis.other
+    )
     names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
     title = f"{diagnosis.verdict.name.replace('_', ' ')}: {names}\n{constants}"
+    title += f"\n{others}" if others else ""
     figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
     return figure
 
