@@ -15,6 +15,7 @@ from ehadiag.assess.acceptance import (
     out_of_range,
     remarks_on_recording,
 )
+from ehadiag.assess.culprit import Culprit, culprit_of
 from ehadiag.assess.other_faults import (
     OtherFault,
     degraded_by,
@@ -57,6 +58,8 @@ class Diagnosis:
     """Of each experiment the check of its position sensor; None where there are too few samples."""
     other: tuple[OtherFault, ...]
     """Effects of the unit that were estimated and have a limit of their own."""
+    culprit: Culprit | None
+    """What may keep the model from explaining the recordings; None where it explains them."""
     notes: tuple[str, ...]
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
@@ -144,12 +147,17 @@ class DiagnosisSession:
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
         others: tuple[OtherFault, ...] = ()
+        culprit: Culprit | None = None
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
         if not reasons:
             identification = self._session.finish(experiments, progress)
             positions = tuple(position_fit(item, identification) for item in experiments)
             others = other_faults(identification, self._actuator)
-            why = tuple(objections_to_estimate(identification) or _of_positions(positions))
+            why = tuple(objections_to_estimate(identification))
+            if why:
+                culprit = culprit_of(experiments, identification, recordings[0].environment)
+            else:
+                why = tuple(_of_positions(positions))
             if not why:
                 verdict, why = degraded_by(others, *judge(identification, self._levels))
         return Diagnosis(
@@ -162,6 +170,7 @@ class DiagnosisSession:
             experiments=tuple(experiments) if identification else (),
             positions=positions,
             other=others,
+            culprit=culprit,
             notes=(
                 *_notes(recordings, matched, self._actuator),
                 *_freed(identification),
@@ -236,6 +245,7 @@ def not_tested(
         experiments=(),
         positions=(),
         other=(),
+        culprit=None,
         notes=_notes(recordings, tests, actuator),
         elapsed=elapsed,
     )

@@ -43,8 +43,11 @@ class OtherFault:
         In two words.
     unit : str
         SI unit; 1 for a share.
-    value, std : float
-    interval95 : tuple of float
+    value : float
+        As estimated.
+    std : float
+        Its standard deviation.
+    interval95 : tuple[float, float]
         Cut at the parameter's bounds.
     limit : float
         Largest size of either sign.

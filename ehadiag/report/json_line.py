@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.core.printable import valid_text
@@ -56,6 +57,7 @@ def json_line(diagnosis: Diagnosis, spent: Spent, solver: str, seed: int) -> str
         },
         "other": [_other(item) for item in diagnosis.other],
         "fit": _fit(diagnosis),
+        "culprit": asdict(diagnosis.culprit) if diagnosis.culprit else None,
         "positions": [_position(fit) for fit in diagnosis.positions],
         "quality": _quality(diagnosis),
         "solver": {
@@ -173,6 +175,6 @@ def _finite(node: Any) -> Any:
     """Put null in the place of numbers that are none: JSON has no others."""
     if isinstance(node, dict):
         return {key: _finite(value) for key, value in node.items()}
-    if isinstance(node, list):
+    if isinstance(node, list | tuple):
         return [_finite(value) for value in node]
     return None if isinstance(node, float) and not math.isfinite(node) else node

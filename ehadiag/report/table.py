@@ -70,6 +70,8 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent | None 
     _line(console, f"test {test}, actuator {diagnosis.actuator.name}{serial}")
     for reason in diagnosis.reasons:
         _line(console, f"- {reason}")
+    for line in diagnosis.culprit.lines if diagnosis.culprit else ():
+        _line(console, f"  {line}")
     if diagnosis.identification is not None:
         console.print(_constants(diagnosis), crop=False)
     if diagnosis.other:
