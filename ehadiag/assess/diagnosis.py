@@ -16,6 +16,14 @@ from ehadiag.assess.acceptance import (
     out_of_range,
     remarks_on_recording,
 )
+from ehadiag.assess.culprit import Culprit, culprit_of
+from ehadiag.assess.other_faults import (
+    OtherFault,
+    degraded_by,
+    notes_on_other_faults,
+    other_faults,
+)
+from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
@@ -52,6 +60,10 @@ class Diagnosis:
     """What was identified from; empty without identification."""
     positions: tuple[PositionFit | None, ...]
     """Of each experiment the check of its position sensor; None where there are too few samples."""
+    other: tuple[OtherFault, ...]
+    """Effects of the unit that were estimated and have a limit of their own."""
+    culprit: Culprit | None
+    """What may keep the model from explaining the recordings; None where it explains them."""
     notes: tuple[str, ...]
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
@@ -121,6 +133,8 @@ class DiagnosisSession:
             return
         if out_of_range(recording.environment, samples, self._actuator):
             return
+        if objections_to_actuator(self._actuator):
+            return
         experiment = build_experiment(samples, recording.environment, test, self._actuator)
         for values in (experiment.spool, experiment.pressure):
             if np.isfinite(values).mean() < LEAST_SHARE:
@@ -136,13 +150,20 @@ class DiagnosisSession:
         experiments, reasons = self._experiments(recordings, matched)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
+        others: tuple[OtherFault, ...] = ()
+        culprit: Culprit | None = None
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
         if not reasons:
             identification = self._session.finish(experiments, progress)
             positions = tuple(position_fit(item, identification) for item in experiments)
-            why = tuple(objections_to_estimate(identification) or _of_positions(positions))
+            others = other_faults(identification, self._actuator)
+            why = tuple(objections_to_estimate(identification))
+            if why:
+                culprit = culprit_of(experiments, identification, recordings[0].environment)
+            else:
+                why = tuple(_of_positions(positions))
             if not why:
-                verdict, why = judge(identification, self._levels)
+                verdict, why = degraded_by(others, *judge(identification, self._levels))
         return Diagnosis(
             recordings=tuple(recordings),
             tests=matched,
@@ -152,10 +173,13 @@ class DiagnosisSession:
             identification=identification,
             experiments=tuple(experiments) if identification else (),
             positions=positions,
+            other=others,
+            culprit=culprit,
             notes=(
                 *_notes(recordings, matched, self._actuator),
                 *_freed(identification, self._actuator),
                 *_unchecked(positions),
+                *notes_on_other_faults(others),
             ),
             elapsed=time.perf_counter() - begin,
         )
@@ -164,7 +188,7 @@ class DiagnosisSession:
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]
     ) -> tuple[list[Experiment], list[str]]:
         """What is identified from, and why that cannot be."""
-        reasons, experiments = [], []
+        reasons, experiments = objections_to_actuator(self._actuator), []
         for recording, test in zip(recordings, matched, strict=True):
             objections = objections_to_recording(recording, test, self._actuator)
             if not objections and test is not None and recording.samples is not None:
@@ -225,6 +249,8 @@ def not_tested(
         identification=None,
         experiments=(),
         positions=(),
+        other=(),
+        culprit=None,
         notes=_notes(recordings, tests, actuator),
         elapsed=elapsed,
     )

@@ -18,6 +18,7 @@ __all__ = [
     "Actuator",
     "Controller",
     "Jack",
+    "Limits",
     "SecondStage",
     "Servovalve",
     "Tolerance",
@@ -165,6 +166,19 @@ class Tolerance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return tuple(name for name in self.__struct_fields__[1:] if self.of(name) > 0.0)
 
 
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Sizes, of either sign, beyond which an effect of the unit is a fault of its own."""
+
+    null_bias: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.03
+    """Of rated current."""
+    hysteresis: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.06
+    """Full width over rated current."""
+    backlash: Annotated[float, msgspec.Meta(gt=0, le=1e-3)] = 8e-6
+    """Half-width, m."""
+    torque_motor_gain: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.1
+    """Relative change."""
+
+
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One actuator: its parts, how far their data may be off, what was learned of the unit."""
 
@@ -173,6 +187,7 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     servovalve: Servovalve
     jack: Jack
     second_stage: SecondStage = SecondStage()
+    limits: Limits = Limits()
     tolerance: Tolerance = Tolerance()
     calibration: Calibration | None = None
     """What was learned of this unit; None: the data are those of a type."""

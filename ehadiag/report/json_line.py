@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.core.dates import date_text
@@ -16,6 +17,7 @@ from ehadiag.report.origin import configuration, log_tree, package, recordings
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.assess.other_faults import OtherFault
     from ehadiag.assess.position import PositionFit
     from ehadiag.core.actuator import Actuator
     from ehadiag.identify.result import Identification
@@ -148,7 +150,9 @@ def _core(diagnosis: Diagnosis, spent: Spent, asked: Asked) -> dict[str, Any]:
         "verdict": diagnosis.verdict.name,
         "reasons": [valid_text(reason) for reason in diagnosis.reasons],
         "faults": {name: _fault(fault if found else None) for name, fault in faults},
+        "other": [_other(item) for item in diagnosis.other],
         "fit": _fit(diagnosis),
+        "culprit": asdict(diagnosis.culprit) if diagnosis.culprit else None,
         "positions": [_position(fit) for fit in diagnosis.positions],
         "quality": _quality(diagnosis),
         "solver": _solver(found, asked),
@@ -234,6 +238,18 @@ def _fit(diagnosis: Diagnosis) -> dict[str, Any] | None:
     }
 
 
+def _other(item: OtherFault) -> dict[str, Any]:
+    return {
+        "name": item.name,
+        "value": item.value,
+        "unit": item.unit,
+        "std": item.std,
+        "interval95": list(item.interval95),
+        "limit": item.limit,
+        "beyond": item.beyond,
+    }
+
+
 def _position(fit: PositionFit | None) -> dict[str, float] | None:
     if fit is None:
         return None
@@ -277,6 +293,6 @@ def _finite(node: Any) -> Any:
     """Put null in the place of numbers that are none: JSON has no others."""
     if isinstance(node, dict):
         return {key: _finite(value) for key, value in node.items()}
-    if isinstance(node, list):
+    if isinstance(node, list | tuple):
         return [_finite(value) for value in node]
     return None if isinstance(node, float) and not math.isfinite(node) else node

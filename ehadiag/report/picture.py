@@ -112,6 +112,14 @@ def _title(diagnosis: Diagnosis, levels: Levels | None) -> list[str]:
                 for item in faults_of(diagnosis).values()
             )
         )
+    if diagnosis.other:
+        lines.append(
+            ",  ".join(
+                f"{item.meaning} {item.shown(item.value):.3g} {item.shown_unit}"
+                + (" beyond its limit" if item.beyond else "")
+                for item in diagnosis.other
+            )
+        )
     width = LETTERS * len(diagnosis.recordings)
     for reason in diagnosis.reasons[:MOST_REASONS]:
         lines += textwrap.wrap(printable(reason), width)[:MOST_REASONS]

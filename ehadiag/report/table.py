@@ -70,8 +70,12 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent | None 
     _line(console, f"test {test}, actuator {diagnosis.actuator.name}{serial}")
     for reason in diagnosis.reasons:
         _line(console, f"- {reason}")
+    for line in diagnosis.culprit.lines if diagnosis.culprit else ():
+        _line(console, f"  {line}")
     if diagnosis.identification is not None:
         console.print(_constants(diagnosis), crop=False)
+    if diagnosis.other:
+        console.print(_others(diagnosis), crop=False)
     _line(console, _quality(diagnosis))
     for note in diagnosis.notes:
         _line(console, f"note: {note}")
@@ -109,6 +113,25 @@ def _constants(diagnosis: Diagnosis) -> Table:
             f"{fault.std:.5f}",
             f"{low:.5f} … {high:.5f}",
             fault.meaning + "".join(REMARKS[flag] for flag in fault.flags),
+        )
+    return table
+
+
+def _others(diagnosis: Diagnosis) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    table.add_column("effect", no_wrap=True)
+    for name in ("estimate", "std", "95 % interval", "limit"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for item in diagnosis.other:
+        low, high = item.interval95
+        table.add_row(
+            item.meaning,
+            f"{item.shown(item.value):.4g} {item.shown_unit}",
+            f"{item.shown(item.std):.2g}",
+            f"{item.shown(low):.4g} … {item.shown(high):.4g}",
+            f"{item.shown(item.limit):.3g} {item.shown_unit}",
+            "beyond its limit" if item.beyond else "",
         )
     return table
 

@@ -18,9 +18,9 @@ MOST_OUTLIERS = 0.01
 """Share of residuals beyond three deviations."""
 
 
-HOPELESS = (0.4, 0.1)
+HOPELESS = (0.3, 0.05)
 """Share of residuals beyond three deviations after one start, and after two, from which on no more
-is looked for: below 0.01 after the first one on 11 in 12 units that a later one explained."""
+is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones."""
 
 
 def excess(residuals: NDArray[np.float64]) -> float:
