@@ -40,6 +40,12 @@ def refuse_beforehand(
     """
     _refuse_contradictions(arguments)
     _refuse_other_rates(test, actuator, bus_map)
+    if arguments.listen and bus_map.find("status.state") is None:
+        raise ConfigurationError(
+            f"--listen: the mapping {bus_map.name} has no status.state, and nothing else tells when"
+            " a test begins and ends: record with another tool, and find the test by ehadiag"
+            " diagnose"
+        )
     if not arguments.listen:
         _refuse_what_cannot_be_requested(test, bus_map)
 

@@ -29,6 +29,10 @@ LEAST_LEVELS = 100
 LONG_HOLE = 50
 """Ticks of a hole that count as guessed: amidst a longer one there is no sample either that a wrong
 current could be held against. An integral in the control law remembers all of them."""
+EXACTLY = 1e-6
+"""Steps of the converter by which its own values may be off."""
+ROUNDED_AGAIN = 0.1
+"""The same of values that a bus of another scale rounded once more."""
 CONTROL_LAW_LSB = 4.0
 """Residual (LSB rms) beyond which the control law does not explain the measured current."""
 
@@ -96,6 +100,19 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed)
 
 
+def _as_digitised(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions as the converter gave them, where a bus of another scale has rounded them again.
+
+    The control law worked on the converter's codes. What lies near none of its steps was measured
+    by something else, and stays.
+    """
+    nearest = np.round(position / POSITION.lsb) * POSITION.lsb
+    away = np.abs(position - nearest)[np.isfinite(position)] / POSITION.lsb
+    if away.size == 0 or away.max() < EXACTLY or np.quantile(away, 0.99) > ROUNDED_AGAIN:
+        return position
+    return np.asarray(nearest)
+
+
 def _guessed_share(unknown: NDArray[np.bool_], longest: int) -> float:
     """Share of ticks that are unknown; of a hole no more than its first `longest` ones."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], unknown.astype(np.int8), [0]])))
@@ -132,7 +149,7 @@ def _positions_seen(
     which the control law turned into current, cannot be told. A current at its limit is none of
     them: there the position did not matter.
     """
-    seen = np.concatenate([[np.nan], samples.position[:-1]])
+    seen = np.concatenate([[np.nan], _as_digitised(samples.position[:-1])])
     lost = np.flatnonzero(np.isnan(seen))
     unknown = np.zeros(len(seen), dtype=np.bool_)
     if lost.size == 0:

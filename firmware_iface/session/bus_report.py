@@ -8,17 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.channels import CHANNELS
 from firmware_iface.alignment.senders import drop_conflicts, too_many
 from firmware_iface.alignment.ticks import TickAxis, place
 from firmware_iface.codec.channel import channels_in, choose_channel
 from firmware_iface.codec.decode import Decoded, decode
 from firmware_iface.mapping.bus_map import DIMENSIONS, BusMap, MessageMap
+from firmware_iface.session.state_words import state_in_words
 from firmware_iface.transport.frames import FrameTable
 
 __all__ = ["BusReport", "MessageReport", "RangeUse", "render", "report_bus"]
 
 MAX_FOREIGN = 20
 """Foreign identifiers that are listed, the most frequent ones."""
+ENGINEERING = {channel.name: (channel.unit, channel.per_unit) for channel in CHANNELS}
 LONGEST_GAP_S = 0.25
 """Span without a sample that a diagnosis bears within a test."""
 
@@ -80,7 +83,8 @@ class MessageReport:
 
 @dataclass(frozen=True, slots=True)
 class RangeUse:
-    """Use of one converter channel: raw codes seen, codes possible (None for floats), SI values."""
+    """Use of one converter channel: raw codes seen, codes possible (None for floats), SI values,
+    the last of them."""
 
     channel: str
     lowest_code: int | None
@@ -88,6 +92,7 @@ class RangeUse:
     codes: int | None
     lowest: float
     highest: float
+    now: float
     saturated: int
 
 
@@ -111,6 +116,8 @@ class BusReport:
         Identifier, whether extended, frames; the most frequent first.
     delay : float | None
         Median time from a command to the telemetry of its tick, s; None if unknown.
+    state : str
+        What the computer said last of its test, in plain words; empty where it says nothing.
     problems : tuple[str, ...]
         What stands in the way of a diagnosis, one sentence each; empty if nothing.
     remarks : tuple[str, ...]
@@ -124,6 +131,7 @@ class BusReport:
     ranges: tuple[RangeUse, ...]
     foreign: tuple[tuple[int, bool, int], ...]
     delay: float | None
+    state: str
     problems: tuple[str, ...]
     remarks: tuple[str, ...]
 
@@ -149,6 +157,7 @@ def report_bus(table: FrameTable, bus_map: BusMap) -> BusReport:
         ranges=ranges,
         foreign=_foreign(table, decoded.foreign),
         delay=_delay(decoded.messages, axis),
+        state=state_in_words(decoded.messages, bus_map),
         problems=((ambiguous,) if ambiguous else ()) + _problems(messages, len(table)),
         remarks=(*_pauses(messages), *_unsaid(decoded.messages, len(table))),
     )
@@ -209,6 +218,7 @@ def _ranges(item: Decoded, table: FrameTable) -> list[RangeUse]:
                 codes=codes,
                 lowest=float(value.min()),
                 highest=float(value.max()),
+                now=float(value[-1]),
                 saturated=int(item.saturated[role.name][known].sum()),
             )
         )
@@ -320,13 +330,22 @@ def render(report: BusReport) -> str:
             f"{item.length_errors:>5}{item.range_errors:>6}"
         )
     if report.ranges:
-        lines += ["", f"{'channel':<12}{'codes seen':>16}{'of':>8}{'use':>7}{'at end':>8}"]
+        lines += [
+            "",
+            f"{'channel':<12}{'codes seen':>16}{'of':>8}{'use':>7}{'at end':>8}"
+            f"{'now':>11}{'least':>11}{'most':>11}",
+        ]
     for use in report.ranges:
         seen, of, share = "-", "-", "-"
         if use.lowest_code is not None and use.highest_code is not None and use.codes:
             seen, of = f"{use.lowest_code} … {use.highest_code}", str(use.codes)
             share = f"{100 * (use.highest_code - use.lowest_code + 1) / use.codes:.0f} %"
-        lines.append(f"{use.channel:<12}{seen:>16}{of:>8}{share:>7}{use.saturated:>8}")
+        unit, per_unit = ENGINEERING[use.channel]
+        values = (f"{item / per_unit:>11.4g}" for item in (use.now, use.lowest, use.highest))
+        codes = f"{use.channel:<12}{seen:>16}{of:>8}{share:>7}{use.saturated:>8}"
+        lines.append(f"{codes}{''.join(values)} {unit}")
+    if report.state:
+        lines += ["", report.state]
     if report.delay is not None:
         lines += ["", f"telemetry follows its command by {1e3 * report.delay:.3f} ms"]
     if report.foreign:

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import progress_bar, put
+from ehadiag.cli.would_diagnose import Outlook, outlook
+from ehadiag.core.printable import valid_text
+
+if TYPE_CHECKING:
+    from firmware_iface.session.bus_report import BusReport
 
 __all__ = ["add_parser", "run"]
 
+SCHEMA = "ehadiag.bus/1"
 NOT_USABLE = 30
 POLL_S = 0.05
 
@@ -33,6 +43,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="S",
         help="how long to listen (default 3)",
     )
+    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_log_options(parser)
     options.add_bus_options(parser)
@@ -43,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Listen and report."""
     if arguments.log is None:
         options.need_one_bus(arguments)
-    bus_map = options.the_bus_map(arguments)
+    bus_map, actuator = options.the_bus_map(arguments), options.the_actuator(arguments)
     from firmware_iface.logs.reader import read_frames  # noqa: PLC0415
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.session.bus_report import render, report_bus  # noqa: PLC0415
@@ -51,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.log is not None:
         table = read_frames(arguments.log, options.the_budget(arguments))
-        put(f"log {arguments.log}")
+        heard = f"log {arguments.log}"
     else:
         with (
             options.open_transport(arguments, transmit=False) as transport,
@@ -68,7 +80,27 @@ def run(arguments: argparse.Namespace) -> int:
                 display("listening", (time.monotonic() - begin) / arguments.duration)
             listened = time.monotonic() - begin
         table = collected.table()
-        put(f"listened to {transport.name} for {listened:.1f} s, sent nothing")
+        heard = f"listened to {transport.name} for {listened:.1f} s, sent nothing"
     report = report_bus(table, bus_map)
-    put(render(report))
+    seen = outlook(table, bus_map, actuator, options.known_tests([]))
+    report = _as_diagnosed(report, seen)
+    if arguments.json:
+        content = {"schema": SCHEMA, "source": valid_text(heard), **dataclasses.asdict(report)}
+        put(json.dumps({**content, "test": seen.test or None}))
+    else:
+        put(heard)
+        put(render(report))
     return NOT_USABLE if report.problems else 0
+
+
+def _as_diagnosed(report: BusReport, seen: Outlook) -> BusReport:
+    """Let what a diagnosis says of a whole test decide, and add what motion contradicts."""
+    if not seen.test:
+        return replace(report, problems=(*report.problems, *seen.units))
+    told = f"test {seen.test!r} is in it whole"
+    if seen.refused:
+        why = tuple(f"a diagnosis of test {seen.test!r} refuses: {item}" for item in seen.refused)
+        return replace(report, problems=(*report.problems, *seen.units, *why))
+    # What a diagnosis bears stands in nobody's way.
+    remarks = (*report.remarks, *report.problems, f"{told}, and a diagnosis takes it")
+    return replace(report, problems=seen.units, remarks=remarks)
