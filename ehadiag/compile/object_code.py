@@ -356,8 +356,7 @@ def _optimise(module: Any, machine: _Machine) -> None:
     options.loop_vectorization = options.slp_vectorization = False
     options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine.target, options)
-    for _ in range(2):
-        builder.getModulePassManager().run(module, builder)
+    builder.getModulePassManager().run(module, builder)
 
 
 def tool_versions() -> dict[str, str]:
