@@ -34,6 +34,7 @@ KERNEL_FOLDERS = (
     "ehadiag/model",
     "ehadiag/identify",
     "ehadiag/monitor",
+    "ehadiag/onboard",
     "ehadiag_sim",
 )
 SUFFIX = ".kernel"

@@ -35,6 +35,9 @@ from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
 from ehadiag.monitor.plan import monitor_plan
 from ehadiag.monitor.prepare import prepare, rest
+from ehadiag.onboard import layout as identification
+from ehadiag.onboard.elementary import cosine, logarithm
+from ehadiag.onboard.kernels import begin_identification, identify_some
 
 __all__ = [
     "HEADER",
@@ -53,7 +56,12 @@ HEADER: Final = "eha_monitor.h"
 SHARED: Final = "libeha.so"
 MANIFEST: Final = "manifest.json"
 SCHEMA: Final = "ehadiag.export/1"
-OWN_FUNCTIONS: Final[Mapping[str, Any]] = {"exp": exponential, "expm1": exponential_less_one}
+OWN_FUNCTIONS: Final[Mapping[str, Any]] = {
+    "exp": exponential,
+    "expm1": exponential_less_one,
+    "log": logarithm,
+    "cos": cosine,
+}
 """What stands for functions of the C library, whose last digit differs from one to the next."""
 PLAN: Final = "eha_plan"
 
@@ -63,11 +71,17 @@ MONITOR: Final = (
     Function("eha_monitor_push", push_tick, (Pointer(), Numbers(5))),
 )
 
+IDENTIFICATION: Final = (
+    Function("eha_identify_begin", begin_identification, (Pointer(), Table(PLAN), Pointer())),
+    Function("eha_identify_run", identify_some, (Pointer(), Table(PLAN), Pointer(), Numbers(2))),
+)
+FUNCTIONS: Final = (*MONITOR, *IDENTIFICATION)
+
 
 def export_library(
     actuator: Actuator, target: Target, folder: Folder, *, hours: float = 100.0, shift: float = 1.0
 ) -> list[str]:
-    """Write a library of the streaming monitor for a target into a folder.
+    """Write a library of monitor and identification for a target into a folder.
 
     Parameters
     ----------
@@ -97,13 +111,20 @@ def export_library(
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
     plan = monitor_plan(actuator, plant_constants(actuator), design)
     code = either_convention(
-        object_code(MONITOR, {PLAN: plan.tolist()}, OWN_FUNCTIONS, target.processor)
+        object_code(FUNCTIONS, {PLAN: plan.tolist()}, OWN_FUNCTIONS, target.processor)
     )
-    library = archive("eha.o", code, [item.name for item in MONITOR])
+    library = archive("eha.o", code, [item.name for item in FUNCTIONS])
     names = {"version": metadata.version("ehadiag"), "target": target.name}
     files = {
         LIBRARY: library,
         HEADER: _header(actuator, target, design, hours, names),
+        "eha_identify.h": template(
+            "eha_identify.h.in",
+            bytes=str(identification.SIZE * layout.NUMBER),
+            own=str(identification.SIZE - len(identification.Outcome._fields)),
+            lanes=str(identification.MONITORS),
+            **names,
+        ),
         "CMakeLists.txt": template("CMakeLists.txt.in", flags=";".join(target.flags), **names),
         "example.c": template("example.c"),
     }
@@ -124,8 +145,9 @@ def export_library(
         compiler_flags=list(target.flags),
         options={"actuator": actuator.name, "hours": hours, "shift": shift},
         plan=_digest(plan),
-        functions=[item.name for item in MONITOR],
+        functions=[item.name for item in FUNCTIONS],
         monitor_bytes=layout.SIZE * layout.NUMBER,
+        identification_bytes=identification.SIZE * layout.NUMBER,
         object_bytes=len(code),
     )
     write(folder, files)

@@ -20,8 +20,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "export",
         help="write the kernels as a library for another computer",
-        description="Write the streaming monitor as a static library with a C header for another"
-        " computer. No cross compiler is needed.",
+        description="Write monitor and identification as a static library with C headers for"
+        " another computer. No cross compiler is needed.",
         allow_abbrev=False,
     )
     what = parser.add_mutually_exclusive_group(required=True)

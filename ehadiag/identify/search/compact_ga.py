@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.kernels import kernel
+from ehadiag.compile.kernels import bare_kernel, kernel
 
-__all__ = ["CompactGaState", "draw", "learn", "start", "state_bytes"]
+__all__ = ["CompactGaState", "draw", "learn", "learn_from", "start", "state_bytes"]
 
 PULL = 0.5
 """Share of its distance from the elite by which the mean moves after a generation."""
@@ -65,7 +65,7 @@ def start(mean: NDArray[np.float64], spread: NDArray[np.float64], seed: int) -> 
     return CompactGaState(mean.copy(), spread.copy(), mean.copy(), np.array([np.inf]), generator)
 
 
-@kernel
+@bare_kernel
 def _next_uniform(state: NDArray[np.uint64]) -> float:
     """Uniform in (0, 1): SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
@@ -76,14 +76,14 @@ def _next_uniform(state: NDArray[np.uint64]) -> float:
     return (float(z >> np.uint64(11)) + 0.5) / 9007199254740992.0
 
 
-@kernel
+@bare_kernel
 def _next_normal(state: NDArray[np.uint64]) -> float:
     """Standard normal: Box and Muller."""
     radius = math.sqrt(-2.0 * math.log(_next_uniform(state)))
     return radius * math.cos(2.0 * math.pi * _next_uniform(state))
 
 
-@kernel
+@bare_kernel
 def draw(state: CompactGaState, out: NDArray[np.float64]) -> None:
     """Draw a generation: out, shape (samples, k), each gene in 0 … 1."""
     for i in range(out.shape[0]):
@@ -111,8 +111,22 @@ def learn(
     tolerance : float
         Deviation at which the search is done; a gene's own is kept above a quarter of it.
     """
+    learn_from(state, population, costs, virtual_population, tolerance, state.elite.copy())
+
+
+@bare_kernel
+def learn_from(
+    state: CompactGaState,
+    population: NDArray[np.float64],
+    costs: NDArray[np.float64],
+    virtual_population: float,
+    tolerance: float,
+    before: NDArray[np.float64],
+) -> None:
+    """Do what `learn` does, allocating nothing; before: shape (k,), overwritten."""
     mean, spread, elite = state.mean, state.spread, state.elite
-    before = elite.copy()
+    for g in range(population.shape[1]):
+        before[g] = elite[g]
     for i in range(population.shape[0]):
         wins = costs[i] < state.best[0]
         for g in range(population.shape[1]):

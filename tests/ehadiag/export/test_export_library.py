@@ -17,7 +17,7 @@ from ehadiag.export.targets import TARGETS, target
 from ehadiag.monitor import Monitor
 from ehadiag.monitor.layout import CUSUM, PREDICTED, SIZE
 from ehadiag_tools.onboard.emulators import EMULATED, missing
-from ehadiag_tools.onboard.replay import own_lines, replayed, ticks_of, unit_of
+from ehadiag_tools.onboard.replay import identified, own_lines, replayed, ticks_of, unit_of
 from firmware_iface.logs.reader import read_recording
 
 SEVERITIES = (0.3, 0.4, 0.2)
@@ -133,6 +133,21 @@ def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
     assert replay.lines == expected
     assert 0 < replay.push_stack <= 2048
     assert 0 < replay.init_stack <= 2048
+
+
+@pytest.mark.slow
+def test_the_identification_has_the_digits_of_the_host_on_a_bare_target(place, tmp_path):
+    host, bare = (
+        next(item for item in EMULATED if item.target == name) for name in ("host", "cortex-m7")
+    )
+    absent = missing(host) + missing(bare)
+    if absent:
+        pytest.skip(f"not installed: {', '.join(absent)}")
+    recording = read_recording(LOGS / "paper-open-1.blf")
+    ticks, unit = ticks_of(recording)[:150], unit_of(recording, (0.0, 0.0, 0.0))
+    expected = identified(host, exported("host", place), unit, ticks, tmp_path)
+    assert expected.startswith("outcome 0 ")
+    assert identified(bare, exported("cortex-m7", place), unit, ticks, tmp_path) == expected
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler here")

@@ -53,7 +53,7 @@ EMULATED: tuple[Emulator, ...] = (
     Emulator(
         "cortex-m7",
         "arm-none-eabi-gcc",
-        (*BARE, "-T", str(HERE / "cortex_m7.ld")),
+        (*BARE, "-DCOUNTED", "-T", str(HERE / "cortex_m7.ld")),
         MPS2,
         ("cortex_m7.c",),
     ),

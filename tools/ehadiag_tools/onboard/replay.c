@@ -12,6 +12,20 @@
 
 static eha_monitor monitor;
 
+#ifdef COUNTED
+uint32_t instructions(void);
+#else
+static uint32_t instructions(void) { return 0u; }
+#endif
+#define COUNTER_SPAN (0x1000000u * 40u) /* after which it begins anew */
+
+static uint32_t since(uint32_t before)
+{
+    const uint32_t now = instructions();
+
+    return now >= before ? now - before : now + COUNTER_SPAN - before;
+}
+
 static double number(uint64_t bits)
 {
     double value;
@@ -52,6 +66,8 @@ int main(void)
 {
     eha_unit unit;
     size_t deepest = 0;
+    uint64_t total = 0u;
+    uint32_t worst = 0u;
 
     (void)memcpy(&unit, unit_bits, sizeof unit);
     (void)stack_paint(0);
@@ -63,6 +79,7 @@ int main(void)
         eha_tick tick;
         int32_t alarms;
         size_t used;
+        uint32_t begin, spent;
 
         tick.command = number(tick_bits[k][0]);
         tick.current = number(tick_bits[k][1]);
@@ -70,7 +87,11 @@ int main(void)
         tick.pressure = number(tick_bits[k][3]);
         tick.position = number(tick_bits[k][4]);
         (void)stack_paint(0);
+        begin = instructions();
         alarms = eha_monitor_push(&monitor, &tick);
+        spent = since(begin);
+        total += spent;
+        worst = spent > worst ? spent : worst;
         used = stack_paint(1);
         deepest = used > deepest ? used : deepest;
         (void)printf("tick %" PRId32 " ", alarms);
@@ -79,6 +100,9 @@ int main(void)
         print_numbers(monitor.cusum, 4);
         (void)printf("\n");
     }
+    (void)printf("worst count %" PRIu32 "\n", worst);
+    (void)printf("mean count %" PRIu32 "\n",
+                 (uint32_t)(total / (sizeof tick_bits / sizeof tick_bits[0])));
     (void)printf("push stack %lu\n", (unsigned long)deepest);
     return 0;
 }

@@ -16,7 +16,7 @@ from ehadiag.monitor import Monitor
 from ehadiag.monitor.prepare import Unit
 from ehadiag_tools.onboard.emulators import Emulator, run_program
 
-__all__ = ["Replay", "own_lines", "replayed", "ticks_of", "unit_of"]
+__all__ = ["Replay", "identified", "own_lines", "replayed", "ticks_of", "unit_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +31,17 @@ class Replay:
         Bytes of stack that its start took.
     push_stack : int
         The most that a push took.
+    mean_push : int
+        Instructions of a push in the mean, to within some dozens; 0 where they are not counted.
+    worst_push : int
+        The most of one push.
     """
 
     lines: list[str]
     init_stack: int
     push_stack: int
+    mean_push: int
+    worst_push: int
 
 
 def ticks_of(recording: Recording) -> NDArray[np.float64]:
@@ -107,6 +113,43 @@ def replayed(
     Replay
         What was printed.
     """
+    _write_ticks(unit, ticks, work)
+    said = run_program(emulator, export, "replay.c", work).splitlines()
+    lines = [line.removeprefix("tick ").strip() for line in said if line.startswith("tick ")]
+    stacks = {line.split()[0]: int(line.split()[-1]) for line in said if " stack " in line}
+    counts = {line.split()[0]: int(line.split()[-1]) for line in said if " count " in line}
+    return Replay(lines, stacks["init"], stacks["push"], counts["mean"], counts["worst"])
+
+
+def identified(
+    emulator: Emulator, export: Path, unit: Unit, ticks: NDArray[np.float64], work: Path
+) -> str:
+    """Identify ticks by an export on its target; return what it found, in bits.
+
+    Parameters
+    ----------
+    emulator : Emulator
+        The target's.
+    export : Path
+        Folder of the export.
+    unit : Unit
+        What the identification is told.
+    ticks : NDArray[np.float64]
+        Shape (n, 5).
+    work : Path
+        Folder for what is made.
+
+    Returns
+    -------
+    str
+        One line.
+    """
+    _write_ticks(unit, ticks, work)
+    return run_program(emulator, export, "identify.c", work).strip()
+
+
+def _write_ticks(unit: Unit, ticks: NDArray[np.float64], work: Path) -> None:
+    """Write the header that the programs of this folder read."""
     rows = ",\n".join("{" + _words(row) + "}" for row in ticks)
     text = (
         "#include <stdint.h>\n"
@@ -114,10 +157,6 @@ def replayed(
         f"static const uint64_t tick_bits[{len(ticks)}][5] = {{\n{rows}\n}};\n"
     )
     (work / "ticks.h").write_text(text)
-    said = run_program(emulator, export, "replay.c", work).splitlines()
-    lines = [line.removeprefix("tick ").strip() for line in said if line.startswith("tick ")]
-    stacks = {line.split()[0]: int(line.split()[-1]) for line in said if " stack " in line}
-    return Replay(lines, stacks["init"], stacks["push"])
 
 
 def _bits(numbers: Sequence[float] | NDArray[np.float64]) -> list[int]:

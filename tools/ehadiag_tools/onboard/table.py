@@ -65,7 +65,8 @@ def main(argv: list[str] | None = None) -> int:
                 different += count
                 print(
                     f"{log.name} {emulator.target}: {count} of {len(ticks)} ticks differ,"
-                    f" stack of init {replay.init_stack}, of push {replay.push_stack} bytes",
+                    f" stack of init {replay.init_stack}, of push {replay.push_stack} bytes,"
+                    f" instructions of push {replay.mean_push}, at most {replay.worst_push}",
                     flush=True,
                 )
     return 1 if different else 0

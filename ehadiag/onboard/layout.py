@@ -1,0 +1,149 @@
+"""Where the numbers of an identification stand in its one flat array."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from ehadiag.compile.rows import packer, unpacker
+from ehadiag.monitor.layout import SIZE as MONITOR_SIZE
+
+__all__ = [
+    "ADVANCE",
+    "ELITE",
+    "GENERATOR",
+    "GENES",
+    "GRADIENT",
+    "LANES",
+    "MEAN",
+    "MONITORS",
+    "NORMAL",
+    "OUTCOME",
+    "PARAMETERS",
+    "POINT",
+    "POPULATION",
+    "SAMPLES",
+    "SCRATCH",
+    "SIZE",
+    "SPREAD",
+    "TRIAL",
+    "UNIT",
+    "Advance",
+    "Outcome",
+    "advance_of",
+    "keep_advance",
+    "keep_outcome",
+    "outcome_of",
+]
+
+GENES: Final = 3
+"""Severities: Kintas, FSS, FDJ."""
+PARAMETERS: Final = 5
+"""Severities, then the offsets of spool and pressure in units of their noise."""
+SAMPLES: Final = 8
+"""Of a generation of the compact genetic algorithm."""
+MONITORS: Final = 1 + 2 * PARAMETERS
+"""Models that run side by side for derivatives: at the point, and either side in each direction."""
+
+
+class Outcome(NamedTuple):
+    """What an identification has found; the first members of its memory.
+
+    Attributes
+    ----------
+    Kintas : float
+        Severities, 0 … 1.
+    FSS : float
+        See `Kintas`.
+    FDJ : float
+        See `Kintas`.
+    std_Kintas : float
+        Their standard deviations.
+    std_FSS : float
+        See `std_Kintas`.
+    std_FDJ : float
+        See `std_Kintas`.
+    spool_offset : float
+        Constant error of the spool's sensor, m.
+    pressure_offset : float
+        Constant error of the sensor of differential pressure, Pa.
+    verdict : float
+        0 healthy, 10 degraded, 20 fault, 30 not tested.
+    cost : float
+        Capped sum of squares of the residuals, in units of noise.
+    samples : float
+        Residuals that it is of.
+    outliers : float
+        Share of them beyond three deviations.
+    runs : float
+        Runs of the model so far.
+    converged : float
+        Not 0: the refinement came to an end by itself.
+    """
+
+    Kintas: float
+    FSS: float
+    FDJ: float
+    std_Kintas: float
+    std_FSS: float
+    std_FDJ: float
+    spool_offset: float
+    pressure_offset: float
+    verdict: float
+    cost: float
+    samples: float
+    outliers: float
+    runs: float
+    converged: float
+
+
+class Advance(NamedTuple):
+    """How far an identification is.
+
+    Attributes
+    ----------
+    phase : float
+        0 grid of the spool's severities, 1 grid of the jack's, 2 genetic search, 3 refinement,
+        4 done.
+    steps : float
+        Runs or steps within the phase.
+    best : float
+        Least cost of the phase so far.
+    damping : float
+        Of the refinement's next step.
+    """
+
+    phase: float
+    steps: float
+    best: float
+    damping: float
+
+
+def _behind(start: int, length: int) -> int:
+    return start + length
+
+
+OUTCOME: Final = 0
+ADVANCE: Final = _behind(OUTCOME, len(Outcome._fields))
+UNIT: Final = _behind(ADVANCE, len(Advance._fields))
+"""What the monitor's kernels are told of the unit, severities and offsets of the run."""
+POINT: Final = _behind(UNIT, 8)
+"""Best point so far."""
+TRIAL: Final = _behind(POINT, PARAMETERS)
+"""Point of the next run."""
+MEAN: Final = _behind(TRIAL, PARAMETERS)
+SPREAD: Final = _behind(MEAN, GENES)
+ELITE: Final = _behind(SPREAD, GENES)
+GENERATOR: Final = _behind(ELITE, GENES)
+"""Cost of the elite, then the state of the random numbers."""
+POPULATION: Final = _behind(GENERATOR, 2)
+"""A generation, then its costs."""
+NORMAL: Final = _behind(POPULATION, SAMPLES * (GENES + 1))
+"""Normal matrix and gradient at the best point."""
+GRADIENT: Final = _behind(NORMAL, PARAMETERS * PARAMETERS)
+SCRATCH: Final = _behind(GRADIENT, PARAMETERS)
+"""The same at the trial, a matrix, two vectors, and the elite before a generation."""
+LANES: Final = _behind(SCRATCH, 2 * PARAMETERS * PARAMETERS + 4 * PARAMETERS + GENES)
+SIZE: Final = _behind(LANES, MONITORS * MONITOR_SIZE)
+
+outcome_of, keep_outcome = unpacker(Outcome, OUTCOME), packer(Outcome, OUTCOME)
+advance_of, keep_advance = unpacker(Advance, ADVANCE), packer(Advance, ADVANCE)
