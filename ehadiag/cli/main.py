@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from ehadiag.cli.commands import bit, diagnose, history, replay, rul, sim, tests, warmup
+from ehadiag.cli.commands import bit, diagnose, history, replay, report, rul, sim, tests, warmup
 from ehadiag.cli.commands import check_bus as checkbus
 from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
 from ehadiag.cli.output import abandon, say
@@ -120,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
         help="print versions, also of libraries, and exit",
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
-    for command in (bit, diagnose, sim, tests, checkbus, replay, history, rul, warmup):
+    for command in (bit, diagnose, sim, tests, checkbus, replay, history, rul, report, warmup):
         command.add_parser(subparsers)
     return parser
 

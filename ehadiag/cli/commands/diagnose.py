@@ -14,6 +14,7 @@ from ehadiag.cli.deadline import Deadline
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
 from ehadiag.cli.output import progress_bar, say, say_if_compiling
+from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import EhadiagError, NotTestedError
 from ehadiag.core.stored_test import resolve_test
@@ -63,6 +64,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_log_options(parser)
     options.add_diagnosis_options(parser)
     add_keeping_options(parser)
+    add_report_option(parser)
     parser.set_defaults(run=run)
 
 
