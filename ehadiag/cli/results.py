@@ -86,9 +86,11 @@ class Results:
         if self._arguments.json:
             import ehadiag.report.json_line  # noqa: PLC0415
         else:
-            import ehadiag.report.table  # noqa: F401, PLC0415
+            import ehadiag.report.table  # noqa: PLC0415
 
             rendered(lambda _: None)
+        if self._arguments.report:
+            import ehadiag.report.page  # noqa: F401, PLC0415
 
     def deliver(self, diagnosis: Diagnosis, spent: Spent, name: str) -> int:
         """Write and print one result; return its exit code.
