@@ -20,6 +20,7 @@ from ehadiag.cli.commands import (
     history,
     init,
     replay,
+    report,
     rul,
     sim,
     tests,
@@ -163,8 +164,8 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
         metavar="COMMAND", required=True
     )
     for command in (
-        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, export,
-        warmup, init,
+        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, report,
+        export, warmup, init,
     ):  # fmt: skip
         command.add_parser(subparsers)
     completion.add_parser(subparsers, _parser)

@@ -10,10 +10,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.assess.verdict import Levels
 from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import emit, put, rendered, say
-from ehadiag.core.errors import InputOutputError
+from ehadiag.cli.report_page import need_report_library, report_of
+from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import plain_name
 
@@ -70,6 +72,10 @@ class Results:
         self._folder = folder
         self._names: set[str] = set()
         self._keeper = Keeper(arguments)
+        if arguments.report:
+            need_report_library()
+            if folder is None:
+                raise ConfigurationError("--report: name by --out the folder where the page goes")
         self.stopped = False
         """Whether a signal came while a result was brought out."""
 
@@ -78,9 +84,11 @@ class Results:
         if self._arguments.json:
             import ehadiag.report.json_line  # noqa: PLC0415
         else:
-            import ehadiag.report.table  # noqa: F401, PLC0415
+            import ehadiag.report.table  # noqa: PLC0415
 
             rendered(lambda _: None)
+        if self._arguments.report:
+            import ehadiag.report.page  # noqa: F401, PLC0415
 
     def deliver(
         self,
@@ -115,6 +123,10 @@ class Results:
                 with _said(codes):
                     self._draw(draw, f"{stem}.png")
                     written.append(f"{stem}.png")
+            if stem is not None and self._arguments.report and not came.is_set():
+                with _said(codes):
+                    self._report(diagnosis, line, f"{stem}.html")
+                    written.append(f"{stem}.html")
             if self._folder is not None and written:
                 say("wrote " + ", ".join(str(self._folder.path / item) for item in written))
         self.stopped = self.stopped or came.is_set()
@@ -168,7 +180,8 @@ class Results:
             try:
                 if _same_recording(folder, name, line):
                     folder.write(name, content)
-                    folder.remove(f"{stem}.png")  # of the result that is no more
+                    for suffix in (".png", ".html"):  # of the result that is no more
+                        folder.remove(f"{stem}{suffix}")
                 elif folder.exists(f"{stem}.png"):
                     continue
                 else:
@@ -190,6 +203,16 @@ class Results:
         except OSError as error:
             place = self._folder.path / name
             raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
+
+    def _report(self, diagnosis: Diagnosis, line: str, name: str) -> None:
+        assert self._folder is not None
+        levels = Levels(self._arguments.advisory, self._arguments.limit)
+        page = report_of(line, levels, self._keeper.place, diagnosis)
+        try:
+            self._folder.write(name, page)
+        except OSError as error:
+            place = self._folder.path / name
+            raise InputOutputError(f"report {place}: {error.strerror or error}") from None
 
 
 @contextlib.contextmanager

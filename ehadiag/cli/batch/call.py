@@ -192,7 +192,8 @@ class _Call:
 
     def _workers(self) -> int:
         """Return how many processes; 1: only this one."""
-        if len(self._inputs) < 2 or self._arguments.cluster:
+        # A report draws samples, which no worker sends back.
+        if len(self._inputs) < 2 or self._arguments.cluster or self._arguments.report:
             return 1
         asked = self._arguments.jobs
         return min(asked, len(self._inputs)) if asked else processors_for(len(self._inputs))

@@ -14,6 +14,7 @@ from ehadiag.cli.drawing import can_be_drawn, drawn
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import progress_bar, say_if_compiling
+from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import NotTestedError
 from ehadiag.core.stored_test import resolve_test
@@ -81,6 +82,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_diagnosis_options(parser)
     add_keeping_options(parser)
     options.add_result_options(parser)
+    add_report_option(parser)
     options.add_bus_options(parser)
     options.add_fault_options(parser)
     parser.set_defaults(run=run)

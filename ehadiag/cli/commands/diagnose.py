@@ -14,6 +14,7 @@ from ehadiag.cli.batch.job import Job
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
 from ehadiag.core.stored_test import resolve_test
@@ -67,6 +68,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_diagnosis_options(parser)
     add_keeping_options(parser)
     options.add_result_options(parser)
+    add_report_option(parser)
     add_batch_options(parser)
     parser.set_defaults(run=run)
 
@@ -108,6 +110,9 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
     for name, value in several.items():
         if alone and value:
             raise ConfigurationError(f"{name}: {alone} gives one result, and has no use for it")
+    for name in ("--jobs", "--cluster"):
+        if arguments.report and several[name]:
+            raise ConfigurationError(f"{name}: --report draws samples, which workers do not send")
     if arguments.cluster and arguments.jobs:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
 

@@ -24,6 +24,7 @@ sys.exit(code)
 """
 BUSES = {"can", "cantools", "serial", "asammdf", "pandas"}
 REPORTS = {"matplotlib"}
+PAGES = {"bokeh", "jinja2", "sqlite3"}
 NUMERICS = {"scipy.linalg", "scipy.optimize", "scipy.special", "scipy.stats", "pygad"}
 COMPILED = """
 import sys
@@ -61,7 +62,7 @@ def test_what_needs_no_model_loads_no_compiler(
 ) -> None:
     found = loaded(arguments, environment)
     assert "ehadiag.cli.main" in found
-    assert not found & (BUSES | REPORTS | NUMERICS | {"numba", "llvmlite", "scipy"})
+    assert not found & (BUSES | REPORTS | PAGES | NUMERICS | {"numba", "llvmlite", "scipy"})
 
 
 @pytest.mark.parametrize("name", ["paper-open-1.blf", "paper-closed-1.blf"])
@@ -70,7 +71,7 @@ def test_diagnosis_of_a_recording_loads_no_bus(name: str, environment: dict[str,
     loaded(command, environment)  # the first one may have to read the DBC
     found = loaded(command, environment)
     assert {"numba", "ehadiag.identify.session"} <= found
-    assert not found & (BUSES | REPORTS | NUMERICS | {"rich"})
+    assert not found & (BUSES | REPORTS | PAGES | NUMERICS | {"rich"})
 
 
 @pytest.mark.parametrize("name", ["paper-open-1.blf", "paper-closed-1.blf"])
