@@ -176,6 +176,11 @@ class _Encoder:
             name = self._names[frame.can_id, frame.extended]
             before = out.get(name, bytes(len(frame.data)))
             out[name] = bytes(a | b for a, b in zip(before, frame.data, strict=True))
+        if np.isnan(values).any():
+            # Lost: with a sample that shares its message a command is lost too.
+            out = {
+                name: data for name, data in out.items() if not self._map.messages[name].measures
+            }
         return out
 
 
