@@ -41,6 +41,8 @@ __all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_test
 
 CHANGED = 6.0
 """Deviations of a calibration beyond which an effect has changed since."""
+LEAST_CHANGE = 0.1
+"""Of an effect, in units of its scale."""
 LEAST_SHARE = 0.75
 """Share of samples without which nothing is worked out of a running test."""
 
@@ -316,7 +318,8 @@ def _freed(identification: Identification | None, actuator: Actuator) -> tuple[s
             f"{identification.nuisances[name].value:.4g} {parameter(name).unit} now"
             for name, value in calibration.effects.items()
             if name in identification.nuisances
-            and abs(identification.nuisances[name].value - value) > CHANGED * stds[name]
+            and abs(identification.nuisances[name].value - value)
+            > max(CHANGED * stds[name], LEAST_CHANGE * parameter(name).scale)
         ]
     learned = (*learned, *OF_THE_DAY)
     words = [parameter(name).short for name in identification.freed if name not in learned]

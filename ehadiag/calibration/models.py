@@ -20,6 +20,7 @@ from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, param
 
 __all__ = [
     "SECOND_STAGES",
+    "SENSING",
     "SMOOTH",
     "Learned",
     "Model",

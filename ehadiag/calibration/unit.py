@@ -19,6 +19,7 @@ from ehadiag.assess.acceptance import (
 from ehadiag.assess.diagnosis import match_tests
 from ehadiag.assess.verdict import Levels
 from ehadiag.calibration.models import (
+    SENSING,
     SMOOTH,
     Learned,
     Model,
@@ -35,7 +36,7 @@ from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import is_noise
-from ehadiag.identify.nuisance.knowledge import knowledge_of
+from ehadiag.identify.nuisance.knowledge import Knowledge, knowledge_of
 from ehadiag.identify.nuisance.prior import usual
 from ehadiag.identify.refine.first_part import CONSIDERED
 from ehadiag.identify.uncertainty import covariance
@@ -49,6 +50,8 @@ SURE = 2.0
 """Deviations by which a severity must be beyond it, or stay below twice of it."""
 MOST_SEARCHES = 4
 """For what is kept, until two have come to the same place."""
+NEARLY_EXPLAINED = 3.0
+"""Excess of residuals over noise up to which the search may be to blame, and not the model."""
 ALIKE = 30.0
 """Cost by which searches that came to the same place differ."""
 LEAST_RECORDINGS = 2
@@ -115,9 +118,7 @@ def calibrate(
     if reasons:
         return session.refused(reasons, best, tried)
     learned = session.learned_as_new(best)
-    known = {name: item.std for name, item in learned.model.known.items()}
-    usual_std = {item.name: usual(item).std for item in learned.estimated.refined.parameters}
-    lesson = lesson_of(learned.estimated, {**usual_std, **known})
+    lesson = lesson_of(learned.estimated, _usual_std(learned))
     return session.done(lesson, learned, best, tried, sources)
 
 
@@ -166,24 +167,13 @@ def update(
         return session.refused(reasons)
     knowledge = knowledge_of(start)
     experiments = share_offsets(session.build(start))
-    session.tell("learning", 0.0)
-    found = estimate(
-        experiments,
-        (*FAULTS, *OFFSETS, *knowledge.free),
-        known=knowledge.known,
-        joint=knowledge.joint,
-        considered=CONSIDERED,
-        hint=dict.fromkeys((item.name for item in FAULTS), 0.02),
-        seed=seed,
-        tell=lambda share: session.tell("learning", share),
-    )
+    found = session.refined(experiments, knowledge)
     model = Model(start.second_stage.kind, start.calibration.plays)
     learned = Learned(model, list(experiments), found, 0.0)
     reasons = session.unexplained(learned) or _not_healthy(found)
     if reasons:
         return session.refused(reasons, learned, [learned])
-    before = dict(zip(start.calibration.parameters, start.calibration.std, strict=True))
-    lesson = lesson_of(found, before)
+    lesson = lesson_of(found, _usual_std(learned))
     return session.done(lesson, learned, learned, [learned], sources)
 
 
@@ -206,6 +196,32 @@ class _Session:
         self._seed = seed
         self._evaluations = 0
         self.tell = progress or (lambda _stage, _share: None)
+
+    def refined(self, experiments: Sequence[Experiment], knowledge: Knowledge) -> Estimated:
+        """Estimate about what is known of a unit, until a search explains the recordings.
+
+        Where none does its effects may have changed since.
+        """
+        loosened = knowledge.loosened()
+        small = dict.fromkeys((item.name for item in FAULTS), 1e-3)
+        found: list[Estimated] = []
+        for turn in range(MOST_SEARCHES):
+            self.tell("learning", turn / MOST_SEARCHES)
+            found.append(
+                estimate(
+                    experiments,
+                    (*FAULTS, *OFFSETS, *knowledge.free),
+                    known=knowledge.known,
+                    joint=(knowledge if turn < MOST_SEARCHES // 2 else loosened).joint,
+                    considered=CONSIDERED,
+                    hint=None if turn % 2 else small,
+                    seed=self._seed + turn,
+                )
+            )
+            self._evaluations += found[-1].evaluations
+            if found[-1].explained:
+                break
+        return min(found, key=lambda item: item.excess)
 
     def objections(self) -> list[str]:
         """Why the recordings cannot be learned from, each named."""
@@ -244,9 +260,14 @@ class _Session:
         out: list[Learned] = []
         for model in models:
             found = self._learn(model, nearly_new=True)
-            if not found.estimated.explained and not out:
+            turn = 1
+            while turn < MOST_SEARCHES and _may_have_stopped_beside(found, first=not out):
                 # The unit may be worn, or the search have stopped beside the optimum.
-                found = min(found, self._learn(model), key=lambda item: item.criterion)
+                other = self._learn(model, nearly_new=turn != 1, turn=turn)
+                found = min(found, other, key=lambda item: item.criterion)
+                turn += 1
+                if found.estimated.excess > NEARLY_EXPLAINED:
+                    break
             out.append(found)
             if found.estimated.explained and not compare:
                 break
@@ -420,6 +441,22 @@ def _severities(found: Estimated) -> tuple[Severity, ...]:
         for item in FAULTS
         if item.name in values
     )
+
+
+def _may_have_stopped_beside(found: Learned, *, first: bool) -> bool:
+    """Whether another search with the same model may explain more."""
+    if found.estimated.explained:
+        return False
+    return first or found.estimated.excess <= NEARLY_EXPLAINED
+
+
+def _usual_std(learned: Learned) -> dict[str, float]:
+    """Deviations of what is known of any unit, by name."""
+    known = {**SENSING, **learned.model.known}
+    return {
+        item.name: known.get(item.name, usual(item)).std
+        for item in learned.estimated.refined.parameters
+    }
 
 
 def _not_as_new(found: Estimated) -> list[str]:
