@@ -60,11 +60,18 @@ def play(
     Parameters
     ----------
     test : StoredTest
+        What is played.
     actuator : Actuator
-    severities : tuple of float
+        Data of the actuator.
+    severities : tuple[float, ...]
         In the order of the registry, each 0 … 1.
-    effects : mapping
+    effects : Mapping[str, float]
         Nuisances and errors of data by the registry's names, SI.
+
+    Returns
+    -------
+    Played
+        The answer, without noise but for the fed-back position.
 
     Raises
     ------

@@ -94,13 +94,20 @@ def propose(
     test : StoredTest
         Where the search begins.
     actuator : Actuator
+        Data of the actuator.
     limits : Limits
+        What no test may exceed.
     budget : int
         Tests to look at.
     seed : int
         The same seed gives the same test.
-    tell : callable, optional
+    tell : Callable[[float], None] | None
         Called after each test with the share of the budget that is spent.
+
+    Returns
+    -------
+    Proposal | None
+        None where all tests that were looked at exceed the limits.
     """
     space = space_of(test, actuator.controller.IM)
     rng = np.random.default_rng(seed)

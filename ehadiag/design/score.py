@@ -34,15 +34,15 @@ class Bound:
 
     Attributes
     ----------
-    severities : tuple of float
+    severities : tuple[float, ...]
         The point.
-    std : shape (k,)
-        Smallest deviation of an unbiased estimate of each severity.
-    alone : shape (k,)
-        The same if the severities and the sensors' offsets were all that is unknown.
-    alike : tuple of (str, str, float)
+    std : NDArray[np.float64]
+        Smallest deviation of an unbiased estimate of each severity, shape (k,).
+    alone : NDArray[np.float64]
+        The same if the severities and the sensors' offsets were all that is unknown, shape (k,).
+    alike : tuple[tuple[str, str, float], ...]
         A severity, what it is hardly told apart from, and the correlation of the two.
-    unseen : tuple of str
+    unseen : tuple[str, ...]
         Parameters of which the test shows nothing.
     """
 
@@ -59,13 +59,16 @@ class Score:
 
     Attributes
     ----------
-    bounds : tuple of Bound
+    bounds : tuple[Bound, ...]
         At each point.
     figure : float
         Geometric mean of the bounds of all severities at all points.
-    travel, rate, pressure : float
-        Largest distance of the jack from its middle (m), speed (m/s) and differential pressure
-        (Pa) over the points.
+    travel : float
+        Largest distance of the jack from its middle over the points, m.
+    rate : float
+        Largest speed of the jack, m/s.
+    pressure : float
+        Largest differential pressure, Pa.
     """
 
     bounds: tuple[Bound, ...]
@@ -89,9 +92,16 @@ def score(
     Parameters
     ----------
     test : StoredTest
+        What is scored.
     actuator : Actuator
-    points : sequence of tuple of float
+        Data of the actuator, with their tolerances.
+    points : Sequence[tuple[float, ...]]
         Severities in the order of the registry.
+
+    Returns
+    -------
+    Score
+        The bounds at all points.
 
     Raises
     ------

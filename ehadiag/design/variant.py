@@ -30,7 +30,11 @@ class Space:
     Attributes
     ----------
     test : StoredTest
-    lower, upper : shape (k,)
+        The test itself.
+    lower : NDArray[np.float64]
+        Bounds of the points, shape (k,).
+    upper : NDArray[np.float64]
+        The same, shape (k,).
     largest : float
         Largest command, in the test's unit.
     """
@@ -45,7 +49,13 @@ class Space:
 
         Parameters
         ----------
-        point : shape (k,)
+        point : Sequence[float] | NDArray[np.float64]
+            Shape (k,).
+
+        Returns
+        -------
+        StoredTest
+            A valid test.
         """
         factors = iter(np.exp(np.asarray(point, dtype=np.float64)).tolist())
         tick = 1.0 / self.test.rate
@@ -84,8 +94,14 @@ def space_of(test: StoredTest, rated_current: float) -> Space:
     Parameters
     ----------
     test : StoredTest
+        Where the space has its middle.
     rated_current : float
         A; a current command does not go beyond, a position not beyond the largest factor.
+
+    Returns
+    -------
+    Space
+        All variants within the factors.
     """
     bounds = []
     for part in test.segment:

@@ -216,7 +216,8 @@ class Session:
             hint=hint,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
-            give_up=True,
+            # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
+            give_up=not knowledge.doubts,
         )
 
     def _said(

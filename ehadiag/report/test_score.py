@@ -62,7 +62,14 @@ def json_of(test: StoredTest, score: Score) -> dict[str, Any]:
     Parameters
     ----------
     test : StoredTest
+        The test.
     score : Score
+        What it shows.
+
+    Returns
+    -------
+    dict[str, Any]
+        For JSON.
     """
     return {
         "test": test.name,

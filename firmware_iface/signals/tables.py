@@ -68,9 +68,11 @@ def holds_signals(path: Path | str, *, mapped: bool) -> bool:
     if kind != ".csv" or not path.is_file():
         return False
     try:
-        return bool(header := _head(path)) and not header.startswith(FRAMES_HEADER)
+        header = _head(path)
     except InputOutputError:
         return False
+    is_text = header != "" and all(c.isprintable() or c.isspace() for c in header)
+    return is_text and not header.startswith(FRAMES_HEADER)
 
 
 def _head(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -48,6 +49,8 @@ class Job:
     """Every test of a log, not its last complete one."""
     draw: bool
     """Whether a picture is wanted."""
+    folder: str
+    """Working folder of the call, which names of logs start from."""
 
     def read(self, *logs: str) -> Reading:
         """Read what is to be diagnosed of one recording.
@@ -187,6 +190,8 @@ def work(job: Job, log: str) -> tuple[Finding, ...]:
         At least one.
     """
     leave_interrupt_to_parent()
+    with contextlib.suppress(OSError):  # a cluster's worker may not have it
+        os.chdir(job.folder)
     os.environ.setdefault("EHADIAG_THREADS", "1")  # the processors are shared by the workers
     try:
         return _findings(job, log)

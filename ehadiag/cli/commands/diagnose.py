@@ -134,6 +134,7 @@ def _job(arguments: argparse.Namespace) -> Job:
         budget=options.the_budget(arguments),
         every=arguments.all,
         draw=arguments.out is not None and not arguments.no_picture,
+        folder=str(Path.cwd()),
     )
 
 

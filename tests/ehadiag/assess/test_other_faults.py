@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from types import SimpleNamespace
 
-import msgspec
 import pytest
 
 from ehadiag.assess.diagnosis import diagnose
@@ -17,6 +16,7 @@ from ehadiag.assess.other_faults import (
 )
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.core.actuator_file import actuator_toml
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag.core.toml_file import decode_toml
@@ -80,7 +80,7 @@ def test_the_chance_counts_both_signs():
 
 
 def test_the_actuator_file_may_set_the_limits():
-    text = msgspec.toml.encode(default_actuator())
+    text = actuator_toml(default_actuator())
     changed = decode_toml(text + b"", Actuator, "file")
     assert changed.limits == default_actuator().limits
     wider = text.replace(b"null_bias = 0.03", b"null_bias = 0.05")

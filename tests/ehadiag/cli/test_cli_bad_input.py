@@ -59,12 +59,12 @@ def test_a_dbc_outside_the_mappings_folder_is_named_by_the_user(run: Run, dbc: s
         "1,2,3,4,5,6,7,8,9\n",
     ],
 )
-def test_decoded_signals_are_no_log_of_frames(text: str, run: Run) -> None:
+def test_decoded_signals_without_names_ask_for_them(text: str, run: Run) -> None:
     Path("daq.csv").write_text(text)
     result = run("diagnose", "daq.csv")
-    assert result.code == 3
-    assert "unpack" not in result.message
-    assert "daq.csv: " in result.message
+    assert result.code == 2
+    assert "log daq.csv: no column for channels." in result.message
+    assert "--column ROLE=NAME:UNIT" in result.message
 
 
 def test_options_may_follow_logs(run: Run, tmp_path: Path) -> None:

@@ -225,7 +225,7 @@ def test_check_bus_says_how_long_a_bus_was_silent(run: Run, channel: str) -> Non
 def test_check_bus_reads_logs(run: Run) -> None:
     assert run("check-bus", "--log", LOGS / "paper-open-1.blf").code == 0
     lossy = run("check-bus", "--log", LOGS / "lossy-open.blf")
-    assert lossy.code == 30
+    assert lossy.code == 0  # as a diagnosis bears it
     assert re.search(r"ServoTelemetry: \d+ frames lost", lossy.out)
 
 

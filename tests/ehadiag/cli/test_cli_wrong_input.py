@@ -168,7 +168,11 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
     ("options", "code", "words"),
     [
         (["--test", "open"], 2, "no bus named: give --interface and --channel, or --serial"),
-        (["--test", "opne", "--simulate"], 2, "test 'opne': neither a stored test (closed, open)"),
+        (
+            ["--test", "opne", "--simulate"],
+            2,
+            "test 'opne': neither a stored test (closed or 2, open or 1)",
+        ),
         (["--test", "gone.toml", "--simulate"], 3, "test file gone.toml: No such file"),
         (["--simulate"], 2, "bit: the following arguments are required: --test; see ehadiag bit"),
         (["--test", "open", "-i", "nonsense"], 2, "interface 'nonsense' unknown, need one of"),
@@ -226,7 +230,7 @@ def test_a_recording_is_never_overwritten(run: Run, tmp_path: Path) -> None:
         (["replay", LOG, "-i", "virtual", "--speed", "-1"], "need a number above 0"),
         (["sim"], "no bus named"),
         (["sim", "-i", "virtual", "--FDJ", "-0.1"], "fault FDJ: -0.1 is outside 0 … 1"),
-        (["tests", "--csv", "shut"], "test 'shut': neither a stored test (closed, open)"),
+        (["tests", "--csv", "shut"], "test 'shut': neither a stored test (closed or 2, open or 1)"),
     ],
 )
 def test_wrong_usage(arguments: list[str], words: str, run: Run) -> None:

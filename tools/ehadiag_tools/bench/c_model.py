@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ehadiag.model.batch import Batch
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.transition import SpoolTables
-from ehadiag.model.simd.jack import STAGES
+from ehadiag.model.simd.jack import MIDDLE, STAGE_NUMBERS, STAGES
 
 __all__ = ["CLanes", "CModel", "CPeak", "CUnlocated", "NoCompilerError"]
 
@@ -33,6 +33,10 @@ PLANT = [PlantConstants._fields.index(name) for name in (
     "PSR", "GP", "GQ", "CLK", "AJ", "MJ", "CJ", "XJM", "FDJ", "FDJ1", "FR", "OXS", "OPD",
 )]  # fmt: skip
 """Places of the constants that `plant.h` has."""
+
+
+WITHOUT_MIDDLE = STAGES.reshape(-1, STAGE_NUMBERS)[:, :MIDDLE].ravel()
+"""Places of stages and start, which is all that the C models ask for."""
 
 
 class NoCompilerError(Exception):
@@ -109,7 +113,7 @@ class CLanes:
             kind,
             *(batch.test, batch.tick, batch.start, batch.origin, *_currents(batch)),
             *(batch.spool, batch.pressure, batch.weight, batch.anchor[:, :3]),
-            *(levels, STAGES, candidates[..., PLANT]),
+            *(levels, WITHOUT_MIDDLE, candidates[..., PLANT]),
         )
         *inputs, rows = map(_pointer, self._kept)
         wanted = None if self.residuals is None else _pointer(self.residuals)
@@ -153,7 +157,7 @@ class CUnlocated:
             kind,
             *(batch.test, batch.tick, batch.start, _currents(batch)[1]),
             *(np.nan_to_num(batch.spool), np.nan_to_num(batch.pressure)),
-            *(np.where(seen, batch.weight, 0.0), levels, STAGES),
+            *(np.where(seen, batch.weight, 0.0), levels, WITHOUT_MIDDLE),
             np.resize(candidates[..., PLANT], (len(self.costs), candidates.shape[1], len(PLANT))),
         )
         *inputs, rows = map(_pointer, self._kept)
