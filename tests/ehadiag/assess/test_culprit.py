@@ -12,6 +12,7 @@ from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.stored_test import bundled_tests, resolve_test
+from ehadiag.report.asked import Asked
 from ehadiag.report.json_line import json_line
 from ehadiag.report.spent import Spent
 from ehadiag.report.table import text_of
@@ -64,7 +65,7 @@ def test_a_single_cause_is_named(effects, sensors, name, advice):
     assert found.culprit.advice.startswith(advice)
     assert 0.0 <= found.culprit.start < found.culprit.end <= 5.5
     assert advice in text_of(found)
-    told = json.loads(json_line(found, Spent(), "cga", 0))["culprit"]
+    told = json.loads(json_line(found, Spent(), Asked()))["culprit"]
     assert told["suspects"][0]["name"] == name
     assert told["advice"] == found.culprit.advice
 

@@ -21,6 +21,7 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag.core.toml_file import decode_toml
 from ehadiag.identify.result import Nuisance
+from ehadiag.report.asked import Asked
 from ehadiag.report.json_line import json_line
 from ehadiag.report.picture import diagnosis_figure
 from ehadiag.report.spent import Spent
@@ -99,7 +100,7 @@ def test_a_large_null_bias_degrades_and_is_reported_everywhere():
     assert diagnosis.verdict is Verdict.DEGRADED
     (reason,) = diagnosis.reasons
     assert reason.startswith("null bias 0.4 mA beyond the limit")
-    told = json.loads(json_line(diagnosis, Spent(), "cga", 0))["other"]
+    told = json.loads(json_line(diagnosis, Spent(), Asked()))["other"]
     by_name = {item["name"]: item for item in told}
     assert by_name["null_bias"]["value"] == pytest.approx(4e-4, rel=0.01)
     assert by_name["null_bias"]["beyond"]
