@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
-from ehadiag.model.parameters import REGISTRY, Unknowns
+from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.response import respond
+from ehadiag.model.sensors import sensor_law
 
-__all__ = ["Signal", "signals_of"]
+__all__ = ["Signal", "sensed", "signals_of"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,31 @@ class Signal:
     def residual(self) -> Array:
         """Measured less modelled."""
         return self.measured - self.modelled
+
+
+def sensed(experiment: Experiment, constants: PlantConstants) -> tuple[Array, Array, Array]:
+    """Run the model from rest, and read its response by sensors with these errors.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What was recorded.
+    constants : PlantConstants
+        Of the actuator, with the offsets and gains of its sensors.
+
+    Returns
+    -------
+    tuple[Array, Array, Array]
+        Spool (m), differential pressure (Pa) and jack position (m), shape (ticks,) each.
+    """
+    current = experiment.trace.current
+    model = respond(constants, current, experiment.tick, origin=experiment.origin)
+    law = sensor_law(constants)
+    return (
+        law.spool_offset + law.spool_gain * model.spool,
+        law.pressure_offset + law.pressure_gain * model.pressure,
+        law.position_offset + law.position_gain * model.position,
+    )
 
 
 def signals_of(
@@ -52,16 +78,8 @@ def signals_of(
     tuple[Signal, ...]
         Current (measured against commanded), spool, differential pressure, jack position.
     """
-    values = {item.name: item.value for item in found.estimates}
-    values |= {name: item.value for name, item in found.nuisances.items()}
-    free = tuple(item for item in REGISTRY if item.name in values)
-    point = np.array([values[item.name] for item in free])
-    constants = Unknowns(free, (experiment.constants,), {}).constants(point)
+    spool, pressure, position = sensed(experiment, found.constants(experiment.constants))
     trace = experiment.trace
-    model = respond(constants, trace.current, experiment.tick, origin=experiment.origin)
-    spool = model.spool + values.get("spool_offset", 0.0)
-    pressure = model.pressure + values.get("pressure_offset", 0.0)
-    position = model.position + values.get("position_offset", 0.0)
     current = measured_current[: experiment.ticks] - trace.offset
     return (
         Signal("servovalve current", "mA", current * 1e3, trace.current * 1e3),

@@ -21,8 +21,8 @@ from ehadiag.core.dates import date_text
 from ehadiag.core.printable import printable
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar.response import respond
 from ehadiag.report.faults import faults_of
+from ehadiag.report.modelled import sensed
 from ehadiag.report.picture_untested import draw_untested
 
 __all__ = ["Picture", "can_be_drawn", "diagnosis_figure", "draw_column", "draw_diagnosis"]
@@ -147,9 +147,7 @@ def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConsta
         Of the actuator as it was found.
     """
     time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    model = respond(constants, experiment.trace.current, experiment.tick, origin=experiment.origin)
-    spool = constants.OXS + (1.0 + constants.GXS) * model.spool
-    pressure = constants.OPD + (1.0 + constants.GPD) * model.pressure
+    spool, pressure, _ = sensed(experiment, constants)
     axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
     axes[0].set_ylabel("current, mA")
     axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
