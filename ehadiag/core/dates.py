@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-__all__ = ["date_text", "start_text"]
+__all__ = ["date_text", "start_text", "utc_text"]
 
 DATED_NS = 10**17
 """Stamps beyond are times of day, those before it seconds since a log without a date began."""
@@ -29,7 +29,23 @@ def date_text(time_ns: int | None) -> str | None:
         moment = datetime.fromtimestamp(time_ns / 1e9, UTC)
     except (OverflowError, ValueError, OSError):
         return None
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return utc_text(moment)
+
+
+def utc_text(moment: datetime) -> str:
+    """Write a moment in UTC (ISO 8601, ms): two of them compare as text.
+
+    Parameters
+    ----------
+    moment : datetime
+        With its time zone.
+
+    Returns
+    -------
+    str
+        Such as `2026-03-01T12:00:00.000Z`.
+    """
+    return moment.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def start_text(time_ns: int | None) -> str | None:

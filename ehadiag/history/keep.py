@@ -6,6 +6,7 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from ehadiag.core.dates import date_text, utc_text
 from ehadiag.core.printable import valid_text
 from ehadiag.history.fingerprint import hash_of_file, hash_of_samples
 from ehadiag.history.records import Effect, Entry, Severity, Source, Usage
@@ -13,20 +14,12 @@ from ehadiag.history.records import Effect, Entry, Severity, Source, Usage
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
 
-__all__ = ["entry_of", "now", "utc"]
-
-DATED_NS = 10**17
-"""Stamps beyond are times of day, those before it seconds since a log without a date began."""
+__all__ = ["entry_of", "now"]
 
 
 def now() -> str:
     """Time of day: UTC, ISO 8601, to the millisecond."""
-    return utc(datetime.now(UTC))
-
-
-def utc(moment: datetime) -> str:
-    """Write a time as the history does: two of them compare as text."""
-    return moment.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return utc_text(datetime.now(UTC))
 
 
 def entry_of(
@@ -60,7 +53,7 @@ def entry_of(
     tests = [test.name for test in diagnosis.tests if test is not None]
     return Entry(
         appended=now(),
-        tested=_start(recordings[0].start_ns) if recordings else None,
+        tested=date_text(recordings[0].start_ns) if recordings else None,
         actuator=valid_text(diagnosis.actuator.name),
         serial=next((item.serial for item in recordings if item.serial is not None), None),
         test=valid_text("+".join(tests)) or None,
@@ -96,15 +89,6 @@ def entry_of(
         simulated=simulated,
         result=result,
     )
-
-
-def _start(time_ns: int | None) -> str | None:
-    if time_ns is None or time_ns < DATED_NS:
-        return None
-    try:
-        return utc(datetime.fromtimestamp(time_ns / 1e9, UTC))
-    except (OverflowError, ValueError, OSError):
-        return None
 
 
 def _finite(value: float) -> float | None:

@@ -186,11 +186,11 @@ def _event(arguments: argparse.Namespace) -> None:
 
 
 def _when(text: str) -> str:
-    from ehadiag.history.keep import utc  # noqa: PLC0415
+    from ehadiag.core.dates import utc_text  # noqa: PLC0415
 
     try:
         moment = datetime.fromisoformat(text)
-        return utc(moment if moment.tzinfo else moment.replace(tzinfo=UTC))
+        return utc_text(moment if moment.tzinfo else moment.replace(tzinfo=UTC))
     except (ValueError, OverflowError):
         raise ConfigurationError(
             f"--when {text}: need ISO 8601, such as 2026-03-01T12:00"
