@@ -6,7 +6,6 @@ A whole test is put together afterwards, from columns, by `firmware_iface.alignm
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import NamedTuple
 
 from ehadiag.core.errors import ConfigurationError
@@ -98,7 +97,7 @@ class LiveTicks:
         told = (*values, "command.mode") if self._mode_told else tuple(values)
         self._command, command_counter = _counted(bus_map, told)
         self._counters = {self._telemetry.name: counter, self._command.name: command_counter}
-        self._modes: Mapping[float, CommandMode] = dict(bus_map.modes)
+        self._modes = {float(number): meaning for number, meaning in bus_map.modes.items()}
         self._ends = tuple(_ends(self._telemetry, key) for key in KEYS)
         self._turn = min(self._telemetry.modulus, _longest_turn(bus_map.tick_ns))
         self._commands = [NAN] * self._turn
