@@ -19,6 +19,7 @@ from ehadiag.cli.commands import (
     export,
     history,
     init,
+    monitor,
     replay,
     report,
     rul,
@@ -164,8 +165,8 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
         metavar="COMMAND", required=True
     )
     for command in (
-        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, report,
-        export, warmup, init,
+        bit, diagnose, monitor, calibrate, design, sim, tests, checkbus, replay, history, rul,
+        report, export, warmup, init,
     ):  # fmt: skip
         command.add_parser(subparsers)
     completion.add_parser(subparsers, _parser)

@@ -6,6 +6,11 @@ middle, where less than a step decides whether the jack slides or sticks, and by
 of the pressure's converter. The modelled pressure is of no use there, however right the model. So
 the sums of the pressure rest while the spool, measured or modelled, is that near to the middle;
 those of the spool go on.
+
+Nobody tells in what state a unit is when the watching begins: where friction holds the spool is not
+in the middle, and a measured sample is a converter step off. A third of a converter step that
+lasts is an alarm before long. So at first the modelled spool is moved by the mean of its
+innovations, with ever smaller steps, and no alarm counts.
 """
 
 from __future__ import annotations
@@ -26,6 +31,8 @@ STEPS = 3.0
 """Converter steps of the spool within which its modelled position is known."""
 FRICTIONS = 2.0
 """Static friction of the jack, over the dynamic one (PHY-15)."""
+SETTLING = 300
+"""Ticks with a spool sample until alarms count."""
 AFTER = 5
 """Ticks for which the pressure rests behind the last undecided one: the jack may still stick."""
 
@@ -40,12 +47,25 @@ class FreeMotionMonitor:
     undecided : float
         Spool position either side of the middle within which the pressure says nothing, m; see
         `undecided_spool`.
+    offset : float
+        Constant error of the spool's sensor, m.
     """
 
-    def __init__(self, monitor: Monitor, undecided: float) -> None:
+    def __init__(self, monitor: Monitor, undecided: float, offset: float = 0.0) -> None:
         self.monitor = monitor
-        self._undecided = undecided
+        """What it pushes into."""
+        self._undecided, self._offset = undecided, offset
         self._resting = 0
+        self._age = 0
+
+    @property
+    def settled(self) -> bool:
+        """Whether alarms count."""
+        return self._age >= SETTLING
+
+    def settle(self) -> None:
+        """Go on from the present state, but as one that is not known well."""
+        self._age = 0
 
     def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
         """Advance by one tick, see `Monitor.push`.
@@ -62,13 +82,19 @@ class FreeMotionMonitor:
             says nothing.
         """
         command, current, spool, _, position = sample
-        near = self._undecided
-        if abs(spool) < near or abs(self.monitor.reading.predicted[0]) < near:
+        monitor, near = self.monitor, self._undecided
+        if abs(spool - self._offset) < near or abs(monitor.reading.predicted[0]) < near:
             self._resting = AFTER
         if self._resting:
             self._resting -= 1
-            return self.monitor.push((command, current, spool, math.nan, position))
-        return self.monitor.push(sample)
+            sample = command, current, spool, math.nan, position
+        reading = monitor.push(sample)
+        if self._age < SETTLING:
+            residual = float(reading.residual[0])
+            if math.isfinite(residual):
+                self._age += 1
+                monitor.nudge(residual * monitor.noise[0] / (self._age + 1))
+        return reading
 
     def follow(self, mode: CommandMode) -> None:
         """Take commands as of this mode from the next tick on, see `Monitor.follow`."""
@@ -76,7 +102,7 @@ class FreeMotionMonitor:
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m)."""
-        self._resting = AFTER
+        self._resting, self._age = AFTER, 0
         self.monitor.reset(spool)
 
 

@@ -87,7 +87,7 @@ def watch(case: Case) -> Outcome:
     for tick, row in enumerate(rows.tolist()):
         reading = monitor.push(tuple(row))
         resting += bool(np.isnan(reading.residual[1]))
-        if reading.alarmed.any():
+        if monitor.settled and reading.alarmed.any():
             alarms += [(tick, int(item)) for item in np.flatnonzero(reading.alarmed)]
     return Outcome(tuple(alarms), resting / len(rows), time.process_time() - began)
 
