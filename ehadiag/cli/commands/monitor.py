@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from ehadiag.cli.watch.known import KnownUnit
     from ehadiag.core.actuator import Actuator
-    from ehadiag.live.traffic import Traffic
-    from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.transport.interface import Transport
 
 __all__ = ["ALARM", "add_parser", "run"]
@@ -30,8 +28,6 @@ __all__ = ["ALARM", "add_parser", "run"]
 ALARM = 40
 NOT_MONITORED = 30
 BUS_LOST = 3
-DEFAULT_BITRATE = 1_000_000
-"""Of the default bus (BUS-1)."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -131,10 +127,11 @@ def run(arguments: argparse.Namespace) -> int:
     from ehadiag.cli.watch.session import Outlets, WatchSession  # noqa: PLC0415
     from ehadiag.cli.watch.surroundings import Surroundings  # noqa: PLC0415
     from ehadiag.cli.watch.watcher import Watcher  # noqa: PLC0415 - loads numba
+    from ehadiag.live.traffic import Traffic  # noqa: PLC0415
     from firmware_iface.transport.receiver import open_source  # noqa: PLC0415
 
     with contextlib.ExitStack() as stack:
-        traffic = _traffic(arguments, bus_map)
+        traffic = Traffic(options.the_bitrate(arguments, bus_map))
         outlets = Outlets(
             AlarmLog(Path(arguments.log_file) if arguments.log_file else None),
             Surroundings(
@@ -210,17 +207,6 @@ def _found(place: Path, serial: int, actuator: Actuator) -> KnownUnit | None:
     from ehadiag.cli.watch.known import from_history  # noqa: PLC0415
 
     return from_history(place, serial, actuator)
-
-
-def _traffic(arguments: argparse.Namespace, bus_map: BusMap) -> Traffic:
-    from ehadiag.live.traffic import Traffic  # noqa: PLC0415
-    from firmware_iface.mapping.bus_map import default_map  # noqa: PLC0415
-
-    if arguments.log is not None or arguments.serial:
-        return Traffic()
-    if arguments.bitrate is None and bus_map.name == default_map().name:
-        return Traffic(DEFAULT_BITRATE)
-    return Traffic(arguments.bitrate)
 
 
 def _transport(arguments: argparse.Namespace) -> Transport:

@@ -28,6 +28,7 @@ VERDICT_STYLES = {
     "ALARM": "bold red",
 }
 BAR = 20
+TEST_BAR = 10
 SHOWN_ALARMS = 4
 HIGHEST = 1.0
 
@@ -148,7 +149,7 @@ def _test(test: RunningTest, mode: str | None, *, unicode: bool) -> Text:
     share = 0.0
     if test.duration_s and test.phase == "running":
         share = test.elapsed_s / test.duration_s
-    bar = _bar(share, unicode=unicode) if share else ""
+    bar = _bar(share, unicode=unicode, length=TEST_BAR) if share else ""
     left = "" if test.left_s is None else f"  {test.left_s:.1f} s left"
     name = f" {printable(test.name)}" if test.name else ""
     number = "" if test.number is None else f" ({test.number})"
@@ -159,10 +160,10 @@ def _test(test: RunningTest, mode: str | None, *, unicode: bool) -> Text:
     return text
 
 
-def _bar(share: float, *, unicode: bool) -> str:
+def _bar(share: float, *, unicode: bool, length: int = BAR) -> str:
     full, empty = ("█", "·") if unicode else ("#", "-")
-    done = round(min(max(share, 0.0), HIGHEST) * BAR)
-    return full * done + empty * (BAR - done)
+    done = round(min(max(share, 0.0), HIGHEST) * length)
+    return full * done + empty * (length - done)
 
 
 def _signals(signals: Signals, width: int, *, unicode: bool) -> RenderableType:

@@ -44,7 +44,7 @@ class AlarmLog:
         Parameters
         ----------
         event : str
-            Its name: `begin`, `alarm`, `again`, `silence`, `end`, ….
+            Its name: `begin`, `unit`, `alarm` or `end`.
         **content : Any
             What there is to say of it.
 
