@@ -25,6 +25,7 @@ from ehadiag.assess.other_faults import (
 )
 from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
+from ehadiag.assess.travel import objections_to_travel
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
@@ -197,7 +198,9 @@ class DiagnosisSession:
                 experiment = build_experiment(
                     recording.samples, recording.environment, test, self._actuator
                 )
-                objections = objections_to_experiment(experiment)
+                objections = objections_to_experiment(experiment) or objections_to_travel(
+                    recording.samples, self._actuator
+                )
                 experiments.append(experiment)
             reasons += objections
         if len({recording.serial for recording in recordings} - {None}) > 1:
