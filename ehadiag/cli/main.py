@@ -22,6 +22,7 @@ from ehadiag.cli.commands import (
     replay,
     report,
     rul,
+    serve,
     sim,
     tests,
     warmup,
@@ -165,7 +166,7 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
     )
     for command in (
         bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, report,
-        export, warmup, init,
+        serve, export, warmup, init,
     ):  # fmt: skip
         command.add_parser(subparsers)
     completion.add_parser(subparsers, _parser)
