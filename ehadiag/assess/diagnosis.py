@@ -34,7 +34,7 @@ from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, kno
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
-from ehadiag.identify.session import Nuisances, Session
+from ehadiag.identify.session import Nuisances, Session, SoFar
 from ehadiag.model.parameters import parameter
 
 __all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
@@ -117,6 +117,11 @@ class DiagnosisSession:
     def reused(self) -> int:
         """Stages that did not have to run again when the diagnosis was finished."""
         return self._session.reused
+
+    @property
+    def so_far(self) -> SoFar | None:
+        """Severities as the running test shows them; another thread may look."""
+        return self._session.so_far
 
     def due_s(self, test: StoredTest) -> tuple[float, ...]:
         """Instants of a running test (s) from which there is something more to work out.

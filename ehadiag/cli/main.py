@@ -19,6 +19,7 @@ from ehadiag.cli.commands import (
     export,
     history,
     init,
+    monitor,
     replay,
     report,
     rul,
@@ -165,8 +166,8 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
         metavar="COMMAND", required=True
     )
     for command in (
-        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, report,
-        serve, export, warmup, init,
+        bit, diagnose, monitor, serve, calibrate, design, sim, tests, checkbus, replay, history,
+        rul, report, export, warmup, init,
     ):  # fmt: skip
         command.add_parser(subparsers)
     completion.add_parser(subparsers, _parser)
