@@ -204,10 +204,10 @@ class _Handler(BaseHTTPRequestHandler):
                 if news is None:
                     self.wfile.write(b": still here\n\n")
                 else:
-                    seen, snapshot = news
-                    state = {"running": sessions.running, "said": sessions.said}
+                    seen = news.number
+                    state = {"running": news.running, "said": news.said}
                     self.wfile.write(
-                        b"data: " + snapshot + b"\nevent: snapshot\n\nevent: state\ndata: "
+                        b"event: snapshot\ndata: " + news.snapshot + b"\n\nevent: state\ndata: "
                         + json.dumps(state).encode() + b"\n\n"
                     )  # fmt: skip
 

@@ -9,13 +9,14 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import IO
 
 from ehadiag.core.errors import EhadiagError
 from ehadiag.core.printable import printable
 from ehadiag.live.snapshot import Snapshot
 
-__all__ = ["BusyError", "Sessions"]
+__all__ = ["BusyError", "News", "Sessions"]
 
 LONGEST_LINE = 1 << 20
 """Bytes of one snapshot; a longer line is none."""
@@ -32,6 +33,28 @@ PROGRAM = (sys.executable, "-m", "ehadiag.cli.main")
 
 class BusyError(EhadiagError):
     """A test is running already, or none is."""
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """How the sessions are.
+
+    Attributes
+    ----------
+    number : int
+        Counts the changes.
+    snapshot : bytes
+        The newest one, a line of JSON; `null` before the first.
+    running : str | None
+        Name of the test that runs.
+    said : tuple[str, ...]
+        What the sessions said last, fit for a page.
+    """
+
+    number: int
+    snapshot: bytes
+    running: str | None
+    said: tuple[str, ...]
 
 
 class Sessions:
@@ -56,12 +79,13 @@ class Sessions:
         self._program = program
         self._watch = watch
         self.tests = dict(tests)
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._asked: str | None = None
         self._ending = False
         self._process: subprocess.Popen[bytes] | None = None
         self._running: str | None = None
-        self._latest: tuple[int, bytes] = (0, b"null")
+        self._number = 1
+        self._snapshot = b"null"
         self._said: deque[str] = deque(maxlen=SAID)
         self._thread = threading.Thread(target=self._run, name="ehadiag-sessions", daemon=True)
 
@@ -82,30 +106,26 @@ class Sessions:
         """Whether no more snapshots come."""
         return self._ending
 
-    @property
-    def said(self) -> tuple[str, ...]:
-        """What the sessions said last, fit for a page."""
-        with self._news:
-            return tuple(self._said)
-
-    def wait(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
-        """Wait for a snapshot newer than one already seen.
+    def wait(self, after: int, timeout_s: float) -> News | None:
+        """Wait for news.
 
         Parameters
         ----------
         after : int
-            Number of the one seen last; 0: none yet.
+            Number of the last news; 0: none yet.
         timeout_s : float
             Longest wait.
 
         Returns
         -------
-        tuple[int, bytes] | None
-            Its number over all sessions, and the snapshot as a line of JSON; None where none came.
+        News | None
+            The newest; None where none came.
         """
-        with self._news:
-            self._news.wait_for(lambda: self._latest[0] > after or self._ending, timeout_s)
-            return self._latest if self._latest[0] > after else None
+        with self._changed:
+            self._changed.wait_for(lambda: self._number > after or self._ending, timeout_s)
+            if self._number <= after:
+                return None
+            return News(self._number, self._snapshot, self._running, tuple(self._said))
 
     def start(self, test: str) -> None:
         """Ask for a test; it begins once the watch has let go of the bus.
@@ -124,11 +144,12 @@ class Sessions:
         """
         if test not in self.tests:
             raise KeyError(test)
-        with self._news:
+        with self._changed:
             if self._running is not None or self._asked is not None:
                 raise BusyError("a test is under way: wait for its end, or abort it")
             self._asked = test
             self._stop_process()
+            self._tell()
 
     def abort(self) -> None:
         """Tell the running test to ask for its abort.
@@ -138,7 +159,7 @@ class Sessions:
         BusyError
             No test is under way.
         """
-        with self._news:
+        with self._changed:
             if self._asked is not None:
                 self._asked = None
                 return
@@ -148,11 +169,11 @@ class Sessions:
 
     def close(self) -> None:
         """End all; a running test asks for its abort first."""
-        with self._news:
+        with self._changed:
             self._ending = True
             self._asked = None
             self._stop_process()
-            self._news.notify_all()
+            self._tell()
         self._thread.join(ABORT_S)
         process = self._process
         if process is not None and process.poll() is None:
@@ -160,19 +181,20 @@ class Sessions:
 
     def _run(self) -> None:
         while not self._ending:
-            with self._news:
+            with self._changed:
                 test, self._asked = self._asked, None
                 self._running = test
                 command = self.tests[test] if test is not None else self._watch
                 process = None if command is None else self._begun(command)
                 if process is None:
-                    self._news.wait_for(lambda: self._asked is not None or self._ending)
+                    self._changed.wait_for(lambda: self._asked is not None or self._ending)
                     continue
             self._follow(process)
-            with self._news:
+            with self._changed:
                 self._process, self._running = None, None
+                self._tell()
                 if test is None:
-                    self._news.wait_for(lambda: self._asked is not None or self._ending, PAUSE_S)
+                    self._changed.wait_for(lambda: self._asked is not None or self._ending, PAUSE_S)
 
     def _begun(self, command: Sequence[str]) -> subprocess.Popen[bytes] | None:
         self._said.append(printable(f"$ ehadiag {' '.join(command)}"))
@@ -186,7 +208,12 @@ class Sessions:
             creationflags=flags,
             start_new_session=sys.platform != "win32",
         )
+        self._tell()
         return self._process
+
+    def _tell(self) -> None:
+        self._number += 1
+        self._changed.notify_all()
 
     def _follow(self, process: subprocess.Popen[bytes]) -> None:
         """Read what a session says until it ends."""
@@ -200,19 +227,21 @@ class Sessions:
                     snapshot = Snapshot.from_json(line)
                 except ValueError:
                     continue
-                with self._news:
-                    self._latest = self._latest[0] + 1, snapshot.to_json()
-                    self._news.notify_all()
+                with self._changed:
+                    self._snapshot = snapshot.to_json()
+                    self._tell()
             code = process.wait()
             words.join()
-        with self._news:
+        with self._changed:
             self._said.append(f"ended with exit code {code}")
+            self._tell()
 
     def _listen(self, stream: IO[bytes]) -> None:
         while line := stream.readline(LONGEST_LINE):
             text = printable(line.decode("utf-8", errors="backslashreplace").rstrip())
-            with self._news:
+            with self._changed:
                 self._said.append(text)
+                self._tell()
 
     def _stop_process(self) -> None:
         """Send what Ctrl-C sends: the session asks for an abort, writes what it has, ends."""

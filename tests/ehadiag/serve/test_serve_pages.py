@@ -79,12 +79,15 @@ def events(port, count):
 
 def test_snapshots_of_the_watch_are_streamed_with_texts_as_texts(tmp_path):
     with site(tmp_path) as (port, _):
-        first, state, second, _ = events(port, 4)
-    assert first[0] == "snapshot"
-    assert first[1]["command"] == "monitor"
-    assert "\x1b" not in first[1]["actuator"]
-    assert second[1]["number"] > first[1]["number"]
-    assert state == ("state", {"running": None, "said": state[1]["said"]})
+        came = events(port, 60)
+    shown = [item for kind, item in came if kind == "snapshot" and item is not None]
+    assert shown[0]["command"] == "monitor"
+    assert "\x1b" not in shown[0]["actuator"]
+    assert "<script>" in shown[0]["actuator"]
+    assert shown[-1]["number"] > shown[0]["number"]
+    states = [item for kind, item in came if kind == "state"]
+    assert all(item["running"] is None for item in states)
+    assert any(line.startswith("$ ehadiag monitor") for line in states[-1]["said"])
 
 
 def test_a_test_starts_and_aborts_by_token_only(tmp_path):
@@ -96,15 +99,24 @@ def test_a_test_starts_and_aborts_by_token_only(tmp_path):
         assert ask(port, "/start", "POST", '{"test": "other"}', X_Ehadiag_Token=TOKEN)[0] == 404
         assert sessions.running is None
         assert ask(port, "/start", "POST", body, X_Ehadiag_Token=TOKEN)[0] == 202
-        snapshots = (item for kind, item in events(port, 40) if kind == "snapshot")
+        snapshots = (item for kind, item in events(port, 200) if kind == "snapshot" and item)
         assert any(item["command"] == "bit" for item in snapshots)
         assert sessions.running == "open"
         assert ask(port, "/start", "POST", body, X_Ehadiag_Token=TOKEN)[0] == 409
         assert ask(port, "/abort", "POST", "{}", X_Ehadiag_Token=TOKEN)[0] == 202
-        kinds = [item["command"] for kind, item in events(port, 60) if kind == "snapshot"]
+        kinds = [item["command"] for kind, item in events(port, 300) if kind == "snapshot" and item]
         assert kinds[-1] == "monitor"
-        assert "abort asked for" in sessions.said
-        assert "ended with exit code 30" in sessions.said
+        said = sessions.wait(0, 1.0).said
+        assert "abort asked for" in said
+        assert "ended with exit code 30" in said
+
+
+def test_a_test_starts_where_nothing_is_watched(tmp_path):
+    with site(tmp_path, watch=None) as (port, _):
+        body = json.dumps({"test": "open"})
+        assert ask(port, "/start", "POST", body, X_Ehadiag_Token=TOKEN)[0] == 202
+        snapshots = (item for kind, item in events(port, 100) if kind == "snapshot" and item)
+        assert any(item["command"] == "bit" for item in snapshots)
 
 
 def test_without_allowing_tests_none_starts(tmp_path):
