@@ -41,13 +41,14 @@ from ehadiag.identify.search.stages import (
 )
 from ehadiag.identify.spans import lay_out
 from ehadiag.identify.textbook import (
+    HOPELESS,
     Attempt,
     attempt,
     explains,
     first_ticks,
     named,
     rescued,
-    resembles,
+    unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
@@ -142,7 +143,7 @@ class Session:
         for stage, result in enumerate(itertools.islice(self._stages(experiments, best), ready)):
             best = result.best
             self.so_far = SoFar(f"search, stage {stage + 1} of {len(STAGES)}", named(best))
-        if ready == len(STAGES) and resembles(experiments, best):
+        if ready == len(STAGES) and unlikeness(experiments, best) <= HOPELESS:
             self.so_far = _refined(self._first_part(experiments, best).refined)
 
     def finish(
@@ -166,7 +167,7 @@ class Session:
         tell("refinement", 0.0)
         doubts = self.knowledge.doubts
         alone = self.nuisances is Nuisances.NONE and not doubts
-        near = resembles(experiments, found.best)
+        found, near = _nearer(experiments, found, start)
         best: Attempt | None = None
         if alone or (near and self.nuisances is Nuisances.AUTO and not doubts):
             best = attempt(experiments, found, self._first_part)
@@ -305,6 +306,17 @@ def identify(
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
     return Session(solver, seed, nuisances, knowledge).finish(experiments, progress)
+
+
+def _nearer(
+    experiments: Sequence[Experiment], found: SearchResult, start: NDArray[np.float64]
+) -> tuple[SearchResult, bool]:
+    """Return what a refinement begins from, and whether it may explain the recordings: the optimum
+    of the search, unless only what the search began from resembles them."""
+    if unlikeness(experiments, found.best) <= HOPELESS:
+        return found, True
+    near = unlikeness(experiments, start) <= HOPELESS
+    return (replace(found, best=start) if near else found), near
 
 
 def _timing(begin: float, searched_at: float, search_s: float) -> Timing:

@@ -74,7 +74,7 @@ class RunningTest:
     """Until its end."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Signals:
     """The four signals and the command: a short history, the newest value last.
 
@@ -236,5 +236,7 @@ def _fit(tree: Any) -> Any:
     if isinstance(tree, dict):
         return {key: _fit(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
+        if tree and not isinstance(tree[0], str | dict | list | tuple):
+            return list(tree)  # numbers, and some of them None
         return [_fit(value) for value in tree]
     return tree

@@ -15,7 +15,8 @@ SCALES = (1e3, 1e3, 1e-6, 1e3)
 """From A, m, Pa, m to mA, mm, MPa, mm."""
 COMMAND_SCALE = 1e3
 """From A to mA, from m to mm."""
-Row = tuple[float, CommandMode | None, float, tuple[float, float, float, float]]
+Row = tuple[float | None, ...]
+"""As the fields of `Signals`."""
 
 
 class Trace:
@@ -39,26 +40,20 @@ class Trace:
         if time_s < self._due_s:
             return
         self._due_s = time_s + SPACING_S
-        self._rows.append((time_s, mode, command, signals))
+        sent = known(command * COMMAND_SCALE)
+        self._rows.append(
+            (
+                time_s,
+                sent if mode is CommandMode.CURRENT else None,
+                sent if mode is CommandMode.POSITION else None,
+                *(known(value * scale) for value, scale in zip(signals, SCALES, strict=True)),
+            )
+        )
 
     def signals(self) -> Signals:
         """Return what was kept, in engineering units."""
         rows = tuple(self._rows)
-
-        def column(index: int) -> tuple[float | None, ...]:
-            return tuple(known(row[3][index] * SCALES[index]) for row in rows)
-
-        def command(mode: CommandMode) -> tuple[float | None, ...]:
-            return tuple(
-                known(value * COMMAND_SCALE) if said is mode else None for _, said, value, _ in rows
-            )
-
-        return Signals(
-            time_s=tuple(row[0] for row in rows),
-            command_mA=command(CommandMode.CURRENT),
-            command_mm=command(CommandMode.POSITION),
-            current_mA=column(0),
-            spool_mm=column(1),
-            pressure_MPa=column(2),
-            position_mm=column(3),
-        )
+        if not rows:
+            return Signals()
+        times, *columns = zip(*rows, strict=True)
+        return Signals(tuple(float(time or 0.0) for time in times), *columns)

@@ -54,7 +54,9 @@ def drawn(snapshot: Snapshot, width: int, *, unicode: bool = True) -> Renderable
     parts = [_signals(snapshot.signals, inner, unicode=unicode)]
     if snapshot.residuals is not None or snapshot.command == "monitor":
         parts.append(_residuals(snapshot.residuals, unicode=unicode))
-    beside: list[RenderableType] = [_severities(snapshot.severities, unicode=unicode)]
+    none = "severities: none" if snapshot.ending else "severities: none yet"
+    severities = _severities(snapshot.severities, unicode=unicode)
+    beside: list[RenderableType] = [severities if snapshot.severities else _line(none, "dim")]
     if snapshot.command == "monitor":
         beside.append(_alarms(snapshot))
     body: RenderableType
@@ -111,7 +113,7 @@ def _line(text: str, style: str = "") -> Text:
 
 def _head(snapshot: Snapshot) -> RenderableType:
     serial = "unknown" if snapshot.serial is None else str(snapshot.serial)
-    head = Table.grid(expand=True)
+    head = Table.grid(expand=True, padding=(0, 1))
     head.add_column(overflow="ellipsis", no_wrap=True, ratio=1)
     head.add_column(justify="right", no_wrap=True)
     left = Text.assemble(
@@ -213,8 +215,6 @@ def _residuals(found: Residuals | None, *, unicode: bool) -> RenderableType:
 
 
 def _severities(severities: Sequence[Severity], *, unicode: bool) -> RenderableType:
-    if not severities:
-        return _line("severities: none yet", "dim")
     table = Table.grid(padding=(0, 1))
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from ehadiag.live.snapshot import Alarm, Snapshot
+from ehadiag.live.snapshot import Alarm, Severity, Snapshot
 
 __all__ = ["Lines"]
+
+UNTOLD = ("connecting", "closed")
+"""States of the bus at both ends of a session, which nobody needs to be told."""
 
 
 class Lines:
@@ -19,17 +22,15 @@ class Lines:
     def of(self, snapshot: Snapshot) -> Iterator[str]:
         """Give the lines that a snapshot adds to those before."""
         bus = snapshot.bus
-        if bus.state != "connecting":
+        if bus.state not in UNTOLD:
             detail = f": {bus.detail}" if bus.detail else ""
             yield from self._new("bus", f"bus {bus.name} {bus.state}{detail}")
         test = snapshot.test
         if test is not None and test.phase:
             name = f"test {test.name!r}" if test.name else "no test"
             yield from self._new("test", f"{name}: {test.phase}")
-        for item in snapshot.severities:
-            std = "" if item.std is None else f" ± {item.std:.4f}"
-            text = f"{item.name} {item.estimate:.4f}{std} ({item.source})"
-            yield from self._new(f"severity {item.name}", text)
+        if snapshot.severities:
+            yield from self._new("severities", _severities(snapshot.severities))
         fresh = snapshot.alarm_count - self._alarms
         self._alarms = snapshot.alarm_count
         for alarm in snapshot.alarms[len(snapshot.alarms) - min(fresh, len(snapshot.alarms)) :]:
@@ -46,6 +47,14 @@ class Lines:
         if self._said.get(key) != text:
             self._said[key] = text
             yield text
+
+
+def _severities(severities: Sequence[Severity]) -> str:
+    each = (
+        f"{item.name} {item.estimate:.4f}" + ("" if item.std is None else f" ± {item.std:.4f}")
+        for item in severities
+    )
+    return f"{', '.join(each)} ({severities[0].source})"
 
 
 def _alarm(alarm: Alarm) -> str:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import can
 import pytest
-from cli_result import Run
+from cli_result import REPOSITORY, Run
 from places import LOGS
 
 from ehadiag.core.actuator import default_actuator
@@ -174,6 +178,32 @@ def test_a_silent_bus_is_not_monitored_and_the_time_ends_it(run: Run) -> None:
     found = run("monitor", "-i", "virtual", "-c", "monitor-silent", "--duration", "0.3")
     assert found.code == 30
     assert "NOT MONITORED: the bus was silent" in found.err
+
+
+def test_a_bus_whose_ticks_cannot_be_told_is_refused_before_it_is_opened(run: Run) -> None:
+    mapping = REPOSITORY / "docs" / "examples" / "buses" / "canaerospace.toml"
+    found = run("monitor", "-i", "virtual", "-c", "monitor-other", "--mapping", mapping)
+    assert found.code == 2
+    assert "to follow single ticks" in found.err
+    assert found.err.count("\n") == 1
+
+
+def test_ctrl_c_ends_it_in_order(tmp_path: Path, environment: dict[str, str]) -> None:
+    log = tmp_path / "a.jsonl"
+    command = [sys.executable, "-m", "ehadiag.cli.main", "monitor", "--log-file", str(log)]
+    with subprocess.Popen(
+        [*command, "-i", "virtual", "-c", "monitor-stop"], env=environment, cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        patience = time.monotonic() + 60.0
+        while not (log.exists() and log.read_text()) and time.monotonic() < patience:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 30
+    assert [item["event"] for item in events(log)] == ["begin", "end"]
+    assert b"NOT MONITORED" in said
+    assert b"Traceback" not in said
 
 
 def test_it_follows_tests_and_modes_on_a_bus_and_sends_nothing(run: Run, tmp_path: Path) -> None:
