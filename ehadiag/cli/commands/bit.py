@@ -18,7 +18,7 @@ from ehadiag.cli.output import say_if_compiling
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.cli.screen.bit_view import BitView
-from ehadiag.cli.screen.show import add_plain_option, shown
+from ehadiag.cli.screen.show import add_screen_options, shown
 from ehadiag.core.errors import NotTestedError
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.facade.inputs import log_file
@@ -80,7 +80,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             metavar=unit,
             help=f"abort the test when the {what} goes beyond ±{unit} (default: not watched)",
         )
-    add_plain_option(parser)
+    add_screen_options(parser)
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_diagnosis_options(parser)
@@ -130,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
             actuator,
             test,
             session,
-            lambda: _begin(stack, view, plain=arguments.plain),
+            lambda: _begin(stack, view, arguments),
             options.the_bitrate(arguments, bus_map),
         )
         with stop_on_signals() as stop:
@@ -158,5 +158,5 @@ def run(arguments: argparse.Namespace) -> int:
     return results.deliver(result, line, spent, heard.name, draw)
 
 
-def _begin(stack: ExitStack, view: BitView, *, plain: bool) -> None:
-    stack.enter_context(shown(view.look, plain=plain))
+def _begin(stack: ExitStack, view: BitView, arguments: argparse.Namespace) -> None:
+    stack.enter_context(shown(view.look, plain=arguments.plain, snapshots=arguments.snapshots))

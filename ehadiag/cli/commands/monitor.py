@@ -13,7 +13,7 @@ from ehadiag.cli import options
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import say, say_if_compiling
-from ehadiag.cli.screen.show import add_plain_option, shown
+from ehadiag.cli.screen.show import add_screen_options, shown
 from ehadiag.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar=options.TEST,
         help="further test that the computer may run, to call it by its name; repeatable",
     )
-    add_plain_option(parser)
+    add_screen_options(parser)
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_log_options(parser)
@@ -148,7 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
             _transport(arguments) as transport,
             stop_on_signals() as stop,
             open_source(transport) as source,
-            shown(session.look, plain=arguments.plain) as publisher,
+            shown(session.look, plain=arguments.plain, snapshots=arguments.snapshots) as publisher,
         ):
             session.tell = publisher.refresh
             session.run(source, stop, arguments.duration)

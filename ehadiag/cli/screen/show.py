@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -16,7 +17,7 @@ from ehadiag.cli.screen.lines import Lines
 from ehadiag.live.publisher import Publisher
 from ehadiag.live.snapshot import Snapshot
 
-__all__ = ["add_plain_option", "shown", "wants_screen"]
+__all__ = ["add_screen_options", "shown", "wants_screen"]
 
 WAIT_S = 1.0
 PATIENCE_S = 5.0
@@ -25,12 +26,18 @@ LEAST_COLUMNS, LEAST_LINES = 60, 20
 """A smaller terminal gets plain lines."""
 
 
-def add_plain_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--plain`."""
+def add_screen_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--plain` and `--snapshots`."""
     parser.add_argument(
         "--plain",
         action="store_true",
         help="plain lines instead of the live view (so anyway where standard error is no terminal)",
+    )
+    parser.add_argument(
+        "--snapshots",
+        action="store_true",
+        help="write what the live view shows to standard output, ten JSON lines a second; all else"
+        " goes to standard error. The session ends as by Ctrl-C when nobody reads any more",
     )
 
 
@@ -46,7 +53,9 @@ def wants_screen(*, plain: bool) -> bool:
 
 
 @contextmanager
-def shown(look: Callable[[int], Snapshot], *, plain: bool) -> Iterator[Publisher]:
+def shown(
+    look: Callable[[int], Snapshot], *, plain: bool, snapshots: bool = False
+) -> Iterator[Publisher]:
     """Show a session while the context lasts.
 
     Parameters
@@ -55,6 +64,8 @@ def shown(look: Callable[[int], Snapshot], *, plain: bool) -> Iterator[Publisher
         Makes a snapshot, see `Publisher`.
     plain : bool
         Plain lines also on a terminal.
+    snapshots : bool
+        Write snapshots to standard output; whatever else is printed goes to standard error.
 
     Yields
     ------
@@ -63,8 +74,10 @@ def shown(look: Callable[[int], Snapshot], *, plain: bool) -> Iterator[Publisher
     """
     with contextlib.ExitStack() as stack:
         publisher = Publisher(look)
-        screen = _Screen.begun() if wants_screen(plain=plain) else None
+        screen = _Screen.begun() if wants_screen(plain=plain or snapshots) else None
         show = screen.take if screen is not None else _Plain().take
+        if snapshots:
+            show = _Stream(show).take
         reader = threading.Thread(
             target=_follow, args=(publisher, show), name="ehadiag-screen", daemon=True
         )
@@ -101,6 +114,28 @@ class _Plain:
     def take(self, snapshot: Snapshot) -> None:
         for line in self._lines.of(snapshot):
             say(line)
+
+
+class _Stream:
+    """Writes snapshots to what was standard output, and hands them on."""
+
+    def __init__(self, others: Callable[[Snapshot], None]) -> None:
+        self._out = sys.stdout.buffer
+        sys.stdout = sys.stderr
+        self._others = others
+        self._gone = False
+
+    def take(self, snapshot: Snapshot) -> None:
+        self._others(snapshot)
+        if self._gone:
+            return
+        try:
+            self._out.write(snapshot.to_json() + b"\n")
+            self._out.flush()
+        except (OSError, ValueError):
+            # Whoever watched is gone: nothing moves unwatched.
+            self._gone = True
+            signal.raise_signal(signal.SIGINT)
 
 
 class _Screen:
