@@ -14,6 +14,8 @@ __all__ = ["EMULATED", "Emulator", "missing", "run_program"]
 
 HERE = Path(__file__).parent
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2")
+MOST_S = 3600.0
+"""An emulated identification takes minutes."""
 BARE = ("--specs=rdimon.specs", "-Wl,--no-warn-execstack", "-Wl,--no-warn-rwx-segments")
 
 
@@ -111,6 +113,6 @@ def run_program(emulator: Emulator, export: Path, program: str, work: Path) -> s
         check=True, stderr=sys.stderr,
     )  # fmt: skip
     done = subprocess.run(
-        [*emulator.command, str(made)], check=True, capture_output=True, text=True, timeout=600
+        [*emulator.command, str(made)], check=True, capture_output=True, text=True, timeout=MOST_S
     )
     return done.stdout

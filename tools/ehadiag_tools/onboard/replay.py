@@ -14,9 +14,10 @@ from ehadiag.core.recording import CommandMode, Recording
 from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.monitor import Monitor
 from ehadiag.monitor.prepare import Unit
+from ehadiag.onboard.layout import Outcome
 from ehadiag_tools.onboard.emulators import Emulator, run_program
 
-__all__ = ["Replay", "identified", "own_lines", "replayed", "ticks_of", "unit_of"]
+__all__ = ["Identified", "Replay", "identified", "own_lines", "replayed", "ticks_of", "unit_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,31 @@ class Replay:
     push_stack: int
     mean_push: int
     worst_push: int
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """What an exported identification printed.
+
+    Attributes
+    ----------
+    bits : str
+        What it returned, and its results in bits.
+    stack : int
+        Bytes of stack that its calls took at most.
+    millions : int
+        Instructions, in millions; 0 where they are not counted.
+    """
+
+    bits: str
+    stack: int
+    millions: int
+
+    @property
+    def outcome(self) -> Outcome:
+        """The results as numbers."""
+        words = np.array([int(word, 16) for word in self.bits.split()[1:]], dtype=np.uint64)
+        return Outcome(*words.view(np.float64).tolist())
 
 
 def ticks_of(recording: Recording) -> NDArray[np.float64]:
@@ -123,8 +149,8 @@ def replayed(
 
 def identified(
     emulator: Emulator, export: Path, unit: Unit, ticks: NDArray[np.float64], work: Path
-) -> str:
-    """Identify ticks by an export on its target; return what it found, in bits.
+) -> Identified:
+    """Identify ticks by an export on its target.
 
     Parameters
     ----------
@@ -141,11 +167,15 @@ def identified(
 
     Returns
     -------
-    str
-        One line.
+    Identified
+        What was printed.
     """
     _write_ticks(unit, ticks, work)
-    return run_program(emulator, export, "identify.c", work).strip()
+    said = dict(
+        line.split(maxsplit=1)
+        for line in run_program(emulator, export, "identify.c", work).splitlines()
+    )
+    return Identified(said["outcome"], int(said["stack"]), int(said["millions"]))
 
 
 def _write_ticks(unit: Unit, ticks: NDArray[np.float64], work: Path) -> None:
