@@ -98,6 +98,7 @@ def acquire(
                     stop=stop,
                     progress=tell,
                     all_there=ahead.all_there,
+                    onboard_wait=arguments.onboard_wait,
                 )
             except InputOutputError as error:  # of the recording; the abort was requested
                 why = str(error)
@@ -111,6 +112,8 @@ def acquire(
             why = outcome.why
             if recording.serial is None:
                 recording = replace(recording, serial=outcome.serial)
+            if outcome.onboard is not None:
+                recording = replace(recording, onboard=outcome.onboard)
             if outcome.degraded:
                 say(outcome.degraded)
         if outcome is None or not outcome.complete:

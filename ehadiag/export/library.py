@@ -37,6 +37,7 @@ from ehadiag.monitor.plan import monitor_plan
 from ehadiag.monitor.prepare import prepare, rest
 from ehadiag.onboard import layout as identification
 from ehadiag.onboard.elementary import cosine, logarithm
+from ehadiag.onboard.environment import set_environment
 from ehadiag.onboard.kernels import begin_identification, identify_some
 
 __all__ = [
@@ -70,12 +71,13 @@ MONITOR: Final = (
     Function("eha_monitor_reset", rest, (Pointer(), Numbers(1))),
     Function("eha_monitor_push", push_tick, (Pointer(), Numbers(5))),
 )
+SURROUNDINGS: Final = (Function("eha_unit_environment", set_environment, (Pointer(), Numbers(3))),)
 
 IDENTIFICATION: Final = (
     Function("eha_identify_begin", begin_identification, (Pointer(), Table(PLAN), Pointer())),
     Function("eha_identify_run", identify_some, (Pointer(), Table(PLAN), Pointer(), Numbers(2))),
 )
-FUNCTIONS: Final = (*MONITOR, *IDENTIFICATION)
+FUNCTIONS: Final = (*MONITOR, *SURROUNDINGS, *IDENTIFICATION)
 
 
 def export_library(

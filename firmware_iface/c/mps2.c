@@ -1,4 +1,5 @@
-/* What a bare Cortex-M7 needs before newlib starts: its vectors, and floating-point switched on. */
+/* What a bare Cortex-M7 (QEMU's mps2-an500) needs before newlib starts: its vectors, and
+ * floating-point switched on; and its instructions counted. */
 #include <stdint.h>
 
 extern void _start(void);
@@ -32,6 +33,10 @@ static void hang(void)
     }
 }
 
+/* The control tick of a program that has one. */
+void tick_handler(void);
+__attribute__((weak)) void tick_handler(void) {}
+
 __attribute__((section(".vectors"), used)) static void (*const vectors[16])(void) = {
-    __stack, reset, hang, hang, hang, hang, hang,
+    __stack, reset, hang, hang, hang, hang, hang, 0, 0, 0, 0, hang, hang, 0, hang, tick_handler,
 };
