@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.recording import CommandMode, Recording
+from ehadiag.core.recording import Recording
 from ehadiag.export.targets import target
 from ehadiag_tools.onboard.emulators import BARE, EMULATED, FIRMWARE, WARNINGS
 from firmware_iface.mapping.bus_map import default_map
@@ -67,12 +67,6 @@ def _codes(role: str, values: NDArray[np.float64]) -> list[int]:
     known = np.flatnonzero(np.isfinite(raw))
     filled = raw[known[np.maximum(np.searchsorted(known, np.arange(len(raw)), "right") - 1, 0)]]
     return [int(value) for value in filled]
-
-
-def mode_of(recording: Recording) -> CommandMode:
-    """Whether a test commands currents or positions."""
-    assert recording.samples is not None
-    return recording.samples.mode
 
 
 def build_node(export: Path, work: Path, *options: str) -> Path:
@@ -160,3 +154,4 @@ def bare_node(program: Path) -> Iterator[BareNode]:
         process.kill()
         process.wait()
         reader.join()
+        process.stdout.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,20 @@ from ehadiag.core.recording import CommandMode, Recording
 from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.monitor import Monitor
 from ehadiag.monitor.prepare import Unit
+from ehadiag.onboard.environment import set_environment
 from ehadiag.onboard.layout import Outcome
 from ehadiag_tools.onboard.emulators import Emulator, run_program
 
-__all__ = ["Identified", "Replay", "identified", "own_lines", "replayed", "ticks_of", "unit_of"]
+__all__ = [
+    "Identified",
+    "Replay",
+    "identified",
+    "own_lines",
+    "replayed",
+    "surrounded",
+    "ticks_of",
+    "unit_of",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +108,16 @@ def unit_of(recording: Recording, faults: Sequence[float]) -> Unit:
     viscosity = 1.0 if degc is None else relative_viscosity(degc)
     a, b, c = faults
     return Unit(a, b, c, 0.0, 0.0, viscosity, constants.PSR, float(closed))
+
+
+def surrounded(recording: Recording) -> Unit:
+    """Return what a computer that identifies by itself makes of a recording's surroundings."""
+    around = recording.environment
+    numbers = np.array(unit_of(recording, (0.0, 0.0, 0.0)), dtype=np.float64)
+    said = around.oil_temperature, around.supply_pressure, around.return_pressure
+    told = tuple(math.nan if value is None else value for value in said)
+    set_environment(numbers.ctypes.data, told)
+    return Unit(*numbers.tolist())
 
 
 def own_lines(

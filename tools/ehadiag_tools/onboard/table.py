@@ -16,7 +16,7 @@ from ehadiag.core.recording import Recording
 from ehadiag.export.library import LIBRARY, export_library
 from ehadiag.export.targets import target
 from ehadiag_tools.onboard.emulators import EMULATED, Emulator, missing
-from ehadiag_tools.onboard.replay import identified, replayed, ticks_of, unit_of
+from ehadiag_tools.onboard.replay import identified, replayed, surrounded, ticks_of, unit_of
 from firmware_iface.logs.reader import read_recording
 
 __all__ = ["main"]
@@ -114,7 +114,7 @@ def _identify(
     work: Path,
 ) -> int:
     """Print a line for each target; on how many the result differs."""
-    unit, different = unit_of(recording, (0.0, 0.0, 0.0)), 0
+    unit, different = surrounded(recording), 0
     bits: dict[str, str] = {}
     for emulator, export in exports.items():
         found = identified(emulator, export, unit, ticks, work)
