@@ -26,6 +26,7 @@ from ehadiag.core.folder import Folder
 from ehadiag.core.printable import plain_name
 from ehadiag.export.archive import archive
 from ehadiag.export.arm_attributes import either_convention
+from ehadiag.export.firmware import SOURCES, firmware
 from ehadiag.export.linking import c_compiler, link_shared
 from ehadiag.export.targets import Target
 from ehadiag.model.exponential import exponential, exponential_less_one
@@ -65,6 +66,10 @@ OWN_FUNCTIONS: Final[Mapping[str, Any]] = {
 }
 """What stands for functions of the C library, whose last digit differs from one to the next."""
 PLAN: Final = "eha_plan"
+NOT_MEASURED: Final = dict.fromkeys(
+    ("bit_equality", "instructions_of_push", "instructions_of_identification"), "not measured"
+)
+NEEDED: Final = "in the sources of ehadiag, with the target's compiler and QEMU"
 
 MONITOR: Final = (
     Function("eha_monitor_init", prepare, (Pointer(), Table(PLAN), Pointer())),
@@ -127,8 +132,11 @@ def export_library(
             lanes=str(identification.MONITORS),
             **names,
         ),
-        "CMakeLists.txt": template("CMakeLists.txt.in", flags=";".join(target.flags), **names),
+        "CMakeLists.txt": template(
+            "CMakeLists.txt.in", flags=";".join(target.flags), firmware=" ".join(SOURCES), **names
+        ),
         "example.c": template("example.c"),
+        **firmware(),
     }
     compiler = c_compiler() if target.processor.shared else None
     if compiler is not None:
@@ -151,6 +159,7 @@ def export_library(
         monitor_bytes=layout.SIZE * layout.NUMBER,
         identification_bytes=identification.SIZE * layout.NUMBER,
         object_bytes=len(code),
+        measured=NOT_MEASURED | {"command": f"tools/onboard --into FOLDER LOG, {NEEDED}"},
     )
     write(folder, files)
     return list(files)

@@ -23,7 +23,6 @@ static bool receive(void *self, struct fcc_frame *frame, bool *got)
 {
     struct serial *serial = self;
     uint32_t time_us;
-    ssize_t count;
 
     *got = false;
     for (;;) {
@@ -33,8 +32,9 @@ static bool receive(void *self, struct fcc_frame *frame, bool *got)
                 return true;
             }
         }
+        const ssize_t count = read(serial->descriptor, serial->bytes, sizeof serial->bytes);
+
         serial->used = serial->size = 0;
-        count = read(serial->descriptor, serial->bytes, sizeof serial->bytes);
         if (count <= 0) {
             return count == 0 || errno == EAGAIN || errno == EINTR;
         }

@@ -305,7 +305,9 @@ def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place
     option, out = f"-DFCC_DIAGNOSIS_TICKS={ticks}u", tmp_path / "out"
     bits = None
     if target == "host":
-        program = build_node(exported("host", place), tmp_path, option)
+        program = build_node(
+            exported("host", place), tmp_path, option, "-fsanitize=address,undefined"
+        )
         with cable() as (here, there), subprocess.Popen([program, there, "--serial", "1"]) as node:
             try:
                 told, heard = told_by(here, out)

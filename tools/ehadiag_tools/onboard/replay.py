@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,9 +113,9 @@ def surrounded(recording: Recording) -> Unit:
     """Return what a computer that identifies by itself makes of a recording's surroundings."""
     around = recording.environment
     numbers = np.array(unit_of(recording, (0.0, 0.0, 0.0)), dtype=np.float64)
-    said = around.oil_temperature, around.supply_pressure, around.return_pressure
-    told = tuple(math.nan if value is None else value for value in said)
-    set_environment(numbers.ctypes.data, told)
+    oil, supply, back = around.oil_temperature, around.supply_pressure, around.return_pressure
+    if oil is not None and supply is not None and back is not None:
+        set_environment(numbers.ctypes.data, (oil, supply, back))
     return Unit(*numbers.tolist())
 
 
