@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import default_actuator
+from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.recording import CommandMode, Recording
 from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.monitor import Monitor
@@ -98,10 +98,12 @@ def ticks_of(recording: Recording) -> NDArray[np.float64]:
     return np.column_stack([s.command, s.current, s.spool, s.pressure, s.position])
 
 
-def unit_of(recording: Recording, faults: Sequence[float]) -> Unit:
-    """Return what a monitor is told of the unit on a recording."""
+def unit_of(
+    recording: Recording, faults: Sequence[float], actuator: Actuator | None = None
+) -> Unit:
+    """Return what a monitor is told of the unit on a recording; None: the reference actuator."""
     environment, samples = recording.environment, recording.samples
-    constants = plant_constants(default_actuator(), environment)
+    constants = plant_constants(actuator or default_actuator(), environment)
     degc = None if environment is None else environment.oil_temperature
     closed = samples is not None and samples.mode is CommandMode.POSITION
     viscosity = 1.0 if degc is None else relative_viscosity(degc)
@@ -109,10 +111,10 @@ def unit_of(recording: Recording, faults: Sequence[float]) -> Unit:
     return Unit(a, b, c, 0.0, 0.0, viscosity, constants.PSR, float(closed))
 
 
-def surrounded(recording: Recording) -> Unit:
+def surrounded(recording: Recording, actuator: Actuator | None = None) -> Unit:
     """Return what a computer that identifies by itself makes of a recording's surroundings."""
     around = recording.environment
-    numbers = np.array(unit_of(recording, (0.0, 0.0, 0.0)), dtype=np.float64)
+    numbers = np.array(unit_of(recording, (0.0, 0.0, 0.0), actuator), dtype=np.float64)
     oil, supply, back = around.oil_temperature, around.supply_pressure, around.return_pressure
     if oil is not None and supply is not None and back is not None:
         set_environment(numbers.ctypes.data, (oil, supply, back))

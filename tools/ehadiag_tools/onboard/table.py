@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import default_actuator
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.recording import Recording
 from ehadiag.export.library import LIBRARY, MANIFEST, export_library
@@ -64,6 +64,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--ticks", type=int, help="of each recording, from its start; default all")
     parser.add_argument("--target", action="append", help="only this one; repeatable")
     parser.add_argument(
+        "--actuator", type=Path, metavar="FILE", help="of the unit that was recorded"
+    )
+    parser.add_argument(
         "--into", type=Path, metavar="DIR", help="measure this export, and tell its manifest"
     )
     arguments = parser.parse_args(argv)
@@ -74,13 +77,16 @@ def main(argv: list[str] | None = None) -> int:
         given, wanted = {own: arguments.into.resolve()}, {own, *REFERENCE.values()}
     work = _identify if arguments.identify else _replay
     measured: list[Measured] = []
+    actuator = default_actuator()
+    if arguments.actuator is not None:
+        actuator = load_actuator(arguments.actuator)
     with tempfile.TemporaryDirectory() as name:
-        exports = _exports(wanted, Path(name), given)
+        exports = _exports(wanted, actuator, Path(name), given)
         if len({_manifest(export)["plan"] for export in exports.values()}) > 1:
             parser.error("--into: an export of another actuator than the recordings' own")
         for log, recording in _recordings(arguments.logs):
             ticks = ticks_of(recording)[: arguments.ticks]
-            measured += work(log, recording, ticks, exports, Path(name))
+            measured += work(log, actuator, recording, ticks, exports, Path(name))
     if arguments.into is not None:
         _tell(arguments.into / MANIFEST, [item for item in measured if item.target in given])
     return 0 if all(item.same for item in measured) else 1
@@ -117,7 +123,9 @@ def _tell(manifest: Path, measured: list[Measured]) -> None:
     manifest.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def _exports(wanted: set[str], work: Path, given: Mapping[str, Path]) -> dict[Emulator, Path]:
+def _exports(
+    wanted: set[str], actuator: Actuator, work: Path, given: Mapping[str, Path]
+) -> dict[Emulator, Path]:
     """Export for every target that is wanted and can be run here, hosts first."""
     exports: dict[Emulator, Path] = {}
     for emulator in EMULATED:
@@ -130,7 +138,7 @@ def _exports(wanted: set[str], work: Path, given: Mapping[str, Path]) -> dict[Em
         if emulator.target not in given:
             out.mkdir()
             with Folder.at(out, RESULT_MODE) as folder:
-                export_library(default_actuator(), target(emulator.target), folder)
+                export_library(actuator, target(emulator.target), folder)
         exports[emulator] = out
         print(f"{emulator.target}: {(out / LIBRARY).stat().st_size} bytes", flush=True)
     return exports
@@ -142,13 +150,14 @@ def _reference(emulator: Emulator) -> str:
 
 def _replay(
     log: str,
+    actuator: Actuator,
     recording: Recording,
     ticks: NDArray[np.float64],
     exports: dict[Emulator, Path],
     work: Path,
 ) -> Iterator[Measured]:
     """Print a line for each target."""
-    unit = unit_of(recording, SEVERITIES)
+    unit = unit_of(recording, SEVERITIES, actuator)
     lines: dict[str, list[str]] = {}
     for emulator, export in exports.items():
         replay = replayed(emulator, export, unit, ticks, work)
@@ -168,13 +177,14 @@ def _replay(
 
 def _identify(
     log: str,
+    actuator: Actuator,
     recording: Recording,
     ticks: NDArray[np.float64],
     exports: dict[Emulator, Path],
     work: Path,
 ) -> Iterator[Measured]:
     """Print a line for each target."""
-    unit = surrounded(recording)
+    unit = surrounded(recording, actuator)
     bits: dict[str, str] = {}
     for emulator, export in exports.items():
         found = identified(emulator, export, unit, ticks, work)
