@@ -37,7 +37,7 @@ from ehadiag.monitor.kernel import push_tick
 from ehadiag.monitor.plan import monitor_plan
 from ehadiag.monitor.prepare import prepare, rest
 from ehadiag.onboard import layout as identification
-from ehadiag.onboard.elementary import cosine, logarithm
+from ehadiag.onboard.elementary import cosine, logarithm, round_down, round_even
 from ehadiag.onboard.environment import set_environment
 from ehadiag.onboard.kernels import begin_identification, identify_some
 
@@ -65,6 +65,8 @@ OWN_FUNCTIONS: Final[Mapping[str, Any]] = {
     "cos": cosine,
 }
 """What stands for functions of the C library, whose last digit differs from one to the next."""
+ROUNDING: Final[Mapping[str, Any]] = {"rint": round_even, "floor": round_down}
+"""The same for a processor without such instructions; exact, so that no digit depends on it."""
 PLAN: Final = "eha_plan"
 NOT_MEASURED: Final = dict.fromkeys(
     ("bit_equality", "instructions_of_push", "instructions_of_identification"), "not measured"
@@ -117,9 +119,8 @@ def export_library(
     """
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
     plan = monitor_plan(actuator, plant_constants(actuator), design)
-    code = either_convention(
-        object_code(FUNCTIONS, {PLAN: plan.tolist()}, OWN_FUNCTIONS, target.processor)
-    )
+    own = OWN_FUNCTIONS if target.processor.rounds else {**OWN_FUNCTIONS, **ROUNDING}
+    code = either_convention(object_code(FUNCTIONS, {PLAN: plan.tolist()}, own, target.processor))
     library = archive("eha.o", code, [item.name for item in FUNCTIONS])
     names = {"version": metadata.version("ehadiag"), "target": target.name}
     files = {

@@ -210,3 +210,16 @@ def test_cmake_builds_the_export(place, tmp_path):
 def test_a_number_of_hours_that_no_threshold_gives(place):
     with pytest.raises(ConfigurationError, match="hours"):
         export_library(default_actuator(), target("host"), None, hours=1e9)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("arm-none-eabi-nm"), reason="no binutils for Arm here")
+@pytest.mark.parametrize("name", ["cortex-m7", "cortex-r5"])
+def test_arm_code_hands_numbers_to_nobody(name, place):
+    """Either calling convention fits only functions of pointers, and those of the compiler."""
+    told = subprocess.run(
+        ["arm-none-eabi-nm", "--undefined-only", exported(name, place) / "libeha.a"],
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    called = {line.split()[-1] for line in told.splitlines() if line.split()[:1] == ["U"]}
+    assert called <= {"memset", "memcpy", "__divdi3", "__fixdfdi", "__floatdidf", "__floatundidf"}
