@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 
@@ -223,3 +224,22 @@ def test_arm_code_hands_numbers_to_nobody(name, place):
     ).stdout  # fmt: skip
     called = {line.split()[-1] for line in told.splitlines() if line.split()[:1] == ["U"]}
     assert called <= {"memset", "memcpy", "__divdi3", "__fixdfdi", "__floatdidf", "__floatundidf"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck here")
+def test_every_deviation_from_misra_is_listed(place):
+    out = exported("host", place)
+    sources = [name for name in SOURCES if name != "eha_fcc.c"]
+    done = subprocess.run(
+        ["cppcheck", "--addon=misra", "--std=c99", "--enable=style", "--quiet", f"-I{out}",
+         *(out / name for name in ("example.c", *sources))],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    found = set(re.findall(r"\[misra-c2012-([\d.]+)\]", done.stderr))
+    if not found:
+        pytest.skip("this cppcheck has no rules of MISRA")
+    page = (ROOT / "docs" / "reference" / "misra.md").read_text()
+    cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| ")]
+    rules = {rule for cell in cells for rule in re.findall(r"\d+\.\d+", cell)}
+    assert found <= rules
