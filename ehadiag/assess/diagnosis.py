@@ -159,7 +159,7 @@ class DiagnosisSession:
             identification = self._session.finish(experiments, progress)
             positions = tuple(position_fit(item, identification) for item in experiments)
             others = other_faults(identification, self._actuator)
-            why = tuple(objections_to_estimate(identification))
+            why = tuple(objections_to_estimate(identification, self._actuator.calibration))
             if why:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:

@@ -50,6 +50,7 @@ from ehadiag.model.simd.layout import (
     sensor_law_of_lane,
     spool_law_of_lane,
 )
+from ehadiag.model.simd.spool_creep import creeping_instants
 from ehadiag.model.spool_events import (
     BREAKAWAY,
     ENGAGE,
@@ -258,19 +259,22 @@ def _event_tick(
         shift, fine = SHIFTS[level], level == finest
         whole = WIDTH - ((done >> shift) & (WIDTH - 1))
         h, place = unit * (1 << shift), i * len(SHIFTS) + level
-        if s.clamped:
-            found = _clamped_instants(t, moving, place, deflection, s, path)
+        if s.direction != 0 and t.extra > 0.0:
+            first = creeping_instants(
+                t, moving, loose, place, h, fine, deflection, s, path, INSTANTS
+            )
+        elif s.clamped:
+            first = first_place(_clamped_instants(t, moving, place, deflection, s, path))
         elif s.direction != 0:
             if carried(t, s.direction, s.xs, s.wire):
                 base = slide_base(t, deflection, float(s.direction))
-                found = _moving_instants(t, moving, place, h, fine, base, s, path)
+                first = first_place(_moving_instants(t, moving, place, h, fine, base, s, path))
             else:
                 still = still_flapper(t.ratio, deflection, s.wire)
-                found = _loose_instants(t, loose, place, h, fine, still, s, path)
+                first = first_place(_loose_instants(t, loose, place, h, fine, still, s, path))
         else:
             still = still_flapper(t.ratio, deflection, s.wire)
-            found = _stuck_instants(t, stuck, place, h, fine, still, s, path)
-        first = first_place(found)
+            first = first_place(_stuck_instants(t, stuck, place, h, fine, still, s, path))
         event = NOTHING
         if first < whole and fine:
             o = INSTANTS + first

@@ -1,0 +1,170 @@
+"""Chooses the model that a unit is learned by: simple ones first, then all effects, then fewer.
+
+A simple model that leaves nothing is taken. Else all that a unit may have besides is freed at
+once, since one effect left out bends the others, and what the recordings do not ask for is taken
+out again: an effect stays if leaving it out would cost more than the Bayesian information
+criterion takes for one more unknown (a Wald test, A. Wald, Trans. AMS 54(3), 1943, of the
+optimum's own covariance).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ehadiag.calibration.judging import MOST_LEFT, is_explained
+from ehadiag.calibration.models import EFFECTS, SMOOTH, Learned, Model, simple_models
+from ehadiag.calibration.session import Session
+from ehadiag.core.actuator import Actuator
+from ehadiag.identify.uncertainty import covariance
+
+__all__ = ["ALIKE", "choose", "learned_as_new"]
+
+MOST_SEARCHES = 4
+"""With one model, until two have come to the same place."""
+ALIKE = 30.0
+"""Cost by which searches that came to the same place differ."""
+ONE_START = 1
+"""Budget of a search that ends after its first start."""
+
+
+def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]:
+    """Learn with one model after the other until one explains the recordings; all that were tried.
+
+    Parameters
+    ----------
+    session : Session
+        The recordings.
+    start : Actuator
+        Data of the unit's type.
+    compare : bool
+        Try either second stage with one play and with a smooth hysteresis, in any case.
+
+    Returns
+    -------
+    list[Learned]
+        In the order in which they were tried.
+    """
+    models = simple_models(start)
+    if compare:
+        models += [replace(item, plays=SMOOTH) for item in models]
+    out: list[Learned] = []
+    for model in models:
+        out.append(_searched(session, model, first=not out))
+        if is_explained(out[-1]) and not compare:
+            return out
+    if any(is_explained(item) for item in out):
+        return out
+    for simple in simple_models(start):
+        model = Model(simple.second_stage, SMOOTH, tuple(EFFECTS))
+        found = session.learn(model, nearly_new=True, budget=ONE_START)
+        turn = 1
+        while not found.estimated.explained and turn < MOST_SEARCHES // 2:
+            if found.estimated.excess > MOST_LEFT:
+                break
+            other = session.learn(
+                model,
+                nearly_new=True,
+                hint=found.estimated.refined.values,
+                budget=ONE_START,
+                turn=turn,
+            )
+            found = min(found, other, key=lambda item: item.criterion)
+            turn += 1
+        out.append(found)
+        if is_explained(found):
+            out.append(_pruned(session, found))
+            break
+    return out
+
+
+def learned_as_new(session: Session, best: Learned) -> Learned:
+    """Learn once more, the severities taken for 0 and the frictions as new in their place.
+
+    Residuals like noise are no proof of the best optimum, and what is learned here is believed
+    ever after: the best of several searches is taken.
+
+    Parameters
+    ----------
+    session : Session
+        The recordings.
+    best : Learned
+        With the severities estimated.
+
+    Returns
+    -------
+    Learned
+        With the frictions.
+    """
+    hint = best.estimated.refined.values
+    found = [session.learn(best.model, new=True, hint=hint, budget=ONE_START)]
+    for turn in range(1, MOST_SEARCHES):
+        around = None if turn % 2 and not best.model.rich else hint
+        found.append(session.learn(best.model, new=True, hint=around, budget=ONE_START, turn=turn))
+        found.sort(key=lambda item: item.criterion)
+        if found[1].criterion - found[0].criterion < ALIKE:
+            break
+    return found[0]
+
+
+def _searched(session: Session, model: Model, *, first: bool) -> Learned:
+    """Learn with a simple model, again where the search may have stopped beside the optimum."""
+    found = session.learn(model, nearly_new=True, brief=True)
+    turn = 1
+    while turn < MOST_SEARCHES and _may_have_stopped_beside(found, first=first):
+        # The unit may be worn, too.
+        other = session.learn(model, nearly_new=turn != 1, brief=True, turn=turn)
+        found = min(found, other, key=lambda item: item.criterion)
+        turn += 1
+        if found.estimated.excess > MOST_LEFT:
+            break
+    return found
+
+
+def _may_have_stopped_beside(found: Learned, *, first: bool) -> bool:
+    """Whether another search with the same model may explain more."""
+    if found.estimated.explained:
+        return False
+    return first or found.estimated.excess <= MOST_LEFT
+
+
+def _pruned(session: Session, found: Learned) -> Learned:
+    """Learn without the effects that the recordings do not ask for."""
+    keep = asked_for(found)
+    if keep == found.model.beside:
+        return found
+    return session.learn(
+        replace(found.model, beside=keep),
+        nearly_new=True,
+        hint=found.estimated.refined.values,
+        budget=ONE_START,
+    )
+
+
+def asked_for(found: Learned) -> tuple[str, ...]:
+    """Effects that leaving out would cost more than one unknown is worth.
+
+    Taken out one after the other, the least asked for first, the rest adjusted each time.
+    """
+    refined = found.estimated.refined
+    names = [item.name for item in refined.parameters]
+    values = refined.x * refined.scale
+    spread = covariance(refined)
+    worth = math.log(max(int((refined.residuals != 0.0).sum()), 2))
+    left = list(found.model.beside)
+    while left:
+        places = [names.index(name) for name in left]
+        variances = np.diag(spread)[places]
+        squares = values[places] ** 2 / np.maximum(variances, 1e-300)
+        least = int(np.argmin(squares))
+        if squares[least] >= worth:
+            break
+        k = places[least]
+        # The others where this one is 0, and what is then known of them.
+        gain = spread[:, k] / spread[k, k]
+        values = values - gain * values[k]
+        spread = spread - np.outer(gain, spread[k])
+        left.pop(least)
+    return tuple(left)
