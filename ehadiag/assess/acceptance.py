@@ -223,7 +223,7 @@ def objections_to_estimate(
     out = []
     rms = max(fit.spool_rms, fit.pressure_rms)
     most_outliers, most_rms = MOST_OUTLIERS, MOST_RMS
-    if calibration is not None and calibration.fit.leaves:
+    if calibration is not None and calibration.fit.left > 0.0:
         most_outliers += CHANGED * calibration.fit.outliers
         most_rms *= CHANGED * max(calibration.fit.spool_rms, calibration.fit.pressure_rms)
     if fit.outliers > most_outliers or not rms <= most_rms:

@@ -4,15 +4,17 @@ A simple model that leaves nothing is taken. Else all that a unit may have besid
 once, since one effect left out bends the others, and what the recordings do not ask for is taken
 out again: an effect stays if leaving it out would cost more than the Bayesian information
 criterion takes for one more unknown (a Wald test, A. Wald, Trans. AMS 54(3), 1943, of the
-optimum's own covariance).
+optimum's own covariance). One recording of each test suffices to choose; all are learned from.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ehadiag.calibration.judging import MOST_LEFT, is_explained
 from ehadiag.calibration.models import EFFECTS, SMOOTH, Learned, Model, simple_models
@@ -20,7 +22,7 @@ from ehadiag.calibration.session import Session
 from ehadiag.core.actuator import Actuator
 from ehadiag.identify.uncertainty import covariance
 
-__all__ = ["ALIKE", "choose", "learned_as_new"]
+__all__ = ["asked_for", "choose", "learned_as_new"]
 
 MOST_SEARCHES = 4
 """With one model, until two have come to the same place."""
@@ -28,6 +30,7 @@ ALIKE = 30.0
 """Cost by which searches that came to the same place differ."""
 ONE_START = 1
 """Budget of a search that ends after its first start."""
+TINY = 1e-300
 
 
 def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]:
@@ -59,7 +62,7 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
         return out
     for simple in simple_models(start):
         model = Model(simple.second_stage, SMOOTH, tuple(EFFECTS))
-        found = session.learn(model, nearly_new=True, budget=ONE_START)
+        found = session.learn(model, nearly_new=True, budget=ONE_START, some=True)
         turn = 1
         while not found.estimated.explained and turn < MOST_SEARCHES // 2:
             if found.estimated.excess > MOST_LEFT:
@@ -69,6 +72,7 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
                 nearly_new=True,
                 hint=found.estimated.refined.values,
                 budget=ONE_START,
+                some=True,
                 turn=turn,
             )
             found = min(found, other, key=lambda item: item.criterion)
@@ -111,11 +115,11 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
 
 def _searched(session: Session, model: Model, *, first: bool) -> Learned:
     """Learn with a simple model, again where the search may have stopped beside the optimum."""
-    found = session.learn(model, nearly_new=True, brief=True)
+    found = session.learn(model, nearly_new=True, brief=True, some=True)
     turn = 1
     while turn < MOST_SEARCHES and _may_have_stopped_beside(found, first=first):
         # The unit may be worn, too.
-        other = session.learn(model, nearly_new=turn != 1, brief=True, turn=turn)
+        other = session.learn(model, nearly_new=turn != 1, brief=True, some=True, turn=turn)
         found = min(found, other, key=lambda item: item.criterion)
         turn += 1
         if found.estimated.excess > MOST_LEFT:
@@ -132,32 +136,58 @@ def _may_have_stopped_beside(found: Learned, *, first: bool) -> bool:
 
 def _pruned(session: Session, found: Learned) -> Learned:
     """Learn without the effects that the recordings do not ask for."""
-    keep = asked_for(found)
+    refined = found.estimated.refined
+    keep = asked_for(
+        found.model.beside,
+        [item.name for item in refined.parameters],
+        refined.x * refined.scale,
+        covariance(refined),
+        math.log(max(int((refined.residuals != 0.0).sum()), 2)),
+    )
     if keep == found.model.beside:
         return found
     return session.learn(
         replace(found.model, beside=keep),
         nearly_new=True,
-        hint=found.estimated.refined.values,
+        hint=refined.values,
         budget=ONE_START,
+        some=True,
     )
 
 
-def asked_for(found: Learned) -> tuple[str, ...]:
+def asked_for(
+    beside: Sequence[str],
+    names: Sequence[str],
+    values: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    worth: float,
+) -> tuple[str, ...]:
     """Effects that leaving out would cost more than one unknown is worth.
 
     Taken out one after the other, the least asked for first, the rest adjusted each time.
+
+    Parameters
+    ----------
+    beside : Sequence[str]
+        Effects that may be left out.
+    names : Sequence[str]
+        All that was estimated.
+    values : NDArray[np.float64]
+        Their estimates, shape (k,).
+    spread : NDArray[np.float64]
+        Their covariance, shape (k, k).
+    worth : float
+        Cost that one unknown must save.
+
+    Returns
+    -------
+    tuple[str, ...]
+        In the order given.
     """
-    refined = found.estimated.refined
-    names = [item.name for item in refined.parameters]
-    values = refined.x * refined.scale
-    spread = covariance(refined)
-    worth = math.log(max(int((refined.residuals != 0.0).sum()), 2))
-    left = list(found.model.beside)
+    left = list(beside)
     while left:
         places = [names.index(name) for name in left]
-        variances = np.diag(spread)[places]
-        squares = values[places] ** 2 / np.maximum(variances, 1e-300)
+        squares = values[places] ** 2 / np.maximum(np.diag(spread)[places], TINY)
         least = int(np.argmin(squares))
         if squares[least] >= worth:
             break

@@ -76,8 +76,8 @@ def not_healthy(found: Estimated) -> list[str]:
     ]
 
 
-def unexplained(best: Learned, recordings: Sequence[Recording]) -> list[str]:
-    """Why the best model cannot be learned from, which recordings it leaves something of."""
+def unexplained(best: Learned, recordings: Sequence[Recording] = ()) -> list[str]:
+    """Why the best model cannot be learned from, and of which recordings it leaves something."""
     reasons = [
         f"no model explains the recordings: the residuals are {best.estimated.excess:.1f} times"
         " the noise: other recordings than of one sound unit as new, another type of unit, or"

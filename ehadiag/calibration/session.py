@@ -75,8 +75,19 @@ class Session:
             if test is not None
         ]
 
-    def _experiment(self, recording: Recording, test: StoredTest, actuator: Actuator) -> Experiment:
+    def build_some(self, actuator: Actuator) -> list[Experiment]:
+        """Experiments of the first recording of each test."""
+        first = {test.name: index for index, test in reversed([*enumerate(self._tests)]) if test}
+        return [
+            self._experiment(self.recordings[index], self._tests[index], actuator)
+            for index in sorted(first.values())
+        ]
+
+    def _experiment(
+        self, recording: Recording, test: StoredTest | None, actuator: Actuator
+    ) -> Experiment:
         assert recording.samples is not None
+        assert test is not None
         return build_experiment(recording.samples, recording.environment, test, actuator)
 
     def learn(
@@ -88,15 +99,16 @@ class Session:
         hint: Mapping[str, float] | None = None,
         budget: int = BUDGET,
         brief: bool = False,
+        some: bool = False,
         turn: int = 0,
     ) -> Learned:
         """Learn with a model; see `ehadiag.calibration.models.learn`.
 
-        turn: of several searches with it.
+        some: from the first recording of each test; turn: of several searches with it.
         """
         found = learn(
             model,
-            self.build,
+            self.build_some if some else self.build,
             self._start,
             new=new,
             nearly_new=nearly_new,

@@ -85,11 +85,13 @@ def calibrate(
     tried = choose(session, plain, compare=compare)
     best = min(tried, key=lambda item: (not is_explained(item), item.criterion))
     if not is_explained(best):
-        return session.refused(unexplained(best, recordings), best, tried)
+        return session.refused(unexplained(best), best, tried)
     reasons = not_as_new(best.estimated)
     if reasons:
         return session.refused(reasons, best, tried)
     learned = learned_as_new(session, best)
+    if not is_explained(learned):
+        return session.refused(unexplained(learned, recordings), best, tried)
     lesson = lesson_of(learned.estimated, _usual_std(learned))
     return session.done(lesson, learned, best, tried, sources)
 
@@ -142,8 +144,8 @@ def update(
     found = _refined(session, experiments, knowledge)
     model = Model(start.second_stage.kind, start.calibration.plays)
     learned = Learned(model, list(experiments), found, 0.0)
-    if not found.explained and found.excess > start.calibration.fit.most_excess:
-        return session.refused(unexplained(learned, recordings), learned, [learned])
+    if not found.explained:
+        return session.refused(unexplained(learned, session.recordings), learned, [learned])
     reasons = not_healthy(found)
     if reasons:
         return session.refused(reasons, learned, [learned])
@@ -172,6 +174,7 @@ def _refined(
                 considered=CONSIDERED,
                 hint=None if turn % 2 else small,
                 seed=session.seed + turn,
+                explains=knowledge.explains,
             )
         )
         session.evaluations += found[-1].evaluations

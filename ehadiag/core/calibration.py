@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-__all__ = ["CHANGED", "Calibration", "Goodness", "Source"]
+__all__ = ["CHANGED", "NOISE_ALONE", "Calibration", "Goodness", "Source"]
 
 MOST_PARAMETERS = 64
 ROUNDING = 1e-9
@@ -44,9 +44,9 @@ class Goodness(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     pressure_rms: Positive
 
     @property
-    def leaves(self) -> bool:
-        """Whether the model leaves more than noise."""
-        return self.excess > NOISE_ALONE
+    def left(self) -> float:
+        """What the model leaves beside noise, over what noise alone may leave; 0: nothing."""
+        return max(self.excess / NOISE_ALONE - 1.0, 0.0)
 
     @property
     def most_excess(self) -> float:

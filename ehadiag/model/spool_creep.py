@@ -19,10 +19,10 @@ __all__ = ["DOUBT", "Transition", "creep", "creeping_step"]
 
 DOUBT = 2e-9
 """Distance (m) by which a step may be off; a hundredth of a converter's step."""
-ROUNDS = 2
+ROUNDS = 3
 """Of Newton's method."""
-LEAST_SLOPE = 0.5
-"""Of the trapezium's equation: below, the step is longer than the velocity takes to run away."""
+LEAST_SLOPE = 0.2
+"""Of the equation of the end's friction: below, the velocity runs away within the step."""
 
 
 class Transition(NamedTuple):
@@ -59,22 +59,29 @@ def creep(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any) -> Any:
 
     Returns
     -------
-    Its mean; the larger of start and end; by how much the step may be off, m, beyond `DOUBT` where
-    it cannot be told.
+    Its mean; the larger of start and end; the velocity (m/s) that the end has less than with the
+    mean; by how much the step may be off, m, beyond `DOUBT` where it cannot be told.
     """
     first = t.extra * faded(most(before, 0.0) * t.by_stribeck)
-    mean, last, slope, move = first, first, first * 0.0 + 1.0, first * 0.0
+    # The velocity follows what acts within microseconds: the end's goes by the end's friction.
+    length = span * t.damping / t.mass
+    kept = faded(length)
+    weight = (1.0 - (1.0 - kept) / length) / (1.0 - kept)
+    last, slope, move = first, first * 0.0 + 1.0, first * 0.0
     for _ in range(ROUNDS):
-        last = t.extra * faded(most(free - pull * mean, 0.0) * t.by_stribeck)
-        slope = 1.0 - 0.5 * t.by_stribeck * pull * last
-        move = (0.5 * (first + last) - mean) / most(slope, LEAST_SLOPE)
-        mean = mean + move
-    change = least(magnitude(free - pull * mean - before) * t.by_stribeck, 1.0)
+        after = free - pull * (first + weight * (last - first))
+        there = t.extra * faded(most(after, 0.0) * t.by_stribeck)
+        slope = 1.0 - weight * t.by_stribeck * pull * there
+        move = (there - last) / most(slope, LEAST_SLOPE)
+        last = most(least(last + move, t.extra), 0.0)
+    after = free - pull * (first + weight * (last - first))
+    change = least(magnitude(after - before) * t.by_stribeck, 1.0)
     largest = most(first, last)
     # The last move is far more than what is left after it.
     miss = largest * change * change * (1.0 / 12.0) + 0.1 * magnitude(move)
     unsure = most((LEAST_SLOPE - slope) * 1e9, 0.0) * DOUBT
-    return mean, largest, span * t.force / t.damping * miss + unsure
+    doubt = span * t.force / t.damping * miss + unsure
+    return 0.5 * (first + last), largest, pull * (weight - 0.5) * (last - first), doubt
 
 
 @inlined
@@ -92,10 +99,10 @@ def creeping_step(
         rest = steady_rate(t, s.xf, d)
         pull = t.force / t.damping * (1.0 - fade)
         free = rest + (s.vs - rest) * fade
-        mean, _, doubt = creep(t, h, s.vs * d, free * d, pull)
+        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull)
         steady = steady_rate(t, s.xf - mean * d, d)
         xs = s.xs + steady * h + (s.vs - steady) * (1.0 - fade) * t.mass / t.damping
-        vs = steady + (s.vs - steady) * fade
+        vs = steady + (s.vs - steady) * fade - less * d
         after = SpoolState(s.xf, s.wf, xs, vs, s.wire, s.direction, s.clamped)
     elif loose:
         still = still_flapper(t.ratio, deflection, s.wire)
@@ -103,14 +110,14 @@ def creeping_step(
         a, w = s.xf - still, s.wf
         pull = t.force / t.damping * (1.0 - m.m33)
         free = rest + m.m30 * a + m.m31 * w + m.m33 * (s.vs - rest)
-        mean, _, doubt = creep(t, h, s.vs * d, free * d, pull)
+        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull)
         steady = steady_rate(t, still - mean * d, d)
         v = s.vs - steady
         after = SpoolState(
             still + m.m00 * a + m.m01 * w,
             m.m10 * a + m.m11 * w,
             s.xs + steady * h + m.m20 * a + m.m21 * w + m.m23 * v,
-            steady + m.m30 * a + m.m31 * w + m.m33 * v,
+            steady + m.m30 * a + m.m31 * w + m.m33 * v - less * d,
             s.wire,
             s.direction,
             s.clamped,
@@ -119,14 +126,14 @@ def creeping_step(
         base = slide_base(t, deflection, d)
         a, w, b, v = s.xf - t.dry * d, s.wf, s.xs - base, s.vs
         free = m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v
-        mean, _, doubt = creep(t, h, s.vs * d, free * d, m.m30 - m.m32 * t.reach)
+        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, m.m30 - m.m32 * t.reach)
         rest_xf, rest_xs = (t.dry + mean) * d, base - mean * t.reach * d
         a, b = s.xf - rest_xf, s.xs - rest_xs
         after = SpoolState(
             rest_xf + m.m00 * a + m.m01 * w + m.m02 * b + m.m03 * v,
             m.m10 * a + m.m11 * w + m.m12 * b + m.m13 * v,
             rest_xs + m.m20 * a + m.m21 * w + m.m22 * b + m.m23 * v,
-            m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v,
+            m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v - less * d,
             s.wire,
             s.direction,
             s.clamped,

@@ -1,7 +1,8 @@
 """Spools whose friction falls with their velocity: all lanes by quarters of a tick, or one alone.
 
 `ehadiag.model.simd.spool` leaves such a lane BUSY where it moves; most of them come through here
-(`creeping_lanes`), the rest is looked into in short steps (`creeping_instants`).
+(`creeping_lanes`), the rest is looked into in short steps with a friction held over some of them
+(`held_friction`).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.laws import SpoolLaw, play, slide_base
+from ehadiag.model.laws import SpoolLaw, play, slide_base, steady_rate, still_flapper
 from ehadiag.model.simd.coefficients import MOVING_ROWS
 from ehadiag.model.simd.layout import (
     BUSY,
@@ -41,17 +42,10 @@ from ehadiag.model.simd.layout import (
     WIRE,
     spool_laws,
 )
-from ehadiag.model.spool_creep import DOUBT, Transition, creep, creeping_step
-from ehadiag.model.spool_events import (
-    NOTHING,
-    TOUCH,
-    SpoolState,
-    carried,
-    clamped_event,
-    moving_event,
-)
+from ehadiag.model.spool_creep import DOUBT, creep
+from ehadiag.model.spool_events import TOUCH, SpoolState, carried
 
-__all__ = ["creeping_instants", "creeping_lanes"]
+__all__ = ["creeping_lanes", "held_friction"]
 
 BIG = 1e30
 LEAST_VELOCITY = 1e-13
@@ -68,12 +62,12 @@ def _quarter(
     a, b: from where flapper and spool would rest by the dynamic friction alone.
     """
     free = m[12] * a + m[13] * w + m[14] * b + m[15] * v
-    mean, largest, miss = creep(t, span, v, free, m[12] - m[14] * t.reach)
+    mean, largest, less, miss = creep(t, span, v, free, m[12] - m[14] * t.reach)
     a, b = a - mean, b + t.reach * mean
     na = m[0] * a + m[1] * w + m[2] * b + m[3] * v + mean
     nw = m[4] * a + m[5] * w + m[6] * b + m[7] * v
     nb = m[8] * a + m[9] * w + m[10] * b + m[11] * v - t.reach * mean
-    nv = m[12] * a + m[13] * w + m[14] * b + m[15] * v
+    nv = m[12] * a + m[13] * w + m[14] * b + m[15] * v - less
     swing = 0.25 * span * most(magnitude(w), magnitude(nw))
     inside = where(w * nw < 0.0, least(a + mean, na) - largest - swing, BIG)
     widest = most(widest, magnitude(na + t.dry) + swing)
@@ -160,43 +154,45 @@ def _keep(
 
 
 @inlined
-def creeping_instants(
-    t: SpoolLaw, moving: NDArray[np.float64], loose: NDArray[np.float64], place: int, h: float,
-    fine: bool, deflection: float, begin: SpoolState, path: NDArray[np.float64], scratch: int,
-) -> int:  # fmt: skip
-    """Moving spool and flapper of one lane after 1 … WIDTH steps of `h` seconds, one by one.
+def held_friction(
+    t: SpoolLaw, moving: NDArray[np.float64], loose: NDArray[np.float64], place: int, steps: int,
+    h: float, deflection: float, s: SpoolState,
+) -> tuple[SpoolLaw, float, bool]:  # fmt: skip
+    """Law of a moving spool with the friction that it has in the mean of some steps of one length.
 
-    place: of the lane and the length of the steps in the tables; scratch: where instants stand
-    behind the path. Returns the first instant at which an event has come or, steps not being the
-    finest, may hide; WIDTH if there is none.
+    Parameters
+    ----------
+    moving, loose: transitions, see `ehadiag.model.simd.coefficients`.
+    place: of the lane and the length of the steps in them.
+    steps: 1 … WIDTH.
+    h: length of a step, s.
+    s: state before.
+
+    Returns
+    -------
+    The law, the velocity (m/s) that the end has less along the motion, and whether the friction
+    may be held for so long.
     """
-    slack = begin.direction != 0 and not carried(t, begin.direction, begin.xs, begin.wire)
-    k = place * MOVING_ROWS * WIDTH
-    table = loose if slack else moving
-    m = Transition(
-        table[k], table[k + WIDTH], table[k + 2 * WIDTH], table[k + 3 * WIDTH],
-        table[k + 4 * WIDTH], table[k + 5 * WIDTH], table[k + 6 * WIDTH], table[k + 7 * WIDTH],
-        table[k + 8 * WIDTH], table[k + 9 * WIDTH], table[k + 10 * WIDTH], table[k + 11 * WIDTH],
-        table[k + 12 * WIDTH], table[k + 13 * WIDTH], table[k + 14 * WIDTH],
-        table[k + 15 * WIDTH],
+    d = float(s.direction)
+    k = place * MOVING_ROWS * WIDTH + steps - 1
+    if s.clamped:
+        rest, fade = steady_rate(t, s.xf, d), moving[k + 17 * WIDTH]
+        free, pull = rest + (s.vs - rest) * fade, t.force / t.damping * (1.0 - fade)
+    elif carried(t, s.direction, s.xs, s.wire):
+        free = moving[k + 12 * WIDTH] * (s.xf - t.dry * d) + moving[k + 13 * WIDTH] * s.wf
+        free += moving[k + 14 * WIDTH] * (s.xs - slide_base(t, deflection, d))
+        free += moving[k + 15 * WIDTH] * s.vs
+        pull = moving[k + 12 * WIDTH] - moving[k + 14 * WIDTH] * t.reach
+    else:
+        still = still_flapper(t.ratio, deflection, s.wire)
+        rest, fade = steady_rate(t, still, d), loose[k + 15 * WIDTH]
+        free = rest + (s.vs - rest) * fade
+        free += loose[k + 12 * WIDTH] * (s.xf - still) + loose[k + 13 * WIDTH] * s.wf
+        pull = t.force / t.damping * (1.0 - fade)
+    mean, _, less, doubt = creep(t, steps * h, s.vs * d, free * d, pull)
+    law = SpoolLaw(
+        t.ratio, t.reach, t.force, t.mass, t.damping, t.dynamic + t.force * mean, t.dry + mean,
+        t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash, t.bend,
+        t.ring_damping, t.ring_rate,
     )  # fmt: skip
-    fade = moving[k + 17 * WIDTH]
-    s = begin
-    for n in range(WIDTH):
-        new, sure = creeping_step(t, m, h, fade, deflection, slack, s)
-        wire = play(s.wire, new.xs, t.backlash)
-        if s.clamped:
-            event = clamped_event(t, deflection, new.xf, new.xs, new.vs, wire, s.direction)
-        else:
-            event = moving_event(
-                t, h, s.xf, s.wf, new.xf, new.wf, new.xs, new.vs, s.wire, slack, s.direction
-            )
-        path[scratch + n], path[scratch + WIDTH + n] = new.xf, new.wf
-        path[scratch + 2 * WIDTH + n], path[scratch + 3 * WIDTH + n] = new.xs, new.vs
-        if fine:
-            if event > NOTHING:
-                return n
-        elif event != NOTHING or not sure:
-            return n
-        s = SpoolState(new.xf, new.wf, new.xs, new.vs, wire, s.direction, s.clamped)
-    return WIDTH
+    return law, less, doubt <= DOUBT
