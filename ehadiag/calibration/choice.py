@@ -56,9 +56,9 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     out: list[Learned] = []
     for model in models:
         out.append(_searched(session, model, first=not out))
-        if is_explained(out[-1]) and not compare:
+        if out[-1].estimated.explained and not compare:
             return out
-    if any(is_explained(item) for item in out):
+    if any(item.estimated.explained for item in out):
         return out
     for simple in simple_models(start):
         model = Model(simple.second_stage, SMOOTH, tuple(EFFECTS))
@@ -79,7 +79,6 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
             turn += 1
         out.append(found)
         if is_explained(found):
-            out.append(_pruned(session, found))
             break
     return out
 
@@ -87,8 +86,9 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
 def learned_as_new(session: Session, best: Learned) -> Learned:
     """Learn once more, the severities taken for 0 and the frictions as new in their place.
 
-    Residuals like noise are no proof of the best optimum, and what is learned here is believed
-    ever after: the best of several searches is taken.
+    Effects that the recordings do not ask for are left out. Residuals like noise are no proof of
+    the best optimum, and what is learned here is believed ever after: with a simple model the best
+    of several searches is taken. With many effects each search begins where the first one ended.
 
     Parameters
     ----------
@@ -103,10 +103,13 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
         With the frictions.
     """
     hint = best.estimated.refined.values
-    found = [session.learn(best.model, new=True, hint=hint, budget=ONE_START)]
+    model = replace(best.model, beside=_asked_for(best)) if best.model.rich else best.model
+    found = [session.learn(model, new=True, hint=hint, budget=ONE_START)]
     for turn in range(1, MOST_SEARCHES):
+        if best.model.rich and found[0].estimated.excess <= MOST_LEFT:
+            break
         around = None if turn % 2 and not best.model.rich else hint
-        found.append(session.learn(best.model, new=True, hint=around, budget=ONE_START, turn=turn))
+        found.append(session.learn(model, new=True, hint=around, budget=ONE_START, turn=turn))
         found.sort(key=lambda item: item.criterion)
         if found[1].criterion - found[0].criterion < ALIKE:
             break
@@ -134,24 +137,15 @@ def _may_have_stopped_beside(found: Learned, *, first: bool) -> bool:
     return first or found.estimated.excess <= MOST_LEFT
 
 
-def _pruned(session: Session, found: Learned) -> Learned:
-    """Learn without the effects that the recordings do not ask for."""
+def _asked_for(found: Learned) -> tuple[str, ...]:
+    """Effects of the model that the recordings ask for."""
     refined = found.estimated.refined
-    keep = asked_for(
+    return asked_for(
         found.model.beside,
         [item.name for item in refined.parameters],
         refined.x * refined.scale,
         covariance(refined),
         math.log(max(int((refined.residuals != 0.0).sum()), 2)),
-    )
-    if keep == found.model.beside:
-        return found
-    return session.learn(
-        replace(found.model, beside=keep),
-        nearly_new=True,
-        hint=refined.values,
-        budget=ONE_START,
-        some=True,
     )
 
 

@@ -38,7 +38,7 @@ learned and every interval after it (`ehadiag.identify.nuisance.knowledge`)."""
 def is_explained(learned: Learned) -> bool:
     """Whether nothing is left, or no more than a unit with effects of its own may leave."""
     found = learned.estimated
-    return found.explained or (learned.model.rich and found.excess <= MOST_LEFT)
+    return found.explained or (learned.model.plays > 1 and found.excess <= MOST_LEFT)
 
 
 def severities_of(found: Estimated) -> tuple[Severity, ...]:
