@@ -63,20 +63,6 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     for simple in simple_models(start):
         model = Model(simple.second_stage, SMOOTH, tuple(EFFECTS))
         found = session.learn(model, nearly_new=True, budget=ONE_START, some=True)
-        turn = 1
-        while not found.estimated.explained and turn < MOST_SEARCHES // 2:
-            if found.estimated.excess > MOST_LEFT:
-                break
-            other = session.learn(
-                model,
-                nearly_new=True,
-                hint=found.estimated.refined.values,
-                budget=ONE_START,
-                some=True,
-                turn=turn,
-            )
-            found = min(found, other, key=lambda item: item.criterion)
-            turn += 1
         out.append(found)
         if is_explained(found):
             break

@@ -38,18 +38,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     try:
         for unit in options.unit:
-            _print_unit(options.recordings, unit)
+            _print_unit(options.recordings, unit, options.new)
     except EhadiagError as error:
         print(f"real_units: {error}", file=sys.stderr)
         return error.exit_code
     return 0
 
 
-def _print_unit(folder: Path, name: str) -> None:
+def _print_unit(folder: Path, name: str, count: int | None) -> None:
     rows = [row for row in read_rows(folder / "truth.csv") if row["file"].startswith(f"{name}-")]
     begin = time.process_time()
+    new = [row["file"] for row in rows if "-new-" in row["file"]][:count]
     found = calibrate(
-        [read_recording(folder / row["file"]) for row in rows if "-new-" in row["file"]],
+        [read_recording(folder / file) for file in new],
         default_actuator(),
         bundled_tests().values(),
     )
@@ -110,4 +111,7 @@ def _parser() -> argparse.ArgumentParser:
         "--recordings", type=Path, required=True, metavar="DIR", help="with truth.csv"
     )
     parser.add_argument("--unit", action="append", required=True, help="name; may be repeated")
+    parser.add_argument(
+        "--new", type=int, metavar="N", help="calibrate on the first N recordings as new (all)"
+    )
     return parser
