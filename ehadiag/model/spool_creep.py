@@ -80,6 +80,9 @@ def creep(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any) -> Any:
     # The last move is far more than what is left after it.
     miss = largest * change * change * (1.0 / 12.0) + 0.1 * magnitude(move)
     unsure = most((LEAST_SLOPE - slope) * 1e9, 0.0) * DOUBT
+    # What friction does early in the step the feedback wire has partly undone at its end.
+    undone = least(span * t.ratio * t.force / t.damping, first * 0.0 + 1.0) * (1.0 / 12.0)
+    miss = miss + undone * magnitude(last - first)
     doubt = span * t.force / t.damping * miss + unsure
     return 0.5 * (first + last), largest, pull * (weight - 0.5) * (last - first), doubt
 
