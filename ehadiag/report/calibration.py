@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 __all__ = ["SCHEMA", "calibration_json", "print_calibration"]
 
 SCHEMA = "ehadiag.calibration/1"
-SHOWN_IN = {"A": (1e3, "mA"), "m": (1e6, "µm"), "s": (1e3, "ms"), "1": (1e2, "%")}
+SHOWN_IN = {
+    "A": (1e3, "mA"),
+    "m": (1e6, "µm"),
+    "s": (1e3, "ms"),
+    "Pa": (1e-3, "kPa"),
+    "1": (1e2, "%"),
+}
 """Factor and unit in which a table shows an effect; data are shown as their file has them."""
 
 
