@@ -65,8 +65,11 @@ def plot_severities(
             "high": [row[3] for row in rows],
         }
     )
-    out = new_figure(height=90 + 45 * len(rows), tools="save")
-    out.y_range = FactorRange(factors=names[::-1], range_padding=0.25)
+    out = new_figure(
+        height=90 + 45 * len(rows),
+        y_range=FactorRange(factors=names[::-1], range_padding=0.25),
+        tools="save",
+    )
     out.x_range = Range1d(start=0.0, end=1.02 * max(1.0, *(row[3] for row in rows)))
     out.hbar(y="name", right="value", height=0.5, color=COLOURS[0], source=source)
     out.add_layout(
