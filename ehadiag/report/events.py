@@ -25,6 +25,11 @@ class Events:
     stops: Ticks
     """It meets its end stop."""
 
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return bool(self.breakaways.size or self.reversals.size or self.stops.size)
+
 
 NO_EVENTS = Events(*(np.zeros(0, dtype=np.intp) for _ in range(3)))
 

@@ -35,6 +35,8 @@ def fill(template: str, plots: Mapping[str, LayoutDOM], **texts: Any) -> str:
         HTML.
     """
     scripts, elements = embedded(plots)
+    if scripts:
+        scripts = [*scripts, _source("print.js")]
     return str(
         _environment()
         .get_template(template)
@@ -45,6 +47,13 @@ def fill(template: str, plots: Mapping[str, LayoutDOM], **texts: Any) -> str:
             **texts,
         )
     )
+
+
+def _source(name: str) -> str:
+    """Read a script of the templates' folder as the template engine finds it."""
+    loader = _environment().loader
+    assert loader is not None
+    return loader.get_source(_environment(), name)[0]
 
 
 @cache

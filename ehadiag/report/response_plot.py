@@ -74,30 +74,30 @@ def plot_response(
     )
     strip = VStrip(x0="start", x1="end", fill_color="colour", fill_alpha=0.35, line_color=None)
     out = []
-    for index, signal in enumerate(signals):
+    for signal in signals:
         source = _source(signal, tick, most)
         upper = new_figure(height=240, x_range=x_range, tools=TOOLS, active_drag="xbox_zoom")
         upper.yaxis.axis_label = f"{signal.name}, {signal.unit}"
-        lower = new_figure(height=120, x_range=x_range, tools="", toolbar_location=None)
-        lower.yaxis.axis_label = f"residual, {signal.small_unit}"
-        for part in (upper, lower):
-            part.add_glyph(shades, strip, level="image")
-            part.add_tools(cross.clone())
         _draw_pair(upper, source, signal, tick)
-        lower.add_glyph(source, Line(x="time", y="residual", line_color=GAP, line_width=0.8))
-        lower.y_range = _range_of(signal)
-        out += [upper, lower]
-        if index < len(signals) - 1:
-            upper.xaxis.visible = lower.xaxis.visible = False
+        out.append(upper)
+        if np.isfinite(signal.residual).any():
+            lower = new_figure(height=120, x_range=x_range, tools="", toolbar_location=None)
+            lower.yaxis.axis_label = f"residual, {signal.small_unit}"
+            lower.add_glyph(source, Line(x="time", y="residual", line_color=GAP, line_width=0.8))
+            lower.y_range = _range_of(signal)
+            out.append(lower)
+    for part in out:
+        part.add_glyph(shades, strip, level="image")
+        part.add_tools(cross.clone())
+        part.xaxis.visible = part is out[-1]
     for (start, _), names in spans.items():
         words = Label(
             x=start, y=2, y_units="screen", text=f" {', '.join(names)}", text_color=TEXT,
             text_font_size="11px",
         )  # fmt: skip
         out[0].add_layout(words)
-    out[-2].xaxis.visible = False
     out[-1].xaxis.axis_label = "time, s"
-    out[-1].height = 150
+    out[-1].height = (out[-1].height or 0) + 30
     return column(*out, sizing_mode="stretch_width")
 
 
@@ -156,6 +156,5 @@ def _draw_pair(upper: figure, source: ColumnDataSource, signal: Signal, tick: fl
 
 def _range_of(signal: Signal) -> Range1d:
     seen = np.abs(signal.residual[np.isfinite(signal.residual)])
-    spread = 2.0 * float(np.percentile(seen, SPREAD)) if seen.size else 0.0
-    most = SMALL * spread or 1.0
+    most = SMALL * 2.0 * float(np.percentile(seen, SPREAD)) or 1.0
     return Range1d(start=-most, end=most)

@@ -32,6 +32,7 @@ MOST_TICKS = 16_000
 class Drawn:
     """What is drawn of a recording."""
 
+    title: str
     source: str
     signals: tuple[Signal, ...]
     tick: float
@@ -46,7 +47,12 @@ class Response:
     key: str
     """Of its plot."""
     source: str
+    title: str
     words: str
+    parts: bool
+    """Whether parts of its test are shaded."""
+    events: bool
+    """Whether any are marked."""
     ticks: int
     """Of the recording, in each signal."""
     drawn: int
@@ -70,6 +76,7 @@ def modelled(
     """
     return [
         Drawn(
+            "Measured and modelled",
             recording.source,
             signals_of(experiment, constants, recording.samples.current),
             experiment.tick,
@@ -99,6 +106,7 @@ def expected(
     """
     return [
         Drawn(
+            "Measured and expected",
             recording.source,
             expected_signals(recording, recording.samples, test, actuator),
             recording.samples.period_ns * 1e-9,
@@ -133,7 +141,10 @@ def draw_responses(chosen: Sequence[Drawn], plots: dict[str, LayoutDOM]) -> list
             Response(
                 key=key,
                 source=printable(item.source),
-                words="Measured and modelled current, spool position, differential pressure and"
+                title=item.title,
+                parts=item.test is not None,
+                events=any(signal.events.any for signal in item.signals),
+                words=f"{item.title} current, spool position, differential pressure and"
                 f" jack position over {ticks * item.tick:g} s{_gaps(item.signals)}.",
                 ticks=ticks,
                 drawn=min(most, ticks),

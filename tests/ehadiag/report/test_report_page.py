@@ -117,6 +117,7 @@ def test_what_was_not_tested_is_drawn_beside_what_was_expected(worn: ehadiag.Res
     diagnosis = replace(worn.diagnosis, identification=None, verdict=ehadiag.Verdict.NOT_TESTED)
     html = page_of({"verdict": "NOT_TESTED"}, Levels(), "1", NOW, diagnosis)
     assert "expected of a unit as new" in html
+    assert "Measured and expected" in Page(html).text
     unknown = replace(diagnosis, tests=(None,))
     assert "expected of a unit as new" not in page_of({}, Levels(), "1", NOW, unknown)
 
