@@ -18,7 +18,14 @@ from ehadiag.core.converters import Converter
 from ehadiag.core.recording import Samples
 from ehadiag.core.step_seen import step_seen
 
-__all__ = ["Conversion", "actuator_channels", "conversion_of", "stated_channels"]
+__all__ = [
+    "Conversion",
+    "actuator_channels",
+    "conversion_of",
+    "range_is_stated",
+    "reach_of",
+    "stated_channels",
+]
 
 MARGIN = 1.25
 """Range over the actuator's own reach, of a converter of which nothing is known."""
@@ -82,6 +89,23 @@ def stated_channels(stated: tuple[Stated | None, ...], actuator: Actuator) -> Ch
     return Channels(*(_told(item, channel) for item, channel in zip(said, own, strict=True)))
 
 
+def range_is_stated(stated: Stated | None, actuator: Actuator, channel: Channel) -> bool:
+    """Tell whether mapping (`stated`) or actuator file say what range a converter has."""
+    return _converter(actuator, channel) is not None or (
+        stated is not None and stated.low is not None
+    )
+
+
+def reach_of(actuator: Actuator, channel: Channel) -> float:
+    """Return the largest value that a channel has on an actuator: current, stops, supply; SI."""
+    return {
+        "current": actuator.controller.IM,
+        "spool": actuator.servovalve.XSM,
+        "pressure": actuator.servovalve.PSR,
+        "position": actuator.jack.XJM,
+    }[channel.name]
+
+
 def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
     """Converters that samples went through.
 
@@ -136,12 +160,7 @@ def _of_file(actuator: Actuator, usual: Channel) -> Channel:
     item = _converter(actuator, usual)
     if item is not None:
         return replace(usual, full_scale=item.full_scale, levels=float(1 << item.bits))
-    reach = {
-        "current": actuator.controller.IM,
-        "spool": actuator.servovalve.XSM,
-        "pressure": actuator.servovalve.PSR,
-        "position": actuator.jack.XJM,
-    }[usual.name]
+    reach = reach_of(actuator, usual)
     return usual if reach <= usual.full_scale else replace(usual, full_scale=MARGIN * reach)
 
 

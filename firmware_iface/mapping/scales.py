@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import SCALES, Channel, Scales
-from ehadiag.core.conversion import stated_channels
+from ehadiag.core.channels import CHANNELS, SCALES, Channel, Channels, Scales
+from ehadiag.core.conversion import range_is_stated, reach_of, stated_channels
 from ehadiag.core.errors import ConfigurationError
 from firmware_iface.codec.decode import raw_ends
 from firmware_iface.mapping.bus_map import BusMap, Role
@@ -35,11 +37,16 @@ def scales_of(bus_map: BusMap, actuator: Actuator) -> Scales:
     ConfigurationError
         A signal cannot carry the range of its converter, or the rated current.
     """
-    channels = stated_channels(bus_map.stated, actuator)
-    for channel in channels:
+    said = bus_map.stated or (None,) * len(CHANNELS)
+    channels = []
+    for stated, channel in zip(said, stated_channels(bus_map.stated, actuator), strict=True):
         found = bus_map.find(f"channels.{channel.name}")
         if found is not None:
-            _carries(bus_map, found[1], channel)
+            assumed = not range_is_stated(stated, actuator, channel)
+            least = reach_of(actuator, channel) if assumed else channel.full_scale
+            channels.append(_carried(bus_map, found[1], channel, least))
+        else:
+            channels.append(channel)
     current = bus_map.find("command.current")
     if current is not None:
         reach = actuator.controller.IM
@@ -51,7 +58,7 @@ def scales_of(bus_map: BusMap, actuator: Actuator) -> Scales:
                 f" {1e3 * reach:g} mA: name a mapping whose command fits, --mapping"
             )
     return Scales(
-        channels,
+        Channels(*channels),
         _step(current[1] if current else None, SCALES.current_step),
         _step(
             found[1] if (found := bus_map.find("command.position")) else None, SCALES.position_step
@@ -59,19 +66,21 @@ def scales_of(bus_map: BusMap, actuator: Actuator) -> Scales:
     )
 
 
-def _carries(bus_map: BusMap, role: Role, channel: Channel) -> None:
-    """Refuse a signal whose numbers end before the converter does."""
+def _carried(bus_map: BusMap, role: Role, channel: Channel, least: float) -> Channel:
+    """Return a converter within what its signal carries, which must be `least` (SI) either way."""
     low, high = _span(role)
     slack = abs(role.signal.scale * role.gain) + channel.lsb
-    if low <= -channel.full_scale + slack and high >= channel.full_scale - slack:
-        return
+    carried = max(min(-low, high + slack), 0.0)
+    if carried >= channel.full_scale:
+        return channel
+    if carried >= least:
+        return replace(channel, full_scale=min(-low, channel.full_scale))
     unit, per_unit = channel.unit, channel.per_unit
     raise ConfigurationError(
         f"bus {bus_map.name}: signal {role.signal.name} carries {low / per_unit:.5g} …"
-        f" {high / per_unit:.5g} {unit}, the {channel.name} converter reaches"
-        f" ±{channel.full_scale / per_unit:.5g} {unit}: name a mapping whose signals"
-        " fit, --mapping, or state the converter's range in it, or in the actuator file's"
-        " [converters]"
+        f" {high / per_unit:.5g} {unit}, {channel.name} reaches ±{least / per_unit:.5g} {unit} by"
+        " the actuator file: name a mapping whose signals fit, --mapping, or state the converter's"
+        " range in it, or in the actuator file's [converters]"
     )
 
 
