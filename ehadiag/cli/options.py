@@ -402,8 +402,12 @@ def the_budget(arguments: argparse.Namespace) -> Budget:
     )
 
 
-def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
-    """Return the options of a diagnosis, for its JSON result."""
+def the_asked(arguments: argparse.Namespace, bus_map: BusMap, tests: Sequence[StoredTest]) -> Asked:
+    """Return the options of a diagnosis, for its JSON result.
+
+    tests: that a recording may be of; the one that stands for all the others comes first.
+    """
+    columns = the_columns(arguments) if hasattr(arguments, "column") else None
     return Asked(
         solver=arguments.solver,
         seed=arguments.seed,
@@ -413,6 +417,11 @@ def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
         every=getattr(arguments, "all", False),
         mapping=bus_map.name,
         mapping_sha256=fingerprint(bus_map),
+        mapping_file=arguments.mapping or None,
+        tests_sha256=fingerprint(tuple(tests)),
+        columns_sha256=None if columns is None else fingerprint(columns),
+        start_s=getattr(arguments, "start", None),
+        end_s=getattr(arguments, "end", None),
     )
 
 

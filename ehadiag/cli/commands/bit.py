@@ -139,7 +139,10 @@ def run(arguments: argparse.Namespace) -> int:
     ended_at = heard.ended_at
     spent = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
     line = json_line(
-        result, spent, options.the_asked(arguments, bus_map), [log_file(heard.recording.source)]
+        result,
+        spent,
+        options.the_asked(arguments, bus_map, [test]),
+        [log_file(heard.recording.source)],
     )
     draw = partial(drawn, result, levels) if can_be_drawn(result) else None
     return results.deliver(result, line, spent, heard.name, draw)
