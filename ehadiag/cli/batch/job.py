@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.signals.columns import ColumnMap
 
-__all__ = ["Finding", "Job", "Reading", "failure", "work"]
+__all__ = ["Finding", "Job", "Reading", "failure", "labelled", "work"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Job:
         if not self.every:
             found = (choose(found),)
         if self.label:
-            found = tuple(_labelled(item, self.label) for item in found)
+            found = tuple(labelled(item, self.label) for item in found)
         return Reading(found, log_file(logs[0]), time.perf_counter() - begin)
 
     def diagnose(
@@ -241,7 +241,8 @@ def _findings(job: Job, log: str) -> tuple[Finding, ...]:
     return tuple(out)
 
 
-def _labelled(recording: Recording, label: str) -> Recording:
+def labelled(recording: Recording, label: str) -> Recording:
+    """Return a recording with a note that tells it from those of other actuators on its bus."""
     notes = (*recording.quality.notes, f"actuator of mapping {label}")
     return replace(recording, quality=replace(recording.quality, notes=notes))
 

@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 from cli_result import Run
 from places import LOGS, ROOT
+from two_actuators import write_log, write_mappings
 
 from ehadiag.cli.batch.row import COLUMNS
 from ehadiag.cli.batch.summary import Summary, worst_code
@@ -239,13 +240,16 @@ def test_the_page_works_as_typed(run: Run, tmp_path: Path, monkeypatch: pytest.M
         shutil.copy(log, tmp_path / "recordings")
     page = (ROOT / "docs" / "how-to" / "many-recordings.md").read_text()
     commands = re.findall(r"```sh\n(.*)\n```", page)
-    assert len(commands) == 4
+    assert len(commands) == 5
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"recordings/{WORN.name}\n"))
     for command in commands[:3]:
         _, _, typed = command.rpartition("| ")
         program, *arguments = shlex.split(typed)
         assert program == "ehadiag"
         assert run(*arguments).code == 10
+    write_mappings(tmp_path)
+    write_log(tmp_path / "both.blf", HEALTHY, WORN)
+    assert run(*shlex.split(commands[3])[1:]).code == 10
     names = ("all.jsonl", "all.csv", "report.xml", "summary.json")
     assert all(Path(name).stat().st_size for name in names)
     assert len(Path("all.jsonl").read_text().splitlines()) == 2

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
+import uuid
 from pathlib import Path
 
+import can
+import can.interfaces.virtual
 import pytest
 from cli_result import Run
 from places import LOGS
@@ -75,3 +80,42 @@ def test_what_several_mappings_do_not_go_with(rig, more: list[str], why: str, ru
     result = run("diagnose", *options, *more, log)
     assert result.code == 2
     assert why in result.message
+
+
+@pytest.mark.slow
+def test_two_tests_are_listened_to_at_once_and_recorded_once(rig, run: Run) -> None:
+    options, log = rig
+    channel = f"two-{uuid.uuid4()}"
+
+    def play() -> None:
+        while not can.interfaces.virtual.channels.get(channel):  # nobody listens yet
+            time.sleep(0.05)
+        with (
+            can.LogReader(str(log)) as reader,
+            can.Bus(interface="virtual", channel=channel) as bus,
+        ):
+            for message in can.MessageSync(reader, timestamps=True):
+                message.channel = None
+                bus.send(message)
+
+    player = threading.Thread(target=play, daemon=True)
+    player.start()
+    bus = ["-i", "virtual", "-c", channel]
+    listen = ["bit", "--listen", "--test", "open", *options, *bus, "--no-picture", "--no-history"]
+    result = run(*listen, "--json", "--out", "runs", "--record", "once.blf")
+    player.join(30.0)
+    assert [tree["verdict"] for tree in result.objects] == ["HEALTHY", "DEGRADED"]
+    assert result.code == 10
+    assert {tree["source"] for tree in result.objects} == {"once.blf"}
+    names = sorted(path.name for path in Path("runs").iterdir())
+    assert names == ["once-left.json", "once-right.json"]
+    again = run("diagnose", "--json", *options, "once.blf")
+    assert [estimates(tree) for tree in again.objects] == [
+        estimates(tree) for tree in result.objects
+    ]
+
+
+def test_only_one_actuator_is_asked_for_a_test(rig, run: Run) -> None:
+    result = run("bit", "--test", "open", "-i", "virtual", *rig[0])
+    assert result.code == 2
+    assert "a test is requested of one actuator" in result.message
