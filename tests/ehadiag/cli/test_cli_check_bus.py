@@ -84,3 +84,18 @@ def test_the_bus_of_a_context_of_python_cans_file(
         assert result.out.startswith(f"listened to virtual {channel} for ")
     result = run("check-bus", "--context", "MS")
     assert (result.code, "no section [MS]" in result.message) == (2, True)
+
+
+def test_a_picture_of_what_was_heard(run: Run, tmp_path: Path) -> None:
+    log = LOGS / "paper-closed-1.blf"
+    came = run("check-bus", "--log", log, "--plot", "bus.png")
+    assert (came.code, came.err) == (0, "ehadiag: wrote bus.png\n")
+    assert (tmp_path / "bus.png").read_bytes().startswith(b"\x89PNG")
+    came = run("check-bus", "--log", log, "--plot", "none/bus.png")
+    assert (came.code, "picture none/bus.png: " in came.message) == (3, True)
+    empty = tmp_path / "empty.log"
+    empty.write_text("(1.0) can0 7FF#00\n")
+    came = run("check-bus", "--log", empty, "--plot", "nothing.png")
+    assert came.code == 30
+    assert "nothing is drawn" in came.message
+    assert not (tmp_path / "nothing.png").exists()

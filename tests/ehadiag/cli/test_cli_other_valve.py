@@ -49,7 +49,8 @@ def diagnosed(rig, capsys, number, **conditions):
 def test_faults_and_null_bias_are_found_with_the_converters_seen_in_the_data(tmp_path, capsys):
     rig = write_rig(tmp_path, converters="")
     result = diagnosed(rig, capsys, 41, effects=Effects(null_bias=0.7e-3))
-    assert result["nuisances"]["null_bias"]["value"] == pytest.approx(0.7e-3, abs=0.02e-3)
+    (bias,) = (item for item in result["other"] if item["name"] == "null_bias")
+    assert bias["value"] == pytest.approx(0.7e-3, abs=0.02e-3)
 
 
 @pytest.mark.slow
