@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from ehadiag.cli import options
 from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.cli.deadline import Deadline
-from ehadiag.cli.output import progress_bar, say
+from ehadiag.cli.output import say
+from ehadiag.cli.screen.bit_view import BitView
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.printable import plain_name
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.session.tester import Progress, TesterOutcome
+    from firmware_iface.transport.frames import Frame
     from firmware_iface.transport.interface import Transport
 
 __all__ = ["STOPPED", "Heard", "acquire", "recording_path"]
@@ -57,6 +59,7 @@ def acquire(
     folder: Path,
     session: DiagnosisSession,
     stop: threading.Event,
+    view: BitView,
     shared: tuple[Transport, Path] | None = None,
 ) -> Heard:
     """Run the test on the bus; `shared`: listen on one that is open, and recorded there already."""
@@ -77,11 +80,15 @@ def acquire(
             bus = ours.name
             if not shared:
                 say(f"test {test.name!r} on {bus}, recording to {path}")
-            display = stack.enter_context(progress_bar(shown=not shared))
+            view.connected(ours)
 
             def tell(progress: Progress) -> None:
                 ahead.watch(progress)
-                display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
+                view.progress(progress)
+
+            def take(frame: Frame) -> None:
+                assembler.add(frame)
+                view.take(frame)
 
             began = time.monotonic()
             # From here on a second signal means that the abort was requested and nobody waits.
@@ -99,7 +106,7 @@ def acquire(
                         pressure=_scaled(arguments.max_pressure, 1e6),
                         current=_scaled(arguments.max_current, 1e-3),
                     ),
-                    on_frame=assembler.add,
+                    on_frame=take,
                     stop=stop,
                     progress=tell,
                     all_there=ahead.all_there,
@@ -117,7 +124,7 @@ def acquire(
             if recording.serial is None:
                 recording = replace(recording, serial=outcome.serial)
             if outcome.degraded:
-                say(outcome.degraded)
+                view.notes = (outcome.degraded,)
         if outcome is None or not outcome.complete:
             ahead.abandon()
         if outcome is not None and not outcome.complete:

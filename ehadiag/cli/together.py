@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ehadiag.cli.acquire import Heard
     from firmware_iface.transport.interface import Transport
 
-__all__ = ["listen_together"]
+__all__ = ["Listener", "listen_together"]
 
 Listener = Callable[["Transport", Path], "Heard"]
 
