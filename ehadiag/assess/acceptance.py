@@ -8,7 +8,7 @@ import numpy as np
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.calibration import CHANGED, Calibration
-from ehadiag.core.channels import PRESSURE, SPOOL
+from ehadiag.core.conversion import conversion_of
 from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
 from ehadiag.identify.commanded_current import CONTROL_LAW_LSB, FRAME_TOLERANCE
@@ -161,8 +161,9 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
 def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
     """What the model must not be run with; holds for a running test too."""
     out = []
+    saturated = conversion_of(samples, actuator).saturated
     for index, name in ((1, "spool"), (2, "pressure"), (3, "position")):
-        share = float(np.mean(samples.saturated[index]))
+        share = float(np.mean(saturated[index]))
         if share > MOST_SATURATED:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
     temperature = environment.oil_temperature
@@ -185,14 +186,19 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     out = []
     trace, test = experiment.trace, experiment.test
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-    if trace.command_deviation > FRAME_TOLERANCE[mode]:
+    channels = experiment.channels
+    reach = (channels.position if test.closed_loop else channels.current).full_scale
+    if trace.command_deviation > max(FRAME_TOLERANCE[mode] * reach, trace.command_step):
         unit = "mm" if test.closed_loop else "mA"
         out.append(
             f"the command differs from test {test.name!r} by up to "
             f"{trace.command_deviation * 1e3:.3g} {unit}: another test was played"
         )
     # The current's own noise is not to be had in closed loop; the other converters' stands for it.
-    noise_lsb = min(experiment.spool_noise / SPOOL.lsb, experiment.pressure_noise / PRESSURE.lsb)
+    noise_lsb = min(
+        experiment.spool_noise / channels.spool.grain,
+        experiment.pressure_noise / channels.pressure.grain,
+    )
     limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
     if trace.residual_lsb > limit_lsb:
         out.append(

@@ -372,6 +372,7 @@ def _samples(grid: _Grid) -> tuple[Samples, list[str]]:
         command=command,
         saturated=np.stack([filled[key].saturated for key in CHANNEL_KEYS]),
         host_ns=filled["spool"].host_ns,
+        stated=grid.bus_map.stated,
     )
     return samples, notes + said
 
