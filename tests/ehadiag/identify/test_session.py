@@ -116,7 +116,7 @@ def test_stages_follow_the_second_part():
 
 def test_other_samples_are_not_answered_from_memory():
     experiment = own_experiment(FAULTS)
-    session = Session(CompactGa(budget=128))
+    session = Session()
     session.feed([experiment])
     assert session.reused == 0
     experiment.spool[4200] += 1e-6  # after the first stage's window, in the others
