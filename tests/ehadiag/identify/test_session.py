@@ -12,7 +12,6 @@ from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import Samples
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.search.solvers import CompactGa
 from ehadiag.identify.search.stages import STAGES, first_ends_at, stage_ends_at
 from ehadiag.identify.session import Session, identify
 from ehadiag_sim.plant.conditions import Faults
