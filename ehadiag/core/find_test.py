@@ -19,7 +19,7 @@ from ehadiag.core.actuator import Controller
 from ehadiag.core.recording import CommandMode, Recording, Samples
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
 
-__all__ = ["Found", "Sought", "find_test", "found_tests", "rows_of_samples"]
+__all__ = ["Found", "Sought", "find_test", "found_tests", "played_tests", "rows_of_samples"]
 
 LEAST_COMMANDS = 100
 LEAST_SHARE = 0.75
@@ -126,18 +126,42 @@ def found_tests(
     if (low, high) != (0, samples.ticks):
         samples = rows_of_samples(samples, low, low, high - low)
     begin = low - before
-    found, nearest = [], None
-    for item in _each(samples, search, once=within):
-        if item.misfit > MOST_MISFIT:
-            nearest = item
-            break
-        found.append(item)
+    found, nearest = played_tests(samples, search, once=within)
     if not found and search.start_s is not None and len(search.tests) == 1:
         return (_taken_at(recording, samples, search.tests[0], begin),)
     if not found:
         return (_not_found(recording, nearest, samples.period_ns, begin),)
     found.sort(key=lambda item: item.first)
     return tuple(_cut(recording, samples, item, begin) for item in found)
+
+
+def played_tests(
+    samples: Samples, search: Sought, *, once: bool = False, most: float = MOST_MISFIT
+) -> tuple[list[Found], Found | None]:
+    """Find all tests in a stretch of samples.
+
+    Parameters
+    ----------
+    samples : Samples
+        On a tick grid.
+    search : Sought
+        What to look for; where to look does not count.
+    once : bool
+        It holds one test at most.
+    most : float
+        Misfit up to which a test is found: more where samples are placed roughly.
+
+    Returns
+    -------
+    tuple[list[Found], Found | None]
+        Those found, the best one first, and what came nearest where the next is none.
+    """
+    found: list[Found] = []
+    for item in _each(samples, search, once=once):
+        if item.misfit > most:
+            return found, item
+        found.append(item)
+    return found, None
 
 
 def _window(samples: Samples, search: Sought, before: int) -> tuple[int, int]:

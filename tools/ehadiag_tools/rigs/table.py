@@ -32,8 +32,8 @@ from firmware_iface.mapping.bus_map import default_map
 
 __all__ = ["main", "on_bus"]
 
-DAQ, DAQ_RATE = "daq", 2000.0
-"""Decoded signals at that rate, Hz."""
+DAQ = "daq"
+"""Decoded signals."""
 NAMES = ("Kintas", "FSS", "FDJ")
 
 
@@ -66,15 +66,20 @@ def on_bus(
 
 
 def on_daq(
-    recording: Recording, test: StoredTest, how: Disturbance, actuator: Actuator, seed: int
+    recording: Recording,
+    test: StoredTest,
+    how: Disturbance,
+    actuator: Actuator,
+    seed: int,
+    rate: float,
 ) -> Recording:
-    """Write a recording as a decoded CSV at 2 kHz, and read it as `diagnose` does."""
+    """Write a recording as a decoded CSV at a rate (Hz), and read it as `diagnose` does."""
     import pandas  # noqa: PLC0415 - optional, and slow
 
     if recording.samples is None:
         raise ValueError(f"{recording.source}: nothing to play")
     this = played(recording.samples, _as_sent(test), how.lead_in_s)
-    columns = logged(this, how, DAQ_RATE, recording.samples.period_ns, seed)
+    columns = logged(this, how, rate, recording.samples.period_ns, seed)
     known = recording.environment
     for name in ("supply_pressure", "return_pressure", "oil_temperature"):
         columns[name] = np.full(len(columns["time"]), getattr(known, name))
@@ -101,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--batch", type=float, default=0.0, help="ms")
     parser.add_argument("--lost", type=float, default=0.0, help="share of the frames")
     parser.add_argument("--unordered", action="store_true", help="log sorted by its stamps")
+    parser.add_argument("--rate", type=float, default=2000.0, help="of the decoded signals, Hz")
     parser.add_argument("--only", nargs="*", help="recordings by name")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("-v", "--verbose", action="store_true", help="a line a recording")
@@ -122,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in names:
             test = next(item for item in tests.values() if item.id == read[name].test_id)
             if bus is None:
-                got = on_daq(read[name], test, how, actuator, given.seed)
+                got = on_daq(read[name], test, how, actuator, given.seed, given.rate)
             else:
                 got = on_bus(bus, read[name], test, how, actuator, given.seed)
             lines[name] = _line(got, actuator, tests, truth[name])
