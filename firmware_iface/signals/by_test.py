@@ -26,7 +26,10 @@ ROUGH = 3.0
 """Deviation of the delays, ticks, before anything is known of them."""
 STRANGEST = 25.0
 """Most that the current of one value counts, in variances: a wrong one is no matter of placing."""
+SOON = 0.6
+"""Ticks between two values in which the later one has waited for the earlier."""
 LEAST_TOLD = 200
+"""Values whose ticks the current tells, from which on the others do not count for the clock."""
 LEAST_NOISE = 0.01
 """Of what the noise was held to be."""
 EARLIEST = 0.02
@@ -112,18 +115,16 @@ class Placed:
         Ascending, shape (n,).
     late : Floats
         Delay beyond the earliest ones, ticks, shape (n,).
+    deviation : float
+        Root mean square of the delays of those that did not wait for others, ticks.
     phase : Floats
         Arrival of a value that is not late, less its tick: a straight line over the arrivals.
     """
 
     tick: Ticks
     late: Floats
+    deviation: float
     phase: Floats
-
-    @property
-    def deviation(self) -> float:
-        """Root mean square of the delays, ticks."""
-        return max(float(np.sqrt(np.mean(self.late**2))), LEAST_DEVIATION)
 
 
 def placed_in_order(events: Events, expected: Expected, noise: float) -> Placed:
@@ -176,7 +177,7 @@ def placed_by_time(at: Floats, like: Placed, like_at: Floats) -> Placed:
     nothing = np.full(len(at), np.nan)
     silent = Expected(np.zeros(0), np.zeros(0, dtype=np.bool_), Controller(IM=1.0, GAP=0.0))
     tick, _ = _path(Events(at, nothing, nothing), silent, phase, like.deviation, 1.0)
-    return Placed(tick, np.maximum(at - phase - tick, 0.0), phase)
+    return Placed(tick, np.maximum(at - phase - tick, 0.0), like.deviation, phase)
 
 
 def _described(at: Floats, tick: Ticks, told: NDArray[np.bool_]) -> Placed:
@@ -194,7 +195,10 @@ def _described(at: Floats, tick: Ticks, told: NDArray[np.bool_]) -> Placed:
         slope, level = np.polyfit(at[near], away[near], 1)
     rest = away - slope * at
     phase = slope * at + float(np.quantile(rest[used], EARLIEST))
-    return Placed(tick, np.maximum(away - phase, 0.0), phase)
+    late = np.maximum(away - phase, 0.0)
+    own = late[used & ~_waited(at)]
+    deviation = float(np.sqrt(np.mean(own**2))) if own.size else ROUGH
+    return Placed(tick, late, max(deviation, LEAST_DEVIATION), phase)
 
 
 def _path(
@@ -213,7 +217,9 @@ def _path(
     ticks = np.floor(events.at - phase + 0.5).astype(np.int64)[:, None] - np.arange(CANDIDATES)
     ticks += CANDIDATES // 2 if rough else 1
     delay = (events.at - phase)[:, None] - ticks
-    alone = (delay / np.where((delay > 0.0) | rough, deviation, EARLY)) ** 2
+    alone = np.minimum((delay / np.where((delay > 0.0) | rough, deviation, EARLY)) ** 2, STRANGEST)
+    # One that comes right behind another had to wait for it: its delay says nothing of its own.
+    alone = np.where(_waited(events.at)[:, None] & (delay > 0.0), 0.0, alone)
     steps, away = _steps(events, expected, ticks, noise)
     count = len(events.at)
     origin = np.zeros((count, CANDIDATES), dtype=np.int64)
@@ -241,9 +247,14 @@ def _steps(events: Events, expected: Expected, ticks: Ticks, noise: float) -> tu
     away = events.current[1:, None, None] - asked
     guessed = expected.controller.GAP * _roughness(events.position)
     scatter = noise**2 + np.where(gap > 1, guessed**2, 0.0)
-    squares = np.minimum(away**2 / scatter, STRANGEST)
+    squares = np.minimum(away**2 / scatter, STRANGEST) + np.log(scatter / noise**2)
     cost = np.where(np.isfinite(squares), squares, 0.0)
     return np.where(gap >= 1, cost + LOST * (gap - 1), IMPOSSIBLE), away
+
+
+def _waited(at: Floats) -> NDArray[np.bool_]:
+    """Values that came so soon after the one before that this one kept them waiting."""
+    return np.concatenate([[False], np.diff(at) < SOON])
 
 
 def _speed(events: Events) -> Floats:

@@ -100,7 +100,9 @@ def held_by_test(
             value = np.full(clock.ticks, np.nan)
             inside = (own.tick >= 0) & (own.tick < clock.ticks)
             value[own.tick[inside]] = item.value[np.searchsorted(item.time, group.at[inside])]
-            rows[role] = value if group.complete else forward(value, item.value[0])
+            if not group.complete:
+                value = _kept(forward(value, item.value[0]), value, role, expected)
+            rows[role] = value
     offset = np.interp(np.arange(clock.ticks + 1), at, placed.phase)
     return HeldRows(Clock(clock.begin + period * offset), rows, placed.deviation, told=True)
 
@@ -130,6 +132,15 @@ def _beside(
     return placed_in_order(
         Events(at, _values(held, role, group), nothing), told, COMMAND_NOISE * most
     )
+
+
+def _kept(filled: Floats, seen: Floats, role: str, expected: Expected) -> Floats:
+    """Values until the next one; of a command that moves, what was not seen is not known."""
+    if not role.startswith("command."):
+        return filled
+    steps = np.abs(np.diff(expected.command, prepend=expected.command[:1]))
+    moves = np.nan_to_num(steps) > 0.0
+    return np.where(np.isnan(seen) & moves, np.nan, filled)
 
 
 def _expected(found: Sequence[Found], ticks: int, controller: Controller) -> Expected:
