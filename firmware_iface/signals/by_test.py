@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Controller
 
-__all__ = ["Events", "Expected", "Placed", "placed_by_time", "placed_in_order"]
+__all__ = ["Clockwork", "Events", "Expected", "Placed", "placed_by_time", "placed_in_order"]
 
 CANDIDATES = 10
 """Ticks of which a value may be, from one after the tick in which it came on backwards."""
@@ -32,6 +32,8 @@ LEAST_TOLD = 200
 """Values whose ticks the current tells, from which on the others do not count for the clock."""
 LEAST_NOISE = 0.01
 """Of what the noise was held to be."""
+DRIFTS = np.arange(-400, 401, 10) * 1e-6
+"""Of the clocks against each other, beyond what the tests showed roughly."""
 EARLIEST = 0.02
 """Quantile of the delays at which a value is on time."""
 PASSES = 2
@@ -59,11 +61,14 @@ class Events:
         A; NaN where it came by another message, shape (n,).
     position : Floats
         m, see `current`.
+    every : float
+        Ticks between two looks of the logger: as much later a value may be seen than it came.
     """
 
     at: Floats
     current: Floats
     position: Floats
+    every: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +110,26 @@ class Expected:
         return np.asarray(inside & (gain * np.minimum(before, after) > CLEAR * noise))
 
 
+@dataclass(frozen=True, slots=True)
+class Clockwork:
+    """When values that are not late come, less their ticks: a straight line over the arrivals.
+
+    Attributes
+    ----------
+    slope : float
+        Drift of the clocks, ticks a tick.
+    level : float
+        At time 0, ticks.
+    """
+
+    slope: float
+    level: float
+
+    def at(self, arrival: Floats) -> Floats:
+        """Phase at some arrivals, ticks."""
+        return self.slope * arrival + self.level
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
     """Ticks of values, and how late they came.
@@ -116,18 +141,24 @@ class Placed:
     late : Floats
         Delay beyond the earliest ones, ticks, shape (n,).
     deviation : float
-        Root mean square of the delays of those that did not wait for others, ticks.
+        Root mean square of the delays beyond an interval of the logger's looks, of those that did
+        not wait for others, ticks.
     phase : Floats
-        Arrival of a value that is not late, less its tick: a straight line over the arrivals.
+        Arrival of a value that is not late, less its tick, shape (n,).
+    clock : Clockwork
+        The same as a function of the arrival.
     """
 
     tick: Ticks
     late: Floats
     deviation: float
     phase: Floats
+    clock: Clockwork
 
 
-def placed_in_order(events: Events, expected: Expected, noise: float) -> Placed:
+def placed_in_order(
+    events: Events, expected: Expected, noise: float, clock: Clockwork | None = None
+) -> Placed:
     """Find the most likely ticks of values, by their currents, arrivals and order.
 
     Parameters
@@ -138,6 +169,9 @@ def placed_in_order(events: Events, expected: Expected, noise: float) -> Placed:
         What was commanded.
     noise : float
         Of the currents, roughly, A.
+    clock : Clockwork | None
+        That of others of the same computer, which tells how the clocks drift; None: their own
+        arrivals do.
 
     Returns
     -------
@@ -146,59 +180,68 @@ def placed_in_order(events: Events, expected: Expected, noise: float) -> Placed:
     """
     least = LEAST_NOISE * noise
     tick, away = _path(events, expected, np.zeros(len(events.at)), ROUGH, noise, rough=True)
-    placed = _described(events.at, tick, expected.tells(tick, noise))
+    placed = _described(events, tick, expected.tells(tick, noise), clock)
     for _ in range(PASSES):
         known = away[np.isfinite(away)]
         if known.size:
             noise = max(1.4826 * float(np.median(np.abs(known))), least)
         tick, away = _path(events, expected, placed.phase, placed.deviation, noise)
-        placed = _described(events.at, tick, expected.tells(tick, noise))
+        placed = _described(events, tick, expected.tells(tick, noise), clock)
     return placed
 
 
-def placed_by_time(at: Floats, like: Placed, like_at: Floats) -> Placed:
+def placed_by_time(at: Floats, clock: Clockwork, deviation: float) -> Placed:
     """Find the ticks of values that tell nothing of them, on the clock that others have shown.
 
     Parameters
     ----------
     at : Floats
         When each was seen first, ticks, ascending, shape (n,).
-    like : Placed
-        Others of the same computer.
-    like_at : Floats
-        Their arrivals.
+    clock : Clockwork
+        Of the others.
+    deviation : float
+        Of their delays, ticks.
 
     Returns
     -------
     Placed
         Their ticks.
     """
-    phase = np.interp(at, like_at, like.phase)
+    phase = clock.at(at)
     nothing = np.full(len(at), np.nan)
     silent = Expected(np.zeros(0), np.zeros(0, dtype=np.bool_), Controller(IM=1.0, GAP=0.0))
-    tick, _ = _path(Events(at, nothing, nothing), silent, phase, like.deviation, 1.0)
-    return Placed(tick, np.maximum(at - phase - tick, 0.0), like.deviation, phase)
+    tick, _ = _path(Events(at, nothing, nothing, 0.0), silent, phase, deviation, 1.0)
+    return Placed(tick, np.maximum(at - phase - tick, 0.0), deviation, phase, clock)
 
 
-def _described(at: Floats, tick: Ticks, told: NDArray[np.bool_]) -> Placed:
+def _described(
+    events: Events, tick: Ticks, told: NDArray[np.bool_], clock: Clockwork | None
+) -> Placed:
     """Clock and delays that ticks show: a line along the earliest arrivals.
 
     told: values whose current has told the tick.
     """
-    away = at - tick
+    at, away = events.at, events.at - tick
     used = told if told.sum() >= LEAST_TOLD else np.ones(len(at), dtype=np.bool_)
-    # The slope is that of most of them: delays are alike all along.
-    slope, level = np.polyfit(at[used], away[used], 1)
-    for _ in range(3):
-        rest = away - slope * at - level
-        near = used & (np.abs(rest) <= 3.0 * 1.4826 * np.median(np.abs(rest[used])) + 1e-9)
-        slope, level = np.polyfit(at[near], away[near], 1)
+    slope = _drift(at[used], away[used]) if clock is None else clock.slope
     rest = away - slope * at
-    phase = slope * at + float(np.quantile(rest[used], EARLIEST))
-    late = np.maximum(away - phase, 0.0)
-    own = late[used & ~_waited(at)]
+    found = Clockwork(slope, float(np.quantile(rest[used], EARLIEST)))
+    late = np.maximum(away - found.at(at), 0.0)
+    own = np.maximum(late[used & ~_waited(at)] - min(events.every, 1.0), 0.0)
     deviation = float(np.sqrt(np.mean(own**2))) if own.size else ROUGH
-    return Placed(tick, late, max(deviation, LEAST_DEVIATION), phase)
+    return Placed(tick, late, max(deviation, LEAST_DEVIATION), found.at(at), found)
+
+
+def _drift(at: Floats, away: Floats) -> float:
+    """Slope of the highest line below most of the delays, ticks a tick.
+
+    Looks of a logger with a clock of its own make delays climb and fall back by a tick: a line
+    through their midst would follow the climb. That below them does not (Moon, Skelly and Towsley,
+    INFOCOM 1999).
+    """
+    middle = float(at.mean())
+    rest = away[None, :] - DRIFTS[:, None] * (at - middle)[None, :]
+    return float(DRIFTS[np.argmax(np.quantile(rest, EARLIEST, axis=1))])
 
 
 def _path(
@@ -217,7 +260,9 @@ def _path(
     ticks = np.floor(events.at - phase + 0.5).astype(np.int64)[:, None] - np.arange(CANDIDATES)
     ticks += CANDIDATES // 2 if rough else 1
     delay = (events.at - phase)[:, None] - ticks
-    alone = np.minimum((delay / np.where((delay > 0.0) | rough, deviation, EARLY)) ** 2, STRANGEST)
+    # Uniform over an interval of the logger's looks, and beyond that as late as frames are.
+    over = delay if rough else delay - np.clip(delay, 0.0, min(events.every, 1.0))
+    alone = np.minimum((over / np.where((over > 0.0) | rough, deviation, EARLY)) ** 2, STRANGEST)
     # One that comes right behind another had to wait for it: its delay says nothing of its own.
     alone = np.where(_waited(events.at)[:, None] & (delay > 0.0), 0.0, alone)
     steps, away = _steps(events, expected, ticks, noise)

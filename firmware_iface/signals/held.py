@@ -17,17 +17,23 @@ from firmware_iface.signals.by_test import (
     placed_by_time,
     placed_in_order,
 )
-from firmware_iface.signals.resample import Clock, Group, forward, groups_of
+from firmware_iface.signals.resample import DENSE, Clock, Group, forward, groups_of, holds, interval
 from firmware_iface.signals.tables import Signal
 
-__all__ = ["HeldRows", "held_by_test"]
+__all__ = ["HeldRows", "held_by_test", "off_a_bus"]
 
 NOISE = 5e-4
 """Noise of the current, of the rated current, before it is known."""
 COMMAND_NOISE = 1e-4
 """The same of a command, of the greatest."""
+COARSE = 1.0
+"""Steps of a converter, in units of noise, that are those of the computer's, not of a logger's."""
 WIDEST = 10.0
 """A, m: no command is beyond."""
+
+SMALL = 0.1
+LEAST_COMMANDS = 200
+COMMANDS = ("command.position", "command.current")
 
 Floats = NDArray[np.float64]
 
@@ -44,14 +50,46 @@ class HeldRows:
         By role, NaN where the tick's value was not seen, shape (ticks,).
     late : float
         Root mean square of the delays, ticks.
-    told : bool
-        Whether the current tells the ticks, not only the time.
     """
 
     clock: Clock
     rows: Mapping[str, Floats]
     late: float
-    told: bool
+
+
+def off_a_bus(signals: Mapping[str, Signal], period: float) -> dict[str, Signal]:
+    """Find the signals that a logger took off a bus rather than measured by itself.
+
+    Parameters
+    ----------
+    signals : Mapping[str, Signal]
+        By role.
+    period : float
+        Length of a tick, s.
+
+    Returns
+    -------
+    dict[str, Signal]
+        Those that keep each value for a tick; where samples come too seldom to show that, all
+        channels and commands if each channel has the coarse steps of the computer's converters.
+    """
+    held = {role: item for role, item in signals.items() if holds(item, period)}
+    channels = {role: item for role, item in signals.items() if role.startswith("channels.")}
+    # In closed loop the noise of the jack's sensor is that of the current too.
+    measured = [item for role, item in channels.items() if role != "channels.current"]
+    slow = all(period / interval(item) < DENSE for item in channels.values())
+    if held or not slow or not all(map(_is_coarse, measured)):
+        return held
+    return channels | {role: item for role, item in signals.items() if role in COMMANDS}
+
+
+def _is_coarse(signal: Signal) -> bool:
+    """Whether the steps between values are no less than the noise."""
+    second = np.abs(np.diff(signal.value, 2))
+    noise = 1.4826 * float(np.median(second)) / float(np.sqrt(6.0))
+    levels = np.unique(signal.value)
+    steps = np.diff(levels)
+    return steps.size > 0 and float(np.quantile(steps, SMALL)) > COARSE * noise
 
 
 def held_by_test(
@@ -84,17 +122,32 @@ def held_by_test(
     if lead is None or len(lead.at) < 2:
         return None
     expected = _expected(found, clock.ticks, controller)
+    commands = [item for item in groups if item.command]
+    by_command = {
+        group.roles[0]: _command(held, group, clock, period, expected) for group in commands
+    }
+    # A command is exact: it tells best how the clocks drift.
+    exact = max(by_command.values(), key=lambda item: len(item.tick), default=None)
     at = _arrivals(lead, clock, period)
     placed = placed_in_order(
         Events(
-            at, _values(held, "channels.current", lead), _values(held, "channels.position", lead)
+            at,
+            _values(held, "channels.current", lead),
+            _values(held, "channels.position", lead),
+            interval(held["channels.current"]) / period,
         ),
         expected,
         NOISE * controller.IM,
+        exact.clock if exact is not None and len(exact.tick) >= LEAST_COMMANDS else None,
     )
     rows: dict[str, Floats] = {}
     for group in groups:
-        own = placed if group is lead else _beside(held, group, clock, period, expected, placed, at)
+        if group is lead:
+            own = placed
+        elif group.command:
+            own = by_command[group.roles[0]]
+        else:
+            own = placed_by_time(_arrivals(group, clock, period), placed.clock, placed.deviation)
         for role in group.roles:
             item = held[role]
             value = np.full(clock.ticks, np.nan)
@@ -103,23 +156,15 @@ def held_by_test(
             if not group.complete:
                 value = _kept(forward(value, item.value[0]), value, role, expected)
             rows[role] = value
-    offset = np.interp(np.arange(clock.ticks + 1), at, placed.phase)
-    return HeldRows(Clock(clock.begin + period * offset), rows, placed.deviation, told=True)
+    offset = placed.clock.at(np.arange(clock.ticks + 1, dtype=np.float64))
+    return HeldRows(Clock(clock.begin + period * offset), rows, placed.deviation)
 
 
-def _beside(
-    held: Mapping[str, Signal],
-    group: Group,
-    clock: Clock,
-    period: float,
-    expected: Expected,
-    lead: Placed,
-    lead_at: Floats,
+def _command(
+    held: Mapping[str, Signal], group: Group, clock: Clock, period: float, expected: Expected
 ) -> Placed:
-    """Ticks of a group without the current: a command's by the tests, another's by time."""
+    """Ticks of a command's values, by the tests."""
     at = _arrivals(group, clock, period)
-    if not group.command:
-        return placed_by_time(at, lead, lead_at)
     (role,) = group.roles
     mine = expected.closed == (role == "command.position")
     told = Expected(
@@ -129,18 +174,19 @@ def _beside(
     )
     nothing = np.full(len(at), np.nan)
     most = float(np.nanmax(np.abs(told.command), initial=0.0))
-    return placed_in_order(
-        Events(at, _values(held, role, group), nothing), told, COMMAND_NOISE * most
-    )
+    noise = COMMAND_NOISE * (most or 1.0)
+    every = interval(held[role]) / period
+    return placed_in_order(Events(at, _values(held, role, group), nothing, every), told, noise)
 
 
 def _kept(filled: Floats, seen: Floats, role: str, expected: Expected) -> Floats:
-    """Values until the next one; of a command that moves, what was not seen is not known."""
+    """Values until the next one; of a command that has moved since, what was not seen is lost."""
     if not role.startswith("command."):
         return filled
-    steps = np.abs(np.diff(expected.command, prepend=expected.command[:1]))
-    moves = np.nan_to_num(steps) > 0.0
-    return np.where(np.isnan(seen) & moves, np.nan, filled)
+    ticks = np.arange(len(seen))
+    last = np.maximum.accumulate(np.where(np.isfinite(seen), ticks, 0))
+    moved = expected.command[last] != expected.command
+    return np.where(moved & np.isfinite(expected.command), np.nan, filled)
 
 
 def _expected(found: Sequence[Found], ticks: int, controller: Controller) -> Expected:

@@ -13,12 +13,11 @@ from ehadiag.core.find_test import Found, Sought, find_test, found_tests, played
 from ehadiag.core.recording import CommandMode, Environment, Outcome, Quality, Recording, Samples
 from firmware_iface.logs.budget import Budget
 from firmware_iface.signals.columns import NEEDED, ColumnMap
-from firmware_iface.signals.held import held_by_test
+from firmware_iface.signals.held import held_by_test, off_a_bus
 from firmware_iface.signals.resample import (
     Clock,
     bend,
     held_on_ticks,
-    holds,
     interval,
     on_ticks,
 )
@@ -114,7 +113,7 @@ def _clock(
         return even, {}, (unsure,)
     phase, rate = _fitted(led, even, period, found)
     begin = first + period * (1.0 + rate) * (np.arange(ticks + 1)) + phase * period
-    held = {role: item for role, item in signals.items() if holds(item, period)}
+    held = off_a_bus(signals, period)
     tests, _ = played_tests(samples, sought, most=MOST_ROUGHLY)
     if held and tests:
         placed = held_by_test(held, Clock(begin), tests, sought.controller)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from firmware_iface.signals.tables import Signal
 
 __all__ = [
+    "DENSE",
     "Clock",
     "Group",
     "bend",
