@@ -141,8 +141,8 @@ class Placed:
     late : Floats
         Delay beyond the earliest ones, ticks, shape (n,).
     deviation : float
-        Root mean square of the delays beyond an interval of the logger's looks, of those that did
-        not wait for others, ticks.
+        Of the delays beyond an interval of the logger's looks, of those that did not wait for
+        others, ticks.
     phase : Floats
         Arrival of a value that is not late, less its tick, shape (n,).
     clock : Clockwork
@@ -227,9 +227,15 @@ def _described(
     rest = away - slope * at
     found = Clockwork(slope, float(np.quantile(rest[used], EARLIEST)))
     late = np.maximum(away - found.at(at), 0.0)
-    own = np.maximum(late[used & ~_waited(at)] - min(events.every, 1.0), 0.0)
-    deviation = float(np.sqrt(np.mean(own**2))) if own.size else ROUGH
+    own = late[used & ~_waited(at)]
+    deviation = _jitter(own, min(events.every, 1.0)) if own.size else ROUGH
     return Placed(tick, late, max(deviation, LEAST_DEVIATION), found.at(at), found)
+
+
+def _jitter(late: Floats, look: float) -> float:
+    """Deviation of a half-normal delay to which a uniform one of the logger's looks is added."""
+    both, mixed = float(np.mean(late**2)), 0.5 * look * np.sqrt(2.0 / np.pi)
+    return float(np.sqrt(max(both - look**2 / 3.0 + mixed**2, mixed**2)) - mixed)
 
 
 def _drift(at: Floats, away: Floats) -> float:
