@@ -28,7 +28,7 @@ __all__ = [
 
 LATEST_S = 0.05
 """A frame that comes later than this after its tick does not come."""
-MOST_LOST = 0.25
+MOST_LOST = 0.4
 """Share of samples of a channel that may be missing."""
 MOST_SPACING = 2
 """Ticks between two samples: half the control rate is enough to diagnose from."""

@@ -24,7 +24,7 @@ __all__ = ["HeldRows", "held_by_test", "off_a_bus"]
 
 NOISE = 5e-4
 """Noise of the current, of the rated current, before it is known."""
-COMMAND_NOISE = 1e-4
+COMMAND_NOISE = 2e-5
 """The same of a command, of the greatest."""
 COARSE = 1.0
 """Steps of a converter, in units of noise, that are those of the computer's, not of a logger's."""
@@ -176,7 +176,8 @@ def _command(
     most = float(np.nanmax(np.abs(told.command), initial=0.0))
     noise = COMMAND_NOISE * (most or 1.0)
     every = interval(held[role]) / period
-    return placed_in_order(Events(at, _values(held, role, group), nothing, every), told, noise)
+    values = Events(at, _values(held, role, group), nothing, every)
+    return placed_in_order(values, told, noise, exact=True)
 
 
 def _kept(filled: Floats, seen: Floats, role: str, expected: Expected) -> Floats:
