@@ -1,7 +1,8 @@
 """Diagnoses the reference recordings on foreign buses beside the default one: verdicts, errors.
 
 tools/foreign_buses tests/data/logs
-tools/foreign_buses --bus psi29 --jitter 0 1 --lead-in 0 10 tests/data/logs
+tools/foreign_buses --bus psi29 --jitter 0 1 --lead-in 0 10 -- tests/data/logs
+tools/foreign_buses --calibrated FOLDER UNITS      (FOLDER holds A.toml … of `ehadiag calibrate`)
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose
-from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest, bundled_tests
@@ -44,7 +46,25 @@ class Line:
     verdict: str
     error: float
     """Largest difference of an estimate from the truth, 1."""
+    covered: tuple[bool, ...]
+    """Whether the 95 % interval of each severity holds the truth; empty without estimates."""
     why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is known of a recording.
+
+    Attributes
+    ----------
+    severities : tuple[float, float, float]
+        In the order of `NAMES`.
+    actuator : Actuator
+        The unit that it is of.
+    """
+
+    severities: tuple[float, float, float]
+    actuator: Actuator
 
 
 def on_bus(
@@ -107,15 +127,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--lost", type=float, default=0.0, help="share of the frames")
     parser.add_argument("--unordered", action="store_true", help="log sorted by its stamps")
     parser.add_argument("--rate", type=float, default=2000.0, help="of the decoded signals, Hz")
+    parser.add_argument("--calibrated", type=Path, help="folder of the units' actuator files")
     parser.add_argument("--only", nargs="*", help="recordings by name")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("-v", "--verbose", action="store_true", help="a line a recording")
     given = parser.parse_args(arguments)
-    actuator, tests = default_actuator(), bundled_tests()
-    truth = _truth(given.folder)
+    tests = bundled_tests()
+    truth = _truth(given.folder, given.calibrated)
     names = [name for name in truth if not given.only or Path(name).stem in given.only]
     read = {name: read_recording(given.folder / name) for name in names}
-    usual = {name: _line(item, actuator, tests, truth[name]) for name, item in read.items()}
+    usual = {name: _line(item, tests, truth[name]) for name, item in read.items()}
     _show("default", "", usual, usual)
     buses: list[ForeignBus | None] = [*BUSES, None]
     chosen = [bus for bus in buses if not given.bus or _name(bus) in given.bus]
@@ -126,12 +147,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines = {}
         begin = time.perf_counter()
         for name in names:
+            actuator = truth[name].actuator
             test = next(item for item in tests.values() if item.id == read[name].test_id)
             if bus is None:
                 got = on_daq(read[name], test, how, actuator, given.seed, given.rate)
             else:
                 got = on_bus(bus, read[name], test, how, actuator, given.seed)
-            lines[name] = _line(got, actuator, tests, truth[name])
+            lines[name] = _line(got, tests, truth[name])
             if given.verbose:
                 line = lines[name]
                 print(f"    {name:<24}{line.verdict:<12}{100 * line.error:8.2f} %  {line.why}")
@@ -148,38 +170,48 @@ def _name(bus: ForeignBus | None) -> str:
     return DAQ if bus is None else bus.name
 
 
-def _truth(folder: Path) -> dict[str, tuple[float, float, float]]:
+def _truth(folder: Path, calibrated: Path | None) -> dict[str, Truth]:
+    """What is known of each recording; without those of units that are not calibrated."""
     with (folder / "truth.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    return {
-        row["file"]: (float(row["Kintas"]), float(row["FSS"]), float(row["FDJ"])) for row in rows
-    }
+    out = {}
+    for row in rows:
+        path = calibrated / f"{row['unit']}.toml" if calibrated is not None else None
+        if path is None or path.is_file():
+            actuator = load_actuator(path) if path is not None else default_actuator()
+            severities = (float(row["Kintas"]), float(row["FSS"]), float(row["FDJ"]))
+            out[row["file"]] = Truth(severities, actuator)
+    return out
 
 
-def _line(
-    recording: Recording,
-    actuator: Actuator,
-    tests: dict[str, StoredTest],
-    truth: tuple[float, float, float],
-) -> Line:
-    result = diagnose([recording], actuator, tests.values())
-    return Line(result.verdict.name, _error(result, truth), "; ".join(result.reasons))
-
-
-def _error(result: Diagnosis, truth: tuple[float, float, float]) -> float:
+def _line(recording: Recording, tests: dict[str, StoredTest], truth: Truth) -> Line:
+    result = diagnose([recording], truth.actuator, tests.values())
+    why = "; ".join(result.reasons)
     if result.identification is None:
-        return float("nan")
-    found = {item.name: item.value for item in result.identification.estimates}
-    return max(abs(found[name] - value) for name, value in zip(NAMES, truth, strict=True))
+        return Line(result.verdict.name, float("nan"), (), why)
+    found = {item.name: item for item in result.identification.estimates}
+    pairs = [(found[name], value) for name, value in zip(NAMES, truth.severities, strict=True)]
+    return Line(
+        result.verdict.name,
+        max(abs(item.value - value) for item, value in pairs),
+        tuple(item.interval95[0] <= value <= item.interval95[1] for item, value in pairs),
+        why,
+    )
 
 
 def _show(bus: str, how: str, lines: dict[str, Line], usual: dict[str, Line]) -> None:
-    """One line: verdicts that agree with the default bus, mean and greatest error."""
+    """One line: verdicts that agree with the default bus, mean and greatest error, coverage.
+
+    Errors and coverage are of the recordings that got a verdict.
+    """
     same = sum(line.verdict == usual[name].verdict for name, line in lines.items())
-    errors = np.array([line.error for line in lines.values()])
-    known = errors[np.isfinite(errors)]
-    mean, most = (100 * known.mean(), 100 * known.max()) if len(known) else (np.nan, np.nan)
+    told = [line for line in lines.values() if line.verdict != Verdict.NOT_TESTED.name]
+    errors = np.array([line.error for line in told])
+    mean, most = (100 * errors.mean(), 100 * errors.max()) if told else (np.nan, np.nan)
+    covered = [item for line in told for item in line.covered]
+    wrong = sum(line.verdict != usual[name].verdict for name, line in lines.items() if line in told)
     print(
-        f"{bus:<10}{how:<16}{same:>3} of {len(lines)} verdicts{mean:>9.2f} %{most:>9.2f} %",
+        f"{bus:<10}{how:<16}{same:>3} of {len(lines)} verdicts, {wrong} wrong,"
+        f"{mean:>8.2f} %{most:>8.2f} %{sum(covered):>5} of {len(covered)} covered",
         flush=True,
     )
