@@ -98,7 +98,12 @@ class Found:
 
 
 def found_tests(
-    recording: Recording, search: Sought, *, within: bool = False, before: int = 0
+    recording: Recording,
+    search: Sought,
+    *,
+    within: bool = False,
+    before: int = 0,
+    others: bool = False,
 ) -> tuple[Recording, ...]:
     """Cut out of a recording the tests that it holds.
 
@@ -112,6 +117,8 @@ def found_tests(
         The recording is known to hold one test: only its instant is looked for.
     before : int
         Rows at the recording's beginning that its reader does not count.
+    others : bool
+        Other tests may have been played too: no start is taken at its word.
 
     Returns
     -------
@@ -127,7 +134,8 @@ def found_tests(
         samples = rows_of_samples(samples, low, low, high - low)
     begin = low - before
     found, nearest = played_tests(samples, search, once=within)
-    if not found and search.start_s is not None and len(search.tests) == 1:
+    alone = len(search.tests) == 1 and not others
+    if not found and search.start_s is not None and alone:
         return (_taken_at(recording, samples, search.tests[0], begin),)
     if not found:
         return (_not_found(recording, nearest, samples.period_ns, begin),)

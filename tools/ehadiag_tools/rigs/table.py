@@ -32,7 +32,7 @@ from firmware_iface.logs.any_recording import Meaning, recorded_tests
 from firmware_iface.logs.reader import choose, read_recording
 from firmware_iface.mapping.bus_map import default_map
 
-__all__ = ["main", "on_bus"]
+__all__ = ["as_sent", "main", "on_bus"]
 
 DAQ = "daq"
 """Decoded signals."""
@@ -78,7 +78,7 @@ def on_bus(
     """Play a recording on a bus, and read it there as a log of that bus is read."""
     if recording.samples is None:
         raise ValueError(f"{recording.source}: nothing to play")
-    this = played(recording.samples, _as_sent(test), how.lead_in_s)
+    this = played(recording.samples, as_sent(test), how.lead_in_s)
     table, bus_map = frames_on(bus, recording, this, how, seed)
     sought = Sought(tuple(bundled_tests().values()), actuator.controller)
     name = f"{Path(recording.source).stem} on {bus.name}"
@@ -98,7 +98,7 @@ def on_daq(
 
     if recording.samples is None:
         raise ValueError(f"{recording.source}: nothing to play")
-    this = played(recording.samples, _as_sent(test), how.lead_in_s)
+    this = played(recording.samples, as_sent(test), how.lead_in_s)
     columns = logged(this, how, rate, recording.samples.period_ns, seed)
     known = recording.environment
     for name in ("supply_pressure", "return_pressure", "oil_temperature"):
@@ -110,7 +110,8 @@ def on_daq(
         return choose(recorded_tests([path], Meaning(default_map(), None, sought)))
 
 
-def _as_sent(test: StoredTest) -> NDArray[np.float64]:
+def as_sent(test: StoredTest) -> NDArray[np.float64]:
+    """Command of a test as the default bus's frames carry it, A or m."""
     step = 2e-6 if test.closed_loop else 0.5e-6
     return np.asarray(np.round(test.command() / step) * step)
 
