@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.assess.unobservable import lost_positions
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import PRESSURE, SPOOL
 from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
@@ -38,8 +39,6 @@ LEAST_COMMANDS = 100
 """Command frames that tell at which resolution the control law got its command."""
 LEAST_CURRENTS = 0.4
 """Share of ticks whose measured current must bear out a stored command that was not recorded."""
-MOST_GUESSED = 0.015
-"""Share of ticks in closed loop whose current had to be guessed (docs/reference/bus-faults.md)."""
 LEAST_MISSED_S = 0.01
 """A shorter piece missing at an end of the test is a lost frame like others."""
 LEAST_SHARE = 0.5
@@ -209,11 +208,8 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
             f"{'control law' if test.closed_loop else 'command'} gives (limit "
             f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
         )
-    if trace.guessed > MOST_GUESSED:
-        out.append(
-            f"{trace.guessed:.1%} of the jack positions that the control law worked on are lost "
-            f"(limit {MOST_GUESSED:.1%}): the servovalve current cannot be rebuilt"
-        )
+    if lost := lost_positions(experiment):
+        out.append(lost)
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
         seen = values[np.isfinite(values)]
         if seen.size and float(np.ptp(seen)) == 0.0:

@@ -25,6 +25,7 @@ from ehadiag.assess.other_faults import (
 )
 from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
+from ehadiag.assess.unobservable import lost_positions, observable, what_is_left
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
@@ -150,11 +151,17 @@ class DiagnosisSession:
         begin = time.perf_counter()
         matched = match_tests(recordings, self._tests, self._default)
         experiments, reasons = self._experiments(recordings, matched)
+        hidden = tuple(dict.fromkeys(filter(None, map(lost_positions, experiments))))
+        lost = bool(hidden) and set(reasons) <= set(hidden) and observable(experiments)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
         others: tuple[OtherFault, ...] = ()
         culprit: Culprit | None = None
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
+        if lost:
+            found = self._session.finish(experiments, progress)
+            identification, words = what_is_left(found)
+            why = tuple(f"{reason}: {words}" for reason in hidden)
         if not reasons:
             identification = self._session.finish(experiments, progress)
             positions = tuple(position_fit(item, identification) for item in experiments)
