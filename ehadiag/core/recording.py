@@ -209,6 +209,8 @@ class Recording:
     """Adapter channel of the recording; None where it has only one or does not say."""
     start_ns: int | None = None
     """Host time of the test's first sample, ns since the epoch (or the log's start)."""
+    by_time: bool = False
+    """No counter told the samples' ticks: one message's may be placed later than another's."""
 
     @property
     def duration(self) -> float:

@@ -241,6 +241,7 @@ def _recording(
         quality=quality,
         channel=bus_map.channel,
         start_ns=_start_ns(samples),
+        by_time=axis is not None and not axis.turn,
     )
 
 

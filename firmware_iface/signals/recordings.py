@@ -93,6 +93,7 @@ def recordings_of_signals(
         environment=_environment(signals),
         quality=Quality(notes=notes),
         start_ns=round((clock.begin[0]) * 1e9),
+        by_time=True,
     )
     return found_tests(whole, sought)
 
