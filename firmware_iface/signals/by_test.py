@@ -218,7 +218,7 @@ def placed_by_time(at: Floats, clock: Clockwork, deviation: float) -> Placed:
     """
     phase = clock.at(at)
     nothing = np.full(len(at), np.nan)
-    silent = Expected(np.zeros(0), np.zeros(0, dtype=np.bool_), Controller(IM=1.0, GAP=0.0))
+    silent = Expected(np.full(1, np.nan), np.zeros(1, dtype=np.bool_), Controller(IM=1.0, GAP=0.0))
     tick, _ = _path(Events(at, nothing, nothing, 0.0), silent, phase, deviation, 1.0)
     return Placed(tick, np.maximum(at - phase - tick, 0.0), deviation, phase, clock)
 
