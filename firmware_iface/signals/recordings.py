@@ -30,6 +30,7 @@ COARSE = (np.arange(-1.5, 1.51, 0.1), np.arange(-300e-6, 301e-6, 50e-6))
 FINE = (np.arange(-0.1, 0.101, 0.02), np.arange(-50e-6, 51e-6, 10e-6))
 """Phase in ticks and rate of the logger's clock, over which the test's own command is fitted."""
 LEAST_SAMPLES = 100
+MOST_FITTED = 20_000
 MOST_ROUGHLY = 0.25
 """Misfit of a test's command that delays of some ticks make: it is judged anew afterwards."""
 CHANNELS = {"current": ("mA", 1e3), "spool": ("mm", 1e3), "pressure": ("MPa", 1e-6),
@@ -83,7 +84,12 @@ def recordings_of_signals(
     else:
         clock, rows, said = _clock(signals, period, sought)
     samples, rules = _samples(signals, rows, clock, columns.tick_ns, start)
-    notes = ("decoded signals: no check sum, no counter", *said, *rules)
+    jitter = max(item.jitter for item in signals.values())
+    even = (
+        f"time stamps jitter by {1e3 * jitter:.2g} ms: the rows' own even clock takes their place"
+    )
+    evened = (even,) if jitter > 0.0 else ()
+    notes = ("decoded signals: no check sum, no counter", *evened, *said, *rules)
     whole = Recording(
         source=source,
         samples=samples,
@@ -146,6 +152,8 @@ def _fitted(signal: Signal, even: Clock, period: float, found: Found) -> tuple[f
     begin = even.begin[0] + found.first * period
     inside = (signal.time >= begin - 2 * period) & (signal.time <= begin + len(stored) * period)
     time, value = signal.time[inside], signal.value[inside]
+    every = max(len(time) // MOST_FITTED, 1)
+    time, value = time[::every], value[::every]
     if len(time) < LEAST_SAMPLES:
         return 0.0, 0.0
 
