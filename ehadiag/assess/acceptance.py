@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ehadiag.assess.unobservable import lost_positions
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.calibration import CHANGED, Calibration
 from ehadiag.core.conversion import conversion_of
@@ -28,16 +30,16 @@ __all__ = [
 
 LATEST_S = 0.05
 """A frame that comes later than this after its tick does not come."""
-MOST_LOST = 0.25
+MOST_LOST = 0.4
 """Share of samples of a channel that may be missing."""
+MOST_SPACING = 2
+"""Ticks between two samples: half the control rate is enough to diagnose from."""
 LONGEST_GAP_S = 0.25
 """Longest span without a sample."""
 LEAST_COMMANDS = 100
 """Command frames that tell at which resolution the control law got its command."""
 LEAST_CURRENTS = 0.4
 """Share of ticks whose measured current must bear out a stored command that was not recorded."""
-MOST_GUESSED = 0.015
-"""Share of ticks in closed loop whose current had to be guessed (docs/reference/bus-faults.md)."""
 LEAST_MISSED_S = 0.01
 """A shorter piece missing at an end of the test is a lost frame like others."""
 LEAST_SHARE = 0.5
@@ -142,7 +144,7 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
     out = []
     for name, values in (("spool", samples.spool), ("pressure", samples.pressure)):
         present = np.flatnonzero(np.isfinite(values[: test.ticks]))
-        share = 1.0 - len(present) / test.ticks
+        share = 1.0 - len(present) * _spacing(present) / test.ticks
         edges = np.concatenate([[-1], present, [test.ticks]])
         longest = float(np.diff(edges).max() - 1) / test.rate
         if share > MOST_LOST:
@@ -150,12 +152,19 @@ def _gaps(samples: Samples, test: StoredTest) -> list[str]:
         elif longest > LONGEST_GAP_S:
             out.append(f"no {name} sample for {longest:.2f} s (limit {LONGEST_GAP_S:g} s)")
     both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])
+    spacing = _spacing(np.flatnonzero(both))
     for search in ("FDJ", "Kintas", "FSS", "refinement"):
         for start, end in getattr(test.windows, search):
             inside = both[round(start * test.rate) : round(end * test.rate)]
-            if inside.sum() < LEAST_SHARE * (end - start) * test.rate:
+            if inside.sum() * spacing < LEAST_SHARE * (end - start) * test.rate:
                 out.append(f"samples are missing in {start:g} … {end:g} s, which {search} needs")
     return out
+
+
+def _spacing(present: NDArray[np.int64]) -> int:
+    """Ticks between two samples: of a bus or a logger that brings each second tick none is lost."""
+    steps = np.diff(present)
+    return int(np.clip(np.median(steps), 1, MOST_SPACING)) if steps.size else 1
 
 
 def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
@@ -206,11 +215,8 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
             f"{'control law' if test.closed_loop else 'command'} gives (limit "
             f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
         )
-    if trace.guessed > MOST_GUESSED:
-        out.append(
-            f"{trace.guessed:.1%} of the jack positions that the control law worked on are lost "
-            f"(limit {MOST_GUESSED:.1%}): the servovalve current cannot be rebuilt"
-        )
+    if lost := lost_positions(experiment):
+        out.append(lost)
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
         seen = values[np.isfinite(values)]
         if seen.size and float(np.ptp(seen)) == 0.0:

@@ -256,6 +256,8 @@ class Recording:
     """Host time of the test's first sample, ns since the epoch (or the log's start)."""
     onboard: OnboardResult | None = None
     """What the computer has found itself; None where it did not say."""
+    by_time: bool = False
+    """No counter told the samples' ticks: one message's may be placed later than another's."""
 
     @property
     def duration(self) -> float:
