@@ -82,7 +82,7 @@ def grid(tick: list[int], value: list[float], **other: Any) -> Grid:
         episode=span(10, 4),
         decoded=SimpleNamespace(messages={"M": item}),
         axis=axis_of([], [], other.get("ticks", {"M": tick})),
-        bus_map=SimpleNamespace(find=known.get),
+        bus_map=SimpleNamespace(find=known.get, stated={}),
         begin=other.get("begin", 0),
         end=other.get("end", 2 * count),
     )
