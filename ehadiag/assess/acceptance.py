@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.calibration import CHANGED, Calibration
 from ehadiag.core.conversion import conversion_of
 from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
@@ -217,16 +218,25 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     return out
 
 
-def objections_to_estimate(identification: Identification) -> list[str]:
-    """Why estimates cannot carry a verdict; empty if they can."""
+def objections_to_estimate(
+    identification: Identification, calibration: Calibration | None = None
+) -> list[str]:
+    """Why estimates cannot carry a verdict; empty if they can.
+
+    calibration: of the unit: what it could not explain is no reason.
+    """
     fit = identification.fit
     out = []
     rms = max(fit.spool_rms, fit.pressure_rms)
-    if fit.outliers > MOST_OUTLIERS or not rms <= MOST_RMS:
+    most_outliers, most_rms = MOST_OUTLIERS, MOST_RMS
+    if calibration is not None and calibration.fit.left > 0.0:
+        most_outliers += CHANGED * calibration.fit.outliers
+        most_rms *= CHANGED * max(calibration.fit.spool_rms, calibration.fit.pressure_rms)
+    if fit.outliers > most_outliers or not rms <= most_rms:
         out.append(
             f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
-            f"three times the noise (limit {MOST_OUTLIERS:.1%}), rms residual {rms:.2f} (limit "
-            f"{MOST_RMS:g}): other actuator data, or an effect that the three faults leave out"
+            f"three times the noise (limit {most_outliers:.1%}), rms residual {rms:.2f} (limit "
+            f"{most_rms:.3g}): other actuator data, or an effect that the three faults leave out"
         )
     hidden = [item.name for item in identification.estimates if not item.shown]
     if hidden:

@@ -110,6 +110,7 @@ def acquire(
                     stop=stop,
                     progress=tell,
                     all_there=ahead.all_there,
+                    onboard_wait=arguments.onboard_wait,
                 )
             except InputOutputError as error:  # of the recording; the abort was requested
                 why = str(error)
@@ -123,6 +124,8 @@ def acquire(
             why = outcome.why
             if recording.serial is None:
                 recording = replace(recording, serial=outcome.serial)
+            if outcome.onboard is not None:
+                recording = replace(recording, onboard=outcome.onboard)
             if outcome.degraded:
                 view.notes = (outcome.degraded,)
         if outcome is None or not outcome.complete:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ehadiag.core.dates import date_text
 from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.printable import valid_text
+from ehadiag.report.onboard import onboard_tree
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
@@ -121,6 +122,7 @@ def _recording(item: Recording, test: StoredTest | None, log: LogFile | None) ->
         "supply_pressure_MPa": _mega(around.supply_pressure),
         "return_pressure_MPa": _mega(around.return_pressure),
         "log": log_tree(log),
+        "onboard": onboard_tree(item.onboard),
     }
 
 

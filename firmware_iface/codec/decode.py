@@ -106,6 +106,8 @@ def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
             bus_map.policy.crc == "flag",
             bus_map.policy.range == "flag",
         )
+    for message in bus_map.onboard:
+        foreign[rows_of(table, message)] = False
     return DecodedTable(messages, np.flatnonzero(foreign), np.flatnonzero(table.error))
 
 

@@ -16,7 +16,14 @@ from ehadiag.core.recording import BitState, CommandMode
 from ehadiag.core.small_file import read_small_file
 from ehadiag.core.toml_file import decode_toml, read_toml
 from firmware_iface.mapping.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, recall_dbc
-from firmware_iface.mapping.file import ChannelRef, MappingFile, Policy, Protection, SignalRef
+from firmware_iface.mapping.file import (
+    ChannelRef,
+    MappingFile,
+    OnboardSignals,
+    Policy,
+    Protection,
+    SignalRef,
+)
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.mapping.units import si_factor
 from firmware_iface.transport.frames import MAX_PAYLOAD
@@ -31,6 +38,15 @@ SMALLEST, LARGEST = 1e-12, 1e12
 
 LEAST_STEPS = 1.0 / 64.0
 """Resolution over range of a converter of 6 bits, the coarsest that is taken."""
+
+SEVERITIES = ("Kintas", "FSS", "FDJ")
+"""Keys of what a computer finds by itself, their standard deviations behind `std_`."""
+
+NEEDED = {
+    "onboard.state",
+    *(f"onboard.{prefix}{name}" for prefix in ("", "std_") for name in SEVERITIES),
+}
+"""Without which the rest of `onboard` says nothing."""
 
 DIMENSIONS: dict[str, dict[str, str | None]] = {
     "channels": {
@@ -53,6 +69,9 @@ DIMENSIONS: dict[str, dict[str, str | None]] = {
         "serial": None,
     },
     "request": {"code": None, "test_id": None},
+    "onboard": dict.fromkeys(
+        ("state", "test_id", "verdict", "runs", *SEVERITIES, *(f"std_{n}" for n in SEVERITIES))
+    ),
 }
 
 
@@ -115,6 +134,8 @@ class BusMap:
     policy: Policy
     channel: int | None = None
     """Adapter channel of a recording that is the actuator's, from 1; None: the only one."""
+    onboard: tuple[MessageMap, ...] = ()
+    """Messages of what the computer has found by itself; no part of a recording's samples."""
 
     def find(self, role: str) -> tuple[MessageMap, Role] | None:
         """Message and signal of a role (`command.mode`); None if the mapping leaves it out."""
@@ -164,6 +185,7 @@ def default_map(dbc: Path | str | None = None) -> BusMap:
         text = folder.joinpath(tree.dbc).read_bytes()
         return resolve(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
     found = recall_dbc(read_small_file(Path(dbc), MAX_DBC_BYTES, "DBC file"), str(dbc))
+    tree = _without_onboard(tree, found)
     try:
         return resolve(tree, found, where, str(dbc))
     except ConfigurationError as error:
@@ -171,6 +193,16 @@ def default_map(dbc: Path | str | None = None) -> BusMap:
             f"DBC file {dbc}: names another bus than the default mapping ({error}): name a mapping"
             " file, --mapping"
         ) from None
+
+
+def _without_onboard(tree: MappingFile, database: Mapping[str, DbcMessage]) -> MappingFile:
+    """Leave out what a computer finds by itself, where a DBC knows no such messages."""
+    refs = [ref for ref in msgspec.structs.astuple(tree.onboard) if ref is not None]
+    named = {ref.message for ref in refs}
+    if named & database.keys():
+        return tree
+    guards = {name: item for name, item in tree.protection.items() if name not in named}
+    return msgspec.structs.replace(tree, onboard=OnboardSignals(), protection=guards)
 
 
 def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
@@ -229,10 +261,13 @@ def resolve(
         for name, items in roles.items()
     }
     seen: dict[tuple[int, bool], str] = {}
+    _refuse_half(roles, where)
     for item in messages.values():
         other = seen.setdefault((item.can_id, item.extended), item.name)
         if other != item.name:
             raise ConfigurationError(f"{where}: {other} and {item.name} share an identifier")
+    onboard = tuple(item for item in messages.values() if _onboard(item))
+    messages = {item.name: item for item in messages.values() if not _onboard(item)}
     moduli = {item.modulus for item in messages.values() if item.counts_ticks}
     if len(moduli) > 1:
         raise ConfigurationError(f"{where}: counters that count ticks must be equally wide")
@@ -248,7 +283,24 @@ def resolve(
         requests={str(key): value for key, value in tree.request.codes.items()},
         policy=tree.policy,
         channel=tree.channel,
+        onboard=onboard,
     )
+
+
+def _onboard(message: MessageMap) -> bool:
+    return message.roles[0].name.startswith("onboard.")
+
+
+def _refuse_half(roles: Mapping[str, list[Role]], where: str) -> None:
+    """Refuse findings without what makes them whole, or in a message with anything else."""
+    named = {item.name for items in roles.values() for item in items}
+    ours = {name for name in named if name.startswith("onboard.")}
+    missing = sorted(NEEDED - named) if ours else []
+    if missing:
+        raise ConfigurationError(f"{where}: onboard: {missing[0]} is needed beside the rest")
+    for name, items in roles.items():
+        if 0 < sum(item.name in ours for item in items) < len(items):
+            raise ConfigurationError(f"{where}: {name} carries onboard findings and other signals")
 
 
 def _fixed_mode(tree: MappingFile, where: str) -> CommandMode | None:

@@ -15,6 +15,7 @@ __all__ = [
     "CommandSignals",
     "EnvironmentSignals",
     "MappingFile",
+    "OnboardSignals",
     "Policy",
     "PolicyLimits",
     "Protection",
@@ -103,6 +104,21 @@ class RequestSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
+class OnboardSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a computer that identifies by itself says it has found."""
+
+    state: SignalRef | None = None
+    test_id: SignalRef | None = None
+    verdict: SignalRef | None = None
+    runs: SignalRef | None = None
+    Kintas: SignalRef | None = None
+    FSS: SignalRef | None = None
+    FDJ: SignalRef | None = None
+    std_Kintas: SignalRef | None = None
+    std_FSS: SignalRef | None = None
+    std_FDJ: SignalRef | None = None
+
+
 class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How one message is guarded."""
 
@@ -155,5 +171,6 @@ class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     environment: EnvironmentSignals = EnvironmentSignals()
     status: StatusSignals = StatusSignals()
     request: RequestSignals = RequestSignals()
+    onboard: OnboardSignals = OnboardSignals()
     protection: Annotated[dict[Name, Protection], msgspec.Meta(max_length=256)] = {}
     policy: Policy = Policy()

@@ -96,6 +96,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             metavar=unit,
             help=f"abort the test when the {what} goes beyond ±{unit} (default: not watched)",
         )
+    parser.add_argument(
+        "--onboard-wait",
+        type=options.positive,
+        default=60.0,
+        metavar="S",
+        help="how long to wait after the test for what the flight-control computer finds itself,"
+        " where it says that it is at it (default 60)",
+    )
     add_screen_options(parser)
     add_unit_options(parser)
     options.add_diagnosis_options(parser)
