@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.channels import Stated
 from ehadiag.core.errors import NotTestedError
 
 if TYPE_CHECKING:
@@ -98,6 +99,8 @@ class Samples:
         Shape (4, ticks), the channel's converter stood at its end.
     host_ns : NDArray[np.int64]
         Host time stamp of each telemetry row, ns; -1 where none arrived.
+    stated : tuple[Stated | None, ...]
+        What the mapping says of each channel's converter; empty: nothing of any.
     """
 
     period_ns: int
@@ -109,6 +112,7 @@ class Samples:
     command: NDArray[np.float64]
     saturated: NDArray[np.bool_]
     host_ns: NDArray[np.int64]
+    stated: tuple[Stated | None, ...] = ()
 
     @property
     def ticks(self) -> int:
@@ -252,6 +256,8 @@ class Recording:
     """Host time of the test's first sample, ns since the epoch (or the log's start)."""
     onboard: OnboardResult | None = None
     """What the computer has found itself; None where it did not say."""
+    by_time: bool = False
+    """No counter told the samples' ticks: one message's may be placed later than another's."""
 
     @property
     def duration(self) -> float:

@@ -59,9 +59,14 @@ def configuration(asked: Asked) -> dict[str, Any]:
         "nuisances": asked.nuisances,
         "time_limit_s": asked.time_limit_s,
         "every_test": asked.every,
+        "tests_sha256": asked.tests_sha256,
+        "columns_sha256": asked.columns_sha256,
+        "start_s": asked.start_s,
+        "end_s": asked.end_s,
         "mapping": {
             "name": None if asked.mapping is None else valid_text(asked.mapping),
             "sha256": asked.mapping_sha256,
+            "file": None if asked.mapping_file is None else valid_text(asked.mapping_file),
         },
     }
 

@@ -6,15 +6,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
 import msgspec
 
+from ehadiag.core.channels import CHANNELS, Stated
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitState, CommandMode
 from ehadiag.core.small_file import read_small_file
 from ehadiag.core.toml_file import decode_toml, read_toml
 from firmware_iface.mapping.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, recall_dbc
-from firmware_iface.mapping.file import MappingFile, OnboardSignals, Policy, Protection, SignalRef
+from firmware_iface.mapping.file import (
+    ChannelRef,
+    MappingFile,
+    OnboardSignals,
+    Policy,
+    Protection,
+    SignalRef,
+)
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.mapping.units import si_factor
 from firmware_iface.transport.frames import MAX_PAYLOAD
@@ -35,6 +44,8 @@ NEEDED = {
     *(f"onboard.{prefix}{name}" for prefix in ("", "std_") for name in SEVERITIES),
 }
 """Without which the rest of `onboard` says nothing."""
+LEAST_STEPS = 1.0 / 64.0
+"""Resolution over range of a converter of 6 bits, the coarsest that is taken."""
 
 DIMENSIONS: dict[str, dict[str, str | None]] = {
     "channels": {
@@ -63,6 +74,10 @@ DIMENSIONS: dict[str, dict[str, str | None]] = {
 }
 
 
+StatedOrUnset: TypeAlias = Stated | msgspec.UnsetType
+"""Unset where nothing is said, so that the fingerprint of a mapping is that of what it says."""
+
+
 @dataclass(frozen=True, slots=True)
 class Role:
     """A signal in its role: SI value = physical * gain + bias."""
@@ -72,6 +87,8 @@ class Role:
     signal: SignalLayout
     gain: float = 1.0
     bias: float = 0.0
+    stated: StatedOrUnset = msgspec.UNSET
+    """What the mapping says of the converter behind a channel, SI."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +143,18 @@ class BusMap:
                 if item.name == role:
                     return message, item
         return None
+
+    @property
+    def stated(self) -> tuple[Stated | None, ...]:
+        """What the mapping says of each channel's converter; empty: nothing of any."""
+        roles = (self.find(f"channels.{channel.name}") for channel in CHANNELS)
+        said = tuple(
+            None
+            if found is None or isinstance(found[1].stated, msgspec.UnsetType)
+            else found[1].stated
+            for found in roles
+        )
+        return said if any(said) else ()
 
 
 def default_map(dbc: Path | str | None = None) -> BusMap:
@@ -306,7 +335,26 @@ def _role(
         raise ConfigurationError(
             f"{at}: scale must lie within {SMALLEST:g} … {LARGEST:g}, offset within ±{LARGEST:g}"
         )
-    return Role(name, signal, gain * ref.scale, gain * ref.offset + bias)
+    stated = _stated(ref, gain, bias, at) if isinstance(ref, ChannelRef) else msgspec.UNSET
+    return Role(name, signal, gain * ref.scale, gain * ref.offset + bias, stated)
+
+
+def _stated(ref: ChannelRef, gain: float, bias: float, at: str) -> StatedOrUnset:
+    """What a mapping says of a converter, from the channel's unit to SI."""
+    if ref.range is None and ref.resolution is None:
+        return msgspec.UNSET
+    low, high = None, None
+    if ref.range is not None:
+        if not ref.range[0] < ref.range[1]:
+            raise ConfigurationError(f"{at}: range must be [least, most], not {list(ref.range)!r}")
+        low, high = (gain * value + bias for value in ref.range)
+        if ref.resolution is not None and ref.resolution > LEAST_STEPS * (
+            ref.range[1] - ref.range[0]
+        ):
+            raise ConfigurationError(
+                f"{at}: resolution {ref.resolution:g} is more than {LEAST_STEPS:g} of the range"
+            )
+    return Stated(low, high, None if ref.resolution is None else gain * ref.resolution)
 
 
 def _layout(message: DbcMessage, name: str, at: str, depth: int = 0) -> SignalLayout:

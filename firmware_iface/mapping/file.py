@@ -10,6 +10,7 @@ from typing import Annotated, Literal, get_args
 import msgspec
 
 __all__ = [
+    "ChannelRef",
     "ChannelSignals",
     "CommandSignals",
     "EnvironmentSignals",
@@ -42,13 +43,22 @@ class SignalRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: float = 0.0
 
 
+class ChannelRef(SignalRef, frozen=True, forbid_unknown_fields=True):
+    """A measured channel, and what is known of the converter behind it, in the signal's unit."""
+
+    range: tuple[float, float] | None = None
+    """Values at the converter's ends, after scale and offset."""
+    resolution: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    """One step of the converter; a bus signal may be finer."""
+
+
 class ChannelSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The four measured channels."""
 
-    current: SignalRef
-    spool: SignalRef
-    pressure: SignalRef
-    position: SignalRef
+    current: ChannelRef
+    spool: ChannelRef
+    pressure: ChannelRef
+    position: ChannelRef
 
 
 class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -54,7 +54,7 @@ def test_ranges_are_those_of_the_converters_and_of_the_bus(messages: dict[str, M
         assert channel.full_scale / channel.per_unit == pytest.approx(float(half))
         assert channel.lsb / channel.per_unit == pytest.approx(int(width) / 4096)
         assert signal.scale == pytest.approx(int(width) / 4096)
-        assert signal.length == channel.bits
+        assert 2.0**signal.length == channel.levels
 
 
 @pytest.mark.parametrize(
