@@ -67,7 +67,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=options.positive,
         default=100.0,
         metavar="H",
-        help="mean time between false alarms (default 100)",
+        help="mean time between false alarms of the sums (default 100); between tests only what"
+        " lasts is an alarm",
     )
     group.add_argument(
         "--log-file", metavar="FILE", help="append alarms to this file, JSON lines with their time"
