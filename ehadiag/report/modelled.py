@@ -58,8 +58,9 @@ def sensed(experiment: Experiment, constants: PlantConstants) -> tuple[Array, Ar
     current = experiment.trace.current
     model = respond(constants, current, experiment.tick, origin=experiment.origin)
     law = sensor_law(constants)
+    bent = model.spool * (law.spool_even + law.spool_odd * model.spool)
     return (
-        law.spool_offset + law.spool_gain * model.spool,
+        law.spool_offset + model.spool * (law.spool_gain + bent),
         law.pressure_offset + law.pressure_gain * model.pressure,
         law.position_offset + law.position_gain * model.position,
     )

@@ -12,6 +12,7 @@ from ehadiag.core.find_test import Sought, found_tests, rows_of_samples
 from ehadiag.core.recording import (
     CommandMode,
     Environment,
+    OnboardResult,
     Outcome,
     Quality,
     Recording,
@@ -29,6 +30,7 @@ from firmware_iface.alignment.senders import (
 from firmware_iface.alignment.ticks import TickAxis, place
 from firmware_iface.codec.channel import channels_in, choose_channel
 from firmware_iface.codec.decode import DecodedTable, decode
+from firmware_iface.codec.onboard import onboard_results
 from firmware_iface.codec.status import read_status, resolve_turns
 from firmware_iface.mapping.bus_map import BusMap
 from firmware_iface.transport.frames import FrameTable
@@ -103,12 +105,31 @@ def assemble(
     looked_for = sought if axis is not None and not _says_when(decoded, axis, bus_map) else None
     margin = LOOKED_BESIDE if looked_for is not None else 0
     found: list[Recording] = []
-    for item in episodes:
+    own = onboard_results(table, bus_map)
+    for item, after in zip(episodes, (*episodes[1:], None), strict=True):
         one = _recording(
             item, decoded, conflicts, bounds, bus_map, source, notes, len(table), margin
         )
+        if own:
+            one = replace(one, onboard=_onboard_of(item, after, own, bounds, len(table)))
         found += [one] if looked_for is None else _looked_for(one, item, looked_for, margin)
     return tuple(found)
+
+
+def _onboard_of(
+    episode: Episode,
+    after: Episode | None,
+    found: list[tuple[int, OnboardResult]],
+    bounds: _Bounds | None,
+    rows: int,
+) -> OnboardResult | None:
+    """What the computer found between a test and the one after it, of that test."""
+    if bounds is None or episode.ticks == 0:
+        return None
+    begin = bounds.rows(episode, rows)[1]
+    end = rows if after is None or after.ticks == 0 else bounds.rows(after, rows)[0]
+    between = (item for row, item in found if begin <= row < end)
+    return next((item for item in between if item.is_of(episode.test_id)), None)
 
 
 def _says_when(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> bool:
@@ -351,6 +372,7 @@ def _samples(grid: _Grid) -> tuple[Samples, list[str]]:
         command=command,
         saturated=np.stack([filled[key].saturated for key in CHANNEL_KEYS]),
         host_ns=filled["spool"].host_ns,
+        stated=grid.bus_map.stated,
     )
     return samples, notes + said
 
