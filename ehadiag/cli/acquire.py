@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from ehadiag.cli import options
 from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.cli.deadline import Deadline
-from ehadiag.cli.output import progress_bar, say
+from ehadiag.cli.output import say
+from ehadiag.cli.screen.bit_view import BitView
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.printable import plain_name
@@ -26,9 +27,10 @@ if TYPE_CHECKING:
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.session.tester import Progress, TesterOutcome
+    from firmware_iface.transport.frames import Frame
     from firmware_iface.transport.interface import Transport
 
-__all__ = ["STOPPED", "Heard", "acquire"]
+__all__ = ["STOPPED", "Heard", "acquire", "recording_path"]
 
 STOPPED = "stopped by the user"
 STOPPED_TWICE = "stopped by the user; the abort was requested, its answer not waited for"
@@ -57,26 +59,36 @@ def acquire(
     folder: Path,
     session: DiagnosisSession,
     stop: threading.Event,
+    view: BitView,
+    shared: tuple[Transport, Path] | None = None,
 ) -> Heard:
-    """Run the test on the bus."""
+    """Run the test on the bus; `shared`: listen on one that is open, and recorded there already."""
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.session.limits import Limits  # noqa: PLC0415
     from firmware_iface.session.tester import run_test  # noqa: PLC0415
 
-    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-    path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
+    path = shared[1] if shared else recording_path(arguments, folder, test)
     assembler = Assembler(str(path), bus_map)
     outcome, why, listened = None, STOPPED, 0.0
     with working_ahead(session, assembler, test) as ahead:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
+            ours, recorder = (
+                (shared[0], None)
+                if shared
+                else _connect(arguments, actuator, test, bus_map, path, stack)
+            )
             bus = ours.name
-            say(f"test {test.name!r} on {bus}, recording to {path}")
-            display = stack.enter_context(progress_bar())
+            if not shared:
+                say(f"test {test.name!r} on {bus}, recording to {path}")
+            view.connected(ours)
 
             def tell(progress: Progress) -> None:
                 ahead.watch(progress)
-                display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
+                view.progress(progress)
+
+            def take(frame: Frame) -> None:
+                assembler.add(frame)
+                view.take(frame)
 
             began = time.monotonic()
             # From here on a second signal means that the abort was requested and nobody waits.
@@ -94,10 +106,11 @@ def acquire(
                         pressure=_scaled(arguments.max_pressure, 1e6),
                         current=_scaled(arguments.max_current, 1e-3),
                     ),
-                    on_frame=assembler.add,
+                    on_frame=take,
                     stop=stop,
                     progress=tell,
                     all_there=ahead.all_there,
+                    onboard_wait=arguments.onboard_wait,
                 )
             except InputOutputError as error:  # of the recording; the abort was requested
                 why = str(error)
@@ -111,8 +124,10 @@ def acquire(
             why = outcome.why
             if recording.serial is None:
                 recording = replace(recording, serial=outcome.serial)
+            if outcome.onboard is not None:
+                recording = replace(recording, onboard=outcome.onboard)
             if outcome.degraded:
-                say(outcome.degraded)
+                view.notes = (outcome.degraded,)
         if outcome is None or not outcome.complete:
             ahead.abandon()
         if outcome is not None and not outcome.complete:
@@ -170,6 +185,12 @@ def _what_was_heard(recording: Recording, bus: str, listened: float) -> str:
         f"; {quality.foreign} frames heard on {bus} in {listened:.1f} s, none that the mapping "
         "knows: see ehadiag check-bus"
     )
+
+
+def recording_path(arguments: argparse.Namespace, folder: Path, test: StoredTest) -> Path:
+    """Return where the recording goes."""
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    return Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
 
 
 def _unused(folder: Path, test: str, stamp: str) -> Path:

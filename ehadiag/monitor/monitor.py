@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.address import entry_point
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import Channels
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import CommandMode, Environment
 from ehadiag.model.anchor import Anchor
@@ -21,7 +23,7 @@ from ehadiag.model.unit import unit_constants
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
-from ehadiag.monitor.plan import ANCHOR, NOISE, monitor_plan
+from ehadiag.monitor.plan import monitor_plan, usual_noise
 from ehadiag.monitor.prepare import Unit, prepare, rest
 
 __all__ = ["Monitor", "Reading", "Tick"]
@@ -30,6 +32,13 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 TICKS_S = (1e-5, 0.1)
+CLOSED = layout.SETTINGS + layout.Settings._fields.index("closed")
+NUDGED = [
+    layout.MOVING + layout.Moving._fields.index(name)
+    for name in ("xs", "wire", "jack_spool", "lagged")
+]
+"""All that has the spool's position (`ehadiag.monitor.kernel.push_tick`)."""
+LOST = layout.FOLLOWED + layout.Followed._fields.index("lost")
 ALARMS = np.array([[[n & 1, n & 2], [n & 4, n & 8]] for n in range(16)], dtype=np.bool_)
 """What `push_tick` returns, taken apart: rows spool and pressure, columns upper and lower sum."""
 
@@ -101,13 +110,16 @@ class Monitor:
     shift : float
         Of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
     noise : tuple[float, float] | None
-        Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
+        Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22 on the
+        converters, finer ones than 12 bits counted as 12.
     offsets : tuple[float, float]
         Constant errors of spool (m) and pressure sensor (Pa).
     effects : Mapping[str, float] | None
         Nuisances and errors of data by the registry's names, as last identified, SI; None: none.
-    anchor : Anchor
-        How the modelled spool is kept on the measured one.
+    anchor : Anchor | None
+        How the modelled spool is kept on the measured one; None: by the converters' steps.
+    channels : Channels | None
+        Converters of the unit; None: those of its actuator file.
 
     Raises
     ------
@@ -127,17 +139,21 @@ class Monitor:
         noise: tuple[float, float] | None = None,
         offsets: tuple[float, float] = (0.0, 0.0),
         effects: Mapping[str, float] | None = None,
-        anchor: Anchor = ANCHOR,
+        anchor: Anchor | None = None,
+        channels: Channels | None = None,
     ) -> None:
         law = actuator.controller
         tick = 1.0 / law.rate
-        noise = noise or NOISE
+        channels = channels or actuator_channels(actuator)
+        noise = noise or usual_noise(channels)
         values = _checked(faults, noise, offsets, tick)
         base = unit_constants(actuator, environment)
         constants = Unknowns((), (base,), _known(effects or {})).constants(np.empty(0))
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
-        plan = monitor_plan(actuator, constants, self.design, noise, anchor)
+        self.noise: tuple[float, float] = noise
+        """Of spool (m) and pressure (Pa)."""
+        plan = monitor_plan(actuator, constants, self.design, noise, anchor, channels)
         closed = float(mode is CommandMode.POSITION)
         start = Unit(*values, *offsets, 1.0, float(constants.PSR), closed)
         unit = np.array(start, dtype=np.float64)
@@ -193,6 +209,35 @@ class Monitor:
     def __reduce__(self) -> NoReturn:
         """Refuse to be copied: the copy would go on in the memory of this one."""
         raise TypeError("a monitor cannot be copied; make another one")
+
+    def follow(self, mode: CommandMode) -> None:
+        """Take commands as of this mode from the next tick on; all else goes on as it is.
+
+        The control law begins anew, as the flight-control computer's does.
+
+        Parameters
+        ----------
+        mode : CommandMode
+            What the commands are now.
+        """
+        closed = float(mode is CommandMode.POSITION)
+        if self._memory[CLOSED] == closed:
+            return
+        self._memory[CLOSED] = closed
+        self._memory[layout.CONTROL : layout.FOLLOWED] = 0.0
+        # The last command was of another kind: no slope leads on from it.
+        self._memory[LOST] = 1.0
+
+    def nudge(self, spool: float) -> None:
+        """Move the modelled spool, as re-anchoring does, and begin the sums anew.
+
+        Parameters
+        ----------
+        spool : float
+            By how much, m.
+        """
+        self._memory[NUDGED] += spool
+        self._memory[layout.CUSUM : layout.PLAYS] = 0.0
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""
