@@ -17,7 +17,8 @@ from ehadiag.assess.acceptance import (
     remarks_on_recording,
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
-from ehadiag.assess.delays import added, delays_of, put_back, said, worth_it
+from ehadiag.assess.delays import in_time
+from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
     degraded_by,
@@ -26,6 +27,8 @@ from ehadiag.assess.other_faults import (
 )
 from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
+from ehadiag.assess.supply import objections_to_supply
+from ehadiag.assess.travel import objections_to_travel
 from ehadiag.assess.unobservable import lost_positions, observable, what_is_left
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
@@ -36,8 +39,9 @@ from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, kno
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
-from ehadiag.identify.session import Nuisances, Session
+from ehadiag.identify.session import Nuisances, Session, SoFar
 from ehadiag.model.parameters import parameter
+from ehadiag.model.scalar.response import Response
 
 __all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
 
@@ -45,7 +49,6 @@ CHANGED = 6.0
 """Deviations of a calibration beyond which an effect has changed since."""
 LEAST_CHANGE = 0.1
 """Of an effect, in units of its scale."""
-DELAY_ROUNDS = 3
 LEAST_SHARE = 0.75
 """Share of samples without which nothing is worked out of a running test."""
 
@@ -121,6 +124,11 @@ class DiagnosisSession:
         """Stages that did not have to run again when the diagnosis was finished."""
         return self._session.reused
 
+    @property
+    def so_far(self) -> SoFar | None:
+        """Severities as the running test shows them; another thread may look."""
+        return self._session.so_far
+
     def due_s(self, test: StoredTest) -> tuple[float, ...]:
         """Instants of a running test (s) from which there is something more to work out.
 
@@ -168,16 +176,20 @@ class DiagnosisSession:
         if not reasons:
             identification = self._session.finish(experiments, progress)
             if any(item.by_time for item in recordings):
-                experiments, identification, late = self._in_time(
-                    experiments, identification, progress
+                experiments, identification, late = in_time(
+                    experiments, identification, lambda item: self._session.finish(item, progress)
                 )
-            positions = tuple(position_fit(item, identification) for item in experiments)
+            modelled = [response_of(item, identification) for item in experiments]
+            positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
             why = tuple(objections_to_estimate(identification))
             if why:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:
-                why = tuple(_of_positions(positions))
+                why = (
+                    *_of_supplies(experiments, modelled, identification.fit.pressure_offset),
+                    *_of_positions(positions),
+                )
             if not why:
                 verdict, why = degraded_by(others, *judge(identification, self._levels))
         return Diagnosis(
@@ -201,34 +213,6 @@ class DiagnosisSession:
             elapsed=time.perf_counter() - begin,
         )
 
-    def _in_time(
-        self,
-        experiments: list[Experiment],
-        found: Identification,
-        progress: Progress | None,
-    ) -> tuple[list[Experiment], Identification, tuple[str, ...]]:
-        """Put delays between messages back that the response tells, if that explains more.
-
-        A delay of whole ticks is seen only roughly before it is put back: so twice.
-        """
-        first, best = experiments, found
-        total = [delays_of(item, found) for item in experiments]
-        notes: tuple[str, ...] = ()
-        for _ in range(DELAY_ROUNDS):
-            if not any(map(worth_it, total)):
-                break
-            moved = [put_back(item, own) for item, own in zip(first, total, strict=True)]
-            other = self._session.finish(moved, progress)
-            if other.fit.outliers >= best.fit.outliers:
-                break
-            experiments, best = moved, other
-            notes = tuple(said(own, first[0].tick) for own in total)
-            left = [delays_of(item, best) for item in experiments]
-            if not any(map(worth_it, left)):
-                break
-            total = [added(own, rest) for own, rest in zip(total, left, strict=True)]
-        return experiments, best, notes
-
     def _experiments(
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]
     ) -> tuple[list[Experiment], list[str]]:
@@ -240,7 +224,9 @@ class DiagnosisSession:
                 experiment = build_experiment(
                     recording.samples, recording.environment, test, self._actuator
                 )
-                objections = objections_to_experiment(experiment)
+                objections = objections_to_experiment(experiment) or objections_to_travel(
+                    recording.samples, self._actuator
+                )
                 experiments.append(experiment)
             reasons += objections
         if len({recording.serial for recording in recordings} - {None}) > 1:
@@ -327,6 +313,17 @@ def _notes(
         for recording, test in zip(recordings, tests, strict=True)
     )
     return tuple(dict.fromkeys(note for notes in each for note in notes))
+
+
+def _of_supplies(
+    experiments: Sequence[Experiment], modelled: Sequence[Response], offset: float
+) -> list[str]:
+    """Why the supply pressure cannot be what its probe says, each reason once."""
+    found = (
+        objections_to_supply(experiment, response, offset)
+        for experiment, response in zip(experiments, modelled, strict=True)
+    )
+    return list(dict.fromkeys(why for reasons in found for why in reasons))
 
 
 def _of_positions(positions: Sequence[PositionFit | None]) -> list[str]:

@@ -31,7 +31,7 @@ class Budget:
     frames: int = 20_000_000
     size: int = 4 << 30
     seconds: float = 900.0
-    held: int = 1_300_000
+    held: int = 500_000
 
 
 class Spending:

@@ -9,14 +9,17 @@ the smooth outline first and the fine structure last, each sample in its own tim
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
-from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
+from ehadiag.identify.refine.linearisation import Belief, Linearised
 
-__all__ = ["TAIL", "robust_weights", "sharpen"]
+__all__ = ["TAIL", "Sharpened", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
@@ -33,14 +36,34 @@ HELD_BACK = 0.1
 FREE = 1e-9
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sharpened:
+    """What a search ends with.
+
+    Attributes
+    ----------
+    belief : Belief
+    linear : Linearised
+        The model about it, of the last round.
+    settled : bool
+        Whether the belief came to rest.
+    """
+
+    belief: Belief
+    linear: Linearised
+    settled: bool
+
+
 def sharpen(
     model: Derivatives,
     known: Belief,
     begin: Belief,
     information: NDArray[np.float64],
-    rng: np.random.Generator,
-) -> tuple[Belief, bool]:
-    """Sharpen a belief until the noise stops it; also whether it came to rest.
+    linearise: Callable[[Derivatives, Belief], Linearised],
+    *,
+    least_ratio: float = LEAST_RATIO,
+) -> Sharpened:
+    """Sharpen a belief until the noise stops it.
 
     Parameters
     ----------
@@ -52,13 +75,18 @@ def sharpen(
         Where the search begins.
     information : shape (k, k)
         What was known: inverse covariance, 0 where nothing.
+    linearise : callable
+        How the model is made linear over a belief.
+    least_ratio : float
+        By which the belief may become narrower in a round, in any direction.
     """
-    belief = begin
-    for _ in range(MOST_ROUNDS):
-        belief, ratio, step = _round(model, known, belief, information, rng)
-        if ratio > SETTLED_RATIO and step < SETTLED_STEP:
-            return belief, True
-    return belief, False
+    belief, rounds, settled = begin, 0, False
+    while not settled and rounds < MOST_ROUNDS:
+        linear = linearise(model, belief)
+        belief, ratio, step = _narrowed(model, linear, known, belief, information, least_ratio)
+        settled = ratio > SETTLED_RATIO and step < SETTLED_STEP
+        rounds += 1
+    return Sharpened(belief, linear, settled)
 
 
 def robust_weights(linear: Linearised) -> NDArray[np.float64]:
@@ -67,15 +95,15 @@ def robust_weights(linear: Linearised) -> NDArray[np.float64]:
     return np.asarray(1.0 / (variance + linear.residuals**2 / TAIL**2))
 
 
-def _round(
+def _narrowed(
     model: Derivatives,
+    linear: Linearised,
     known: Belief,
     belief: Belief,
     information: NDArray[np.float64],
-    rng: np.random.Generator,
+    least_ratio: float,
 ) -> tuple[Belief, float, float]:
-    """One linearisation; also the ratio by which the belief would narrow most, and the step."""
-    linear = linearised(model, belief, rng)
+    """Belief after a round; also the ratio by which it would narrow most, and the step."""
     weights = robust_weights(linear).ravel()
     rows = linear.jacobian.reshape(len(belief.x), -1)
     weighed = rows * weights
@@ -93,6 +121,6 @@ def _round(
     spread *= WIDTH**2 * max(excess, 1.0)
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
-    kept = np.clip(ratios, LEAST_RATIO, 1.0)
+    kept = np.clip(ratios, least_ratio, 1.0)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
     return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step
