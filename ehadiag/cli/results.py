@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["Results", "make_folder"]
 
 MAX_RESULT_BYTES = 1 << 20
+BESIDE = (".png", ".html")
+"""Suffixes of what stands beside a result: picture and report."""
 
 
 def make_folder(name: str) -> Folder:
@@ -65,12 +67,16 @@ class Results:
         The parsed command line.
     folder : Folder | None
         For JSON and pictures; None: nothing is written.
+    taken : Iterable[str]
+        Names, without suffix, that other files of the call have there.
     """
 
-    def __init__(self, arguments: argparse.Namespace, folder: Folder | None) -> None:
+    def __init__(
+        self, arguments: argparse.Namespace, folder: Folder | None, taken: Iterable[str] = ()
+    ) -> None:
         self._arguments = arguments
         self._folder = folder
-        self._names: set[str] = set()
+        self._names = set(taken)
         self._keeper = Keeper(arguments)
         if arguments.report:
             need_report_library()
@@ -180,9 +186,9 @@ class Results:
             try:
                 if _same_recording(folder, name, line):
                     folder.write(name, content)
-                    for suffix in (".png", ".html"):  # of the result that is no more
+                    for suffix in BESIDE:  # of the result that is no more
                         folder.remove(f"{stem}{suffix}")
-                elif folder.exists(f"{stem}.png"):
+                elif any(folder.exists(f"{stem}{suffix}") for suffix in BESIDE):
                     continue
                 else:
                     folder.write_new(name, content)

@@ -14,6 +14,7 @@ from ehadiag.cli.drawing import can_be_drawn, drawn
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import progress_bar, say_if_compiling
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import NotTestedError
@@ -95,6 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
     levels = Levels(arguments.advisory, arguments.limit, Rule(arguments.rule))
     bus_map = options.the_bus_map(arguments)
     refuse_beforehand(arguments, test, actuator, bus_map)
+    if arguments.record:
+        refuse_overwriting(arguments, [Output("--record", arguments.record)])
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
     from ehadiag.assess.diagnosis import (  # noqa: PLC0415 - loads numba

@@ -14,6 +14,7 @@ from ehadiag.cli.batch.job import Job
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, names_taken, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
@@ -83,7 +84,11 @@ def run(arguments: argparse.Namespace) -> int:
     # What is wrong with the options is said before anything slow is loaded.
     _refuse_contradictions(arguments)
     job = _job(arguments)
-    results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
+    outputs = _outputs(arguments)
+    reads = [("the log", item.name) for item in inputs]
+    refuse_overwriting(arguments, outputs, [*reads, ("the DBC", job.bus_map.name)])
+    folder = make_folder(arguments.out) if arguments.out else None
+    results = Results(arguments, folder, names_taken(folder.path, outputs) if folder else ())
     say_if_compiling()
     if arguments.merge:
         code = _merged(job, results, inputs)
@@ -115,6 +120,13 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
             raise ConfigurationError(f"{name}: --report draws samples, which workers do not send")
     if arguments.cluster and arguments.jobs:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
+
+
+def _outputs(arguments: argparse.Namespace) -> list[Output]:
+    """Files that hold the results of the whole call."""
+    named = [("--results", name) for name in arguments.results]
+    named += [(f"--{key}", getattr(arguments, key)) for key in ("resume", "junit", "summary")]
+    return [Output(option, name) for option, name in named if name]
 
 
 def _job(arguments: argparse.Namespace) -> Job:

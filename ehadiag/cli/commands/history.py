@@ -15,6 +15,7 @@ from ehadiag.cli.history_file import (
     the_usage,
 )
 from ehadiag.cli.output import emit, put, rendered, say
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import printable, valid_text
@@ -77,6 +78,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what the verb says."""
+    if getattr(arguments, "out", None):
+        refuse_overwriting(arguments, [Output("--out", arguments.out)])
     {
         "init": _init,
         "list": _list,

@@ -11,6 +11,7 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import need_report_library, report_of
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
@@ -58,10 +59,14 @@ def run(arguments: argparse.Namespace) -> int:
     need_report_library()
     levels = Levels(arguments.advisory, arguments.limit)
     options.the_actuator(arguments)
-    options.the_bus_map(arguments)
+    bus_map = options.the_bus_map(arguments)
+    results = list(dict.fromkeys(arguments.results))
+    pages = [Output("report", str(_page_of(Path(name)))) for name in results]
+    reads = [("the result", name) for name in results]
+    refuse_overwriting(arguments, pages, [*reads, ("the DBC", bus_map.name)])
     options.known_tests(arguments.test)
     code = 0
-    for name in arguments.results:
+    for name in results:
         try:
             _write(arguments, Path(name), levels)
         except EhadiagError as error:
@@ -79,13 +84,17 @@ def _write(arguments: argparse.Namespace, path: Path, levels: Levels) -> None:
         say(f"{error}; no responses are drawn")
         diagnosis = None
     page = report_of(line, levels, history_place(arguments), diagnosis)
-    target = path.with_suffix(".html")
+    target = _page_of(path)
     try:
         with Folder.at(target.parent, RESULT_MODE, follow=True) as folder:
             folder.write(target.name, page)
     except OSError as error:
         raise InputOutputError(f"report {target}: {error.strerror or error}") from None
     say(f"wrote {target}")
+
+
+def _page_of(result: Path) -> Path:
+    return result.with_suffix(".html")
 
 
 def _result(path: Path, line: str) -> dict[str, Any]:
