@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
+from ehadiag.cli.batch.alone import alone_with
 from ehadiag.cli.batch.job import Job
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.fingerprint import fingerprint
@@ -20,6 +22,14 @@ __all__ = ["Journal"]
 MAX_LINE = 1 << 20
 Key = tuple[str, int, int]
 """Path, size and time of the last change of a log."""
+
+
+class _Line(NamedTuple):
+    """A result that an earlier call left."""
+
+    log: str
+    failed: bool
+    place: tuple[int, int]
 
 
 class Journal:
@@ -41,7 +51,8 @@ class Journal:
     Raises
     ------
     InputOutputError
-        The file is there and nobody wants to go on with it; it cannot be read or written.
+        The file is there and nobody wants to go on with it; another call uses it; it cannot be
+        read or written.
     ConfigurationError
         It holds something else, or results of other options or of another version.
     """
@@ -56,8 +67,17 @@ class Journal:
         """What the results of this call have in common."""
         self._known: dict[Key, list[tuple[int, int]]] = {}
         self._order: list[tuple[int, int]] = []
+        self._there: list[_Line] = []
+        """What earlier calls left, in its order."""
+        self._diagnosed: set[str] = set()
+        self._failed: set[str] = set()
+        """Logs of this call, by whether they gave a result."""
+        self._held = ExitStack()
         try:
-            self._file = self._open(resume)
+            self._held.enter_context(alone_with(self._path))
+            with self._held:  # let go where the file cannot be opened
+                self._file = self._open(resume)
+                self._held = self._held.pop_all()
         except FileExistsError:
             raise InputOutputError(
                 f"results {name}: there is such a file; go on with it by --resume, or name another"
@@ -76,8 +96,10 @@ class Journal:
     def add(self, line: str, *, reused: bool) -> None:
         """Write a result down, or take note of where one that was there already has its place."""
         content = line.encode() + b"\n"
+        tree = json.loads(line)
+        (self._failed if tree["error"] else self._diagnosed).add(_log_of(tree))
         if reused:
-            log = json.loads(line)["recordings"][0]["log"]
+            log = tree["recordings"][0]["log"]
             places = self._known[log["path"], log["bytes"], log["modified_ns"]]
             self._order.append(places[log["result"] - 1])
             return
@@ -91,9 +113,14 @@ class Journal:
         self._order.append((at, len(content)))
 
     def settle(self) -> None:
-        """Bring the file into the order of the inputs, where it is not: each once as named."""
+        """Bring the results of this call into the order of its inputs, each once as named.
+
+        Those of other logs stay, before them, and so does what was found of a log that cannot be
+        read any more.
+        """
+        order = [item.place for item in self._there if not self._is_replaced(item)] + self._order
         at = 0
-        for start, size in self._order:
+        for start, size in order:
             if start != at:
                 break
             at += size
@@ -106,11 +133,14 @@ class Journal:
                 Folder.at(self._path.parent, RESULT_MODE, follow=True) as folder,
                 folder.drafted(self._path.name) as file,
             ):
-                for start, size in self._order:
+                for start, size in order:
                     file.write(self._line(start, size).encode() + b"\n")
                 self._file.close()  # Windows replaces no file that is open
         except OSError as error:
             raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
+
+    def _is_replaced(self, item: _Line) -> bool:
+        return item.log in self._diagnosed or (item.failed and item.log in self._failed)
 
     def __enter__(self) -> Journal:
         return self
@@ -122,6 +152,7 @@ class Journal:
         trace: TracebackType | None,
     ) -> None:
         self._file.close()
+        self._held.close()
 
     def _open(self, resume: bool) -> BinaryIO:
         if not (resume and os.path.lexists(self._path)):
@@ -150,6 +181,7 @@ class Journal:
             tree = self._checked(line, number)
             if tree["error"] is None and len(tree["recordings"]) == 1:
                 self._remember(groups, tree["recordings"][0]["log"], (at, len(line)))
+            self._there.append(_Line(_log_of(tree), bool(tree["error"]), (at, len(line))))
             at += len(line)
 
     def _remember(
@@ -188,3 +220,11 @@ class Journal:
     def _line(self, at: int, size: int) -> str:
         self._file.seek(at)
         return self._file.read(size).decode().rstrip("\n")
+
+
+def _log_of(tree: dict[str, Any]) -> str:
+    """Path of the log that a result is of."""
+    with suppress(KeyError, IndexError, TypeError):
+        log = tree["error"]["log"] if tree["error"] else tree["recordings"][0]["log"]
+        return str(log["path"])
+    return os.path.abspath(str(tree.get("source")))
