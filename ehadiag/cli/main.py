@@ -112,8 +112,9 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; more logs may follow the options that follow logs."""
     parser, commands = _parser_and_commands()
     given = sys.argv[1:] if argv is None else list(argv)
-    command = next((item for item in given if not item.startswith("-")), "")
-    used = apply_defaults(commands[command], command) if command in commands else []
+    used, ignored = apply_defaults(commands, given)
+    for text in ignored:
+        say(text)
     arguments, rest = parser.parse_known_args(given)
     logs = getattr(arguments, "logs", None)
     late = [item for item in rest if item == "-" or not item.startswith("-")]
