@@ -28,11 +28,12 @@ from ehadiag.cli.commands import (
 )
 from ehadiag.cli.commands import check_bus as checkbus
 from ehadiag.cli.defaults import NAME, apply_defaults
+from ehadiag.cli.exit_codes import FAILED, worst_code
 from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
 from ehadiag.cli.output import abandon, say
 from ehadiag.cli.verbose import tell_all
 from ehadiag.cli.version import ShowVersions
-from ehadiag.core.errors import EhadiagError, InputOutputError
+from ehadiag.core.errors import EhadiagError
 from ehadiag.core.printable import printable
 
 __all__ = ["main", "process"]
@@ -97,11 +98,11 @@ def _run(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:
         # Whoever read our output has gone.
         abandon(sys.stdout)
-        return max(code, InputOutputError.exit_code)
+        return worst_code((code, FAILED))
     except OSError as error:
         abandon(sys.stdout)
         say(f"{error.filename or 'standard output'}: {error.strerror or error}")
-        return max(code, InputOutputError.exit_code)
+        return worst_code((code, FAILED))
     except KeyboardInterrupt:
         say("interrupted")
         return INTERRUPTED

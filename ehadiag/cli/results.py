@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels
+from ehadiag.cli.exit_codes import worst_code
 from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import emit, put, rendered, say
@@ -106,8 +107,9 @@ class Results:
     ) -> int:
         """Write and print one result; return its exit code.
 
-        That is the verdict's, or 3 where something could not be written and 3 is more. From here on
-        signals do not change it: the first leaves the picture out, the second what is not out yet.
+        That is the verdict's, or 3 where something could not be written and that is worse (see
+        `worst_code`). From here on signals do not change it: the first leaves the picture out, the
+        second what is not out yet.
 
         line: JSON object. name: of the files, without suffix; made safe, and numbered where it is
         taken. draw: makes the picture; None: there is none.
@@ -136,7 +138,7 @@ class Results:
             if self._folder is not None and written:
                 say("wrote " + ", ".join(str(self._folder.path / item) for item in written))
         self.stopped = self.stopped or came.is_set()
-        return max(codes)
+        return worst_code(codes)
 
     def refuse(self, line: str, error: str) -> None:
         """Say what is wrong with an input, and print its object; `ehadiag.diagnosis/1` has none."""

@@ -131,7 +131,7 @@ def finish(
     Returns
     -------
     int
-        The verdict's, or 3 where something could not be written and 3 is more.
+        The verdict's, or 3 where something could not be written and that is worse.
     """
     from ehadiag.report.json_line import json_line  # noqa: PLC0415 - loads the model's names
 

@@ -11,6 +11,7 @@ from ehadiag.cli import options
 from ehadiag.cli.batch.call import add_batch_options, diagnose_all, finish
 from ehadiag.cli.batch.inputs import Input, expand
 from ehadiag.cli.batch.job import Job
+from ehadiag.cli.exit_codes import code_of_inputs, worst_code
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import say, say_if_compiling
@@ -154,7 +155,7 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
     """Make one estimate from all logs."""
     together: list[Recording] = []
     files: list[LogFile | None] = []
-    spent, codes = 0.0, [0]
+    spent, codes = 0.0, []
     for item in inputs:
         try:
             if item.why:
@@ -164,12 +165,13 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
             say(str(error))
             codes.append(error.exit_code)
             continue
+        codes.append(0)
         together += reading.recordings
         files += [file for _, file, _ in reading.each()]
         spent += reading.seconds
-    if max(codes) > 0:
+    if any(codes):
         say("no joint estimate: not all of the logs could be read")
-        return max(codes)
+        return code_of_inputs(codes)
     return finish(job, results, together, files, Spent(spent), "joint")
 
 
@@ -184,7 +186,7 @@ def _merged(job: Job, results: Results, inputs: Sequence[Input]) -> int:
         finish(job, results, [recording], [file], Spent(reading.seconds), name + suffix)
         for recording, file, suffix in reading.each()
     ]
-    return max(codes)
+    return worst_code(codes)
 
 
 def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
@@ -196,7 +198,7 @@ def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
     tests = options.known_tests(arguments.test)
     sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
     meaning = Meaning(bus_map, options.the_columns(arguments), sought)
-    code = 0
+    codes = []
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:
         try:
@@ -209,5 +211,7 @@ def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
             )
         except EhadiagError as error:
             say(str(error))
-            code = max(code, error.exit_code)
-    return code
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    return code_of_inputs(codes)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
+from ehadiag.cli.exit_codes import code_of_inputs
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.output import say, say_if_compiling
 from ehadiag.cli.overwriting import Output, refuse_overwriting
@@ -65,14 +66,16 @@ def run(arguments: argparse.Namespace) -> int:
     reads = [("the result", name) for name in results]
     refuse_overwriting(arguments, pages, [*reads, ("the DBC", bus_map.name)])
     options.known_tests(arguments.test)
-    code = 0
+    codes = []
     for name in results:
         try:
             _write(arguments, Path(name), levels)
         except EhadiagError as error:
             say(str(error))
-            code = max(code, error.exit_code)
-    return code
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    return code_of_inputs(codes)
 
 
 def _write(arguments: argparse.Namespace, path: Path, levels: Levels) -> None:
