@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import os
 from pathlib import Path
@@ -116,6 +117,8 @@ class Keeper:
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self._arguments = arguments
+        self._kept: set[bytes] | None = None
+        """Digests of what was in it when that was asked first."""
         self.place = self._place()
         """Of the history; None: nothing is kept."""
         if self.place is not None:
@@ -145,6 +148,18 @@ class Keeper:
         except ConfigurationError as error:  # exchanged since the call began
             raise InputOutputError(str(error)) from None
 
+    def has(self, line: str) -> bool:
+        """Whether a result need not be appended: it was, or there is no history.
+
+        line: its JSON result.
+        """
+        if self.place is None:
+            return True
+        if self._kept is None:
+            with self._open() as history:
+                self._kept = {_digest(kept) for kept in history.results()}
+        return _digest(line) in self._kept
+
     @property
     def _simulated(self) -> bool:
         return bool(getattr(self._arguments, "simulate", False))
@@ -163,6 +178,10 @@ class Keeper:
 
         assert self.place is not None
         return History(self.place, create=True)
+
+
+def _digest(line: str) -> bytes:
+    return hashlib.sha256(line.encode()).digest()
 
 
 def _not_negative(text: str) -> float:

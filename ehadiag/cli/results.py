@@ -155,6 +155,28 @@ class Results:
                 f"{tree['verdict'].replace('_', ' ')}  {tree['source']}  (found by an earlier call)"
             )
 
+    def has(self, line: str, name: str) -> bool:
+        """Whether all that this call is to write of a result is there from an earlier one.
+
+        line: JSON object. name: of the files, without suffix, as for `deliver`.
+        """
+        return self._keeper.has(line) and self._has_files(line, plain_name(name))
+
+    def _has_files(self, line: str, wanted: str) -> bool:
+        folder = self._folder
+        if folder is None:
+            return True
+        content = self._said_as(line).encode() + b"\n"
+        suffixes = [".png"] * self.pictures + [".html"] * bool(self._arguments.report)
+        for stem in _numbered(wanted):
+            try:
+                there = folder.read(f"{stem}.json", MAX_RESULT_BYTES)
+            except OSError:
+                return False
+            if there == content:
+                return all(folder.exists(f"{stem}{suffix}") for suffix in suffixes)
+        raise AssertionError("numbers have no end")
+
     @property
     def pictures(self) -> bool:
         """Whether pictures are wanted."""
@@ -180,8 +202,7 @@ class Results:
         if folder is None:
             return None
         content = line.encode() + b"\n"
-        candidates = (wanted if n == 1 else f"{wanted}-{n}" for n in itertools.count(1))
-        for stem in candidates:
+        for stem in _numbered(wanted):
             if stem in self._names:
                 continue
             name = f"{stem}.json"
@@ -231,6 +252,11 @@ def _said(codes: list[int]) -> Iterator[None]:
     except InputOutputError as error:
         codes.append(error.exit_code)
         say(str(error))
+
+
+def _numbered(name: str) -> Iterator[str]:
+    """Names to try one after another."""
+    return (name if n == 1 else f"{name}-{n}" for n in itertools.count(1))
 
 
 def _same_recording(folder: Folder, name: str, line: str) -> bool:

@@ -199,6 +199,18 @@ class History:
             for row in rows
         ]
 
+    def results(self) -> Iterator[str]:
+        """Give the JSON result of each diagnosis, in the order in which they were appended.
+
+        Yields
+        ------
+        str
+            One line, without its end.
+        """
+        with self._told():
+            for row in self._connection.execute("SELECT result FROM diagnosis ORDER BY id"):
+                yield row["result"]
+
     def events(self, serial: int | None = None) -> list[Event]:
         """Return the maintenance events, in the order in which they were appended.
 

@@ -169,6 +169,8 @@ class _Call:
         self._summary = Summary(len(inputs))
         self._takes: list[Take] = [self._summary.take]
         self._journals: list[Journal] = []
+        self._reusable: dict[str, bool] = {}
+        """Logs that were asked for, by whether an earlier call's results stand for them."""
         self._came = 0
 
     def run(self) -> int:
@@ -293,10 +295,18 @@ class _Call:
         self._came += 1
 
     def _known(self, item: Input) -> list[str]:
-        """Return what an earlier call found of a log; nothing where it must be diagnosed."""
+        """Return what an earlier call found of a log; nothing where it must be diagnosed.
+
+        That is also where something that this call is to write of it is not there yet: pictures,
+        reports and entries of a history are not made from a line of results.
+        """
         if not self._arguments.resume:
             return []
-        return self._journals[0].found(item.name)
+        lines = self._journals[0].found(item.name)
+        if item.name not in self._reusable:
+            names = [Path(item.name).stem + _suffix(line) for line in lines]
+            self._reusable[item.name] = all(map(self._results.has, lines, names))
+        return lines if self._reusable[item.name] else []
 
     def _reuse(self, item: Input) -> bool:
         """Bring out what an earlier call found, if it did."""
@@ -357,6 +367,12 @@ class _Call:
                 say(str(error))
                 code = worst_code({code, FAILED})
         return code
+
+
+def _suffix(line: str) -> str:
+    """What the files of a result are called more than its log, see `Reading.each`."""
+    log = json.loads(line)["recordings"][0]["log"]
+    return f"-{log['result']}" if log["results"] > 1 else ""
 
 
 def _in_worker(job: Job, item: Input) -> tuple[Finding, ...]:

@@ -86,3 +86,44 @@ def test_a_file_that_is_refused_is_let_go(run: Run, logs: None) -> None:
 def test_no_folder_is_made_for_results(run: Run, logs: None) -> None:
     assert "none/r.jsonl" in run("diagnose", "none.blf", "--results", "none/r.jsonl").message
     assert not Path("none").exists()
+
+
+def reused(run: Run, *arguments: object) -> int:
+    result = run("diagnose", "--resume", "all.jsonl", "--summary", "s.json", *arguments)
+    assert result.code == 10, result.err
+    found: int = json.loads(Path("s.json").read_text())["reused"]
+    assert len(kept()) == 2
+    return found
+
+
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_what_a_call_is_to_write_is_written_of_earlier_results_too(
+    jobs: int, run: Run, logs: None
+) -> None:
+    both = ("a.blf", "b.blf", "--jobs", jobs)
+    assert reused(run, *both) == 0
+    assert reused(run, *both) == 2
+    out = ("--out", "o", *both)
+    assert reused(run, *out) == 0  # a picture needs the samples
+    assert sorted(path.name for path in Path("o").iterdir()) == [
+        "a.json", "a.png", "b.json", "b.png",
+    ]  # fmt: skip
+    assert reused(run, *out) == 2
+    Path("o/b.png").unlink()
+    assert reused(run, *out) == 1
+    assert Path("o/b.png").exists()
+    history = ("--history", "h.sqlite", *both)
+    assert reused(run, *history) == 0
+    assert reused(run, *history) == 2
+    listed = run("history", "list", "--all", "--json", "--history", "h.sqlite").objects
+    assert len(listed) == 2
+
+
+@pytest.mark.slow
+def test_reports_are_written_of_earlier_results_too(run: Run, logs: None) -> None:
+    first = ("--out", "o", "--no-picture", "a.blf", "b.blf")
+    assert reused(run, *first) == 0
+    assert reused(run, *first) == 2
+    assert reused(run, "--report", *first) == 0
+    assert {path.name for path in Path("o").glob("*.html")} == {"a.html", "b.html"}
+    assert reused(run, "--report", *first) == 2
