@@ -53,11 +53,13 @@ __all__ = [
     "the_bus_map",
     "the_columns",
     "the_sought",
+    "unit_serial",
 ]
 
 TEST = "open|closed|NUMBER|FILE"
 """How every command lets a test be named."""
 DEFAULT_BAUD = 921600
+MOST_SERIAL = (1 << 63) - 1
 TIME_LIMIT_S = 600.0
 """Some ten thousand times what a sound recording takes."""
 
@@ -521,6 +523,15 @@ def count(text: str) -> int:
     """Read a whole number above zero."""
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
+    return int(text)
+
+
+def unit_serial(text: str) -> int:
+    """Read a serial number of a unit, as far as buses and histories carry them."""
+    if not (text.isascii() and text.isdigit()) or len(text) > 19 or int(text) > MOST_SERIAL:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: a serial number is a whole number, 0 … {MOST_SERIAL}"
+        )
     return int(text)
 
 

@@ -326,6 +326,10 @@ class History:
         except sqlite3.Error as error:
             why = WHY.get(_name(error), str(error))
             raise InputOutputError(f"history {self.path}: {why}") from None
+        except OverflowError:
+            raise InputOutputError(
+                f"history {self.path}: a number beyond what SQLite holds, 64 bits"
+            ) from None
         except ConfigurationError as error:
             raise ConfigurationError(f"history {self.path} {error}") from None
 

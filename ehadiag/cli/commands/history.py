@@ -14,6 +14,7 @@ from ehadiag.cli.history_file import (
     open_history,
     the_usage,
 )
+from ehadiag.cli.options import unit_serial
 from ehadiag.cli.output import emit, put, rendered, say
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.core.errors import ConfigurationError, InputOutputError
@@ -93,7 +94,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _add_serial(parser: argparse.ArgumentParser, *, required: bool) -> None:
     parser.add_argument(
-        "--serial", type=int, metavar="N", required=required, help="serial number of the unit"
+        "--serial",
+        type=unit_serial,
+        metavar="N",
+        required=required,
+        help="serial number of the unit",
     )
 
 
