@@ -122,8 +122,7 @@ class Keeper:
         self.place = self._place()
         """Of the history; None: nothing is kept."""
         if self.place is not None:
-            # Said before a test begins or a log is read.
-            self._open().close()
+            self._try()
         elif arguments.hours is not None or arguments.cycles is not None:
             raise ConfigurationError(
                 "--hours, --cycles: no health history to keep them in: name one by --history, or"
@@ -155,6 +154,8 @@ class Keeper:
         """
         if self.place is None:
             return True
+        if not self.place.exists():
+            return False
         if self._kept is None:
             with self._open() as history:
                 self._kept = {_digest(kept) for kept in history.results()}
@@ -172,6 +173,16 @@ class Keeper:
         if self._simulated and not self._arguments.history:
             return None  # a simulated unit is none of the fleet's unless somebody wants it there
         return history_place(self._arguments)
+
+    def _try(self) -> None:
+        """Say before a test begins or a log is read what is wrong; make no file yet."""
+        assert self.place is not None
+        if os.path.lexists(self.place):
+            self._open().close()
+        elif not os.access(self.place.parent, os.W_OK | os.X_OK):
+            raise InputOutputError(
+                f"history {self.place}: cannot be opened: no such folder, or no right to it"
+            )
 
     def _open(self) -> History:
         from ehadiag.history.store import History  # noqa: PLC0415

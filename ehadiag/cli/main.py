@@ -110,17 +110,17 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the command line; more logs may follow the options that follow logs."""
+    """Parse the command line; more logs (results) may follow the options that follow logs."""
     parser, commands = _parser_and_commands()
     given = sys.argv[1:] if argv is None else list(argv)
     used, ignored = apply_defaults(commands, given)
     for text in ignored:
         say(text)
     arguments, rest = parser.parse_known_args(given)
-    logs = getattr(arguments, "logs", None)
     late = [item for item in rest if item == "-" or not item.startswith("-")]
-    if logs is not None and len(late) == len(rest):
-        logs += late
+    files = _repeated(commands, given)
+    if files is not None and len(late) == len(rest):
+        getattr(arguments, files).extend(late)
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if used and (arguments.verbose or NAME in used):
@@ -128,6 +128,15 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     if arguments.verbose:
         tell_all(arguments)
     return arguments
+
+
+def _repeated(commands: Mapping[str, argparse.ArgumentParser], given: Sequence[str]) -> str | None:
+    """Where the arguments of the command are that may be repeated; None where it has none."""
+    command = next((item for item in given if not item.startswith("-")), "")
+    actions = commands[command]._actions if command in commands else []
+    return next(
+        (item.dest for item in actions if item.nargs == "+" and not item.option_strings), None
+    )
 
 
 def _print_whatever_comes() -> None:

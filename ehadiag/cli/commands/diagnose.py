@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
+NOT_LISTED = (
+    "joint", "out", "report", "history", "hours", "cycles", "results", "resume", "junit", "summary",
+)  # fmt: skip
+"""Options that say what becomes of a diagnosis."""
+UNUSED: tuple[object, ...] = (None, False, [])
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command."""
@@ -194,6 +200,9 @@ def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
     from ehadiag.cli.listing import print_list  # noqa: PLC0415
     from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415
 
+    if unused := [name for name in NOT_LISTED if getattr(arguments, name) not in UNUSED]:
+        told = ", ".join(f"--{name}" for name in unused)
+        say(f"--list diagnoses none, and has no use for {told}")
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
     tests = options.known_tests(arguments.test)
     sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
