@@ -17,6 +17,7 @@ from ehadiag.assess.acceptance import (
     remarks_on_recording,
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
+from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
     degraded_by,
@@ -25,6 +26,7 @@ from ehadiag.assess.other_faults import (
 )
 from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
+from ehadiag.assess.supply import objections_to_supply
 from ehadiag.assess.travel import objections_to_travel
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
@@ -35,8 +37,9 @@ from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, kno
 from ehadiag.identify.result import Identification
 from ehadiag.identify.search.solvers import CompactGa, Solver
 from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
-from ehadiag.identify.session import Nuisances, Session
+from ehadiag.identify.session import Nuisances, Session, SoFar
 from ehadiag.model.parameters import parameter
+from ehadiag.model.scalar.response import Response
 
 __all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
 
@@ -119,6 +122,11 @@ class DiagnosisSession:
         """Stages that did not have to run again when the diagnosis was finished."""
         return self._session.reused
 
+    @property
+    def so_far(self) -> SoFar | None:
+        """Severities as the running test shows them; another thread may look."""
+        return self._session.so_far
+
     def due_s(self, test: StoredTest) -> tuple[float, ...]:
         """Instants of a running test (s) from which there is something more to work out.
 
@@ -158,13 +166,17 @@ class DiagnosisSession:
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
         if not reasons:
             identification = self._session.finish(experiments, progress)
-            positions = tuple(position_fit(item, identification) for item in experiments)
+            modelled = [response_of(item, identification) for item in experiments]
+            positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
             why = tuple(objections_to_estimate(identification))
             if why:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:
-                why = tuple(_of_positions(positions))
+                why = (
+                    *_of_supplies(experiments, modelled, identification.fit.pressure_offset),
+                    *_of_positions(positions),
+                )
             if not why:
                 verdict, why = degraded_by(others, *judge(identification, self._levels))
         return Diagnosis(
@@ -287,6 +299,17 @@ def _notes(
         for recording, test in zip(recordings, tests, strict=True)
     )
     return tuple(dict.fromkeys(note for notes in each for note in notes))
+
+
+def _of_supplies(
+    experiments: Sequence[Experiment], modelled: Sequence[Response], offset: float
+) -> list[str]:
+    """Why the supply pressure cannot be what its probe says, each reason once."""
+    found = (
+        objections_to_supply(experiment, response, offset)
+        for experiment, response in zip(experiments, modelled, strict=True)
+    )
+    return list(dict.fromkeys(why for reasons in found for why in reasons))
 
 
 def _of_positions(positions: Sequence[PositionFit | None]) -> list[str]:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from ehadiag.core.channels import POSITION
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.result import Identification
-from ehadiag.model.scalar.response import respond
+from ehadiag.model.scalar.response import Response
 
 __all__ = ["PositionFit", "objections_to_position", "position_fit"]
 
@@ -62,19 +61,27 @@ class PositionFit:
     outliers: float
 
 
-def position_fit(experiment: Experiment, identification: Identification) -> PositionFit | None:
-    """Fit the sensor's gain and drift; None where there are too few samples of the position."""
+def position_fit(experiment: Experiment, modelled: Response) -> PositionFit | None:
+    """Fit the sensor's gain and drift; None where there are too few samples of the position.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What was measured.
+    modelled : Response
+        Of the identified actuator, over the same ticks.
+
+    Returns
+    -------
+    PositionFit | None
+        What the sensor shows of the modelled motion.
+    """
     span = round(SPAN_S / experiment.tick)
     measured = experiment.position[span:] - experiment.position[:-span]
     seen = np.isfinite(measured)
     if seen.mean() < LEAST_SAMPLES:
         return None
-    model = respond(
-        identification.constants(experiment.constants),
-        experiment.trace.current,
-        experiment.tick,
-        origin=experiment.origin,
-    ).position
+    model = modelled.position
     unit = np.sqrt(2.0) * max(experiment.position_noise, POSITION.lsb)
     travel = (model[span:] - model[:-span])[seen] / unit
     moves = float(np.sqrt(np.mean(travel**2))) * unit >= LEAST_TRAVEL_LSB * POSITION.lsb

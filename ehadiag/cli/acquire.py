@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from ehadiag.cli import options
 from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.cli.deadline import Deadline
-from ehadiag.cli.output import progress_bar, say
+from ehadiag.cli.output import say
+from ehadiag.cli.screen.bit_view import BitView
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.printable import plain_name
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.session.tester import Progress, TesterOutcome
+    from firmware_iface.transport.frames import Frame
     from firmware_iface.transport.interface import Transport
 
 __all__ = ["STOPPED", "Heard", "acquire"]
@@ -57,6 +59,7 @@ def acquire(
     folder: Path,
     session: DiagnosisSession,
     stop: threading.Event,
+    view: BitView,
 ) -> Heard:
     """Run the test on the bus."""
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
@@ -72,11 +75,15 @@ def acquire(
             ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
             bus = ours.name
             say(f"test {test.name!r} on {bus}, recording to {path}")
-            display = stack.enter_context(progress_bar())
+            view.connected(ours)
 
             def tell(progress: Progress) -> None:
                 ahead.watch(progress)
-                display(progress.phase.name.lower(), min(progress.elapsed / progress.duration, 1.0))
+                view.progress(progress)
+
+            def take(frame: Frame) -> None:
+                assembler.add(frame)
+                view.take(frame)
 
             began = time.monotonic()
             # From here on a second signal means that the abort was requested and nobody waits.
@@ -94,7 +101,7 @@ def acquire(
                         pressure=_scaled(arguments.max_pressure, 1e6),
                         current=_scaled(arguments.max_current, 1e-3),
                     ),
-                    on_frame=assembler.add,
+                    on_frame=take,
                     stop=stop,
                     progress=tell,
                     all_there=ahead.all_there,
@@ -112,7 +119,7 @@ def acquire(
             if recording.serial is None:
                 recording = replace(recording, serial=outcome.serial)
             if outcome.degraded:
-                say(outcome.degraded)
+                view.notes = (outcome.degraded,)
         if outcome is None or not outcome.complete:
             ahead.abandon()
         if outcome is not None and not outcome.complete:

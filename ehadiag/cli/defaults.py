@@ -3,7 +3,7 @@
 An option on the command line wins over its variable, that over the project's file (in the working
 folder), that over the user's. A project's file may come from others: it sets only what cannot
 reach beyond a diagnosis (`PROJECT`), must belong to the caller or root, and is named when it is
-used. Of a command that transmits it names neither test nor bus: nobody shall move a surface by
+used. Of a command that can transmit it names neither test nor bus: nobody shall move a surface by
 entering a folder. The user's own may set every option that has a value.
 """
 
@@ -33,7 +33,7 @@ PROJECT = frozenset(
     }
 )  # fmt: skip
 """Options that a project's file may set."""
-LISTENING = frozenset({"check-bus"})
+LISTENING = frozenset({"check-bus", "monitor"})
 """Commands with a bus that send nothing on it."""
 SENT = frozenset(
     {"test", "interface", "channel", "bitrate", "fd", "data_bitrate", "app_name"}
@@ -111,7 +111,7 @@ def apply_defaults(
             if "interface" in known[command] and command not in LISTENING:
                 if sent := sorted(SENT & values.keys() & known[command]):
                     ignored.append(
-                        f"{where}: {', '.join(sent)} ignored: {command} transmits, and takes test"
+                        f"{where}: {', '.join(sent)} ignored: {command} can transmit, and takes test"
                         " and bus from no project's file; name them on the command line, in"
                         f" {user_file()} or by {PREFIX}…"
                     )

@@ -38,13 +38,19 @@ def signals_restored() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def interrupt_on_signals() -> None:
-    """Let each signal raise KeyboardInterrupt, as Ctrl-C does anyway."""
+def interrupt_on_signals() -> threading.Event:
+    """Let each signal raise KeyboardInterrupt, as Ctrl-C does anyway; return whether one came.
+
+    One that comes while the compiler calls back is swallowed there, and ends in another error.
+    """
+    came = threading.Event()
 
     def handle(_number: int, _frame: FrameType | None) -> None:
+        came.set()
         raise KeyboardInterrupt
 
     _handle(handle)
+    return came
 
 
 def keep_signals() -> threading.Event:

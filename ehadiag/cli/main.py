@@ -6,6 +6,7 @@ import argparse
 import io
 import os
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -19,9 +20,11 @@ from ehadiag.cli.commands import (
     export,
     history,
     init,
+    monitor,
     replay,
     report,
     rul,
+    serve,
     sim,
     tests,
     warmup,
@@ -72,19 +75,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         Wrong usage (code 2), `--help` and `--version`.
     """
     with signals_restored():
-        interrupt_on_signals()
-        return _run(argv)
+        return _run(argv, interrupt_on_signals())
 
 
 def process() -> NoReturn:
     """Run the command line as this process: a signal after the verdict does not hide its code."""
-    interrupt_on_signals()
-    code = _run(None)
+    code = _run(None, interrupt_on_signals())
     ignore_signals()
     sys.exit(code)
 
 
-def _run(argv: Sequence[str] | None) -> int:
+def _run(argv: Sequence[str] | None, interrupted: threading.Event) -> int:
     _fill_closed_streams()
     _print_whatever_comes()
     code = 0
@@ -104,6 +105,11 @@ def _run(argv: Sequence[str] | None) -> int:
         say(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return worst_code((code, FAILED))
     except KeyboardInterrupt:
+        say("interrupted")
+        return INTERRUPTED
+    except RuntimeError:
+        if not interrupted.is_set():
+            raise
         say("interrupted")
         return INTERRUPTED
     return code
@@ -175,8 +181,8 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
         metavar="COMMAND", required=True
     )
     for command in (
-        bit, diagnose, calibrate, design, sim, tests, checkbus, replay, history, rul, report,
-        export, warmup, init,
+        bit, diagnose, monitor, serve, calibrate, design, sim, tests, checkbus, replay, history,
+        rul, report, export, warmup, init,
     ):  # fmt: skip
         command.add_parser(subparsers)
     completion.add_parser(subparsers, _parser)

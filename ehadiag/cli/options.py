@@ -49,6 +49,7 @@ __all__ = [
     "refuse_two_buses",
     "the_actuator",
     "the_asked",
+    "the_bitrate",
     "the_budget",
     "the_bus_map",
     "the_columns",
@@ -59,7 +60,10 @@ __all__ = [
 TEST = "open|closed|NUMBER|FILE"
 """How every command lets a test be named."""
 DEFAULT_BAUD = 921600
+DEFAULT_BITRATE = 1e6
+"""Of the default bus (BUS-1)."""
 MOST_SERIAL = (1 << 63) - 1
+"""That a history can hold."""
 TIME_LIMIT_S = 600.0
 """Some ten thousand times what a sound recording takes."""
 
@@ -426,6 +430,16 @@ def the_sought(
     if start is not None and end is not None and end <= start:
         raise ConfigurationError(f"--end {end:g}: not after --start {start:g}")
     return Sought(tuple(tests), actuator.controller, start, end)
+
+
+def the_bitrate(arguments: argparse.Namespace, bus_map: BusMap) -> float | None:
+    """Return the bit rate of the bus, bit/s: the named one, or the default bus's; None: unknown."""
+    if arguments.serial or getattr(arguments, "log", None) is not None:
+        return None
+    from firmware_iface.mapping.bus_map import default_map  # noqa: PLC0415
+
+    default = DEFAULT_BITRATE if bus_map.name == default_map().name else None
+    return arguments.bitrate or default
 
 
 def known_tests(names: list[str]) -> tuple[StoredTest, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -41,18 +41,19 @@ from ehadiag.identify.search.stages import (
 )
 from ehadiag.identify.spans import lay_out
 from ehadiag.identify.textbook import (
+    HOPELESS,
     Attempt,
     attempt,
     explains,
     first_ticks,
     named,
     rescued,
-    resembles,
+    unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
 
-__all__ = ["Nuisances", "Session", "identify"]
+__all__ = ["Nuisances", "Session", "SoFar", "identify"]
 
 
 BEYOND_RESCUE = 0.05
@@ -71,6 +72,25 @@ class Nuisances(Enum):
     NONE = "none"
     ALL = "all"
     """From the start."""
+
+
+@dataclass(frozen=True, slots=True)
+class SoFar:
+    """Severities as a test that still runs shows them.
+
+    Attributes
+    ----------
+    stage : str
+        What was done last, in words.
+    values : Mapping[str, float]
+        Severities by name.
+    std : Mapping[str, float] | None
+        Their standard deviations by name; None before a refinement.
+    """
+
+    stage: str
+    values: Mapping[str, float]
+    std: Mapping[str, float] | None = None
 
 
 class Session:
@@ -104,6 +124,8 @@ class Session:
         self.nuisances = nuisances
         self.knowledge = knowledge
         self._memory = Memory()
+        self.so_far: SoFar | None = None
+        """What the latest `feed` showed; None before the first. Another thread may look."""
 
     @property
     def reused(self) -> int:
@@ -117,10 +139,12 @@ class Session:
             return
         experiments = share_offsets(experiments)
         best = self._first(experiments)[1]
-        for result in itertools.islice(self._stages(experiments, best), ready):
+        self.so_far = SoFar("first approximation", named(best))
+        for stage, result in enumerate(itertools.islice(self._stages(experiments, best), ready)):
             best = result.best
-        if ready == len(STAGES) and resembles(experiments, best):
-            self._first_part(experiments, best)
+            self.so_far = SoFar(f"search, stage {stage + 1} of {len(STAGES)}", named(best))
+        if ready == len(STAGES) and unlikeness(experiments, best) <= HOPELESS:
+            self.so_far = _refined(self._first_part(experiments, best).refined)
 
     def finish(
         self, experiments: Sequence[Experiment], progress: Progress | None = None
@@ -143,7 +167,7 @@ class Session:
         tell("refinement", 0.0)
         doubts = self.knowledge.doubts
         alone = self.nuisances is Nuisances.NONE and not doubts
-        near = resembles(experiments, found.best)
+        found, near = _nearer(experiments, found, start)
         best: Attempt | None = None
         if alone or (near and self.nuisances is Nuisances.AUTO and not doubts):
             best = attempt(experiments, found, self._first_part)
@@ -284,9 +308,33 @@ def identify(
     return Session(solver, seed, nuisances, knowledge).finish(experiments, progress)
 
 
+def _nearer(
+    experiments: Sequence[Experiment], found: SearchResult, start: NDArray[np.float64]
+) -> tuple[SearchResult, bool]:
+    """Return what a refinement begins from, and whether it may explain the recordings: the optimum
+    of the search, unless only what the search began from resembles them."""
+    if unlikeness(experiments, found.best) <= HOPELESS:
+        return found, True
+    near = unlikeness(experiments, start) <= HOPELESS
+    return (replace(found, best=start) if near else found), near
+
+
 def _timing(begin: float, searched_at: float, search_s: float) -> Timing:
     """Time spent so far, s: on the first approximation, on searches, and on the rest."""
     return Timing(searched_at - begin, search_s, time.perf_counter() - searched_at - search_s)
+
+
+def _refined(refined: Refinement) -> SoFar:
+    """Severities of a refinement on the first part of a test."""
+    std = dict(
+        zip(
+            (item.name for item in refined.parameters),
+            np.sqrt(np.diag(covariance(refined))).tolist(),
+            strict=True,
+        )
+    )
+    values = {item.name: refined.values[item.name] for item in FAULTS}
+    return SoFar("refinement of its first part", values, std)
 
 
 def _leaves_nothing(refinement: Refinement) -> bool:

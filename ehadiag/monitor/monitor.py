@@ -30,6 +30,13 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 TICKS_S = (1e-5, 0.1)
+CLOSED = layout.SETTINGS + layout.Settings._fields.index("closed")
+NUDGED = [
+    layout.MOVING + layout.Moving._fields.index(name)
+    for name in ("xs", "wire", "jack_spool", "lagged")
+]
+"""All that has the spool's position (`ehadiag.monitor.kernel.push_tick`)."""
+LOST = layout.FOLLOWED + layout.Followed._fields.index("lost")
 ALARMS = np.array([[[n & 1, n & 2], [n & 4, n & 8]] for n in range(16)], dtype=np.bool_)
 """What `push_tick` returns, taken apart: rows spool and pressure, columns upper and lower sum."""
 
@@ -137,6 +144,8 @@ class Monitor:
         constants = Unknowns((), (base,), _known(effects or {})).constants(np.empty(0))
         self.design: CusumDesign = design_cusum(hours, tick, shift)
         """Reference value and threshold of the sums."""
+        self.noise: tuple[float, float] = noise
+        """Of spool (m) and pressure (Pa)."""
         plan = monitor_plan(actuator, constants, self.design, noise, anchor)
         closed = float(mode is CommandMode.POSITION)
         start = Unit(*values, *offsets, 1.0, float(constants.PSR), closed)
@@ -193,6 +202,35 @@ class Monitor:
     def __reduce__(self) -> NoReturn:
         """Refuse to be copied: the copy would go on in the memory of this one."""
         raise TypeError("a monitor cannot be copied; make another one")
+
+    def follow(self, mode: CommandMode) -> None:
+        """Take commands as of this mode from the next tick on; all else goes on as it is.
+
+        The control law begins anew, as the flight-control computer's does.
+
+        Parameters
+        ----------
+        mode : CommandMode
+            What the commands are now.
+        """
+        closed = float(mode is CommandMode.POSITION)
+        if self._memory[CLOSED] == closed:
+            return
+        self._memory[CLOSED] = closed
+        self._memory[layout.CONTROL : layout.FOLLOWED] = 0.0
+        # The last command was of another kind: no slope leads on from it.
+        self._memory[LOST] = 1.0
+
+    def nudge(self, spool: float) -> None:
+        """Move the modelled spool, as re-anchoring does, and begin the sums anew.
+
+        Parameters
+        ----------
+        spool : float
+            By how much, m.
+        """
+        self._memory[NUDGED] += spool
+        self._memory[layout.CUSUM : layout.PLAYS] = 0.0
 
     def reset(self, spool: float = 0.0) -> None:
         """Begin anew, from rest with the spool there (m), as a stored test begins."""

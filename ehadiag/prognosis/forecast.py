@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.prognosis.belief import Belief, Posterior, learnt, posterior, starting_belief
-from ehadiag.prognosis.lives import Increments, Life, increments_of
+from ehadiag.prognosis.lives import RESOLVED, Increments, Life, increments_of
 from ehadiag.prognosis.wear import PROCESSES, Process
 
 __all__ = ["Fleet", "Forecast", "Remaining", "forecast", "learn_fleet"]
@@ -31,6 +31,12 @@ WIDEST = 20.0
 """Largest ratio of the interval's ends that is a number to plan with."""
 UNLIKELY = 1e-4
 """Chance of any such change in a life below which wear did not make it."""
+NO_WEAR = "no wear falls; if something was done, append it as an event"
+FALLEN = 0.02
+"""Net fall of a severity in a life, beyond its noise, from which on it is none of wear's."""
+STRANGE = 8.0
+"""Rate of an increment over the fleet's median, in median deviations, from which on a life is tried
+before others learn from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +106,46 @@ def learn_fleet(lives: Sequence[Life], scale: float, seed: int = 0) -> Fleet:
     """
     shown = [life for life in lives if len(increments_of([life]))]
     shown = sorted(shown, key=lambda life: -len(life.age))[:MOST_LIVES]
-    seen, start = increments_of(shown), starting_belief(scale)
+    strange = _strange(shown)
+    usual = [life for life, is_strange in zip(shown, strange, strict=True) if not is_strange]
+    fleet = _learnt(usual, scale, seed)
+    if len(usual) == len(shown):
+        return fleet
+    rng = np.random.default_rng(seed)
+    sound = [
+        life
+        for life, is_strange in zip(shown, strange, strict=True)
+        if not (is_strange and _is_alarming(life, fleet, rng))
+    ]
+    return fleet if len(sound) == len(usual) else _learnt(sound, scale, seed)
+
+
+def _learnt(lives: Sequence[Life], scale: float, seed: int) -> Fleet:
+    seen, start = increments_of(lives), starting_belief(scale)
     beliefs = {name: learnt(item, seen, start, seed) for name, item in PROCESSES.items()}
-    return Fleet(len(shown), beliefs)
+    return Fleet(len(lives), beliefs)
+
+
+def _strange(lives: Sequence[Life]) -> list[bool]:
+    """Whether a life has a rate far from the fleet's, so that it may hold what wear did not do."""
+    seen = increments_of(lives)
+    rates = (seen.high - seen.low) / (seen.end - seen.start)
+    if not len(rates):
+        return []
+    off = np.abs(rates - np.median(rates))
+    far = off > STRANGE * max(float(np.median(off)), 1e-3 * abs(float(np.median(rates))))
+    return [bool(far[seen.life == index].any()) for index in range(len(lives))]
+
+
+def _is_alarming(life: Life, fleet: Fleet, rng: np.random.Generator) -> bool:
+    """Whether the likelier process raises an alarm on a life."""
+    seen = increments_of([life])
+    found = {
+        key: posterior(item, seen, fleet.beliefs[key], DRAWS // 4, rng).evidence
+        for key, item in PROCESSES.items()
+    }
+    chosen = max(found, key=lambda key: found[key])
+    return bool(_alarm(PROCESSES[chosen], seen, fleet.beliefs[chosen], life, "", rng))
 
 
 def forecast(
@@ -250,6 +293,10 @@ def _alarm(
     rng: np.random.Generator,
 ) -> str:
     """Tell of the change that wear explains least, if it does not explain it at all."""
+    fallen = float(life.value[0] - life.value[-1])
+    if fallen > max(FALLEN, RESOLVED * float(np.hypot(life.std[0], life.std[-1]))):
+        begin, end = (float(life.born + life.age[at]) for at in (0, -1))
+        return f"{-fallen:+.3f} between {begin:g} and {end:g} {unit}: {NO_WEAR}"
     rates = (seen.high - seen.low) / (seen.end - seen.start)
     suspect = int(np.argmax(np.abs(rates - np.median(rates))))
     everyone = np.arange(len(seen))
@@ -266,5 +313,5 @@ def _alarm(
     begin, end = (float(life.born + at[0]) for at in (tried.start, tried.end))
     what = f"{change:+.3f} between {begin:g} and {end:g} {unit}"
     if change < 0.0:
-        return f"{what}: no wear falls; if something was done, append it as an event"
+        return f"{what}: {NO_WEAR}"
     return f"{what}: no wear explains such a change (chance {min(low, high):.0e})"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from ehadiag.history.records import Entry, Event, Usage
 
-__all__ = ["UNITS", "Increments", "Life", "increments_of", "lives_of"]
+__all__ = ["RESOLVED", "UNITS", "Increments", "Life", "increments_of", "lives_of"]
 
 UNITS = ("hours", "cycles")
 RESOLVED = 5.0
@@ -82,7 +82,8 @@ def lives_of(
         cycles) or whose test does not show the severity are left out.
     events : Sequence[Event]
         Maintenance: one that names the severity begins a new life; one that names none does where
-        the severity fell across it.
+        the severity fell across it. One without hours (or cycles) is placed by its date, right
+        after the last diagnosis before it.
     name : str
         Of the severity.
     unit : str
@@ -95,18 +96,22 @@ def lives_of(
         present one.
     """
     found: dict[int, list[tuple[float, float, float]]] = {}
+    dated: dict[int, list[tuple[str, float]]] = {}
     for entry in entries:
         at = _amount(entry.usage, unit)
         if entry.serial is None or at is None or entry.verdict == "NOT_TESTED":
             continue
+        dated.setdefault(entry.serial, []).append((entry.when, at))
         for item in entry.severities:
             if item.name == name and item.shown and item.estimate is not None and item.std:
                 found.setdefault(entry.serial, []).append((at, item.estimate, item.std))
     out = {}
     for serial, read in found.items():
         rows = _merged(sorted(read))
-        mine = [item for item in events if item.serial == serial]
-        births = [0.0, *sorted(_births(rows, mine, name, unit))]
+        mine = [
+            (item, _placed(item, dated[serial], unit)) for item in events if item.serial == serial
+        ]
+        births = [0.0, *sorted(_births(rows, mine, name))]
         out[serial] = [life for life in _cut(serial, rows, births) if len(life.age)]
         if not out[serial] or births[-1] > out[serial][-1].born:
             out[serial].append(_life(serial, [], births[-1]))
@@ -150,12 +155,21 @@ def _clear(life: Life, first: int, second: int) -> bool:
     return bool(abs(life.value[second] - life.value[first]) >= RESOLVED * spread)
 
 
+def _placed(event: Event, dated: Sequence[tuple[str, float]], unit: str) -> float | None:
+    """Hours or cycles at which an event was; by its date where it does not say."""
+    said = _amount(event.usage, unit)
+    if said is not None:
+        return said
+    return max((at for when, at in dated if when <= event.when), default=None)
+
+
 def _births(
-    rows: Sequence[tuple[float, float, float]], events: Sequence[Event], name: str, unit: str
+    rows: Sequence[tuple[float, float, float]],
+    events: Sequence[tuple[Event, float | None]],
+    name: str,
 ) -> Iterator[float]:
     """Hours or cycles at which the severity began anew."""
-    for event in events:
-        at = _amount(event.usage, unit)
+    for event, at in events:
         if at is None:
             continue
         before = [row for row in rows if row[0] <= at]

@@ -21,6 +21,7 @@ __all__ = ["LiveTick", "LiveTicks"]
 
 NAN = math.nan
 KEYS = ("channels.current", "channels.spool", "channels.pressure", "channels.position")
+VALUES = {mode: f"command.{mode.name.lower()}" for mode in CommandMode}
 LATE = 16
 """Ticks by which a frame may come late; its tick has been given out as lost."""
 DOUBTFUL = 50
@@ -55,11 +56,14 @@ class LiveTicks:
     bus_map : BusMap | None
         Mapping; all channels must come in one frame, and its counter and that of the command
         must count ticks.
-    mode : CommandMode
-        Of the commands to take; those of the other mode count as lost.
+    mode : CommandMode | None
+        Of the commands to take; those of the other mode count as lost. None: both, and `mode` says
+        which the last command had.
 
     Attributes
     ----------
+    mode : CommandMode
+        Of the commands; a tick that `take` gives out has that of the command before it.
     lost : int
         Ticks whose telemetry did not come, or was damaged.
     breaks : int
@@ -74,21 +78,26 @@ class LiveTicks:
         A bus whose ticks cannot be told from single frames.
     """
 
+    mode: CommandMode
     lost: int
     breaks: int
     conflicts: int
 
     def __init__(
-        self, bus_map: BusMap | None = None, mode: CommandMode = CommandMode.POSITION
+        self, bus_map: BusMap | None = None, mode: CommandMode | None = CommandMode.POSITION
     ) -> None:
         bus_map = bus_map or default_map()
-        self._value = f"command.{mode.name.lower()}"
-        self._telemetry, counter = _counted(bus_map, KEYS)
         self._mode_told = bus_map.fixed_mode is None
-        told = (self._value, "command.mode") if self._mode_told else (self._value,)
+        self._follows = mode is None and self._mode_told
+        self.mode = mode or bus_map.fixed_mode or CommandMode.POSITION
+        self._telemetry, counter = _counted(bus_map, KEYS)
+        values = [VALUES[self.mode]]
+        if self._follows:
+            values = [value for value in VALUES.values() if bus_map.find(value)] or values
+        told = (*values, "command.mode") if self._mode_told else tuple(values)
         self._command, command_counter = _counted(bus_map, told)
         self._counters = {self._telemetry.name: counter, self._command.name: command_counter}
-        self._modes = {number for number, meaning in bus_map.modes.items() if meaning is mode}
+        self._modes = {float(number): meaning for number, meaning in bus_map.modes.items()}
         self._ends = tuple(_ends(self._telemetry, key) for key in KEYS)
         self._turn = min(self._telemetry.modulus, _longest_turn(bus_map.tick_ns))
         self._commands = [NAN] * self._turn
@@ -122,7 +131,7 @@ class LiveTicks:
             return []
         count = bit_pattern(self._counters[message.name], frame.data) % self._turn
         out: list[LiveTick] = []
-        if self._value in values:
+        if not values.keys().isdisjoint(VALUES.values()):
             self._take_command(count, values, out)
         if KEYS[0] in values:
             self._take_telemetry(count, frame.time_ns, values, out)
@@ -150,13 +159,19 @@ class LiveTicks:
         return LiveTick(NAN, NAN, NAN, NAN, NAN)
 
     def _take_command(self, count: int, values: dict[str, float], out: list[LiveTick]) -> None:
-        if self._mode_told and values.get("command.mode") not in self._modes:
+        if self._mode_told:
+            mode = self._modes.get(values.get("command.mode", NAN))
+            if mode is None or (mode is not self.mode and not self._follows):
+                return
+            self.mode = mode
+        value = values.get(VALUES[self.mode])
+        if value is None:
             return
         if self._held is not None and count == self._at:
-            out.append(self._held._replace(command=values[self._value]))
+            out.append(self._held._replace(command=value))
             self._held = None
         elif (self._at - count) % self._turn >= LATE or self._at < 0:
-            self._commands[count] = values[self._value]
+            self._commands[count] = value
 
     def _take_telemetry(
         self, count: int, time_ns: int, values: dict[str, float], out: list[LiveTick]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import ExitStack
 from functools import partial
 
 from ehadiag.assess.verdict import Levels, Rule
@@ -13,10 +14,12 @@ from ehadiag.cli.beforehand import refuse_beforehand
 from ehadiag.cli.drawing import can_be_drawn, drawn
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import progress_bar, say_if_compiling
+from ehadiag.cli.output import say_if_compiling
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
+from ehadiag.cli.screen.bit_view import BitView
+from ehadiag.cli.screen.show import add_screen_options, shown
 from ehadiag.core.errors import NotTestedError
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.facade.inputs import log_file
@@ -78,6 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             metavar=unit,
             help=f"abort the test when the {what} goes beyond ±{unit} (default: not watched)",
         )
+    add_screen_options(parser)
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_diagnosis_options(parser)
@@ -123,22 +127,31 @@ def run(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         nuisances=Nuisances(arguments.nuisances),
     )
-    with stop_on_signals() as stop:
-        heard = acquire(arguments, actuator, test, bus_map, folder.path, session, stop)
-    read_s = time.perf_counter() - begin
-    recordings, why = [heard.recording], heard.why
-    try:
-        if stop.is_set() and not why:
-            raise KeyboardInterrupt
-        if not why:
-            with progress_bar() as progress:
-                result = session.finish(recordings, heard.deadline.watch(progress))
-    except KeyboardInterrupt:
-        why = STOPPED
-    except NotTestedError as error:
-        why = str(error)
-    if why:
-        result = not_tested(recordings, [test], actuator, [why])
+    with ExitStack() as stack:
+        # Not before the bus is open: until then lines are printed.
+        view = BitView(
+            actuator,
+            test,
+            session,
+            lambda: _begin(stack, view, arguments),
+            options.the_bitrate(arguments, bus_map),
+        )
+        with stop_on_signals() as stop:
+            heard = acquire(arguments, actuator, test, bus_map, folder.path, session, stop, view)
+        read_s = time.perf_counter() - begin
+        recordings, why = [heard.recording], heard.why
+        try:
+            if stop.is_set() and not why:
+                raise KeyboardInterrupt
+            if not why:
+                result = session.finish(recordings, heard.deadline.watch(view.working))
+        except KeyboardInterrupt:
+            why = STOPPED
+        except NotTestedError as error:
+            why = str(error)
+        if why:
+            result = not_tested(recordings, [test], actuator, [why])
+        view.ended(result)
     ended_at = heard.ended_at
     spent = Spent(read_s, None if ended_at is None else time.perf_counter() - ended_at)
     line = json_line(
@@ -146,3 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     draw = partial(drawn, result, levels) if can_be_drawn(result) else None
     return results.deliver(result, line, spent, heard.name, draw)
+
+
+def _begin(stack: ExitStack, view: BitView, arguments: argparse.Namespace) -> None:
+    stack.enter_context(shown(view.look, plain=arguments.plain, snapshots=arguments.snapshots))

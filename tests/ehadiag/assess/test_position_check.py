@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.modelled import response_of
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
@@ -30,7 +31,7 @@ def sound(request):
 
 def fit(sound, position):
     """Fit with another position than was measured; the current is that of the whole sensor."""
-    return position_fit(replace(sound[2], position=position), sound[1])
+    return position_fit(replace(sound[2], position=position), response_of(sound[2], sound[1]))
 
 
 def test_a_sound_sensor_is_believed(sound):
@@ -85,7 +86,7 @@ def test_a_jack_that_rests_has_no_gain(sound):
     _, identification, experiment = sound
     rest = replace(experiment.trace, current=np.zeros_like(experiment.trace.current))
     still = replace(experiment, trace=rest, position=np.zeros_like(experiment.position))
-    found = position_fit(still, identification)
+    found = position_fit(still, response_of(still, identification))
     assert np.isnan(found.gain)
     assert objections_to_position(found) == []
 

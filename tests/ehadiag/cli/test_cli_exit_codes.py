@@ -14,7 +14,7 @@ from ehadiag.cli.commands import diagnose
 from ehadiag.cli.exit_codes import code_of_inputs, worst_code
 
 HEALTHY, CLOSED = (LOGS / name for name in ("healthy-open.blf", "healthy-closed.blf"))
-WORST_FIRST = (20, 3, 30, 10, 0)
+WORST_FIRST = (20, 40, 3, 30, 10, 0)
 
 
 def test_the_order() -> None:

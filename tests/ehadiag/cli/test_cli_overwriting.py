@@ -138,6 +138,25 @@ def test_a_live_test_records_beside_its_history(place: Path, run: Run) -> None:
     assert not Path("n.blf").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("--log", "rec.csv", "--log-file", "rec.csv"), "the log rec.csv"),
+        (("--from", "r.json", "--log-file", "r.json"), "--from r.json"),
+        (("--history", "h.sqlite", "--log-file", "h.sqlite"), "the health history h.sqlite"),
+    ],
+)
+def test_alarms_are_appended_to_nothing_that_is_read(
+    arguments: tuple[str, ...], what: str, place: Path, run: Run
+) -> None:
+    (place / "r.json").write_text("{}")
+    before = contents(place)
+    result = run("monitor", "-i", "virtual", *arguments)
+    assert result.code == 2
+    assert f": is {what} as well" in result.message
+    assert contents(place) == before
+
+
 def test_a_result_leaves_other_files_of_its_folder_alone(place: Path, run: Run) -> None:
     """The page of somebody else, and the summary that the same call writes there."""
     shutil.copy(WORN, "w.blf")

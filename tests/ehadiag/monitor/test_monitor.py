@@ -333,3 +333,20 @@ def test_bad_values_are_told(options, word):
     with pytest.raises(ConfigurationError, match=word) as caught:
         Monitor(default_actuator(), faults, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_the_mode_can_change_between_two_ticks():
+    """From the change on the commands are currents: as a monitor of that mode, from rest."""
+    monitor = Monitor(default_actuator(), (0.2, 0.3, 0.1), mode=CommandMode.POSITION)
+    other = Monitor(default_actuator(), (0.2, 0.3, 0.1), mode=CommandMode.CURRENT)
+    for _ in range(5):
+        monitor.push(Tick(0.0, 0.0, 0.0, 0.0, 0.0))
+        other.push(Tick(0.0, 0.0, 0.0, 0.0, 0.0))
+    monitor.follow(CommandMode.CURRENT)
+    for command in (1e-3, 2e-3, NAN, 2e-3):
+        tick = Tick(command, NAN, NAN, NAN, 0.0)
+        ours, theirs = monitor.push(tick).copy(), other.push(tick).copy()
+        np.testing.assert_array_equal(ours.predicted, theirs.predicted)
+    monitor.follow(CommandMode.POSITION)
+    monitor.push(Tick(0.0, NAN, NAN, NAN, 0.0))
+    assert monitor.push(Tick(0.0, NAN, NAN, NAN, 0.0)).predicted[0] < ours.predicted[0]

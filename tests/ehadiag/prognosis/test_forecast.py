@@ -136,3 +136,24 @@ def test_a_unit_that_nobody_knows_has_no_numbers() -> None:
     found = prognosis_of(99, [], [], (0.25, 0.75))
     assert found.actuator is None
     assert all(left.median is None for item in found.forecasts for left in item.remaining)
+
+
+def test_one_units_jump_does_not_change_the_forecasts_of_the_others() -> None:
+    others = [worn(serial, 28) for serial in range(10, 16)]
+    life, last = worn(1, 8), worn(16, 28)
+    value = last.value.copy()
+    value[-1] += 0.3
+    jumped = Life(last.serial, last.age, value, last.std, last.born)
+    sound = of(life, learn_fleet([*others, last], 2000.0)).remaining[1].median
+    beside = learn_fleet([*others, jumped], 2000.0)
+    assert beside.lives == len(others)
+    assert of(life, beside).remaining[1].median == pytest.approx(sound, rel=0.1)
+
+
+def test_a_steady_fall_is_an_alarm() -> None:
+    age = 100.0 * np.arange(1.0, 7.0)
+    life = Life(1, age, np.linspace(0.5, 0.25, 6), np.full(6, NOISE), 0.0)
+    for fleet in (FLEET, ALONE):
+        found = of(life, fleet)
+        assert "no wear falls" in found.alarm
+        assert all(left.median is None for left in found.remaining if left.level > 0.3)

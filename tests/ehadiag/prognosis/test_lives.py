@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from history_cases import an_entry, an_event
 from hypothesis import given
 from hypothesis import strategies as st
@@ -44,9 +45,10 @@ def test_a_life_that_nobody_has_seen_is_empty() -> None:
     assert ages([an_event(hours=600.0, resets=("Kintas",))])[-1] == []
 
 
-def test_events_of_other_units_and_without_hours_do_nothing() -> None:
+def test_events_of_other_units_and_those_that_nothing_places_do_nothing() -> None:
     assert len(ages([an_event(hours=300.0, serial=8)])) == 1
-    assert len(ages([an_event(hours=None, resets=("Kintas",))])) == 1
+    early = an_event(hours=None, resets=("Kintas",), when="2026-01-01T00:00:00.000Z")
+    assert len(ages([early])) == 1
 
 
 def test_what_says_no_hours_or_has_no_verdict_is_left_out() -> None:
@@ -78,3 +80,16 @@ def test_increments_are_growth_beyond_noise(values: list[float], std: float) -> 
     half = len(found) // 2
     assert np.array_equal(found.start[1:half], found.end[: max(half - 1, 0)])
     assert found.life.tolist() == [0] * half + [1] * half
+
+
+@pytest.mark.parametrize("usage", [Usage(), Usage(None, 600.0)])
+def test_an_event_without_hours_is_placed_by_its_date(usage: Usage) -> None:
+    values = (0.1, 0.2, 0.3, 0.1, 0.2)
+    rows = [
+        an_entry(7, 100.0 * n, (value, 0, 0), tested=f"2026-03-0{n}T12:00:00Z")
+        for n, value in enumerate(values, start=1)
+    ]
+    event = an_event(resets=("Kintas",), when="2026-03-03T18:00:00.000Z", usage=usage)
+    assert [life.born for life in lives_of(rows, [event], "Kintas", "hours")[7]] == [0.0, 300.0]
+    before = an_event(resets=("Kintas",), when="2026-02-01T00:00:00.000Z", usage=usage)
+    assert [life.born for life in lives_of(rows, [before], "Kintas", "hours")[7]] == [0.0]

@@ -243,3 +243,27 @@ def test_a_bus_without_counters_is_told():
     with pytest.raises(ConfigurationError, match="counter of ticks") as caught:
         LiveTicks(dataclasses.replace(MAP, messages=plain))
     assert "\n" not in str(caught.value)
+
+
+def test_both_modes_are_followed_where_none_is_named():
+    """Each tick with the command of the mode that the computer names; a tick whose is lost, none.
+
+    The other mode's commands would count as lost to a reader of one mode.
+    """
+    encoder, live = Encoder(), LiveTicks(mode=None)
+    seen = []
+    for mode, command in (
+        (CommandMode.POSITION, 1e-3),
+        (CommandMode.CURRENT, 2e-3),
+        (CommandMode.CURRENT, -2e-3),
+        (CommandMode.POSITION, 4e-3),
+    ):
+        for frame in encoder.command(mode, command, 0, 0) + encoder.telemetry([2048] * 4, 0):
+            seen += [(live.mode, tick.command) for tick in live.take(frame)]
+    assert [mode for mode, _ in seen] == [
+        CommandMode.POSITION,
+        CommandMode.CURRENT,
+        CommandMode.CURRENT,
+        CommandMode.POSITION,
+    ]
+    assert [command for _, command in seen] == pytest.approx([1e-3, 2e-3, -2e-3, 4e-3])

@@ -239,7 +239,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--monitor",
         choices=BESIDE,
-        help="the monitor in the receive thread instead, diagnoses beside it in a thread or process"
+        help="the monitor in the receive thread instead, diagnoses or the live view beside it"
         " (sends telemetry and command only)",
     )
     parser.add_argument(

@@ -8,6 +8,7 @@ main thread, where they share the interpreter lock with it, or in a process of t
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import multiprocessing
 import sys
@@ -15,17 +16,23 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
 
+from ehadiag.cli.screen.show import shown
 from ehadiag.core.actuator import default_actuator
+from ehadiag.core.dates import utc_text
 from ehadiag.core.errors import BusLostError, ConfigurationError
 from ehadiag.core.recording import CommandMode
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.session import identify
+from ehadiag.live.snapshot import Bus, Residuals, Severity, Snapshot, known
+from ehadiag.live.trace import Trace
+from ehadiag.live.traffic import Traffic
 from ehadiag.monitor import Monitor
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_sim.plant.simulator import Plant
@@ -39,8 +46,8 @@ from firmware_iface.transport.receiver import Receiver
 
 __all__ = ["BESIDE", "MonitorSoak", "monitor_soak", "monitor_text"]
 
-BESIDE = ("thread", "process", "none")
-"""Where diagnoses run."""
+BESIDE = ("thread", "process", "none", "view")
+"""Where diagnoses run; `view`: the live view instead of them."""
 LOGS = Path(__file__).parents[3] / "tests" / "data" / "logs"
 FAULTS = (0.3, 0.3, 0.3)
 SHARES = (50.0, 99.0, 99.9)
@@ -117,6 +124,7 @@ def monitor_soak(
         _switch_interval(switch_s),
         PythonCanTransport(options) as bus,
         Receiver(bus, sink=watch.take) as source,
+        shown(watch.look, plain=False) if beside == "view" else contextlib.nullcontext(),
     ):
         for process in processes:
             process.start()
@@ -149,6 +157,7 @@ class _Watch:
         self._wall, self._cpu, self._take = np.zeros((3, room), dtype=np.int64)
         self._squares, self._seen = np.zeros(2), np.zeros(2)
         self._breaks = self._alarms = self._pushes = 0
+        self._trace, self._traffic = Trace(), Traffic(1e6)
         self.received = 0
 
     def take(self, frame: Frame) -> None:
@@ -156,6 +165,7 @@ class _Watch:
         clock = time.perf_counter_ns
         begin = clock()
         self.received += frame.can_id in (TELEMETRY, COMMAND)
+        self._traffic.take(len(frame.data))
         for tick in self._ticks.take(frame):
             if self._ticks.breaks != self._breaks:
                 self._breaks = self._ticks.breaks
@@ -171,7 +181,35 @@ class _Watch:
             known = np.isfinite(reading.residual)
             self._seen += known
             self._squares += np.where(known, reading.residual, 0.0) ** 2
+            self._trace.take(self._pushes / 1e3, CommandMode.POSITION, tick[0], tick[1:])
             self._take[k] = clock() - begin
+
+    def look(self, number: int) -> Snapshot:
+        """Return what the live view shows."""
+        rate, load, _ = self._traffic.measure()
+        spool, pressure = self._monitor.reading.residual.tolist()
+        return Snapshot(
+            number=number,
+            time=utc_text(datetime.now(UTC)),
+            command="monitor",
+            actuator="soak",
+            serial=None,
+            bus=Bus(
+                name="soak",
+                state="open",
+                frames=self.received,
+                rate_per_s=rate,
+                load=load,
+                lost=self._ticks.lost,
+            ),
+            mode="position",
+            signals=self._trace.signals(),
+            residuals=Residuals(spool=known(spool), pressure=known(pressure)),
+            severities=tuple(
+                Severity(name=name, estimate=value, source="soak")
+                for name, value in zip(("Kintas", "FSS", "FDJ"), FAULTS, strict=True)
+            ),
+        )
 
     def result(
         self, name: str, seconds: float, beside: str, diagnoses: int, sent: int, unread: int

@@ -1,0 +1,1 @@
+"""Watching a bus with the monitoring model: second half of `ehadiag monitor`."""

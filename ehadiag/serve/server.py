@@ -1,0 +1,233 @@
+"""The server of the local page: loopback only, server-sent events, a token for what moves."""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import json
+import socket
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from ehadiag.core.errors import ConfigurationError, EhadiagError
+from ehadiag.serve.sessions import BusyError, Sessions
+
+__all__ = ["HOST", "Page", "Site", "serve"]
+
+HOST = "127.0.0.1"
+NAMES = (HOST, "localhost")
+MOST_STREAMS = 16
+"""Readers of the live view at a time."""
+MOST_BODY = 1024
+"""Bytes of a request to start or abort a test."""
+SILENCE_S = 10.0
+"""After which a comment keeps a stream open."""
+PATIENCE_S = 30.0
+"""For a request."""
+HTML = "text/html; charset=utf-8"
+JSON = "application/json"
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """What a request gets."""
+
+    body: bytes
+    kind: str = HTML
+    policy: str = "default-src 'none'"
+    """Its Content-Security-Policy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What is served.
+
+    Attributes
+    ----------
+    pages : Callable[[str], Page | None]
+        Gives the page of a path such as `/history/7`; None: there is none.
+    sessions : Sessions
+        Whose snapshots are shown.
+    token : str | None
+        That a request to start or abort a test must carry; None: no test is ever started here.
+    """
+
+    pages: Callable[[str], Page | None]
+    sessions: Sessions
+    token: str | None
+
+
+def serve(site: Site, port: int) -> ThreadingHTTPServer:
+    """Bind to the loopback address; the caller runs `serve_forever` and closes.
+
+    Parameters
+    ----------
+    site : Site
+        What is served.
+    port : int
+        0: any that is free.
+
+    Returns
+    -------
+    ThreadingHTTPServer
+        The bound server; its `server_port` is the port.
+
+    Raises
+    ------
+    ConfigurationError
+        The port is taken, or may not be used.
+    """
+
+    class Handler(_Handler):
+        pass
+
+    Handler.site = site
+    Handler.streams = threading.BoundedSemaphore(MOST_STREAMS)
+    try:
+        server = _Server((HOST, port), Handler)
+    except OSError as error:
+        raise ConfigurationError(
+            f"--port {port}: {error.strerror or error}: name another, or 0 for any"
+        ) from None
+    Handler.port = server.server_port
+    return server
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A reader that went away is no news."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    site: Site
+    streams: threading.BoundedSemaphore
+    port: int
+    timeout = PATIENCE_S
+    server_version = "ehadiag"
+    sys_version = ""
+
+    def do_GET(self) -> None:
+        """Send a page, or the stream of snapshots."""
+        if not self._is_ours():
+            return
+        path = unquote(urlsplit(self.path).path, errors="surrogateescape")
+        if path == "/live":
+            self._stream()
+            return
+        try:
+            page = self.site.pages(path)
+        except EhadiagError as error:
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+            return
+        if page is None:
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+            return
+        self._send(HTTPStatus.OK, page)
+
+    def do_POST(self) -> None:
+        """Start or abort a test, where that is allowed and the token is right."""
+        if not self._is_ours():
+            return
+        asked = self._body()
+        if self.site.token is None:
+            self._refuse(HTTPStatus.FORBIDDEN, "tests are not allowed here: see --allow-tests")
+            return
+        token = self.headers.get("X-Ehadiag-Token", "")
+        if not hmac.compare_digest(token.encode(), self.site.token.encode()):
+            self._refuse(HTTPStatus.FORBIDDEN, "wrong token: use the address that serve printed")
+            return
+        try:
+            if self.path == "/start" and isinstance(asked, dict):
+                self.site.sessions.start(str(asked.get("test")))
+            elif self.path == "/abort":
+                self.site.sessions.abort()
+            else:
+                self._refuse(HTTPStatus.NOT_FOUND, "no such action")
+                return
+        except KeyError:
+            self._refuse(HTTPStatus.NOT_FOUND, "no such test here: see --test")
+            return
+        except BusyError as error:
+            self._refuse(HTTPStatus.CONFLICT, str(error))
+            return
+        self._send(HTTPStatus.ACCEPTED, Page(b"{}", JSON))
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing: the terminal is for the sessions."""
+
+    def _body(self) -> Any:
+        length = self.headers.get("Content-Length", "0")
+        size = int(length) if length.isdecimal() else MOST_BODY + 1
+        if size > MOST_BODY:
+            self.close_connection = True
+            return None
+        with contextlib.suppress(ValueError):
+            return json.loads(self.rfile.read(size) or b"null")
+        return None
+
+    def _is_ours(self) -> bool:
+        """Refuse what another site's page sends by this browser, under whatever name."""
+        hosts = [f"{name}:{self.port}" for name in NAMES]
+        origin = self.headers.get("Origin")
+        good = self.headers.get("Host") in hosts
+        if good and (origin is None or origin in [f"http://{host}" for host in hosts]):
+            return True
+        self._refuse(HTTPStatus.FORBIDDEN, "this page is for this machine only")
+        return False
+
+    def _stream(self) -> None:
+        if not self.streams.acquire(blocking=False):
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_STREAMS} readers are there")
+            return
+        try:
+            self.send_response(HTTPStatus.OK)
+            self._head("text/event-stream", "default-src 'none'")
+            self.end_headers()
+            self.close_connection = True
+            self._tell_all()
+        finally:
+            self.streams.release()
+
+    def _tell_all(self) -> None:
+        seen, sessions = 0, self.site.sessions
+        with contextlib.suppress(OSError):
+            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            while not sessions.ended:
+                news = sessions.wait(seen, SILENCE_S)
+                if news is None:
+                    self.wfile.write(b": still here\n\n")
+                else:
+                    seen = news.number
+                    state = {"running": news.running, "said": news.said}
+                    self.wfile.write(
+                        b"event: snapshot\ndata: " + news.snapshot + b"\n\nevent: state\ndata: "
+                        + json.dumps(state).encode() + b"\n\n"
+                    )  # fmt: skip
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self._send(status, Page(json.dumps({"error": why}).encode(), JSON))
+
+    def _send(self, status: HTTPStatus, page: Page) -> None:
+        self.send_response(status)
+        self._head(page.kind, page.policy)
+        self.send_header("Content-Length", str(len(page.body)))
+        self.end_headers()
+        with contextlib.suppress(OSError):
+            self.wfile.write(page.body)
+
+    def _head(self, kind: str, policy: str) -> None:
+        for name, value in (
+            ("Content-Type", kind),
+            ("Content-Security-Policy", policy),
+            ("X-Content-Type-Options", "nosniff"),
+            ("Referrer-Policy", "no-referrer"),
+            ("Cache-Control", "no-store"),
+        ):
+            self.send_header(name, value)

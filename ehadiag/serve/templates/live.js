@@ -1,0 +1,86 @@
+"use strict";
+// Shows the snapshots of the running session. Every text goes in as text, never as markup.
+const at = (id) => document.getElementById(id);
+const text = (value, digits) =>
+  value === null || value === undefined ? "–" : typeof value === "number" && digits !== undefined ? value.toFixed(digits) : String(value);
+const share = (value) => (value === null || value === undefined ? "–" : (100 * value).toFixed(0) + " %");
+
+function fill(body, rows) {
+  body.replaceChildren(...rows.map((cells) => {
+    const row = document.createElement("tr");
+    cells.forEach((cell, place) => {
+      const made = document.createElement(place === 0 ? "th" : "td");
+      if (place === 0) made.scope = "row";
+      if (typeof cell === "object" && cell !== null) { made.className = "number"; cell = cell.number; }
+      made.textContent = text(cell);
+      row.append(made);
+    });
+    return row;
+  }));
+}
+
+const list = (place, lines) => place.replaceChildren(...lines.map((line) => {
+  const item = document.createElement("li");
+  item.textContent = line;
+  return item;
+}));
+
+const number = (value, digits) => ({ number: text(value, digits) });
+
+function show(snapshot) {
+  if (snapshot === null) return;
+  const { bus, test, residuals, ending, signals } = snapshot;
+  at("unit").textContent = snapshot.actuator + ", serial " + text(snapshot.serial) + " (" + snapshot.command + ")";
+  at("verdict").textContent = ending ? ending.verdict.replace("_", " ") : "";
+  at("verdict").className = "verdict " + (ending ? ending.verdict.replace(" ", "_") : "");
+  list(at("reasons"), ending ? ending.reasons : []);
+  const left = test && test.left_s !== null ? ", " + test.left_s.toFixed(1) + " s left" : "";
+  at("phase").textContent = (test ? "Test " + test.name + ": " + test.phase + left : "No test") +
+    (snapshot.working ? "; " + snapshot.working : "") + (snapshot.mode ? "; commands are a " + snapshot.mode : "");
+  at("share").value = test && test.duration_s ? Math.min(test.elapsed_s / test.duration_s, 1) : 0;
+  fill(at("bus"), [
+    ["name", bus.name], ["state", bus.state + (bus.detail ? ": " + bus.detail : "")], ["frames", bus.frames],
+    ["frames a second", text(bus.rate_per_s, 0)], ["load", share(bus.load)], ["lost ticks", bus.lost],
+    ["dropped by this program", bus.dropped],
+  ]);
+  fill(at("severities"), snapshot.severities.map((item) =>
+    [item.name, number(item.estimate, 4), number(item.std, 4), item.source]));
+  fill(at("residuals"), residuals ? ["spool", "pressure"].map((name) =>
+    [name, number(residuals[name], 2), number(residuals[name + "_above"], 2), number(residuals[name + "_below"], 2)]) : []);
+  at("alarm-count").textContent = snapshot.alarm_count;
+  fill(at("alarms"), snapshot.alarms.map((item) => [item.time, item.signal, item.side, item.during]).reverse());
+  list(at("notes"), snapshot.notes);
+  draw(signals);
+}
+
+function draw(signals) {
+  const source = Bokeh.documents.map((item) => item.get_model_by_name("signals")).find((item) => item);
+  if (!source || signals.time_s.length === 0) return;
+  const count = signals.time_s.length;
+  const column = (values) => Float64Array.from({ length: count }, (_, i) => values[i] ?? NaN);
+  const data = {};
+  for (const name of Object.keys(source.data)) data[name] = column(signals[name] ?? []);
+  source.data = data;
+}
+
+function tell(path, body) {
+  const token = new URLSearchParams(location.hash.slice(1)).get("token") ?? "";
+  at("answer").textContent = "";
+  fetch(path, { method: "POST", headers: { "X-Ehadiag-Token": token }, body: JSON.stringify(body) })
+    .then((answer) => answer.json())
+    .then((answer) => { at("answer").textContent = answer.error ?? ""; })
+    .catch(() => { at("answer").textContent = "ehadiag serve does not answer"; });
+}
+
+if (at("start")) {
+  at("start").addEventListener("click", () => tell("/start", { test: at("test").value }));
+  at("abort").addEventListener("click", () => tell("/abort", {}));
+}
+const stream = new EventSource("/live");
+stream.addEventListener("snapshot", (event) => show(JSON.parse(event.data)));
+stream.addEventListener("state", (event) => {
+  const state = JSON.parse(event.data);
+  at("said").textContent = state.said.join("\n");
+  if (at("start")) { at("start").disabled = state.running !== null; at("abort").disabled = state.running === null; }
+});
+stream.addEventListener("error", () => { at("phase").textContent = "ehadiag serve does not answer"; });

@@ -1,0 +1,257 @@
+"""`ehadiag monitor`: on recordings, on a bus that lives, and what bad input gets."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+from cli_result import REPOSITORY, Run
+from places import LOGS
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.stored_test import bundled_tests
+from ehadiag_sim.fcc.computer import FccCore
+from ehadiag_sim.plant.conditions import Faults
+from firmware_iface.codec.encode import Encoder
+from firmware_iface.logs.reader import read_frames
+from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+
+HEALTHY, WORN = LOGS / "healthy-open.blf", LOGS / "paper-open-2.blf"
+
+
+def events(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture
+def result(run: Run, tmp_path: Path) -> Path:
+    """The diagnosis of a worn unit."""
+    run("diagnose", WORN, "--out", "known", "--no-picture")
+    return tmp_path / "known" / "paper-open-2.json"
+
+
+def test_a_unit_as_new_gives_no_alarm(run: Run) -> None:
+    found = run("monitor", "--log", HEALTHY)
+    assert found.code == 0
+    assert found.out == ""
+    assert "NO ALARM" in found.err
+    assert "0 alarms" in found.err
+
+
+def test_a_worn_unit_is_no_news_to_a_monitor_that_knows_it(run: Run, result: Path) -> None:
+    found = run("monitor", "--log", WORN, "--from", result)
+    assert (found.code, "NO ALARM" in found.err) == (0, True)
+    assert "FSS 0.6" in found.err
+
+
+def test_an_alarm_is_logged_recorded_told_and_the_exit_code(run: Run, tmp_path: Path) -> None:
+    call = "python3 -c \"import sys; open('told.json', 'w').write(sys.stdin.read())\""
+    options = ("--log-file", "a.jsonl", "--record", "around", "--around", "0.2")
+    found = run("monitor", "--log", WORN, *options, "--on-alarm", call)
+    assert found.code == 40
+    begin, first, *_, end = events(tmp_path / "a.jsonl")
+    assert [begin["event"], first["event"], end["event"]] == ["begin", "alarm", "end"]
+    assert begin["severities"] == {"Kintas": 0.0, "FSS": 0.0, "FDJ": 0.0}
+    assert (first["during"], first["mode"], first["signal"]) == ("open", "current", "spool")
+    assert first["time"].endswith("Z")
+    assert end["alarms"] == len(events(tmp_path / "a.jsonl")) - 2
+    assert end["again"] > 0
+    recorded = read_frames(tmp_path / "around" / first["recorded"])
+    before = first["frame_ns"] - int(recorded.time_ns[0])
+    after = int(recorded.time_ns[-1]) - first["frame_ns"]
+    assert 0.19e9 < before <= 0.2e9
+    assert after >= 0.2e9 - 5e6
+    told = json.loads((tmp_path / "told.json").read_text())
+    assert told in events(tmp_path / "a.jsonl")[1:-1]
+    assert f"recorded in {first['recorded']}" in found.err
+
+
+def test_a_log_is_appended_to(run: Run, tmp_path: Path) -> None:
+    for _ in range(2):
+        run("monitor", "--log", HEALTHY, "--log-file", "a.jsonl")
+    names = [item["event"] for item in events(tmp_path / "a.jsonl")]
+    assert names == ["begin", "end", "begin", "end"]
+
+
+def test_a_history_knows_the_unit_by_the_serial_number_on_the_bus(run: Run, tmp_path: Path) -> None:
+    run("diagnose", WORN, "--history", "h.sqlite")
+    found = run("monitor", "--log", WORN, "--history", "h.sqlite", "--log-file", "a.jsonl")
+    assert found.code == 0
+    _, unit, _ = events(tmp_path / "a.jsonl")
+    assert unit["event"] == "unit"
+    assert unit["severities"]["FSS"] == pytest.approx(0.6, abs=0.02)
+    serial = unit["serial"]
+    named = run("monitor", "--log", WORN, "--history", "h.sqlite", "--serial-number", serial)
+    assert named.code == 0
+    other = run("monitor", "--log", WORN, "--history", "h.sqlite", "--serial-number", 999)
+    assert (other.code, "no diagnosis of serial number 999" in other.err) == (2, True)
+
+
+def test_a_unit_that_the_history_does_not_know_is_taken_as_new_and_said(run: Run) -> None:
+    run("history", "init", "--history", "h.sqlite")
+    found = run("monitor", "--log", HEALTHY, "--history", "h.sqlite")
+    assert found.code == 0
+    assert "the history has no diagnosis of serial number" in found.err
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "no result of a diagnosis"),
+        ("[]", "no result of a diagnosis"),
+        ('{"schema": "other/1"}', "its schema is other/1"),
+        ('{"schema": "ehadiag.diagnosis/2", "actuator": "left"}', "of actuator left"),
+        (
+            '{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": null}',
+            "holds no severities",
+        ),
+        ('{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": {}}', "no result"),
+    ],
+)
+def test_what_is_no_result_is_refused(run: Run, tmp_path: Path, content: str, said: str) -> None:
+    (tmp_path / "r.json").write_text(content)
+    found = run("monitor", "--log", HEALTHY, "--from", "r.json")
+    assert found.code == 2
+    assert said in found.err
+    assert found.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "no bus named"),
+        (("--log", HEALTHY, "--from", "r.json", "--history", "h"), "exclude each other"),
+        (("--log", HEALTHY, "--serial-number", "3"), "no health history"),
+        (("--log", HEALTHY, "--hours", "1e9"), "hours between false alarms"),
+        (("--log", HEALTHY, "--on-alarm", "'open"), "--on-alarm"),
+        (("--log", HEALTHY, "--history", "missing.sqlite"), "no history"),
+    ],
+)
+def test_wrong_usage_is_one_line(run: Run, arguments: tuple[object, ...], said: str) -> None:
+    found = run("monitor", *arguments)
+    assert found.code == 2
+    assert said in found.err
+    assert found.err.count("\n") == 1
+
+
+def test_what_cannot_be_written_is_said(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    log = run("monitor", "--log", HEALTHY, "--log-file", "missing/a.jsonl")
+    assert (log.code, "log missing/a.jsonl" in log.err) == (3, True)
+    folder = run("monitor", "--log", HEALTHY, "--record", "file/around")
+    assert (folder.code, "folder file/around" in folder.err) == (3, True)
+
+
+def test_a_command_that_fails_is_said_and_changes_nothing(run: Run) -> None:
+    found = run("monitor", "--log", WORN, "--on-alarm", "/no/such/program")
+    assert found.code == 40
+    assert "--on-alarm /no/such/program: No such file" in found.err
+
+
+def test_a_projects_file_cannot_have_a_command_called(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "ehadiag.toml").write_text('[monitor]\non_alarm = "touch stolen"\n')
+    found = run("monitor", "--log", WORN)
+    assert found.code == 2
+    assert "on_alarm is not for a project's file" in found.err
+    assert not (tmp_path / "stolen").exists()
+
+
+def test_the_users_own_file_can(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = tmp_path / "own" / "ehadiag"
+    own.mkdir(parents=True)
+    words = '["python3", "-c", "open(\'called\', \'w\').close()"]'
+    (own / "ehadiag.toml").write_text(f"[monitor]\non_alarm = {words}\n")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(own.parent))
+    assert run("monitor", "--log", WORN).code == 40
+    assert (tmp_path / "called").exists()
+
+
+def test_a_silent_bus_is_not_monitored_and_the_time_ends_it(run: Run) -> None:
+    found = run("monitor", "-i", "virtual", "-c", "monitor-silent", "--duration", "0.3")
+    assert found.code == 30
+    assert "NOT MONITORED: the bus was silent" in found.err
+
+
+def test_a_bus_whose_ticks_cannot_be_told_is_refused_before_it_is_opened(run: Run) -> None:
+    mapping = REPOSITORY / "docs" / "examples" / "buses" / "canaerospace.toml"
+    found = run("monitor", "-i", "virtual", "-c", "monitor-other", "--mapping", mapping)
+    assert found.code == 2
+    assert "to follow single ticks" in found.err
+    assert found.err.count("\n") == 1
+
+
+def test_ctrl_c_ends_it_in_order(tmp_path: Path, environment: dict[str, str]) -> None:
+    log = tmp_path / "a.jsonl"
+    command = [sys.executable, "-m", "ehadiag.cli.main", "monitor", "--log-file", str(log)]
+    with subprocess.Popen(
+        [*command, "-i", "virtual", "-c", "monitor-stop"], env=environment, cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        patience = time.monotonic() + 60.0
+        while not (log.exists() and log.read_text()) and time.monotonic() < patience:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 30
+    assert [item["event"] for item in events(log)] == ["begin", "end"]
+    assert b"NOT MONITORED" in said
+    assert b"Traceback" not in said
+
+
+def test_it_follows_tests_and_modes_on_a_bus_and_sends_nothing(run: Run, tmp_path: Path) -> None:
+    """A worn unit, held, then tested in current mode, then held; told of its wear, then not."""
+    core = FccCore(default_actuator(), bundled_tests().values(), faults=Faults(0.0, 0.3, 0.0))
+    channel, heard = "monitor-live", []
+    (tmp_path / "worn.json").write_text(
+        json.dumps(_result({"Kintas": 0.0, "FSS": 0.3, "FDJ": 0.0}))
+    )
+    with (
+        PythonCanTransport(BusOptions("virtual", channel=channel), transmit=True) as fcc,
+        can.Bus(interface="virtual", channel=channel) as witness,
+    ):
+        playing = threading.Thread(target=_play, args=(core, fcc), daemon=True)
+        playing.start()
+        found = run(
+            "monitor", "-i", "virtual", "-c", channel, "--duration", "3", "--from", "worn.json",
+            "--log-file", "a.jsonl",
+        )  # fmt: skip
+        playing.join(30.0)
+        while (message := witness.recv(0.0)) is not None:
+            heard.append(message.arbitration_id)
+    begin, end = events(tmp_path / "a.jsonl")
+    assert begin["severities"]["FSS"] == 0.3
+    assert (found.code, end["alarms"]) == (0, 0)
+    assert "test 'open': running" in found.err
+    assert end["monitored"] > 1000
+    assert 0x200 not in heard  # nobody requested anything
+
+
+def _play(core: FccCore, fcc: PythonCanTransport) -> None:
+    """Half a second of rest, the first two seconds of a test: as fast as it goes, in order."""
+    for tick in range(2500):
+        if tick == 500:
+            core.take(Encoder().request("start", 1, 0)[0])
+        for frame in core.step():
+            fcc.send(frame)
+
+
+def _result(severities: dict[str, float]) -> dict[str, Any]:
+    faults = {name: {"estimate": value, "std": 0.001} for name, value in severities.items()}
+    offsets = {"spool_offset_mm": 0.0, "pressure_offset_MPa": 0.0}
+    noise = {"spool_noise_mm": 1.4e-4, "pressure_noise_MPa": 7e-3}
+    return {
+        "schema": "ehadiag.diagnosis/2",
+        "actuator": "reference-31",
+        "serial": 1,
+        "faults": faults,
+        "fit": {**offsets, **noise},
+        "other": [],
+    }

@@ -1,0 +1,122 @@
+"""Random motion of the simulated actuator in both modes, tick by tick."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import CHANNELS
+from ehadiag.core.recording import CommandMode
+from ehadiag_sim.plant.conditions import Faults
+from ehadiag_sim.plant.simulator import COMMAND_STEP, Plant
+
+__all__ = ["free_motion", "random_command"]
+
+PIECE_S = (0.3, 4.0)
+REACH = {CommandMode.POSITION: 10e-3, CommandMode.CURRENT: 1.5e-3}
+"""Largest command, m and A; in current mode what brings the jack back is added."""
+SINE_HZ = (0.2, 20.0)
+NOISE_HZ = (0.2, 10.0)
+CORNER_HZ = 2.0
+"""Amplitudes fall beyond."""
+CENTRING_A_M = 0.1
+CENTRING_S = 0.5
+"""In current mode the jack would walk off: gain and time constant of what brings it back."""
+LSB = np.array([channel.lsb for channel in CHANNELS])
+HALF = np.array([1 << (channel.bits - 1) for channel in CHANNELS])
+
+
+def random_command(rng: np.random.Generator, ticks: int, rate: float, reach: float) -> list[float]:
+    """Return holds, steps, ramps, sines and filtered noise in random order.
+
+    Parameters
+    ----------
+    rng : np.random.Generator
+        Draws them.
+    ticks : int
+        Length.
+    rate : float
+        Ticks a second.
+    reach : float
+        Largest command either way, m or A.
+
+    Returns
+    -------
+    list[float]
+        Command of each tick, m or A.
+    """
+    out: list[NDArray[np.float64]] = []
+    last, length = 0.0, 0
+    while length < ticks:
+        count = int(rng.uniform(*PIECE_S) * rate)
+        time = np.arange(count) / rate
+        target, kind = rng.uniform(-reach, reach), rng.integers(5)
+        if kind == 0:
+            piece = np.full(count, last)
+        elif kind == 1:
+            piece = np.full(count, target)
+        elif kind == 2:
+            piece = np.linspace(last, target, count)
+        elif kind == 3:
+            hertz = _even_in_octaves(rng, SINE_HZ)
+            piece = last + target / (1.0 + hertz / CORNER_HZ) * np.sin(2 * np.pi * hertz * time)
+        else:
+            hertz = _even_in_octaves(rng, NOISE_HZ)
+            share = 2.0 * math.pi * hertz / rate
+            noise, value = np.empty(count), 0.0
+            for k, draw in enumerate(rng.standard_normal(count).tolist()):
+                value += share * (draw - value)
+                noise[k] = value
+            size = 0.25 * reach / math.sqrt(share / (2.0 - share)) / (1.0 + hertz / CORNER_HZ)
+            piece = last + size * (noise - noise[0])
+        piece = np.clip(piece, -reach, reach)
+        out.append(piece)
+        last, length = float(piece[-1]), length + count
+    commands: list[float] = np.concatenate(out)[:ticks].tolist()
+    return commands
+
+
+def free_motion(
+    actuator: Actuator, faults: Faults, mode: CommandMode, seconds: float, seed: int
+) -> NDArray[np.float64]:
+    """Move a simulated actuator at random, from rest.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        Its data.
+    faults : Faults
+        Its severities.
+    mode : CommandMode
+        What commands are.
+    seconds : float
+        Length.
+    seed : int
+        Of motion and noise.
+
+    Returns
+    -------
+    NDArray[np.float64]
+        Shape (ticks, 5): command (A or m), current (A), spool (m), pressure (Pa), position (m).
+    """
+    rate = actuator.controller.rate
+    rng = np.random.default_rng((seed, int(mode)))
+    commands = random_command(rng, round(seconds * rate), rate, REACH[mode])
+    plant = Plant(actuator, faults, seed=int(rng.integers(1 << 31)))
+    centring = CENTRING_A_M if mode is CommandMode.CURRENT else 0.0
+    step, share, away = COMMAND_STEP[mode], 1.0 / (CENTRING_S * rate), 0.0
+    codes = np.empty((len(commands), 4), dtype=np.int64)
+    sent = np.empty(len(commands))
+    for k, command in enumerate(commands):
+        value = round((command - centring * away) / step) * step
+        codes[k] = plant.tick(value, mode)
+        sent[k] = value
+        away += share * (plant.truth[3] - away)
+    return np.column_stack([sent, (codes - HALF) * LSB])
+
+
+def _even_in_octaves(rng: np.random.Generator, ends: tuple[float, float]) -> float:
+    return math.exp(rng.uniform(math.log(ends[0]), math.log(ends[1])))

@@ -1,0 +1,187 @@
+"""False alarms of the monitor in hours of random motion, and how soon it finds a fault that grew.
+
+    tools/free_motion --motion-hours 12 --jobs 2
+    tools/free_motion --delays --jobs 2
+
+The monitored unit is the detailed simulator, moved at random in current and in position mode from
+rest, a minute at a time. False alarms: its severities are drawn anew for each minute, and the
+monitor knows them. Delays: one severity is more than the monitor knows. An interval of a rate is
+Garwood's (Biometrika 28, 1936), 95 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import joblib
+import numpy as np
+from scipy.stats import chi2
+
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.recording import CommandMode
+from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
+from ehadiag_sim.plant.conditions import Faults
+from ehadiag_tools.free_motion.motion import free_motion
+
+__all__ = ["Case", "Outcome", "garwood", "main", "watch"]
+
+MINUTE_S = 60.0
+WORST = 0.7
+"""Severities of the false-alarm study are drawn evenly from 0 … this."""
+BASE = 0.3
+"""Severities that the monitor knows in the study of delays."""
+GROWTHS = (0.05, 0.1, 0.2)
+NAMES = ("Kintas", "FSS", "FDJ")
+SIGNALS = ("spool above", "spool below", "pressure above", "pressure below")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One minute of motion."""
+
+    mode: CommandMode
+    known: tuple[float, float, float]
+    """Severities that the monitor is told."""
+    true: tuple[float, float, float]
+    seed: int
+    hours: float
+    """Between false alarms, as asked of the monitor."""
+    seconds: float = MINUTE_S
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the monitor said in one minute."""
+
+    alarms: tuple[tuple[int, int], ...]
+    """Tick and sum (see `SIGNALS`) of each."""
+    resting: float
+    """Share of ticks in which the pressure said nothing."""
+    cost_s: float
+    """Processor time."""
+
+
+def watch(case: Case) -> Outcome:
+    """Move the simulated unit for a minute and push all of it into a monitor.
+
+    Parameters
+    ----------
+    case : Case
+        Which minute.
+
+    Returns
+    -------
+    Outcome
+        Its alarms.
+    """
+    began = time.process_time()
+    actuator = default_actuator()
+    rows = free_motion(actuator, Faults(*case.true), case.mode, case.seconds, case.seed)
+    inner = Monitor(actuator, case.known, mode=case.mode, hours=case.hours)
+    monitor = FreeMotionMonitor(inner, undecided_spool(actuator, case.known[2]))
+    alarms, resting = [], 0
+    for tick, row in enumerate(rows.tolist()):
+        reading = monitor.push(tuple(row))
+        resting += bool(np.isnan(reading.residual[1]))
+        if monitor.settled and reading.alarmed.any():
+            alarms += [(tick, int(item)) for item in np.flatnonzero(reading.alarmed)]
+    return Outcome(tuple(alarms), resting / len(rows), time.process_time() - began)
+
+
+def garwood(count: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of a Poisson mean of which so many were seen."""
+    low = 0.0 if count == 0 else float(chi2.ppf(0.025, 2 * count)) / 2.0
+    return low, float(chi2.ppf(0.975, 2 * count + 2)) / 2.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    parser = argparse.ArgumentParser(prog="free_motion", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument(
+        "--motion-hours", type=float, default=0.2, metavar="H", help="of motion (default 0.2)"
+    )
+    parser.add_argument(
+        "--hours", type=float, default=0.5, metavar="H", help="between false alarms (default 0.5)"
+    )
+    parser.add_argument("--delays", action="store_true", help="study delays instead")
+    parser.add_argument(
+        "--minutes", type=int, default=2, metavar="N", help="of each delay (default 2)"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="N")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
+    arguments = parser.parse_args(argv)
+    if arguments.delays:
+        _delays(arguments)
+    else:
+        _false_alarms(arguments)
+    return 0
+
+
+def _false_alarms(arguments: argparse.Namespace) -> None:
+    minutes = max(round(arguments.motion_hours * 60.0), 1)
+    rng = np.random.default_rng(arguments.seed)
+    cases = []
+    for number in range(minutes):
+        known = tuple(float(value) for value in rng.uniform(0.0, WORST, 3))
+        mode = CommandMode.POSITION if number % 2 else CommandMode.CURRENT
+        severities = (known[0], known[1], known[2])
+        cases.append(Case(mode, severities, severities, arguments.seed + number, arguments.hours))
+    found = _run(cases, arguments.jobs)
+    for mode in (*CommandMode, None):
+        chosen = [b for a, b in zip(cases, found, strict=True) if mode in (None, a.mode)]
+        if chosen:
+            _tell(mode.name.lower() if mode else "both", chosen, arguments.hours)
+    spent = sum(item.cost_s for item in found)
+    print(f"seed {arguments.seed}; processor time {spent:.0f} s, {spent / minutes * 60.0:.0f} s/h")
+    for case, outcome in zip(cases, found, strict=True):
+        for tick, which in outcome.alarms:
+            told = ", ".join(f"{value:.2f}" for value in case.known)
+            print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {SIGNALS[which]} {tick}")
+
+
+def _tell(label: str, found: Sequence[Outcome], hours: float) -> None:
+    alarms, length = sum(len(item.alarms) for item in found), len(found) / 60.0
+    low, high = garwood(alarms)
+    resting = float(np.mean([item.resting for item in found]))
+    print(
+        f"{label:8s} {length:6.2f} h: {alarms} alarms, {alarms / length:.2f}/h"
+        f" [{low / length:.2f}, {high / length:.2f}], stated {1.0 / hours:.2f}/h;"
+        f" pressure rests {resting:.0%}"
+    )
+
+
+def _delays(arguments: argparse.Namespace) -> None:
+    kinds = list(itertools.product(CommandMode, range(len(NAMES)), GROWTHS))
+    cases = []
+    for mode, fault, growth in kinds:
+        for number in range(arguments.minutes):
+            true = [BASE] * len(NAMES)
+            true[fault] += growth
+            cases.append(
+                Case(
+                    mode,
+                    (BASE, BASE, BASE),
+                    (true[0], true[1], true[2]),
+                    arguments.seed + number,
+                    arguments.hours,
+                )
+            )
+    found = _run(cases, arguments.jobs)
+    print(f"delay to the first alarm, s, in {arguments.minutes} minutes of motion each")
+    for place, (mode, fault, growth) in enumerate(kinds):
+        part = found[place * arguments.minutes : (place + 1) * arguments.minutes]
+        delays = [f"{item.alarms[0][0] / 1e3:.2f}" if item.alarms else "none" for item in part]
+        print(f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}: {', '.join(delays)}")
+    spent = sum(item.cost_s for item in found)
+    print(f"seed {arguments.seed}; processor time {spent:.0f} s")
+
+
+def _run(cases: Sequence[Case], jobs: int) -> list[Outcome]:
+    work = joblib.Parallel(n_jobs=jobs)
+    found: list[Outcome] = work(joblib.delayed(watch)(case) for case in cases)
+    return found
