@@ -111,8 +111,8 @@ def apply_defaults(
             if "interface" in known[command] and command not in LISTENING:
                 if sent := sorted(SENT & values.keys() & known[command]):
                     ignored.append(
-                        f"{where}: {', '.join(sent)} ignored: {command} can transmit, and takes test"
-                        " and bus from no project's file; name them on the command line, in"
+                        f"{where}: {', '.join(sent)} ignored: {command} can transmit, and takes"
+                        " test and bus from no project's file; name them on the command line, in"
                         f" {user_file()} or by {PREFIX}…"
                     )
                 values = {key: value for key, value in values.items() if key not in SENT}
