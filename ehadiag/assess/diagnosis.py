@@ -17,6 +17,7 @@ from ehadiag.assess.acceptance import (
     remarks_on_recording,
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
+from ehadiag.assess.delays import added, delays_of, put_back, said, worth_it
 from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
@@ -28,6 +29,7 @@ from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
 from ehadiag.assess.supply import objections_to_supply
 from ehadiag.assess.travel import objections_to_travel
+from ehadiag.assess.unobservable import lost_positions, observable, what_is_left
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
@@ -47,6 +49,7 @@ CHANGED = 6.0
 """Deviations of a calibration beyond which an effect has changed since."""
 LEAST_CHANGE = 0.1
 """Of an effect, in units of its scale."""
+DELAY_ROUNDS = 3
 LEAST_SHARE = 0.75
 """Share of samples without which nothing is worked out of a running test."""
 
@@ -159,17 +162,28 @@ class DiagnosisSession:
         begin = time.perf_counter()
         matched = match_tests(recordings, self._tests, self._default)
         experiments, reasons = self._experiments(recordings, matched)
+        hidden = tuple(dict.fromkeys(filter(None, map(lost_positions, experiments))))
+        lost = bool(hidden) and set(reasons) <= set(hidden) and observable(experiments)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
         others: tuple[OtherFault, ...] = ()
         culprit: Culprit | None = None
+        late: tuple[str, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
+        if lost:
+            found = self._session.finish(experiments, progress)
+            identification, words = what_is_left(found)
+            why = tuple(f"{reason}: {words}" for reason in hidden)
         if not reasons:
             identification = self._session.finish(experiments, progress)
+            if any(item.by_time for item in recordings):
+                experiments, identification, late = self._in_time(
+                    experiments, identification, progress
+                )
             modelled = [response_of(item, identification) for item in experiments]
             positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
-            why = tuple(objections_to_estimate(identification))
+            why = tuple(objections_to_estimate(identification, self._actuator.calibration))
             if why:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:
@@ -193,11 +207,40 @@ class DiagnosisSession:
             notes=(
                 *_notes(recordings, matched, self._actuator),
                 *_freed(identification, self._actuator),
+                *late,
                 *_unchecked(positions),
                 *notes_on_other_faults(others),
             ),
             elapsed=time.perf_counter() - begin,
         )
+
+    def _in_time(
+        self,
+        experiments: list[Experiment],
+        found: Identification,
+        progress: Progress | None,
+    ) -> tuple[list[Experiment], Identification, tuple[str, ...]]:
+        """Put delays between messages back that the response tells, if that explains more.
+
+        A delay of whole ticks is seen only roughly before it is put back: so twice.
+        """
+        first, best = experiments, found
+        total = [delays_of(item, found) for item in experiments]
+        notes: tuple[str, ...] = ()
+        for _ in range(DELAY_ROUNDS):
+            if not any(map(worth_it, total)):
+                break
+            moved = [put_back(item, own) for item, own in zip(first, total, strict=True)]
+            other = self._session.finish(moved, progress)
+            if other.fit.outliers >= best.fit.outliers:
+                break
+            experiments, best = moved, other
+            notes = tuple(said(own, first[0].tick) for own in total)
+            left = [delays_of(item, best) for item in experiments]
+            if not any(map(worth_it, left)):
+                break
+            total = [added(own, rest) for own, rest in zip(total, left, strict=True)]
+        return experiments, best, notes
 
     def _experiments(
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]

@@ -18,6 +18,7 @@ from ehadiag.core.printable import printable
 from firmware_iface.logs.budget import Budget
 from firmware_iface.logs.packed import kind_of, unpacked
 from firmware_iface.signals.columns import TIME, ColumnMap, missing, unit_of
+from firmware_iface.signals.row_clock import even_times
 
 __all__ = ["DECODED_SUFFIXES", "Signal", "holds_signals", "joined", "read_signals"]
 
@@ -42,10 +43,13 @@ class Signal:
         s, ascending, shape (n,).
     value : NDArray[np.float64]
         SI, finite, shape (n,).
+    jitter : float
+        Deviation of the stamps from the even clock that took their place, s; 0: they are as read.
     """
 
     time: NDArray[np.float64]
     value: NDArray[np.float64]
+    jitter: float = 0.0
 
 
 def holds_signals(path: Path | str, *, mapped: bool) -> bool:
@@ -246,14 +250,15 @@ def _checked(
 ) -> dict[str, Signal]:
     """In order of time, once for each instant, numbers alone."""
     out: dict[str, Signal] = {}
-    for role, (time, value) in found.items():
+    for role, (stamps, value) in found.items():
+        time, jitter = even_times(stamps)
         known = np.isfinite(time) & np.isfinite(value)
         at, values = time[known], value[known]
         order = np.argsort(at, kind="stable")
         at, values = at[order], values[order]
         once = np.diff(at, append=np.inf) > 0.0
         if once.sum() >= LEAST_ROWS or (role.startswith("environment.") and once.any()):
-            out[role] = Signal(at[once], values[once])
+            out[role] = Signal(at[once], values[once], jitter)
         elif role.startswith("channels."):
             raise InputOutputError(f"log {path}: {role} has {int(once.sum())} numbers in all")
     return out
@@ -308,5 +313,5 @@ def joined(parts: Iterable[dict[str, Signal]]) -> dict[str, Signal]:
         order = np.argsort(time, kind="stable")
         time, value = time[order], value[order]
         once = np.concatenate([np.diff(time) > 0.0, [True]])
-        out[role] = Signal(time[once], value[once])
+        out[role] = Signal(time[once], value[once], max(piece.jitter for piece in pieces))
     return out

@@ -110,7 +110,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--delays", action="store_true", help="study delays instead")
     parser.add_argument(
-        "--minutes", type=int, default=2, metavar="N", help="of each delay (default 2)"
+        "--pieces", type=int, default=2, metavar="N", help="of motion, for each delay (default 2)"
+    )
+    parser.add_argument(
+        "--piece", type=float, default=MINUTE_S, metavar="S", help="length of one (default 60)"
     )
     parser.add_argument("--seed", type=int, default=1, metavar="N")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
@@ -123,29 +126,32 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _false_alarms(arguments: argparse.Namespace) -> None:
-    minutes = max(round(arguments.motion_hours * 60.0), 1)
+    minutes = max(round(arguments.motion_hours * 3600.0 / arguments.piece), 1)
     rng = np.random.default_rng(arguments.seed)
     cases = []
     for number in range(minutes):
         known = tuple(float(value) for value in rng.uniform(0.0, WORST, 3))
         mode = CommandMode.POSITION if number % 2 else CommandMode.CURRENT
         severities = (known[0], known[1], known[2])
-        cases.append(Case(mode, severities, severities, arguments.seed + number, arguments.hours))
+        seed = arguments.seed + number
+        cases.append(Case(mode, severities, severities, seed, arguments.hours, arguments.piece))
     found = _run(cases, arguments.jobs)
     for mode in (*CommandMode, None):
         chosen = [b for a, b in zip(cases, found, strict=True) if mode in (None, a.mode)]
         if chosen:
-            _tell(mode.name.lower() if mode else "both", chosen, arguments.hours)
+            hours = len(chosen) * arguments.piece / 3600.0
+            _tell(mode.name.lower() if mode else "both", chosen, hours, arguments.hours)
     spent = sum(item.cost_s for item in found)
-    print(f"seed {arguments.seed}; processor time {spent:.0f} s, {spent / minutes * 60.0:.0f} s/h")
+    each = spent / minutes * 3600.0 / arguments.piece
+    print(f"seed {arguments.seed}; processor time {spent:.0f} s, {each:.0f} s an hour of motion")
     for case, outcome in zip(cases, found, strict=True):
         for tick, which in outcome.alarms:
             told = ", ".join(f"{value:.2f}" for value in case.known)
             print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {SIGNALS[which]} {tick}")
 
 
-def _tell(label: str, found: Sequence[Outcome], hours: float) -> None:
-    alarms, length = sum(len(item.alarms) for item in found), len(found) / 60.0
+def _tell(label: str, found: Sequence[Outcome], length: float, hours: float) -> None:
+    alarms = sum(len(item.alarms) for item in found)
     low, high = garwood(alarms)
     resting = float(np.mean([item.resting for item in found]))
     print(
@@ -159,7 +165,7 @@ def _delays(arguments: argparse.Namespace) -> None:
     kinds = list(itertools.product(CommandMode, range(len(NAMES)), GROWTHS))
     cases = []
     for mode, fault, growth in kinds:
-        for number in range(arguments.minutes):
+        for number in range(arguments.pieces):
             true = [BASE] * len(NAMES)
             true[fault] += growth
             cases.append(
@@ -169,12 +175,14 @@ def _delays(arguments: argparse.Namespace) -> None:
                     (true[0], true[1], true[2]),
                     arguments.seed + number,
                     arguments.hours,
+                    arguments.piece,
                 )
             )
     found = _run(cases, arguments.jobs)
-    print(f"delay to the first alarm, s, in {arguments.minutes} minutes of motion each")
+    length = f"{arguments.pieces} × {arguments.piece:g} s"
+    print(f"delay to the first alarm, s; {length} of motion each, alarms count after 0.3 s")
     for place, (mode, fault, growth) in enumerate(kinds):
-        part = found[place * arguments.minutes : (place + 1) * arguments.minutes]
+        part = found[place * arguments.pieces : (place + 1) * arguments.pieces]
         delays = [f"{item.alarms[0][0] / 1e3:.2f}" if item.alarms else "none" for item in part]
         print(f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}: {', '.join(delays)}")
     spent = sum(item.cost_s for item in found)
