@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ehadiag.assess.unobservable import lost_positions
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import PRESSURE, SPOOL
+from ehadiag.core.calibration import CHANGED, Calibration
+from ehadiag.core.conversion import conversion_of
 from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
 from ehadiag.identify.commanded_current import CONTROL_LAW_LSB, FRAME_TOLERANCE
@@ -169,8 +170,9 @@ def _spacing(present: NDArray[np.int64]) -> int:
 def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
     """What the model must not be run with; holds for a running test too."""
     out = []
+    saturated = conversion_of(samples, actuator).saturated
     for index, name in ((1, "spool"), (2, "pressure"), (3, "position")):
-        share = float(np.mean(samples.saturated[index]))
+        share = float(np.mean(saturated[index]))
         if share > MOST_SATURATED:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
     temperature = environment.oil_temperature
@@ -193,14 +195,19 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     out = []
     trace, test = experiment.trace, experiment.test
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-    if trace.command_deviation > FRAME_TOLERANCE[mode]:
+    channels = experiment.channels
+    reach = (channels.position if test.closed_loop else channels.current).full_scale
+    if trace.command_deviation > max(FRAME_TOLERANCE[mode] * reach, trace.command_step):
         unit = "mm" if test.closed_loop else "mA"
         out.append(
             f"the command differs from test {test.name!r} by up to "
             f"{trace.command_deviation * 1e3:.3g} {unit}: another test was played"
         )
     # The current's own noise is not to be had in closed loop; the other converters' stands for it.
-    noise_lsb = min(experiment.spool_noise / SPOOL.lsb, experiment.pressure_noise / PRESSURE.lsb)
+    noise_lsb = min(
+        experiment.spool_noise / channels.spool.grain,
+        experiment.pressure_noise / channels.pressure.grain,
+    )
     limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
     if trace.residual_lsb > limit_lsb:
         out.append(
@@ -217,16 +224,25 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     return out
 
 
-def objections_to_estimate(identification: Identification) -> list[str]:
-    """Why estimates cannot carry a verdict; empty if they can."""
+def objections_to_estimate(
+    identification: Identification, calibration: Calibration | None = None
+) -> list[str]:
+    """Why estimates cannot carry a verdict; empty if they can.
+
+    calibration: of the unit: what it could not explain is no reason.
+    """
     fit = identification.fit
     out = []
     rms = max(fit.spool_rms, fit.pressure_rms)
-    if fit.outliers > MOST_OUTLIERS or not rms <= MOST_RMS:
+    most_outliers, most_rms = MOST_OUTLIERS, MOST_RMS
+    if calibration is not None and calibration.fit.left > 0.0:
+        most_outliers += CHANGED * calibration.fit.outliers
+        most_rms *= CHANGED * max(calibration.fit.spool_rms, calibration.fit.pressure_rms)
+    if fit.outliers > most_outliers or not rms <= most_rms:
         out.append(
             f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
-            f"three times the noise (limit {MOST_OUTLIERS:.1%}), rms residual {rms:.2f} (limit "
-            f"{MOST_RMS:g}): other actuator data, or an effect that the three faults leave out"
+            f"three times the noise (limit {most_outliers:.1%}), rms residual {rms:.2f} (limit "
+            f"{most_rms:.3g}): other actuator data, or an effect that the three faults leave out"
         )
     hidden = [item.name for item in identification.estimates if not item.shown]
     if hidden:

@@ -182,7 +182,7 @@ class DiagnosisSession:
             modelled = [response_of(item, identification) for item in experiments]
             positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
-            why = tuple(objections_to_estimate(identification))
+            why = tuple(objections_to_estimate(identification, self._actuator.calibration))
             if why:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:

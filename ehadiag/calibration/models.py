@@ -19,12 +19,12 @@ from ehadiag.identify.spans import lay_out
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
 __all__ = [
+    "BUDGET",
+    "EFFECTS",
     "SECOND_STAGES",
-    "SENSING",
     "SMOOTH",
     "Learned",
     "Model",
-    "further_models",
     "learn",
     "simple_models",
 ]
@@ -42,15 +42,23 @@ DATA = ("KSF", "KF", "GP", "GQ", "CS", "MJ", "CJ")
 """Data in which units differ; GM is the torque motor's gain among the nuisances."""
 FRICTIONS = ("FSS0", "FDJ0")
 """Data that pass for a fault: learned where the severities are taken for 0."""
-SENSING = {
+EFFECTS = {
     "filter_time": Known(5e-5, 5e-5),
     "sampling_lead": Known(5e-5, 5e-5),
     "spool_gain": Known(0.0, 0.003),
     "pressure_gain": Known(0.0, 0.003),
     "load": Known(0.0, 30.0),
-    "jack_stribeck": Known(5e-3, 5e-3),
+    "load_spring": Known(5e3, 1e4),
+    "jack_stribeck": Known(1e-2, 1e-2),
+    "spool_stribeck": Known(1e-2, 1e-2),
+    "friction_way": Known(0.0, 0.03),
+    "torque_even": Known(0.0, 0.02),
+    "torque_odd": Known(0.0, 0.03),
+    "hysteresis_skew": Known(0.0, 2.0),
+    "spool_bend": Known(0.0, 0.005),
+    "spool_bow": Known(0.0, 0.01),
 }
-"""What is added where the rest does not explain the recordings: usual sizes (PHY-32 to 36)."""
+"""What is added where the rest does not explain the recordings: usual sizes (PHY-31 to 36)."""
 OIL = {"bulk_modulus": Known(0.0, 0.15)}
 """Of an orifice stage: entrained air lowers the bulk modulus (PHY-39)."""
 NEARLY_NEW = Known(0.02, 0.05)
@@ -66,21 +74,27 @@ class Model:
     second_stage : str
     plays : int
         Of the hysteresis.
-    sensing : bool
-        Whether errors of the sensors and a load are estimated too.
+    beside : tuple[str, ...]
+        Names of the further effects that are estimated.
     """
 
     second_stage: str = "linear"
     plays: int = 1
-    sensing: bool = False
+    beside: tuple[str, ...] = ()
+
+    @property
+    def rich(self) -> bool:
+        """Whether further effects are estimated."""
+        return bool(self.beside)
 
     @property
     def words(self) -> str:
         """What it is, for tables."""
         hysteresis = "one play" if self.plays == 1 else "smooth hysteresis"
-        return f"{self.second_stage} second stage, {hysteresis}" + (
-            ", errors of the sensors" if self.sensing else ""
-        )
+        words = f"{self.second_stage} second stage, {hysteresis}"
+        if len(self.beside) == len(EFFECTS):
+            return f"{words}, all effects"
+        return f"{words}, {len(self.beside)} effects" if self.beside else words
 
     def of(self, actuator: Actuator) -> Actuator:
         """Return an actuator's data with this class of second stage."""
@@ -94,7 +108,7 @@ class Model:
         """What is known of any unit beforehand."""
         data = {f"datum_{name}": DATUM for name in (*DATA, *FRICTIONS)}
         oil = OIL if self.second_stage == "orifice" else {}
-        return {**data, **oil, **(SENSING if self.sensing else {})}
+        return {**data, **oil, **{name: EFFECTS[name] for name in self.beside}}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -105,7 +119,7 @@ class Model:
             *nuisances_of(REGISTRY),
             *(replace(item, lower=-REACH, upper=REACH) for item in data),
             *(parameter(name) for name in OIL if self.second_stage == "orifice"),
-            *(parameter(name) for name in SENSING if self.sensing),
+            *(parameter(name) for name in self.beside),
         )
 
 
@@ -135,12 +149,6 @@ def simple_models(start: Actuator) -> list[Model]:
     return [Model(kind) for kind in sorted({*SECOND_STAGES, first}, key=lambda kind: kind != first)]
 
 
-def further_models(best: Model) -> list[Model]:
-    """Models to try where a second stage with one play does not explain the recordings."""
-    stage = best.second_stage
-    return [Model(stage, SMOOTH), Model(stage, sensing=True), Model(stage, SMOOTH, sensing=True)]
-
-
 def learn(
     model: Model,
     build: Callable[[Actuator], list[Experiment]],
@@ -149,6 +157,8 @@ def learn(
     new: bool,
     nearly_new: bool = False,
     hint: Mapping[str, float] | None = None,
+    budget: int = BUDGET,
+    brief: bool = False,
     seed: int,
     tell: Callable[[float], None] | None = None,
 ) -> Learned:
@@ -168,6 +178,10 @@ def learn(
         Look for small severities.
     hint : Mapping[str, float] | None
         Values by name beside which the optimum probably lies.
+    budget : int
+        Runs of the model after which no further start is made.
+    brief : bool
+        Stop early where nothing explains the recordings.
     seed : int
         The same seed gives the same answer.
     tell : Callable[[float], None] | None
@@ -193,9 +207,10 @@ def learn(
         known={**model.known, **small},
         considered=CONSIDERED,
         hint=hint,
-        budget=BUDGET,
+        budget=budget,
         seed=seed,
         tell=tell,
+        give_up=brief,
     )
     return Learned(model, experiments, found, _criterion(found, len(free)))
 

@@ -22,6 +22,20 @@ __all__ = ["Lesson", "lesson_of", "unit_of", "values_of"]
 
 OTHER_SYMBOLS = {MOTOR_GAIN: "GM", "bulk_modulus": "beta"}
 """Keys of data whose parameter has another name."""
+UNITS = {
+    "GM": "N m/A",
+    "KF": "N m/m",
+    "KSF": "N m/m",
+    "CS": "N s/m",
+    "FSS0": "N",
+    "GP": "Pa/m",
+    "GQ": "m²/s",
+    "MJ": "kg",
+    "CJ": "N s/m",
+    "FDJ0": "N",
+    "beta": "Pa",
+}
+"""SI units of the data that are learned."""
 SHOWN = 0.7
 """Of the deviation known beforehand: what has become no narrower was not shown."""
 HARDLY = "the recordings hardly show it: little is known but its usual size"
@@ -155,7 +169,7 @@ def values_of(start: Actuator, unit: Actuator, lesson: Lesson) -> tuple[Value, .
                 name=item.name,
                 symbol=symbol or item.symbol,
                 meaning=item.short,
-                unit=item.unit if symbol is None else "SI",
+                unit=item.unit if symbol is None else UNITS[symbol],
                 start=before,
                 value=value,
                 std=std if symbol is None else std * before,

@@ -27,7 +27,7 @@ PROJECT = frozenset(
     {
         "actuator", "mapping", "dbc", "test", "log_channel", "solver", "nuisances", "seed",
         "advisory", "limit", "rule", "json", "json_version", "no_picture", "jobs", "interface",
-        "channel", "bitrate", "fd", "data_bitrate", "app_name",
+        "channel", "context", "bitrate", "fd", "data_bitrate", "app_name",
     }
 )  # fmt: skip
 """Options that a project's file may set."""

@@ -6,10 +6,14 @@ from typing import Annotated
 
 import msgspec
 
-__all__ = ["Calibration", "Goodness", "Source"]
+__all__ = ["CHANGED", "NOISE_ALONE", "Calibration", "Goodness", "Source"]
 
 MOST_PARAMETERS = 64
 ROUNDING = 1e-9
+NOISE_ALONE = 1.16
+"""Excess up to which a model leaves nothing (`ehadiag.identify.nuisance.explained`)."""
+CHANGED = 2.0
+"""By which wear may make more of what a model leaves: friction acts on more of it."""
 
 Text = Annotated[str, msgspec.Meta(max_length=1000)]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
@@ -38,6 +42,16 @@ class Goodness(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     spool_rms: Positive
     """Residual in units of the noise."""
     pressure_rms: Positive
+
+    @property
+    def left(self) -> float:
+        """What the model leaves beside noise, over what noise alone may leave; 0: nothing."""
+        return max(self.excess / NOISE_ALONE - 1.0, 0.0)
+
+    @property
+    def most_excess(self) -> float:
+        """Excess that a later recording of the unit may have."""
+        return CHANGED * self.excess
 
 
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -242,6 +242,7 @@ class Session:
             tell=lambda share: tell("nuisances", share),
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
             give_up=not knowledge.doubts,
+            explains=knowledge.explains,
         )
 
     def _said(

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from ehadiag.compile.kernels import inlined
 from ehadiag.compile.vector import least, magnitude, most, packed
+from ehadiag.model.exponential import exponential
 from ehadiag.model.plant import PlantConstants
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "SpoolLaw",
     "creeping",
     "drive_law",
+    "driven",
     "excess",
     "faded",
     "flapper_held",
@@ -53,19 +55,37 @@ class DriveLaw(NamedTuple):
     gain: flapper deflection per current, GM / KF, m/A.
     bias: current that the motor adds to the commanded one, A.
     spacing: of the half-widths of the plays, A: they are spacing (i + 1/2).
-    share: of each play in the current that acts, 1 / plays.
+    share: of the narrowest play in the current that acts.
+    fade: share of each play over that of the next narrower one.
+    even, odd: relative gain of the torque per current (1/A) and per its square (1/A²).
     """
 
     gain: Any
     bias: Any
     spacing: Any
     share: Any
+    fade: Any
+    even: Any
+    odd: Any
 
 
 @inlined
 def drive_law(c: PlantConstants) -> DriveLaw:
     """Precombine what the torque motor's law needs (PHY-4, PHY-29, PHY-30)."""
-    return DriveLaw(c.GM / c.KF, c.IB, c.HYS * c.IM / c.NPL, 1.0 / c.NPL)
+    fade = exponential(-c.SKW / c.NPL)
+    total, weight = 0.0, 1.0
+    for _ in range(int(c.NPL)):
+        total += weight
+        weight *= fade
+    even, odd = c.TQ2 / c.IM, c.TQ3 / (c.IM * c.IM)
+    return DriveLaw(c.GM / c.KF, c.IB, c.HYS * c.IM / c.NPL, 1.0 / total, fade, even, odd)
+
+
+@packed
+def driven(law: DriveLaw, total: Any) -> Any:
+    """Flapper deflection (m) by the sum of what the plays hold, each with its weight (A)."""
+    acting = law.share * total
+    return law.gain * acting * (1.0 + acting * (law.even + law.odd * acting))
 
 
 @packed
@@ -87,6 +107,9 @@ class SpoolLaw(NamedTuple):
     dynamic: dry friction of the moving spool, N.
     dry: flapper deflection that balances it, m.
     breakaway: flapper deflection that overcomes the static friction, m.
+    extra: that which balances the friction that a creeping spool has and a fast one has not, m; 0
+        without Stribeck's effect.
+    by_stribeck: reciprocal of the velocity over which that fades, s/m.
     flapper_stop, stroke: of flapper and spool, m.
     backlash: half-width of the play between spool and feedback wire, m.
     bend: of the spool's path that the second stage does not feel, m.
@@ -102,6 +125,8 @@ class SpoolLaw(NamedTuple):
     dynamic: float
     dry: float
     breakaway: float
+    extra: float
+    by_stribeck: float
     flapper_stop: float
     stroke: float
     backlash: float
@@ -125,6 +150,8 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         STATIC_SHARE_SPOOL * c.FSS,
         STATIC_SHARE_SPOOL * c.FSS / force,
         c.FSS / force,
+        (1.0 - STATIC_SHARE_SPOOL) * c.FSS / force if c.VSS > 0.0 else 0.0,
+        1.0 / max(c.VSS, SLOWEST_STRIBECK) if c.VSS > 0.0 else 0.0,
         c.XFM,
         c.XSM,
         c.BKL,
@@ -178,7 +205,7 @@ class JackLaw(NamedTuple):
     oil: rise of the pressure by the jack's travel where the oil yields, 2 β AJ / V, Pa/m; 0: it
         does not, and the second stage is linear.
     stroke: m.
-    load: external with the jack in its middle, N.
+    load: external with the jack in its middle, N, and what friction is more one way than the other.
     spring: what it gains by the jack's travel, N/m.
     friction: dry friction of the moving jack, N.
     static: of the resting one, N.
@@ -220,7 +247,7 @@ def jack_law(c: PlantConstants) -> JackLaw:
         1.0 / c.PSR,
         c.OIL * c.AJ,
         c.XJM,
-        c.FR,
+        c.FR + c.WAY * c.FDJ,
         c.KA,
         c.FDJ,
         STATIC_RATIO_JACK * c.FDJ,

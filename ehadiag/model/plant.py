@@ -52,6 +52,12 @@ class PlantConstants(NamedTuple):
     """Hysteresis of the torque motor: width of the loop over rated current."""
     NPL: Value
     """Number of plays whose mean the hysteresis is."""
+    SKW: Value
+    """How much less a wide play counts in that mean: by exp(-SKW (i + 1/2) / NPL), i = 0, 1 …"""
+    TQ2: Value
+    """Even part of the torque's curve: at rated current the torque is GM IM (1 + TQ2 + TQ3)."""
+    TQ3: Value
+    """Odd part of it, by the square of the current."""
     GM: Value
     """Torque-motor gain, N m/A."""
     JF: Value
@@ -82,6 +88,8 @@ class PlantConstants(NamedTuple):
     """Static dry friction of the spool, N."""
     FSS1: Value
     """Static dry friction of the spool at the limit of damage, N."""
+    VSS: Value
+    """Stribeck velocity of the spool's friction, m/s; 0: moving, it is the dynamic one."""
     PSR: Value
     """Supply minus return pressure, Pa."""
     GP: Value
@@ -107,6 +115,8 @@ class PlantConstants(NamedTuple):
     """Dynamic dry friction of the jack at the limit of damage, N."""
     VSJ: Value
     """Stribeck velocity of the jack's friction, m/s; 0: moving, it is the dynamic one."""
+    WAY: Value
+    """Friction of a jack that moves out over the mean of both ways, less 1."""
     FR: Value
     """External load, N."""
     KA: Value
@@ -119,6 +129,10 @@ class PlantConstants(NamedTuple):
     """Constant error of the jack's sensor, m."""
     GXS: Value
     """Relative error of the gain of the spool's sensor."""
+    BX2: Value
+    """Even part of the curve of the spool's sensor: at its stop the spool reads 1 + BX2 + BX3."""
+    BX3: Value
+    """Odd part of it, by the square of the position."""
     GPD: Value
     """The same of the sensor of differential pressure."""
     GXJ: Value
@@ -173,6 +187,9 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         IB=0.0,
         HYS=0.0,
         NPL=1.0,
+        SKW=0.0,
+        TQ2=0.0,
+        TQ3=0.0,
         GM=valve.GM,
         JF=valve.JF,
         CF=valve.CF,
@@ -188,6 +205,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         BKL=0.0,
         FSS=valve.FSS0,
         FSS1=valve.FSS1,
+        VSS=0.0,
         PSR=supply,
         GP=valve.GP,
         GQ=valve.GQ,
@@ -200,12 +218,15 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         FDJ=jack.FDJ0,
         FDJ1=jack.FDJ1,
         VSJ=0.0,
+        WAY=0.0,
         FR=jack.FR,
         KA=0.0,
         OXS=0.0,
         OPD=0.0,
         OXJ=0.0,
         GXS=0.0,
+        BX2=0.0,
+        BX3=0.0,
         GPD=0.0,
         GXJ=0.0,
         TAU=0.0,

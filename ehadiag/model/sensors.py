@@ -23,6 +23,7 @@ __all__ = [
     "SensorLaw",
     "followed",
     "following",
+    "read_spool",
     "sensing",
     "sensor_law",
     "through_ends",
@@ -41,7 +42,9 @@ class SensorLaw(NamedTuple):
     Attributes
     ----------
     spool_offset, pressure_offset, position_offset: constant errors, m, Pa, m.
-    spool_gain, pressure_gain, position_gain: what is shown over what is there.
+    spool_gain, pressure_gain, position_gain: what is shown over what is there; of the spool about
+        the middle, and
+    spool_even, spool_odd: what its gain grows by with the position (1/m) and its square (1/m²).
     lead: all are sampled so long before the end of the tick, s.
     lag: time constant of the filter before the converters of spool and pressure, s; 0: none.
     """
@@ -54,12 +57,32 @@ class SensorLaw(NamedTuple):
     position_gain: Any
     lead: Any
     lag: Any
+    spool_even: Any
+    spool_odd: Any
 
 
 @inlined
 def sensor_law(c: PlantConstants) -> SensorLaw:
     """Precombine what the sensors' laws need (PHY-33 to PHY-36)."""
-    return SensorLaw(c.OXS, c.OPD, c.OXJ, 1.0 + c.GXS, 1.0 + c.GPD, 1.0 + c.GXJ, c.DLY, c.TAU)
+    return SensorLaw(
+        c.OXS,
+        c.OPD,
+        c.OXJ,
+        1.0 + c.GXS,
+        1.0 + c.GPD,
+        1.0 + c.GXJ,
+        c.DLY,
+        c.TAU,
+        c.BX2 / c.XSM,
+        c.BX3 / (c.XSM * c.XSM),
+    )
+
+
+@packed
+def read_spool(law: SensorLaw, place: Any) -> Any:
+    """What the spool's sensor reads of a position (m), but for noise and rounding."""
+    bent = place * (law.spool_even + law.spool_odd * place)
+    return law.spool_offset + place * (law.spool_gain + bent)
 
 
 @inlined

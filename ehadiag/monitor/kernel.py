@@ -19,6 +19,7 @@ from ehadiag.model.scalar.drive import drive
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, sensed_path, spool_tick
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.second_stage import jack_tick
+from ehadiag.model.sensors import read_spool
 from ehadiag.model.spool_events import SpoolState
 from ehadiag.monitor.layout import (
     CUSUM,
@@ -172,7 +173,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
     after, count = spool_tick(tables, deflection, control_law_of(p).tick, before, nodes, 0)
     sensor, tick = sensor_law_of(p), control_law_of(p).tick
     seen, lagged = sensed_path(sensor, tick, nodes, 0, count, m.xs, m.lagged)
-    innovation = spool - sensor.spool_offset - sensor.spool_gain * seen
+    innovation = spool - read_spool(sensor, seen)
     p12, jack, jack_spool = jack_tick(
         jack_law_of(p), sensor, tick, nodes, 0, count, jack_of(p), m.jack_spool
     )

@@ -11,6 +11,7 @@ from ehadiag.core.find_test import Sought, found_tests, rows_of_samples
 from ehadiag.core.recording import (
     CommandMode,
     Environment,
+    OnboardResult,
     Outcome,
     Quality,
     Recording,
@@ -30,6 +31,7 @@ from firmware_iface.alignment.senders import (
 from firmware_iface.alignment.ticks import TickAxis, place
 from firmware_iface.codec.channel import channels_in, choose_channel
 from firmware_iface.codec.decode import DecodedTable, decode
+from firmware_iface.codec.onboard import onboard_results
 from firmware_iface.codec.status import read_status, resolve_turns
 from firmware_iface.mapping.bus_map import BusMap
 from firmware_iface.transport.frames import FrameTable
@@ -100,7 +102,8 @@ def assemble(
     looked_for = sought if axis is not None and not _says_when(decoded, axis, bus_map) else None
     margin = LOOKED_BESIDE if looked_for is not None else 0
     found: list[Recording] = []
-    for item in episodes:
+    own = onboard_results(table, bus_map)
+    for item, after in zip(episodes, (*episodes[1:], None), strict=True):
 
         def told(mode: CommandMode | None, item: Episode = item) -> Recording:
             return _recording(
@@ -108,11 +111,31 @@ def assemble(
             )
 
         if looked_for is None or bounds is None:
-            found.append(told(None))
-            continue
-        modes = modes_told(_grid(item, decoded, bounds, bus_map, len(table), margin))
-        found += _in_each_mode(told, modes, item, looked_for, margin)
+            these = [told(None)]
+        else:
+            modes = modes_told(_grid(item, decoded, bounds, bus_map, len(table), margin))
+            these = _in_each_mode(told, modes, item, looked_for, margin)
+        if own:
+            said = _onboard_of(item, after, own, bounds, len(table))
+            these = [replace(one, onboard=said) for one in these]
+        found += these
     return tuple(found)
+
+
+def _onboard_of(
+    episode: Episode,
+    after: Episode | None,
+    found: list[tuple[int, OnboardResult]],
+    bounds: Bounds | None,
+    rows: int,
+) -> OnboardResult | None:
+    """What the computer found between a test and the one after it, of that test."""
+    if bounds is None or episode.ticks == 0:
+        return None
+    begin = bounds.rows(episode, rows)[1]
+    end = rows if after is None or after.ticks == 0 else bounds.rows(after, rows)[0]
+    between = (item for row, item in found if begin <= row < end)
+    return next((item for item in between if item.is_of(episode.test_id)), None)
 
 
 def _in_each_mode(

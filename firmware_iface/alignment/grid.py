@@ -144,6 +144,7 @@ def samples_of(grid: Grid, mode: CommandMode | None = None) -> tuple[Samples, li
         command=command,
         saturated=np.stack([filled[key].saturated for key in CHANNEL_KEYS]),
         host_ns=filled["spool"].host_ns,
+        stated=grid.bus_map.stated,
     )
     return samples, notes + said
 

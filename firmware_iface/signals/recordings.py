@@ -216,7 +216,10 @@ def _samples(
     samples = Samples(
         period_ns=tick_ns,
         mode=mode,
-        **filled,
+        current=filled["current"],
+        spool=filled["spool"],
+        pressure=filled["pressure"],
+        position=filled["position"],
         command=command,
         saturated=np.zeros((len(CHANNELS), ticks), dtype=np.bool_),
         host_ns=np.rint((clock.begin[:-1] - start) * 1e9).astype(np.int64),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ehadiag.core.actuator import default_actuator
@@ -61,9 +63,11 @@ def unknowns_of(values, actuator=None, environment=None):
     return Unknowns(tuple(parameter(name) for name in values), (base,), {})
 
 
-def residuals_of(kind, values, batch, actuator=None):
+def residuals_of(kind, values, batch, actuator=None, *, plays=1):
     """Residuals of one candidate, its parameters by name, in LSB, shape (rows, n)."""
-    model = MODELS[kind](batch, unknowns_of(values, actuator))
+    space = unknowns_of(values, actuator)
+    base = tuple(item._replace(NPL=float(plays)) for item in space.base)
+    model = MODELS[kind](batch, replace(space, base=base))
     return model.residuals(np.array([list(values.values())]))[0][0]
 
 

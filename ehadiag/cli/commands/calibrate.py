@@ -12,6 +12,7 @@ from ehadiag.cli import options
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
 from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import emit, progress_bar, rendered, say, say_if_compiling
+from ehadiag.cli.report_page import add_report_option, calibration_report, need_report_library
 from ehadiag.cli.results import make_folder
 from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError
 from ehadiag.core.stored_test import resolve_test
@@ -65,6 +66,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_log_options(parser)
     options.add_seed_option(parser, "seed of the search")
     options.add_json_option(parser)
+    add_report_option(parser, "beside the actuator file, also where nothing was learned")
     parser.set_defaults(run=run)
 
 
@@ -72,17 +74,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate; return the exit code."""
     start = options.the_actuator(arguments)
     out = _place(arguments)
+    if arguments.report:
+        need_report_library()
     say_if_compiling()
     recordings, digests = _read(arguments)
     found = _learn(arguments, start, recordings, digests)
     keep_signals()
-    written = []
-    if found.actuator is not None:
-        with make_folder(str(out.parent)) as folder:
-            _write(folder, out.name, found.actuator, replaced=arguments.update)
-            written.append(out)
-            _draw(folder, f"{out.stem}.png", found)
-            written.append(out.with_suffix(".png"))
+    written = _bring_out(arguments, out, found)
     if arguments.json:
         from ehadiag.report.calibration import calibration_json  # noqa: PLC0415
 
@@ -94,6 +92,26 @@ def run(arguments: argparse.Namespace) -> int:
     if written:
         say("wrote " + ", ".join(str(item) for item in written))
     return 0 if found.actuator is not None else NotTestedError.exit_code
+
+
+def _bring_out(arguments: argparse.Namespace, out: Path, found: Calibrated) -> list[Path]:
+    """Write file and picture of what was learned, and the report; return what was written."""
+    written = []
+    if found.actuator is not None or arguments.report:
+        with make_folder(str(out.parent)) as folder:
+            if found.actuator is not None:
+                _write(folder, out.name, found.actuator, replaced=arguments.update)
+                written.append(out)
+                _draw(folder, f"{out.stem}.png", found)
+                written.append(out.with_suffix(".png"))
+            if arguments.report:
+                page = out.with_suffix(".html")
+                try:
+                    folder.write(page.name, calibration_report(found))
+                except OSError as error:
+                    raise InputOutputError(f"report {page}: {error.strerror or error}") from None
+                written.append(page)
+    return written
 
 
 def _place(arguments: argparse.Namespace) -> Path:

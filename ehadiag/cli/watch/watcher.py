@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 from ehadiag.cli.watch.known import KnownUnit
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import stated_channels
 from ehadiag.core.recording import BitState, CommandMode, Environment
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.live.snapshot import Residuals, RunningTest, known
 from ehadiag.live.trace import Trace
 from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
-from ehadiag.monitor.plan import NOISE
+from ehadiag.monitor.plan import usual_noise
 from firmware_iface.alignment.live_ticks import LiveTick, LiveTicks
 from firmware_iface.codec.live_decode import LiveDecoder, checked_values
 from firmware_iface.codec.live_messages import BitStatus
@@ -267,7 +268,8 @@ class Watcher:
         if waits and self.ticks < PATIENCE_S * self._rate and self.ticks:
             return
         actuator, effects = self.unit.unit(self._actuator)
-        noise = self.unit.noise
+        noise, channels = self.unit.noise, stated_channels(self._map.stated, actuator)
+        least = usual_noise(channels)
         monitor = Monitor(
             actuator,
             self.unit.faults,
@@ -275,9 +277,10 @@ class Watcher:
             mode=self._live.mode,
             hours=self._hours,
             # A fit may take some of the noise for its own.
-            noise=None if noise is None else (max(noise[0], NOISE[0]), max(noise[1], NOISE[1])),
+            noise=None if noise is None else (max(noise[0], least[0]), max(noise[1], least[1])),
             offsets=self.unit.offsets,
             effects=effects,
+            channels=channels,
         )
         self._made_for, self._other = told, False
         self._threshold = monitor.design.threshold

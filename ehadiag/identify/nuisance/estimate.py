@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.nuisance.explained import excess, is_hopeless, is_noise
+from ehadiag.identify.nuisance.explained import Explains, excess, is_hopeless, is_noise
 from ehadiag.identify.nuisance.prior import (
     ALIAS,
     Joint,
@@ -82,6 +82,7 @@ def estimate(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     give_up: bool = False,
+    explains: Explains = is_noise,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
 
@@ -106,6 +107,8 @@ def estimate(
         Called from time to time with the share of the budget that is spent.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
+    explains : callable
+        Of residuals, shape (signals, N): whether there is nothing better to look for.
     """
     known = known or {}
     coarse = _free_running(experiments, free)
@@ -128,7 +131,7 @@ def estimate(
         first,
         information,
         origins,
-        is_noise,
+        explains,
         alias=ALIAS,
         budget=budget,
         seed=seed,
@@ -146,7 +149,7 @@ def estimate(
         refined=refined,
         experiments=judged,
         covariance=spread_of_optima(found, model.scale),
-        explained=is_noise(refined.residuals),
+        explained=explains(refined.residuals),
         excess=excess(refined.residuals),
         starts=found.starts,
         evaluations=sum(item.evaluations for item in (guide, model, fine) if item),

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.calibration import CHANGED, NOISE_ALONE, Goodness
 from ehadiag.identify.noise import relative_noise
 from ehadiag.identify.refine.posterior import TAIL
 
-__all__ = ["MOST_EXCESS", "excess", "is_hopeless", "is_noise"]
+__all__ = ["Explains", "excess", "is_hopeless", "is_noise", "leaves_no_more"]
+
+Explains = Callable[[NDArray[np.float64]], bool]
+"""Of weighted residuals, shape (signals, N): whether there is nothing better to look for."""
 
 EXPECTED = 0.8618
 """Mean of Cauchy's cost for a standard normal residual, TAIL² E ln(1 + (r/TAIL)²)."""
-MOST_EXCESS = 1.16
+MOST_EXCESS = NOISE_ALONE
 """1.02 to 1.15 at the optimum of 80 simulated tests: rounding makes some noise that lasts."""
 MOST_OUTLIERS = 0.01
 """Share of residuals beyond three deviations."""
@@ -45,6 +51,16 @@ def excess(residuals: NDArray[np.float64]) -> float:
 def is_noise(residuals: NDArray[np.float64]) -> bool:
     """Whether nothing is left to explain."""
     return _outliers(residuals) <= MOST_OUTLIERS and excess(residuals) <= MOST_EXCESS
+
+
+def leaves_no_more(fit: Goodness) -> Explains:
+    """Whether nothing is left beside what a unit's calibration could not explain either."""
+    if not fit.left:
+        return is_noise
+    most_outliers = MOST_OUTLIERS + CHANGED * fit.outliers
+    return lambda residuals: (
+        _outliers(residuals) <= most_outliers and excess(residuals) <= fit.most_excess
+    )
 
 
 def is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:

@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.calibration import Calibration
+from ehadiag.core.channels import Channels
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.identify.nuisance.explained import Explains, is_noise, leaves_no_more
 from ehadiag.identify.nuisance.prior import Joint, Known, usual
+from ehadiag.model.parameter import sized
 from ehadiag.model.parameters import REGISTRY, Kind, Parameter, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
 
@@ -44,6 +48,11 @@ CALIBRATED_STD = 1e-4
 """Of a severity: what two optima on noise of their own, a calibration's and a diagnosis's, differ
 by beyond their covariances. Errors of calibrated random units were 1.3 to 2.7 times what these
 alone state (`tools/data_sheet`), at a discrepancy of 0.003 %."""
+UNEXPLAINED_STD = 3e-3
+"""Of a severity, where the calibration's residuals have twice the cost of noise: what a unit's
+effects that no model has do to an estimate. It grows with the root of what is left, as a deviation
+does with a share of the residual (a model discrepancy: Kennedy and O'Hagan, J. R. Stat. Soc. B
+63(3), 2001; Brynjarsdóttir and O'Hagan, Inverse Problems 30, 2014)."""
 _NAMES = frozenset(item.name for item in REGISTRY if item.kind is not Kind.FAULT)
 
 
@@ -87,6 +96,10 @@ class Knowledge:
     about : mapping
         Effects that the unit's constants already have, by name, SI: what is free is a deviation
         from them.
+    std : float
+        Of each severity, beside all else.
+    explains : callable
+        Of residuals, shape (signals, N): whether no more is left than of the unit as new.
     """
 
     free: tuple[Parameter, ...] = ()
@@ -94,6 +107,8 @@ class Knowledge:
     joint: Joint | None = None
     aliases: tuple[Alias, ...] = ()
     about: Mapping[str, float] = field(default_factory=dict)
+    std: float = 0.0
+    explains: Explains = is_noise
 
     def loosened(self) -> Knowledge:
         """Return what is left of it where the unit's effects have changed since."""
@@ -122,9 +137,8 @@ class Knowledge:
     ) -> NDArray[np.float64]:
         """Covariance that aliases and a calibration add to that of estimates, SI, shape (k, k)."""
         out = np.zeros((len(parameters), len(parameters)))
-        if self.joint is not None:
-            severities = [item.kind is Kind.FAULT for item in parameters]
-            out += np.diag(np.where(severities, CALIBRATED_STD**2, 0.0))
+        severities = [item.kind is Kind.FAULT for item in parameters]
+        out += np.diag(np.where(severities, self.std**2, 0.0))
         names = [item.name for item in parameters]
         for item in self.aliases:
             place = names.index(item.fault.name)
@@ -148,7 +162,7 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
         A calibration has a parameter that the model does not have.
     """
     if actuator.calibration is not None:
-        return _calibrated(actuator.calibration)
+        return _calibrated(actuator.calibration, actuator_channels(actuator))
     free, known, aliases = [], {}, []
     for symbol in actuator.tolerance.names:
         half_width = actuator.tolerance.of(symbol)
@@ -165,18 +179,22 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
     return Knowledge(tuple(free), known, None, tuple(aliases))
 
 
-def _calibrated(calibration: Calibration) -> Knowledge:
+def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:
     """What a calibration says: of deviations from the values that it found, so about 0."""
     for name in (*calibration.effects, *calibration.parameters):
         if name not in _NAMES:
             raise ConfigurationError(f"actuator file: calibration: no parameter {name!r} is known")
     free = []
     for name in calibration.parameters:
-        item, value = parameter(name), calibration.effects.get(name, 0.0)
-        free.append(replace(item, lower=item.lower - value, upper=item.upper - value))
+        item, value = sized(parameter(name), channels), calibration.effects.get(name, 0.0)
+        free.append(
+            replace(item, lower=item.lower - value, upper=item.upper - value, sized_by=None)
+        )
     joint = Joint(calibration.parameters, np.zeros(len(free)), covariance_of(calibration))
     free += [parameter(name) for name in OF_THE_DAY]
-    return Knowledge(tuple(free), OF_THE_DAY, joint, (), calibration.effects)
+    std = math.hypot(CALIBRATED_STD, UNEXPLAINED_STD * math.sqrt(calibration.fit.left))
+    explains = leaves_no_more(calibration.fit)
+    return Knowledge(tuple(free), OF_THE_DAY, joint, (), calibration.effects, std, explains)
 
 
 def covariance_of(calibration: Calibration) -> NDArray[np.float64]:

@@ -110,9 +110,12 @@ def _refine(
     spans: Spans,
     start: Mapping[str, float],
     levels: NDArray[np.int64],
-    spread: float,
+    spread: NDArray[np.float64] | float,
 ) -> Refinement:
-    return refine(anchored_derivatives(experiments, spans, levels=levels), start, spread)
+    batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
+    # What is considered is worked out with the last part.
+    model = SimdModel(batch, unknowns_of(experiments), levels=levels)
+    return refine(Derivatives(model, experiments[0].noise), start, spread)
 
 
 def anchored_derivatives(

@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import CAP, Derivatives, capped
 from ehadiag.identify.refine.linearisation import Belief, Linearised, crossed
-from ehadiag.identify.refine.posterior import sharpen
+from ehadiag.identify.refine.posterior import FEW, sharpen
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Parameter
 
 __all__ = ["SPREAD", "Refinement", "described", "median_offsets", "refine"]
 
-SPREAD = 2e-3
-"""Of the severities about the optimum of a search, which is mostly nearer."""
-LEAST_RATIO = 0.3
-"""By which the belief may become narrower in a round: few unknowns are told apart at once."""
+SPREAD = np.array([2e-3, 1e-3, 4e-4])
+"""Of the severities, in the order of `FAULTS`, about the optimum of a search, which is mostly
+nearer."""
 CLEAR = 1.0
 """Scatter about the linear model, in variances of the noise, from which a row tells nothing."""
 
@@ -97,7 +96,7 @@ def refine(
 ) -> Refinement:
     """Sharpen a belief about a start, values by name (0 where not named).
 
-    spread: of the severities about it, or of each of them, shape (c,).
+    spread: of the severities about it, shape (c,), or of each of them.
     """
     x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
     curved = model.curved
@@ -105,14 +104,7 @@ def refine(
         np.clip(x, model.lower, model.upper),
         np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
     )
-    found = sharpen(
-        model,
-        begin,
-        begin,
-        np.zeros((len(x), len(x))),
-        crossed,
-        least_ratio=LEAST_RATIO,
-    )
+    found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, FEW)
     return described(model, found.belief.x, found.linear, settled=found.settled)
 
 

@@ -19,21 +19,45 @@ from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import Belief, Linearised
 
-__all__ = ["TAIL", "Sharpened", "robust_weights", "sharpen"]
+__all__ = ["FEW", "MANY", "TAIL", "Pace", "Sharpened", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
-MOST_ROUNDS = 18
-LEAST_RATIO = 0.5
-"""By which the belief may become narrower in a round, in any direction."""
+LEAST_RATIO_OF_LINEAR = 0.05
+"""By which a belief may become narrower in a round where the model is linear over it: there is
+nothing to look past."""
+LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
+"""Scatter, in variances of the noise; share of samples with more of it, up to which it is so."""
 WIDTH = 2.0
 """Of the belief, in deviations of what the linear problem leaves."""
-SETTLED_RATIO = 0.85
-SETTLED_STEP = 0.5
-"""Of a round after which nothing changes: ratio of the widths, step in units of them."""
 HELD_BACK = 0.1
 """Share of the belief's information that a round's step is held back by."""
 FREE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast a belief is sharpened.
+
+    Attributes
+    ----------
+    least_ratio : float
+        By which it may become narrower in a round, in any direction.
+    settled_ratio, settled_step : float
+        Of a round after which nothing changes: ratio of the widths, step in units of them.
+    most_rounds : int
+    """
+
+    least_ratio: float
+    settled_ratio: float
+    settled_step: float
+    most_rounds: int
+
+
+MANY = Pace(least_ratio=0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=18)
+"""For many unknowns."""
+FEW = Pace(least_ratio=0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12)
+"""For few ones, which are told apart at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +84,7 @@ def sharpen(
     begin: Belief,
     information: NDArray[np.float64],
     linearise: Callable[[Derivatives, Belief], Linearised],
-    *,
-    least_ratio: float = LEAST_RATIO,
+    pace: Pace = MANY,
 ) -> Sharpened:
     """Sharpen a belief until the noise stops it.
 
@@ -77,14 +100,13 @@ def sharpen(
         What was known: inverse covariance, 0 where nothing.
     linearise : callable
         How the model is made linear over a belief.
-    least_ratio : float
-        By which the belief may become narrower in a round, in any direction.
+    pace : Pace
     """
     belief, rounds, settled = begin, 0, False
-    while not settled and rounds < MOST_ROUNDS:
+    while not settled and rounds < pace.most_rounds:
         linear = linearise(model, belief)
-        belief, ratio, step = _narrowed(model, linear, known, belief, information, least_ratio)
-        settled = ratio > SETTLED_RATIO and step < SETTLED_STEP
+        belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
+        settled = ratio > pace.settled_ratio and step < pace.settled_step
         rounds += 1
     return Sharpened(belief, linear, settled)
 
@@ -95,13 +117,18 @@ def robust_weights(linear: Linearised) -> NDArray[np.float64]:
     return np.asarray(1.0 / (variance + linear.residuals**2 / TAIL**2))
 
 
+def _is_linear(linear: Linearised) -> bool:
+    """Whether next to no sample leaves the line by more than its noise."""
+    return float(np.mean(linear.scatter > LINEAR_SCATTER)) < LINEAR_SHARE
+
+
 def _narrowed(
     model: Derivatives,
     linear: Linearised,
     known: Belief,
     belief: Belief,
     information: NDArray[np.float64],
-    least_ratio: float,
+    pace: Pace,
 ) -> tuple[Belief, float, float]:
     """Belief after a round; also the ratio by which it would narrow most, and the step."""
     weights = robust_weights(linear).ravel()
@@ -121,6 +148,7 @@ def _narrowed(
     spread *= WIDTH**2 * max(excess, 1.0)
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
-    kept = np.clip(ratios, least_ratio, 1.0)
+    least = LEAST_RATIO_OF_LINEAR if _is_linear(linear) else pace.least_ratio
+    kept = np.clip(ratios, least, 1.0)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
     return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import inlined
-from ehadiag.model.laws import DriveLaw, play
+from ehadiag.model.laws import DriveLaw, driven, play
 
 __all__ = ["deflection_held", "drive"]
 
@@ -25,7 +25,8 @@ def drive(law: DriveLaw, held: NDArray[np.float64], current: float) -> float:
 @inlined
 def deflection_held(law: DriveLaw, held: NDArray[np.float64]) -> float:
     """Flapper deflection by the current that acts, m."""
-    total = 0.0
+    total, weight = 0.0, 1.0
     for i in range(held.shape[0]):
-        total += held[i]
-    return law.gain * law.share * total
+        total += weight * held[i]
+        weight *= law.fade
+    return float(driven(law, total))

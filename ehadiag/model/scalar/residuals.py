@@ -19,7 +19,7 @@ from ehadiag.model.scalar.jack import jack_response
 from ehadiag.model.scalar.spool import spool_response
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import spool_tables
-from ehadiag.model.sensors import sensor_law
+from ehadiag.model.sensors import read_spool, sensor_law
 
 __all__ = ["ScalarModel"]
 
@@ -90,7 +90,7 @@ def _residuals(
         )
         law = sensor_law(constants)
         for k in range(n):
-            spool = batch.spool[a + k] - law.spool_offset - law.spool_gain * work.spool[k]
+            spool = batch.spool[a + k] - read_spool(law, work.spool[k])
             out[SPOOL_ROW, a + k] = _weighted(spool, batch.weight[SPOOL_ROW, a + k])
             pressure = batch.pressure[a + k] - law.pressure_offset
             pressure -= law.pressure_gain * work.pressure[k]

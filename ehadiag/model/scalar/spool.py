@@ -12,7 +12,7 @@ from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.drive import deflection_held, drive
 from ehadiag.model.scalar.spool_tick import sensed_path, spool_rest, spool_tick
 from ehadiag.model.scalar.transition import SpoolTables
-from ehadiag.model.sensors import sensor_law
+from ehadiag.model.sensors import read_spool, sensor_law
 from ehadiag.model.spool_events import SpoolState
 
 __all__ = ["spool_response"]
@@ -64,7 +64,7 @@ def spool_response(
         node_end[k] = count
         spool[k], lagged = sensed_path(sensor, tick, nodes, first, count, before, lagged)
         xs, filtered, moved = re_anchored(
-            measured[k] - sensor.spool_offset - sensor.spool_gain * spool[k],
+            measured[k] - read_spool(sensor, spool[k]),
             anchor[0], anchor[1], anchor[2], s.xs, filtered, law.stroke,
         )  # fmt: skip
         if moved:

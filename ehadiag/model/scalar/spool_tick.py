@@ -25,8 +25,10 @@ from ehadiag.model.laws import (
 )
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.sensors import LATE, SensorLaw, followed, following, sensing, through_ends
+from ehadiag.model.spool_creep import Transition, creeping_step
 from ehadiag.model.spool_events import (
     NOTHING,
+    UNSURE,
     SpoolState,
     carried,
     clamped_event,
@@ -125,6 +127,19 @@ def _slide_clamped(t: SpoolLaw, h: float, fade: float, s: SpoolState) -> SpoolSt
 
 
 @inlined
+def _creep(
+    tables: SpoolTables, level: int, h: float, deflection: float, loose: bool, s: SpoolState
+) -> tuple[SpoolState, bool]:
+    """Spool moving with friction that falls with its velocity, flapper free or on its stop."""
+    m = tables.loose[level] if loose else tables.moving[level]
+    transition = Transition(
+        m[0, 0], m[0, 1], m[0, 2], m[0, 3], m[1, 0], m[1, 1], m[1, 2], m[1, 3],
+        m[2, 0], m[2, 1], m[2, 2], m[2, 3], m[3, 0], m[3, 1], m[3, 2], m[3, 3],
+    )  # fmt: skip
+    return creeping_step(tables.law, transition, h, tables.decay[level], deflection, loose, s)
+
+
+@inlined
 def _node_wanted(t: SpoolLaw, event: int, done: int, bend: float) -> bool:
     """Whether the path is to have a node here."""
     if event > NOTHING or done == WHOLE:
@@ -177,17 +192,20 @@ def spool_tick(
         while (WHOLE >> level) > WHOLE - done:
             level += 1
         h = tick / (1 << level)
-        new = s
+        new, sure = s, True
+        loose = s.direction != 0 and not carried(t, s.direction, s.xs, s.wire)
+        creeps = s.direction != 0 and t.extra > 0.0
+        if creeps:
+            new, sure = _creep(tables, level, h, deflection, loose, s)
         if s.clamped:
-            if s.direction != 0:
+            if s.direction != 0 and not creeps:
                 new = _slide_clamped(t, h, tables.decay[level], s)
             wire = play(s.wire, new.xs, t.backlash)
             event = clamped_event(t, deflection, s.xf, new.xs, new.vs, wire, s.direction)
         elif s.direction != 0:
-            loose = not carried(t, s.direction, s.xs, s.wire)
-            if loose:
+            if loose and not creeps:
                 new = _slide_loose(t, tables.loose[level], h, deflection, s)
-            else:
+            elif not creeps:
                 new = _slide(t, tables.moving[level], deflection, s)
             event = moving_event(
                 t, h, s.xf, s.wf, new.xf, new.wf, new.xs, new.vs, s.wire, loose, s.direction
@@ -197,6 +215,8 @@ def spool_tick(
             event = stuck_event(t, h, s.xf, s.wf, new.xf, new.wf, s.xs)
         if level == 0:
             event = NOTHING  # `_rests` has looked
+        elif event == NOTHING and not sure:
+            event = UNSURE
         if event != NOTHING and level < FINEST:
             level += 1
             continue

@@ -163,9 +163,9 @@ def tabulate(
     moving: NDArray[np.float64],
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
-) -> tuple[bool, bool]:
-    """Coefficients of all lanes; returns whether any has backlash, and a filter, a lead or
-    Stribeck's friction of the jack.
+) -> tuple[bool, bool, bool]:
+    """Coefficients of all lanes; returns whether any has backlash, Stribeck's friction of the
+    spool, and a filter, a lead or Stribeck's friction of the jack.
 
     Parameters
     ----------
@@ -178,11 +178,12 @@ def tabulate(
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
-    any_backlash = any_other = False
+    any_backlash = any_creep = any_other = False
     for i in range(LANES):
         c = plant_of(candidates[i])
         t = _laws(c, i, coefficients)
         any_backlash = any_backlash or t.backlash > 0.0
+        any_creep = any_creep or t.extra > 0.0
         any_other = any_other or sensing(sensor_law(c)) or c.VSJ > 0.0
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
@@ -215,4 +216,4 @@ def tabulate(
             for level in range(len(SHIFTS)):
                 place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH
                 loose[place : place + WIDTH] = moving[place : place + WIDTH]
-    return any_backlash, any_other
+    return any_backlash, any_creep, any_other

@@ -22,6 +22,7 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch
 from ehadiag.model.plant import FIELDS, plant_of
+from ehadiag.model.sensors import read_spool
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
 from ehadiag.model.simd.jack import (
     follow_lanes,
@@ -54,6 +55,7 @@ from ehadiag.model.simd.spool import (
     see_lanes,
     spool_lanes,
 )
+from ehadiag.model.simd.spool_creep import creeping_lanes
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
 
 __all__ = [
@@ -201,13 +203,14 @@ def _hold_against(
     """
     for o in range(0, end, WIDTH):
         law = sensor_laws(coefficients, o)
+        value = load(state, row * LANES + o)
         if signal == SPOOL_ROW:
-            offset, gain = law.spool_offset, law.spool_gain
+            shown = read_spool(law, value)
         elif signal == PRESSURE_ROW:
-            offset, gain = law.pressure_offset, law.pressure_gain
+            shown = law.pressure_offset + law.pressure_gain * value
         else:
-            offset, gain = law.position_offset, law.position_gain
-        residual = (measured - offset - gain * load(state, row * LANES + o)) * weight
+            shown = law.position_offset + law.position_gain * value
+        residual = (measured - shown) * weight
         store(sample, o, residual)
         store(sums, o, load(sums, o) + least(residual * residual, cap))
 
@@ -281,7 +284,7 @@ def _block(
         for i in range(LANES):
             for field in range(FIELDS):
                 rows[i, field] = candidates[min(i, count - 1), test, field]
-        backlash, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        backlash, creeps, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
@@ -297,7 +300,10 @@ def _block(
             last -= 1
         for k in range(start[index], start[index + 1]):
             drive_lanes(end, current[since + k - start[index]], plays, state, coefficients)
-            if spool_lanes(end, tick, backlash, state, path, coefficients):
+            busy = spool_lanes(end, tick, backlash, state, path, coefficients)
+            if busy and creeps:
+                busy = creeping_lanes(end, tick, state, path, coefficients)
+            if busy:
                 event_ticks(count, tick, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
             if senses:

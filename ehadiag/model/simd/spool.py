@@ -23,8 +23,8 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.laws import play, slide_base, still_flapper
-from ehadiag.model.sensors import followed, through_ends
+from ehadiag.model.laws import driven, play, slide_base, still_flapper
+from ehadiag.model.sensors import followed, read_spool, through_ends
 from ehadiag.model.simd.layout import (
     ANCHORED,
     BUSY,
@@ -84,13 +84,14 @@ def drive_lanes(
     for o in range(0, end, WIDTH):
         law = drive_laws(coefficients, o)
         value = law.bias + current
-        total = value * 0.0
+        total, weight = value * 0.0, value * 0.0 + 1.0
         for i in range(plays):
             row = (PLAYS + i) * LANES + o
             held = play(load(state, row), value, law.spacing * (i + 0.5))
             store(state, row, held)
-            total = total + held
-        store(state, DEFLECTION * LANES + o, law.gain * law.share * total)
+            total = total + weight * held
+            weight = weight * law.fade
+        store(state, DEFLECTION * LANES + o, driven(law, total))
 
 
 @packed
@@ -100,10 +101,11 @@ def deflect_lanes(
     """Flapper deflection by what the plays hold, all lanes, into the state."""
     for o in range(0, end, WIDTH):
         law = drive_laws(coefficients, o)
-        total = law.bias * 0.0
+        total, weight = law.bias * 0.0, law.bias * 0.0 + 1.0
         for i in range(plays):
-            total = total + load(state, (PLAYS + i) * LANES + o)
-        store(state, DEFLECTION * LANES + o, law.gain * law.share * total)
+            total = total + weight * load(state, (PLAYS + i) * LANES + o)
+            weight = weight * law.fade
+        store(state, DEFLECTION * LANES + o, driven(law, total))
 
 
 @packed
@@ -220,7 +222,9 @@ def spool_lanes(
             a, w, b, v, s, n, x = _quarter(m, a, w, b, v, bow, dry, s, n, x)
             b4, u4 = base + d * b, d * most(v, CREEP)
             loose = d * (xs - wire) < t.backlash - TOUCH
-            moves = (d != 0.0) & free & ~loose & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
+            # A spool whose friction falls with its velocity: `ehadiag.model.simd.spool_creep`.
+            plain = free & (t.extra == 0.0)
+            moves = (d != 0.0) & plain & ~loose & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
             moves = moves & (x < t.flapper_stop) & (d * b4 < t.stroke)
             w = where(magnitude(w) > CREEP, w, 0.0)
             x1, x2 = where(moves, b1, xs), where(moves, b2, xs)
@@ -251,7 +255,7 @@ def spool_lanes(
                 b3, u3 = xs + d * (b + 3.0 * step * steady), d * (v + steady)
                 a, w, b, v, s, n, x = _loose_quarter(q, a, w, b, v, bow, lift, dry, s, n, x, steady)
                 b4, u4 = xs + d * (b + 4.0 * step * steady), d * (v + steady)
-                slips = (d != 0.0) & free & loose & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
+                slips = (d != 0.0) & plain & loose & (s > 10.0 * LEAST_DEPTH) & (n > LEAST_DEPTH)
                 slips = slips & (x < t.flapper_stop) & (d * b4 < t.stroke)
                 slips = slips & (d * (b4 - wire) < t.backlash - TOUCH)
                 x1, x2 = where(slips, b1, x1), where(slips, b2, x2)
@@ -331,7 +335,7 @@ def anchor_lanes(
     for o in range(0, end, WIDTH):
         xs, filtered = load(state, SPOOL * LANES + o), load(state, FILTERED * LANES + o)
         law = sensor_laws(coefficients, o)
-        error = measured - law.spool_offset - law.spool_gain * load(state, read * LANES + o)
+        error = measured - read_spool(law, load(state, read * LANES + o))
         filtered = filtered + gain * (error - filtered)
         move = where(magnitude(filtered) > small, filtered, 0.0)
         move = where(magnitude(error) > large, error, move)

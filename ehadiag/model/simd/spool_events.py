@@ -50,6 +50,7 @@ from ehadiag.model.simd.layout import (
     sensor_law_of_lane,
     spool_law_of_lane,
 )
+from ehadiag.model.simd.spool_creep import held_friction
 from ehadiag.model.spool_events import (
     BREAKAWAY,
     ENGAGE,
@@ -258,19 +259,25 @@ def _event_tick(
         shift, fine = SHIFTS[level], level == finest
         whole = WIDTH - ((done >> shift) & (WIDTH - 1))
         h, place = unit * (1 << shift), i * len(SHIFTS) + level
+        law, less, short = t, 0.0, True
+        if s.direction != 0 and t.extra > 0.0:
+            law, less, short = held_friction(t, moving, loose, place, whole, h, deflection, s)
+            if fine and not short:
+                whole = 1
+                law, less, short = held_friction(t, moving, loose, place, whole, h, deflection, s)
         if s.clamped:
-            found = _clamped_instants(t, moving, place, deflection, s, path)
+            found = _clamped_instants(law, moving, place, deflection, s, path)
         elif s.direction != 0:
             if carried(t, s.direction, s.xs, s.wire):
-                base = slide_base(t, deflection, float(s.direction))
-                found = _moving_instants(t, moving, place, h, fine, base, s, path)
+                base = slide_base(law, deflection, float(s.direction))
+                found = _moving_instants(law, moving, place, h, fine, base, s, path)
             else:
                 still = still_flapper(t.ratio, deflection, s.wire)
-                found = _loose_instants(t, loose, place, h, fine, still, s, path)
+                found = _loose_instants(law, loose, place, h, fine, still, s, path)
         else:
             still = still_flapper(t.ratio, deflection, s.wire)
             found = _stuck_instants(t, stuck, place, h, fine, still, s, path)
-        first = first_place(found)
+        first = first_place(found) if short or fine else 0
         event = NOTHING
         if first < whole and fine:
             o = INSTANTS + first
@@ -281,8 +288,12 @@ def _event_tick(
             else:
                 event = _event(t, s, new_xf, new_xs, new_vs)
         steps = whole if first >= whole else first + 1 if fine else first
-        for n in range(steps):
-            o = INSTANTS + n
+        n = 0
+        while n < steps:
+            # On to the next node of the path, or to the last step.
+            taken = min(steps - n, (QUARTER - (done & (QUARTER - 1))) >> shift)
+            n += taken
+            o = INSTANTS + n - 1
             s = SpoolState(
                 path[o],
                 path[o + WIDTH],
@@ -292,10 +303,13 @@ def _event_tick(
                 s.direction,
                 s.clamped,
             )
+            if less != 0.0 and first >= whole and n == steps - 1:
+                vs = s.vs - less * s.direction
+                s = SpoolState(s.xf, s.wf, s.xs, vs, s.wire, s.direction, s.clamped)
             end_vs = s.vs
-            done += 1 << shift
-            since += 1 << shift
-            switches = event > NOTHING and n == steps - 1
+            done += taken << shift
+            since += taken << shift
+            switches = event > NOTHING and n == steps
             if switches:
                 s = switch(t, event, s)
                 kinks = kinks or event == SPOOL_STOP or (s.direction != 0 and s.vs == 0.0)

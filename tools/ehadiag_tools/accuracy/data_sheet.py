@@ -83,7 +83,7 @@ def perform_sheet(run: SheetRun) -> dict[str, Any]:
         "value": [item.value for item in result.estimates],
         "std": [item.std for item in result.estimates],
         "interval95": [list(item.interval95) for item in result.estimates],
-        "not_tested": bool(reasons or objections_to_estimate(result)),
+        "not_tested": bool(reasons or objections_to_estimate(result, actuator.calibration)),
         "refused": list(reasons),
         "evaluations": result.evaluations,
         "attempts": result.attempts,
