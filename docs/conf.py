@@ -19,6 +19,7 @@ project = "ehadiag"
 author = "the ehadiag maintainers"
 release = version = installed("ehadiag")
 language = "en"
+default_role = "code"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "numpydoc"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4

@@ -7,17 +7,17 @@ modelled then follows the modelled derivative, and their regression is the delay
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.assess.modelled import response_of
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.result import Identification
-from ehadiag.model.scalar.response import respond
 
-__all__ = ["Delay", "added", "delays_of", "put_back", "said", "worth_it"]
+__all__ = ["Delay", "delays_of", "in_time", "put_back", "said", "worth_it"]
 
 LEAST = 0.05
 """Ticks from which on a delay is put back."""
@@ -29,7 +29,10 @@ SURE = 5.0
 """Deviations beyond which it is one."""
 STRANGE = 4.0
 """Deviations beyond which a residual is none of the delay."""
-ROUNDS = 5
+ROUNDS = 3
+"""Times that delays are put back at most."""
+REGRESSIONS = 5
+"""Each without what was strange in the one before."""
 LEAST_USED = 100
 LAGS = 20
 """Ticks over which what the model leaves out is held to be alike."""
@@ -72,8 +75,7 @@ def delays_of(experiment: Experiment, found: Identification) -> tuple[Delay, ...
         Of spool, pressure and position; that of the position infinitely unsure where the jack
         hardly moves.
     """
-    constants = found.constants(experiment.constants)
-    model = respond(constants, experiment.trace.current, experiment.tick, origin=experiment.origin)
+    model = response_of(experiment, found)
     return (
         _delay("spool", experiment.spool, model.spool),
         _delay("pressure", experiment.pressure, model.pressure),
@@ -97,21 +99,51 @@ def worth_it(delays: Sequence[Delay]) -> bool:
     return any(abs(item.value) > max(LEAST, SURE * item.std) for item in delays)
 
 
-def added(before: Sequence[Delay], left: Sequence[Delay]) -> tuple[Delay, ...]:
-    """Delays in all, after some were put back and others are left.
+def in_time(
+    experiments: list[Experiment],
+    found: Identification,
+    identify: Callable[[Sequence[Experiment]], Identification],
+) -> tuple[list[Experiment], Identification, tuple[str, ...]]:
+    """Put delays back that the response tells, if that explains more of the recordings.
+
+    A delay of whole ticks is seen only roughly before it is put back: so several times.
 
     Parameters
     ----------
-    before : Sequence[Delay]
-        Put back.
-    left : Sequence[Delay]
-        Of the same signals then.
+    experiments : list[Experiment]
+        As recorded.
+    found : Identification
+        From these.
+    identify : Callable[[Sequence[Experiment]], Identification]
+        Identifies anew.
 
     Returns
     -------
-    tuple[Delay, ...]
-        Their sums, with the deviations of what is left.
+    tuple[list[Experiment], Identification, tuple[str, ...]]
+        The experiments in time, what they say, and what was put back in words; as they came and
+        nothing where no delay is sure.
     """
+    first, best = experiments, found
+    total = [delays_of(item, found) for item in experiments]
+    notes: tuple[str, ...] = ()
+    for _ in range(ROUNDS):
+        if not any(map(worth_it, total)):
+            break
+        moved = [put_back(item, own) for item, own in zip(first, total, strict=True)]
+        other = identify(moved)
+        if other.fit.outliers >= best.fit.outliers:
+            break
+        experiments, best = moved, other
+        notes = tuple(said(own, first[0].tick) for own in total)
+        left = [delays_of(item, best) for item in experiments]
+        if not any(map(worth_it, left)):
+            break
+        total = [_added(own, rest) for own, rest in zip(total, left, strict=True)]
+    return experiments, best, notes
+
+
+def _added(before: Sequence[Delay], left: Sequence[Delay]) -> tuple[Delay, ...]:
+    """Delays in all, after some were put back and others are left."""
     return tuple(
         replace(rest, value=own.value + rest.value) for own, rest in zip(before, left, strict=True)
     )
@@ -190,7 +222,7 @@ def _delay(name: str, measured: Floats, modelled: Floats) -> Delay:
     left = measured - modelled
     used = np.isfinite(left)
     value, std = 0.0, np.inf
-    for _ in range(ROUNDS):
+    for _ in range(REGRESSIONS):
         if used.sum() < LEAST_USED or not np.ptp(slope[used]):
             return Delay(name, 0.0, np.inf)
         middle = slope[used].mean()

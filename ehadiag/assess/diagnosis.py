@@ -17,7 +17,7 @@ from ehadiag.assess.acceptance import (
     remarks_on_recording,
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
-from ehadiag.assess.delays import added, delays_of, put_back, said, worth_it
+from ehadiag.assess.delays import in_time
 from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
@@ -49,7 +49,6 @@ CHANGED = 6.0
 """Deviations of a calibration beyond which an effect has changed since."""
 LEAST_CHANGE = 0.1
 """Of an effect, in units of its scale."""
-DELAY_ROUNDS = 3
 LEAST_SHARE = 0.75
 """Share of samples without which nothing is worked out of a running test."""
 
@@ -177,8 +176,8 @@ class DiagnosisSession:
         if not reasons:
             identification = self._session.finish(experiments, progress)
             if any(item.by_time for item in recordings):
-                experiments, identification, late = self._in_time(
-                    experiments, identification, progress
+                experiments, identification, late = in_time(
+                    experiments, identification, lambda item: self._session.finish(item, progress)
                 )
             modelled = [response_of(item, identification) for item in experiments]
             positions = tuple(map(position_fit, experiments, modelled))
@@ -213,34 +212,6 @@ class DiagnosisSession:
             ),
             elapsed=time.perf_counter() - begin,
         )
-
-    def _in_time(
-        self,
-        experiments: list[Experiment],
-        found: Identification,
-        progress: Progress | None,
-    ) -> tuple[list[Experiment], Identification, tuple[str, ...]]:
-        """Put delays between messages back that the response tells, if that explains more.
-
-        A delay of whole ticks is seen only roughly before it is put back: so twice.
-        """
-        first, best = experiments, found
-        total = [delays_of(item, found) for item in experiments]
-        notes: tuple[str, ...] = ()
-        for _ in range(DELAY_ROUNDS):
-            if not any(map(worth_it, total)):
-                break
-            moved = [put_back(item, own) for item, own in zip(first, total, strict=True)]
-            other = self._session.finish(moved, progress)
-            if other.fit.outliers >= best.fit.outliers:
-                break
-            experiments, best = moved, other
-            notes = tuple(said(own, first[0].tick) for own in total)
-            left = [delays_of(item, best) for item in experiments]
-            if not any(map(worth_it, left)):
-                break
-            total = [added(own, rest) for own, rest in zip(total, left, strict=True)]
-        return experiments, best, notes
 
     def _experiments(
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]

@@ -54,6 +54,7 @@ __all__ = [
     "the_bus_map",
     "the_columns",
     "the_sought",
+    "unit_serial",
 ]
 
 TEST = "open|closed|NUMBER|FILE"
@@ -61,6 +62,8 @@ TEST = "open|closed|NUMBER|FILE"
 DEFAULT_BAUD = 921600
 DEFAULT_BITRATE = 1e6
 """Of the default bus (BUS-1)."""
+MOST_SERIAL = (1 << 63) - 1
+"""That a history can hold."""
 TIME_LIMIT_S = 600.0
 """Some ten thousand times what a sound recording takes."""
 
@@ -562,6 +565,15 @@ def count(text: str) -> int:
     """Read a whole number above zero."""
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
+    return int(text)
+
+
+def unit_serial(text: str) -> int:
+    """Read a serial number of a unit, as far as buses and histories carry them."""
+    if not (text.isascii() and text.isdigit()) or len(text) > 19 or int(text) > MOST_SERIAL:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: a serial number is a whole number, 0 … {MOST_SERIAL}"
+        )
     return int(text)
 
 

@@ -47,7 +47,7 @@ class Transition(NamedTuple):
 
 
 @packed
-def creep(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any) -> Any:
+def creep(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any, swing: Any) -> Any:
     """Friction of a step beyond the dynamic one, as the flapper deflection (m) that balances it.
 
     Parameters
@@ -56,6 +56,7 @@ def creep(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any) -> Any:
     before: velocity at its start along the motion, m/s.
     free: velocity at its end if there were none of it, m/s.
     pull: how much less that is by each of it, 1/s.
+    swing: by how much the flapper's rate grows along the motion over the step, m/s.
 
     Returns
     -------
@@ -79,12 +80,18 @@ def creep(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any) -> Any:
     largest = most(first, last)
     # The last move is far more than what is left after it.
     miss = largest * change * change * (1.0 / 12.0) + 0.1 * magnitude(move)
+    # The flapper rings within the step: what the derivatives at its ends say of the mean (Euler
+    # and Maclaurin), the velocity following the flapper at once.
+    fall = t.by_stribeck * 0.5 * (first + last) * t.force / t.damping
+    ringing = span * (1.0 / 12.0) * fall * swing / most(1.0 - fall, LEAST_SLOPE)
+    miss = miss + 0.05 * magnitude(ringing)
     unsure = most((LEAST_SLOPE - slope) * 1e9, 0.0) * DOUBT
     # What friction does early in the step the feedback wire has partly undone at its end.
     undone = least(span * t.ratio * t.force / t.damping, first * 0.0 + 1.0) * (1.0 / 12.0)
     miss = miss + undone * magnitude(last - first)
     doubt = span * t.force / t.damping * miss + unsure
-    return 0.5 * (first + last), largest, pull * (weight - 0.5) * (last - first), doubt
+    mean = most(least(0.5 * (first + last) + ringing, t.extra), 0.0)
+    return mean, largest, pull * (weight - 0.5) * (last - first), doubt
 
 
 @inlined
@@ -102,7 +109,7 @@ def creeping_step(
         rest = steady_rate(t, s.xf, d)
         pull = t.force / t.damping * (1.0 - fade)
         free = rest + (s.vs - rest) * fade
-        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull)
+        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull, 0.0)
         steady = steady_rate(t, s.xf - mean * d, d)
         xs = s.xs + steady * h + (s.vs - steady) * (1.0 - fade) * t.mass / t.damping
         vs = steady + (s.vs - steady) * fade - less * d
@@ -113,7 +120,8 @@ def creeping_step(
         a, w = s.xf - still, s.wf
         pull = t.force / t.damping * (1.0 - m.m33)
         free = rest + m.m30 * a + m.m31 * w + m.m33 * (s.vs - rest)
-        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull)
+        swing = (m.m10 * a + m.m11 * w - w) * d
+        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull, swing)
         steady = steady_rate(t, still - mean * d, d)
         v = s.vs - steady
         after = SpoolState(
@@ -129,7 +137,9 @@ def creeping_step(
         base = slide_base(t, deflection, d)
         a, w, b, v = s.xf - t.dry * d, s.wf, s.xs - base, s.vs
         free = m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v
-        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, m.m30 - m.m32 * t.reach)
+        pull = m.m30 - m.m32 * t.reach
+        swing = (m.m10 * a + m.m11 * w + m.m12 * b + m.m13 * v - w) * d
+        mean, _, less, doubt = creep(t, h, s.vs * d, free * d, pull, swing)
         rest_xf, rest_xs = (t.dry + mean) * d, base - mean * t.reach * d
         a, b = s.xf - rest_xf, s.xs - rest_xs
         after = SpoolState(

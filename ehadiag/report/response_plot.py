@@ -148,7 +148,7 @@ def _draw_pair(upper: figure, source: ColumnDataSource, signal: Signal, tick: fl
             named[words] = upper.add_glyph(where, marks)
     items = [LegendItem(label=words, renderers=[item]) for words, item in named.items()]
     legend = Legend(
-        items=items, location="top_left", orientation="horizontal", click_policy="hide",
+        items=items, location="top_left", orientation="horizontal", ncols=2, click_policy="hide",
         label_text_font_size="11px", background_fill_alpha=0.7, margin=4,
     )  # fmt: skip
     upper.add_layout(legend)

@@ -36,6 +36,9 @@ MAX_MULTIPLEXERS = 8
 SMALLEST, LARGEST = 1e-12, 1e12
 """Magnitudes of scales that a physical quantity can have; beyond them arithmetic overflows."""
 
+LEAST_STEPS = 1.0 / 64.0
+"""Resolution over range of a converter of 6 bits, the coarsest that is taken."""
+
 SEVERITIES = ("Kintas", "FSS", "FDJ")
 """Keys of what a computer finds by itself, their standard deviations behind `std_`."""
 
@@ -44,8 +47,6 @@ NEEDED = {
     *(f"onboard.{prefix}{name}" for prefix in ("", "std_") for name in SEVERITIES),
 }
 """Without which the rest of `onboard` says nothing."""
-LEAST_STEPS = 1.0 / 64.0
-"""Resolution over range of a converter of 6 bits, the coarsest that is taken."""
 
 DIMENSIONS: dict[str, dict[str, str | None]] = {
     "channels": {

@@ -131,7 +131,7 @@ def finish(
     Returns
     -------
     int
-        The verdict's, or 3 where something could not be written and 3 is more.
+        The verdict's, or 3 where something could not be written and that is worse.
     """
     from ehadiag.report.json_line import json_line  # noqa: PLC0415 - loads the model's names
 
@@ -178,6 +178,8 @@ class _Call:
         self._summary = Summary(len(self._inputs))
         self._takes: list[Take] = [self._summary.take]
         self._journals: list[Journal] = []
+        self._reusable: dict[tuple[int, str], bool] = {}
+        """Logs that were asked for, by whether an earlier call's results stand for them."""
         self._came = 0
 
     def run(self) -> int:
@@ -308,10 +310,19 @@ class _Call:
         self._came += 1
 
     def _known(self, task: _Task) -> list[str]:
-        """Return what an earlier call found of a log; nothing where it must be diagnosed."""
+        """Return what an earlier call found of a log; nothing where it must be diagnosed.
+
+        That is also where something that this call is to write of it is not there yet: pictures,
+        reports and entries of a history are not made from a line of results.
+        """
         if not self._arguments.resume:
             return []
-        return self._journals[0].found(task.item.name, task.job)
+        name, job = task.item.name, self._jobs[task.job]
+        lines = self._journals[0].found(name, task.job)
+        if (task.job, name) not in self._reusable:
+            names = [job.name(name, _suffix(line)) for line in lines]
+            self._reusable[task.job, name] = all(map(self._results.has, lines, names))
+        return lines if self._reusable[task.job, name] else []
 
     def _reuse(self, task: _Task) -> bool:
         """Bring out what an earlier call found, if it did."""
@@ -371,6 +382,12 @@ class _Call:
                 say(str(error))
                 code = worst_code({code, FAILED})
         return code
+
+
+def _suffix(line: str) -> str:
+    """What the files of a result are called more than its log, see `Reading.each`."""
+    log = json.loads(line)["recordings"][0]["log"]
+    return f"-{log['result']}" if log["results"] > 1 else ""
 
 
 def _in_worker(jobs: Sequence[Job], task: _Task) -> tuple[Finding, ...]:

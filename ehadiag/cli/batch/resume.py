@@ -6,10 +6,12 @@ import json
 import os
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
+from ehadiag.cli.batch.alone import alone_with
 from ehadiag.cli.batch.job import Job
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.fingerprint import fingerprint
@@ -37,6 +39,14 @@ Key = tuple[int, str, int, int]
 """Place of the job that found it; path, size and time of the last change of a log."""
 
 
+class _Line(NamedTuple):
+    """A result that an earlier call left."""
+
+    log: str
+    failed: bool
+    place: tuple[int, int]
+
+
 class Journal:
     """Results on the disk, one object a line, each there before the next is come to.
 
@@ -57,7 +67,8 @@ class Journal:
     Raises
     ------
     InputOutputError
-        The file is there and nobody wants to go on with it; it cannot be read or written.
+        The file is there and nobody wants to go on with it; another call uses it; it cannot be
+        read or written.
     ConfigurationError
         It holds something else.
     """
@@ -70,8 +81,17 @@ class Journal:
         self._others: Counter[str] = Counter()
         self._known: dict[Key, list[tuple[int, int]]] = {}
         self._order: list[tuple[int, int]] = []
+        self._there: list[_Line] = []
+        """What earlier calls left, in its order."""
+        self._diagnosed: set[str] = set()
+        self._failed: set[str] = set()
+        """Logs of this call, by whether they gave a result."""
+        self._held = ExitStack()
         try:
-            self._file = self._open(resume)
+            self._held.enter_context(alone_with(self._path))
+            with self._held:  # let go where the file cannot be opened
+                self._file = self._open(resume)
+                self._held = self._held.pop_all()
         except FileExistsError:
             raise InputOutputError(
                 f"results {name}: there is such a file; go on with it by --resume, or name another"
@@ -101,8 +121,10 @@ class Journal:
     def add(self, line: str, job: int, *, reused: bool) -> None:
         """Write a result down, or take note of where one that was there already has its place."""
         content = line.encode() + b"\n"
+        tree = json.loads(line)
+        (self._failed if tree["error"] else self._diagnosed).add(_log_of(tree))
         if reused:
-            log = json.loads(line)["recordings"][0]["log"]
+            log = tree["recordings"][0]["log"]
             places = self._known[job, log["path"], log["bytes"], log["modified_ns"]]
             self._order.append(places[log["result"] - 1])
             return
@@ -116,9 +138,14 @@ class Journal:
         self._order.append((at, len(content)))
 
     def settle(self) -> None:
-        """Bring the file into the order of the inputs, where it is not: each once as named."""
+        """Bring the results of this call into the order of its inputs, each once as named.
+
+        Those of other logs stay, before them, and so does what was found of a log that cannot be
+        read any more.
+        """
+        order = [item.place for item in self._there if not self._is_replaced(item)] + self._order
         at = 0
-        for start, size in self._order:
+        for start, size in order:
             if start != at:
                 break
             at += size
@@ -131,11 +158,14 @@ class Journal:
                 Folder.at(self._path.parent, RESULT_MODE, follow=True) as folder,
                 folder.drafted(self._path.name) as file,
             ):
-                for start, size in self._order:
+                for start, size in order:
                     file.write(self._line(start, size).encode() + b"\n")
                 self._file.close()  # Windows replaces no file that is open
         except OSError as error:
             raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
+
+    def _is_replaced(self, item: _Line) -> bool:
+        return item.log in self._diagnosed or (item.failed and item.log in self._failed)
 
     def __enter__(self) -> Journal:
         return self
@@ -147,6 +177,7 @@ class Journal:
         trace: TracebackType | None,
     ) -> None:
         self._file.close()
+        self._held.close()
 
     def _open(self, resume: bool) -> BinaryIO:
         if not (resume and os.path.lexists(self._path)):
@@ -176,6 +207,7 @@ class Journal:
             job = self._job_of(tree)
             if job is not None and tree["error"] is None and len(tree["recordings"]) == 1:
                 self._remember(groups, job, tree["recordings"][0]["log"], (at, len(line)))
+            self._there.append(_Line(_log_of(tree), bool(tree["error"]), (at, len(line))))
             at += len(line)
 
     def _remember(
@@ -224,6 +256,14 @@ class Journal:
     def _line(self, at: int, size: int) -> str:
         self._file.seek(at)
         return self._file.read(size).decode().rstrip("\n")
+
+
+def _log_of(tree: dict[str, Any]) -> str:
+    """Path of the log that a result is of."""
+    with suppress(KeyError, IndexError, TypeError):
+        log = tree["error"]["log"] if tree["error"] else tree["recordings"][0]["log"]
+        return str(log["path"])
+    return os.path.abspath(str(tree.get("source")))
 
 
 def _decisive(job: Job) -> dict[str, Any]:

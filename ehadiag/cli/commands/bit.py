@@ -16,12 +16,13 @@ from ehadiag.assess.verdict import Levels, Rule
 from ehadiag.cli import options
 from ehadiag.cli.acquire import STOPPED, Heard, acquire, recording_path
 from ehadiag.cli.batch.job import labelled
-from ehadiag.cli.batch.summary import worst_code
 from ehadiag.cli.beforehand import refuse_beforehand
 from ehadiag.cli.drawing import can_be_drawn, drawn
+from ehadiag.cli.exit_codes import worst_code
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.cli.screen.bit_view import BitView
@@ -129,6 +130,8 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     for unit, actuator, bus_map in described:
         refuse_beforehand(unit.arguments, test, actuator, bus_map)
+    if arguments.record:
+        refuse_overwriting(arguments, [Output("--record", arguments.record)])
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
     results = Results(arguments, folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,11 +77,13 @@ def run(arguments: argparse.Namespace) -> int:
     out = _place(arguments)
     if arguments.report:
         need_report_library()
-    say_if_compiling()
-    recordings, digests = _read(arguments)
-    found = _learn(arguments, start, recordings, digests)
-    keep_signals()
-    written = _bring_out(arguments, out, found)
+    # What cannot be written is said before anything slow.
+    with make_folder(str(out.parent)) as folder:
+        say_if_compiling()
+        recordings, digests = _read(arguments)
+        found = _learn(arguments, start, recordings, digests)
+        keep_signals()
+        written = _bring_out(arguments, folder, out, found)
     if arguments.json:
         from ehadiag.report.calibration import calibration_json  # noqa: PLC0415
 
@@ -94,23 +97,23 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if found.actuator is not None else NotTestedError.exit_code
 
 
-def _bring_out(arguments: argparse.Namespace, out: Path, found: Calibrated) -> list[Path]:
+def _bring_out(
+    arguments: argparse.Namespace, folder: Folder, out: Path, found: Calibrated
+) -> list[Path]:
     """Write file and picture of what was learned, and the report; return what was written."""
     written = []
-    if found.actuator is not None or arguments.report:
-        with make_folder(str(out.parent)) as folder:
-            if found.actuator is not None:
-                _write(folder, out.name, found.actuator, replaced=arguments.update)
-                written.append(out)
-                _draw(folder, f"{out.stem}.png", found)
-                written.append(out.with_suffix(".png"))
-            if arguments.report:
-                page = out.with_suffix(".html")
-                try:
-                    folder.write(page.name, calibration_report(found))
-                except OSError as error:
-                    raise InputOutputError(f"report {page}: {error.strerror or error}") from None
-                written.append(page)
+    if found.actuator is not None:
+        _write(folder, out.name, found.actuator, replaced=arguments.update)
+        written.append(out)
+        _draw(folder, _picture(out).name, found)
+        written.append(_picture(out))
+    if arguments.report:
+        page = out.with_suffix(".html")
+        try:
+            folder.write(page.name, calibration_report(found))
+        except OSError as error:
+            raise InputOutputError(f"report {page}: {error.strerror or error}") from None
+        written.append(page)
     return written
 
 
@@ -123,10 +126,21 @@ def _place(arguments: argparse.Namespace) -> Path:
         raise ConfigurationError("--update: needs --actuator, the calibrated file to refine")
     if arguments.update and arguments.compare:
         raise ConfigurationError("--update keeps the model that was chosen: --compare does nothing")
-    same = arguments.update and out.absolute() == Path(arguments.actuator).absolute()
-    if out.exists() and not same:
-        raise ConfigurationError(f"--out {arguments.out}: exists; name another file, or remove it")
+    same = arguments.update and _is_same(out, Path(arguments.actuator))
+    for path in () if same else (out, _picture(out)):
+        if os.path.lexists(path):
+            raise ConfigurationError(
+                f"--out {arguments.out}: {path.name} exists; name another file, or remove it"
+            )
     return out
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.samefile(other)
+
+
+def _picture(out: Path) -> Path:
+    return out.with_suffix(".png")
 
 
 def _read(arguments: argparse.Namespace) -> tuple[list[Recording], list[str]]:

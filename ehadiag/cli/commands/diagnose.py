@@ -11,10 +11,11 @@ from ehadiag.cli import options
 from ehadiag.cli.batch.call import add_batch_options, diagnose_all, finish
 from ehadiag.cli.batch.inputs import Input, expand
 from ehadiag.cli.batch.job import Job
-from ehadiag.cli.batch.summary import worst_code
+from ehadiag.cli.exit_codes import code_of_inputs, worst_code
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, names_taken, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.cli.units import Unit, add_unit_options, units_of
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
     from ehadiag.report.asked import LogFile
 
 __all__ = ["add_parser", "run"]
+
+NOT_LISTED = (
+    "joint", "out", "report", "history", "hours", "cycles", "results", "resume", "junit", "summary",
+)  # fmt: skip
+"""Options that say what becomes of a diagnosis."""
+UNUSED: tuple[object, ...] = (None, False, [])
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -80,13 +87,18 @@ def run(arguments: argparse.Namespace) -> int:
     if not inputs:
         raise ConfigurationError("no recording named: the list on standard input is empty")
     if arguments.list:
-        return max(_list(unit, inputs) for unit in units_of(arguments))
+        return code_of_inputs([_list(unit, inputs) for unit in units_of(arguments)])
     # What is wrong with the options is said before anything slow is loaded.
     _refuse_contradictions(arguments)
     jobs = [_job(unit) for unit in units_of(arguments)]
     if arguments.joint and len(jobs) > 1:
         raise ConfigurationError("--mapping: --joint is of one actuator, name one mapping")
-    results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
+    outputs = _outputs(arguments)
+    reads = [("the log", item.name) for item in inputs]
+    reads += [("the DBC", job.bus_map.name) for job in jobs]
+    refuse_overwriting(arguments, outputs, reads)
+    folder = make_folder(arguments.out) if arguments.out else None
+    results = Results(arguments, folder, names_taken(folder.path, outputs) if folder else ())
     say_if_compiling()
     if arguments.merge:
         codes = {_merged(job, results, inputs) for job in jobs}
@@ -121,6 +133,13 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
 
 
+def _outputs(arguments: argparse.Namespace) -> list[Output]:
+    """Files that hold the results of the whole call."""
+    named = [("--results", name) for name in arguments.results]
+    named += [(f"--{key}", getattr(arguments, key)) for key in ("resume", "junit", "summary")]
+    return [Output(option, name) for option, name in named if name]
+
+
 def _job(unit: Unit) -> Job:
     """Return what all logs of the call have in common for one actuator."""
     arguments = unit.arguments
@@ -148,7 +167,7 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
     """Make one estimate from all logs."""
     together: list[Recording] = []
     files: list[LogFile | None] = []
-    spent, codes = 0.0, [0]
+    spent, codes = 0.0, []
     for item in inputs:
         try:
             if item.why:
@@ -158,12 +177,13 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
             say(str(error))
             codes.append(error.exit_code)
             continue
+        codes.append(0)
         together += reading.recordings
         files += [file for _, file, _ in reading.each()]
         spent += reading.seconds
-    if max(codes) > 0:
+    if any(codes):
         say("no joint estimate: not all of the logs could be read")
-        return max(codes)
+        return code_of_inputs(codes)
     return finish(job, results, together, files, Spent(spent), "joint")
 
 
@@ -178,7 +198,7 @@ def _merged(job: Job, results: Results, inputs: Sequence[Input]) -> int:
         finish(job, results, [recording], [file], Spent(reading.seconds), job.name(first, suffix))
         for recording, file, suffix in reading.each()
     ]
-    return max(codes)
+    return worst_code(codes)
 
 
 def _list(unit: Unit, inputs: Sequence[Input]) -> int:
@@ -187,11 +207,14 @@ def _list(unit: Unit, inputs: Sequence[Input]) -> int:
     from ehadiag.cli.listing import print_list  # noqa: PLC0415
     from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415
 
+    if unused := [name for name in NOT_LISTED if getattr(arguments, name) not in UNUSED]:
+        told = ", ".join(f"--{name}" for name in unused)
+        say(f"--list diagnoses none, and has no use for {told}")
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
     tests = options.known_tests(arguments.test)
     sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
     meaning = Meaning(bus_map, options.the_columns(arguments), sought)
-    code = 0
+    codes = []
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:
         try:
@@ -203,5 +226,7 @@ def _list(unit: Unit, inputs: Sequence[Input]) -> int:
             print_list(", ".join(names) + of, found, as_json=arguments.json)
         except EhadiagError as error:
             say(str(error))
-            code = max(code, error.exit_code)
-    return code
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    return code_of_inputs(codes)

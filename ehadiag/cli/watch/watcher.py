@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from ehadiag.cli.watch.known import KnownUnit
+from ehadiag.cli.watch.persistence import Persistence
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import stated_channels
 from ehadiag.core.recording import BitState, CommandMode, Environment
@@ -106,6 +107,7 @@ class Watcher:
         self._missing = 0
         self._breaks = 0
         self._last: dict[int, int] = {}
+        self._persistence = Persistence(self._rate)
         self._sums = [0.0] * len(SIDES)
         self._threshold = 1.0
         self._status: BitStatus | None = None
@@ -123,6 +125,8 @@ class Watcher:
         """Raised; those that belong to the one before are not counted."""
         self.again = 0
         """Those that belong to the one before."""
+        self.passing = 0
+        """Alarms of the sums in free motion that did not last, or have not yet."""
         self._build()
 
     @property
@@ -243,6 +247,11 @@ class Watcher:
         for place, value in enumerate(reading.cusum.ravel().tolist()):
             sums[place] = max(sums[place], value)
         if reading.alarmed.any():
+            lasts = self._persistence.take(self.ticks)
+            tested = self._status is not None and self._status.state is BitState.RUNNING
+            if not (lasts or tested):
+                self.passing += 1
+                return
             for place, raised in enumerate(reading.alarmed.ravel().tolist()):
                 if raised:
                     self._raise(place, time_ns)

@@ -48,6 +48,8 @@ from ehadiag.model.spool_events import TOUCH, SpoolState, carried
 __all__ = ["creeping_lanes", "held_friction"]
 
 BIG = 1e30
+LONGEST = 3e-4
+"""s, for which friction is held; the flapper rings with a period of about 1 ms."""
 LEAST_VELOCITY = 1e-13
 """m/s, of a spool that still moves."""
 
@@ -62,7 +64,8 @@ def _quarter(
     a, b: from where flapper and spool would rest by the dynamic friction alone.
     """
     free = m[12] * a + m[13] * w + m[14] * b + m[15] * v
-    mean, largest, less, miss = creep(t, span, v, free, m[12] - m[14] * t.reach)
+    swing = m[4] * a + m[5] * w + m[6] * b + m[7] * v - w
+    mean, largest, less, miss = creep(t, span, v, free, m[12] - m[14] * t.reach, swing)
     a, b = a - mean, b + t.reach * mean
     na = m[0] * a + m[1] * w + m[2] * b + m[3] * v + mean
     nw = m[4] * a + m[5] * w + m[6] * b + m[7] * v
@@ -173,23 +176,28 @@ def held_friction(
     The law, the velocity (m/s) that the end has less along the motion, and whether the friction
     may be held for so long.
     """
-    d = float(s.direction)
+    d, swing = float(s.direction), 0.0
     k = place * MOVING_ROWS * WIDTH + steps - 1
+    if steps * h > LONGEST:
+        return t, 0.0, False
     if s.clamped:
         rest, fade = steady_rate(t, s.xf, d), moving[k + 17 * WIDTH]
         free, pull = rest + (s.vs - rest) * fade, t.force / t.damping * (1.0 - fade)
     elif carried(t, s.direction, s.xs, s.wire):
-        free = moving[k + 12 * WIDTH] * (s.xf - t.dry * d) + moving[k + 13 * WIDTH] * s.wf
-        free += moving[k + 14 * WIDTH] * (s.xs - slide_base(t, deflection, d))
-        free += moving[k + 15 * WIDTH] * s.vs
+        a, b = s.xf - t.dry * d, s.xs - slide_base(t, deflection, d)
+        free = moving[k + 12 * WIDTH] * a + moving[k + 13 * WIDTH] * s.wf
+        free += moving[k + 14 * WIDTH] * b + moving[k + 15 * WIDTH] * s.vs
+        swing = moving[k + 4 * WIDTH] * a + moving[k + 5 * WIDTH] * s.wf - s.wf
+        swing += moving[k + 6 * WIDTH] * b + moving[k + 7 * WIDTH] * s.vs
         pull = moving[k + 12 * WIDTH] - moving[k + 14 * WIDTH] * t.reach
     else:
         still = still_flapper(t.ratio, deflection, s.wire)
         rest, fade = steady_rate(t, still, d), loose[k + 15 * WIDTH]
         free = rest + (s.vs - rest) * fade
         free += loose[k + 12 * WIDTH] * (s.xf - still) + loose[k + 13 * WIDTH] * s.wf
+        swing = loose[k + 4 * WIDTH] * (s.xf - still) + loose[k + 5 * WIDTH] * s.wf - s.wf
         pull = t.force / t.damping * (1.0 - fade)
-    mean, _, less, doubt = creep(t, steps * h, s.vs * d, free * d, pull)
+    mean, _, less, doubt = creep(t, steps * h, s.vs * d, free * d, pull, swing * d)
     law = SpoolLaw(
         t.ratio, t.reach, t.force, t.mass, t.damping, t.dynamic + t.force * mean, t.dry + mean,
         t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash, t.bend,

@@ -18,20 +18,20 @@ def fit(excess, outliers=0.002):
     return Goodness(excess=excess, outliers=outliers, spool_rms=1.0, pressure_rms=1.1)
 
 
-def severity_std(excess):
-    """Of a calibrated unit, beside all else."""
+def severity_std(excess, name="hysteresis"):
+    """Of a calibrated unit of which one effect was learned, beside all else."""
     calibration = Calibration(
         date="2026-01-02T03:04:05Z",
         start="reference-31",
-        effects={"hysteresis": 0.02},
-        parameters=("hysteresis",),
+        effects={name: 0.02},
+        parameters=(name,),
         std=(1e-5,),
         root=((1.0,),),
         fit=fit(excess),
         recordings=(Source(name="a.blf", test="open"),),
     )
     unit = msgspec.structs.replace(default_actuator(), calibration=calibration)
-    free = (*FAULTS, parameter("hysteresis"))
+    free = (*FAULTS, parameter(name))
     added = knowledge_of(unit).spread(
         free, dict.fromkeys((item.name for item in free), 0.0), plant_constants(unit)
     )
@@ -47,6 +47,12 @@ def test_a_unit_that_is_explained_has_the_floor_alone():
 def test_what_is_left_widens_every_severity():
     assert severity_std(2.32) == pytest.approx(np.hypot(1e-4, 3e-3))
     assert (severity_std(1.5) > severity_std(1.3)).all()
+
+
+def test_effects_beyond_the_usual_ones_widen_what_they_bend():
+    kintas, spool, jack = severity_std(1.05, "spool_stribeck")
+    assert spool == pytest.approx(0.02, rel=1e-3)
+    assert spool > kintas > jack > 1e-3
 
 
 def residuals(size):

@@ -277,7 +277,7 @@ def partial(roles: dict[str, list[float]], saturated: list[bool]) -> Any:
         host = 50 + np.arange(count)
         return Filled(np.array(roles[role]), np.array(saturated), host)
 
-    bus_map = SimpleNamespace(tick_ns=2 * MS, fixed_mode=CommandMode.CURRENT, modes={})
+    bus_map = SimpleNamespace(tick_ns=2 * MS, fixed_mode=CommandMode.CURRENT, modes={}, stated=())
     return SimpleNamespace(fill=fill, episode=span(0, count), bus_map=bus_map)
 
 

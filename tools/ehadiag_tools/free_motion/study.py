@@ -21,6 +21,8 @@ import joblib
 import numpy as np
 from scipy.stats import chi2
 
+from ehadiag.cli.watch.persistence import Persistence
+from ehadiag.cli.watch.watcher import QUIET_S
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import CommandMode
 from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
@@ -58,7 +60,9 @@ class Outcome:
     """What the monitor said in one minute."""
 
     alarms: tuple[tuple[int, int], ...]
-    """Tick and sum (see `SIGNALS`) of each."""
+    """Tick and sum (see `SIGNALS`) of each alarm of the sums."""
+    lasting: tuple[int, ...]
+    """Ticks of the alarms that `ehadiag monitor` raises: of what lasts, ten seconds apart."""
     resting: float
     """Share of ticks in which the pressure said nothing."""
     cost_s: float
@@ -83,13 +87,18 @@ def watch(case: Case) -> Outcome:
     rows = free_motion(actuator, Faults(*case.true), case.mode, case.seconds, case.seed)
     inner = Monitor(actuator, case.known, mode=case.mode, hours=case.hours)
     monitor = FreeMotionMonitor(inner, undecided_spool(actuator, case.known[2]))
-    alarms, resting = [], 0
+    alarms, resting, persistence = [], 0, Persistence(actuator.controller.rate)
+    lasting: list[int] = []
     for tick, row in enumerate(rows.tolist()):
         reading = monitor.push(tuple(row))
         resting += bool(np.isnan(reading.residual[1]))
         if monitor.settled and reading.alarmed.any():
             alarms += [(tick, int(item)) for item in np.flatnonzero(reading.alarmed)]
-    return Outcome(tuple(alarms), resting / len(rows), time.process_time() - began)
+            apart = not lasting or tick - lasting[-1] >= QUIET_S * actuator.controller.rate
+            if persistence.take(tick) and apart:
+                lasting.append(tick)
+    cost = time.process_time() - began
+    return Outcome(tuple(alarms), tuple(lasting), resting / len(rows), cost)
 
 
 def garwood(count: int) -> tuple[float, float]:
@@ -145,19 +154,22 @@ def _false_alarms(arguments: argparse.Namespace) -> None:
     each = spent / minutes * 3600.0 / arguments.piece
     print(f"seed {arguments.seed}; processor time {spent:.0f} s, {each:.0f} s an hour of motion")
     for case, outcome in zip(cases, found, strict=True):
-        for tick, which in outcome.alarms:
+        if outcome.alarms:
             told = ", ".join(f"{value:.2f}" for value in case.known)
-            print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {SIGNALS[which]} {tick}")
+            sums = ", ".join(sorted({SIGNALS[which] for _, which in outcome.alarms}))
+            spans = f"{outcome.alarms[0][0]} … {outcome.alarms[-1][0]}"
+            print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {sums}; ticks {spans}")
 
 
 def _tell(label: str, found: Sequence[Outcome], length: float, hours: float) -> None:
-    alarms = sum(len(item.alarms) for item in found)
+    alarms = sum(len(item.lasting) for item in found)
+    pieces = sum(bool(item.alarms) for item in found)
     low, high = garwood(alarms)
     resting = float(np.mean([item.resting for item in found]))
     print(
         f"{label:8s} {length:6.2f} h: {alarms} alarms, {alarms / length:.2f}/h"
         f" [{low / length:.2f}, {high / length:.2f}], stated {1.0 / hours:.2f}/h;"
-        f" pressure rests {resting:.0%}"
+        f" sums alarm in {pieces} of {len(found)} pieces; pressure rests {resting:.0%}"
     )
 
 
@@ -180,13 +192,21 @@ def _delays(arguments: argparse.Namespace) -> None:
             )
     found = _run(cases, arguments.jobs)
     length = f"{arguments.pieces} × {arguments.piece:g} s"
-    print(f"delay to the first alarm, s; {length} of motion each, alarms count after 0.3 s")
+    print(f"s to the first alarm of a sum; to that of what lasts; {length} of motion each")
     for place, (mode, fault, growth) in enumerate(kinds):
         part = found[place * arguments.pieces : (place + 1) * arguments.pieces]
-        delays = [f"{item.alarms[0][0] / 1e3:.2f}" if item.alarms else "none" for item in part]
-        print(f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}: {', '.join(delays)}")
+        sums = [_first(item.alarms[0][0] if item.alarms else None) for item in part]
+        raised = [_first(item.lasting[0] if item.lasting else None) for item in part]
+        print(
+            f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}:"
+            f" {', '.join(sums)}; {', '.join(raised)}"
+        )
     spent = sum(item.cost_s for item in found)
     print(f"seed {arguments.seed}; processor time {spent:.0f} s")
+
+
+def _first(tick: int | None) -> str:
+    return "none" if tick is None else f"{tick / 1e3:.2f}"
 
 
 def _run(cases: Sequence[Case], jobs: int) -> list[Outcome]:
