@@ -1,9 +1,8 @@
 """Diagnosis of electrohydraulic actuators from a short built-in test.
 
-    import ehadiag
-
-    result = ehadiag.diagnose("test.blf")
-    print(result)
+>>> import ehadiag
+>>> result = ehadiag.diagnose("test.blf")
+>>> print(result)
 
 The names below are loaded when they are first used: the import itself costs nothing.
 """

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.channels import PRESSURE, SPOOL
 from ehadiag.core.recording import Environment
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.result import Identification
@@ -24,7 +23,7 @@ from ehadiag.model.simd.model import SimdModel
 
 __all__ = ["Culprit", "Suspect", "culprit_of"]
 
-SIGNALS = (("spool", SPOOL.lsb), ("pressure", PRESSURE.lsb))
+SIGNALS = ("spool", "pressure")
 STEP = 0.2
 """Width of the differences, in units of the parameters' scales."""
 SHARES = (0.0, 0.4, 1.0)
@@ -132,7 +131,7 @@ def culprit_of(
     base = model.residuals(x[None, :])[0][0]
     suspects = _suspects(model, x, base, set(values))
     row, index, start, end = _place(shared, base)
-    signal, experiment = SIGNALS[row][0], shared[index]
+    signal, experiment = SIGNALS[row], shared[index]
     ticks = slice(sum(item.ticks for item in shared[:index]), None)
     modelled = _modelled(model, base, row, ticks.start, experiment.ticks)
     advice = _of_signals(experiment, modelled) or _advice(suspects, environment)
@@ -290,7 +289,7 @@ def _modelled(
 def _of_signals(experiment: Experiment, modelled: tuple[int, NDArray[np.float64]]) -> str:
     """What the worst signal shows by itself; empty if nothing."""
     row, model = modelled
-    name, lsb = SIGNALS[row]
+    name, lsb = SIGNALS[row], experiment.channels[1 + row].grain
     measured = (experiment.spool, experiment.pressure)[row]
     since = _stands_still(measured, model, lsb, round(STILL_S / experiment.tick))
     if since is not None:

@@ -17,6 +17,7 @@ from ehadiag.assess.acceptance import (
     remarks_on_recording,
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
+from ehadiag.assess.delays import in_time
 from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
@@ -28,6 +29,7 @@ from ehadiag.assess.plausible import objections_to_actuator
 from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
 from ehadiag.assess.supply import objections_to_supply
 from ehadiag.assess.travel import objections_to_travel
+from ehadiag.assess.unobservable import lost_positions, observable, what_is_left
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
@@ -159,13 +161,24 @@ class DiagnosisSession:
         begin = time.perf_counter()
         matched = match_tests(recordings, self._tests, self._default)
         experiments, reasons = self._experiments(recordings, matched)
+        hidden = tuple(dict.fromkeys(filter(None, map(lost_positions, experiments))))
+        lost = bool(hidden) and set(reasons) <= set(hidden) and observable(experiments)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
         others: tuple[OtherFault, ...] = ()
         culprit: Culprit | None = None
+        late: tuple[str, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
+        if lost:
+            found = self._session.finish(experiments, progress)
+            identification, words = what_is_left(found)
+            why = tuple(f"{reason}: {words}" for reason in hidden)
         if not reasons:
             identification = self._session.finish(experiments, progress)
+            if any(item.by_time for item in recordings):
+                experiments, identification, late = in_time(
+                    experiments, identification, lambda item: self._session.finish(item, progress)
+                )
             modelled = [response_of(item, identification) for item in experiments]
             positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
@@ -193,6 +206,7 @@ class DiagnosisSession:
             notes=(
                 *_notes(recordings, matched, self._actuator),
                 *_freed(identification, self._actuator),
+                *late,
                 *_unchecked(positions),
                 *notes_on_other_faults(others),
             ),

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.channels import POSITION
+from ehadiag.core.channels import SPOOL
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.scalar.response import Response
 
@@ -26,7 +26,8 @@ LEAST_TRAVEL_LSB = 10.0
 MOST_GAIN_ERROR = 0.1
 """Twice what flow gain and jack area, each 5 % off, make of it."""
 MOST_DRIFT = 0.8e-3
-"""m/s; a spool offset of 1 µm that goes unseen makes half of it."""
+"""m/s; a spool offset of 1 µm that goes unseen makes half of it. So on a spool of the default
+range; of another one it is greater in proportion."""
 MOST_RMS = 4.0
 """Rms residual of the travel, in units of its noise or LSB: 1.0 to 2.5 on sound units."""
 OUTLIER = 12.0
@@ -53,12 +54,15 @@ class PositionFit:
         Of the travels that are left, in units of their noise (not below that of 1 LSB).
     outliers : float
         Share of travels far off.
+    most_drift : float
+        Drift of a sound sensor at most, m/s.
     """
 
     gain: float
     drift: float
     rms: float
     outliers: float
+    most_drift: float = MOST_DRIFT
 
 
 def position_fit(experiment: Experiment, modelled: Response) -> PositionFit | None:
@@ -82,9 +86,10 @@ def position_fit(experiment: Experiment, modelled: Response) -> PositionFit | No
     if seen.mean() < LEAST_SAMPLES:
         return None
     model = modelled.position
-    unit = np.sqrt(2.0) * max(experiment.position_noise, POSITION.lsb)
+    channels = experiment.channels
+    unit = np.sqrt(2.0) * max(experiment.position_noise, channels.position.lsb)
     travel = (model[span:] - model[:-span])[seen] / unit
-    moves = float(np.sqrt(np.mean(travel**2))) * unit >= LEAST_TRAVEL_LSB * POSITION.lsb
+    moves = float(np.sqrt(np.mean(travel**2))) * unit >= LEAST_TRAVEL_LSB * channels.position.grain
     columns = [travel, np.ones_like(travel)] if moves else [np.ones_like(travel)]
     values = measured[seen] / unit - (0.0 if moves else travel)
     solution, left = _robust(np.column_stack(columns), values)
@@ -95,6 +100,7 @@ def position_fit(experiment: Experiment, modelled: Response) -> PositionFit | No
         drift=float(solution[-1]) * unit / SPAN_S,
         rms=float(np.sqrt(np.mean(most))),
         outliers=float(np.mean(lasting > OUTLIER)),
+        most_drift=MOST_DRIFT * (channels.spool.full_scale / SPOOL.full_scale),
     )
 
 
@@ -117,10 +123,10 @@ def objections_to_position(fit: PositionFit) -> list[str]:
             f"the position sensor reads {off:.0%} too {side} (limit {MOST_GAIN_ERROR:.0%}), or "
             "flow gain and jack area are not those of the actuator file"
         ]
-    if abs(fit.drift) > MOST_DRIFT:
+    if abs(fit.drift) > fit.most_drift:
         return [
             f"the position sensor runs away by {fit.drift * 1e3:.2g} mm/s "
-            f"(limit {MOST_DRIFT * 1e3:g})"
+            f"(limit {fit.most_drift * 1e3:g})"
         ]
     return []
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ehadiag.assess.wrong_units import relations
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import POSITION
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.recording import Samples
 
 __all__ = ["objections_to_travel"]
@@ -50,7 +50,7 @@ def objections_to_travel(samples: Samples, actuator: Actuator) -> list[str]:
     if travels is None:
         return []
     expected, measured = travels
-    least = LEAST_TRAVEL_LSB * POSITION.lsb
+    least = LEAST_TRAVEL_LSB * actuator_channels(actuator).position.grain
     moved = float(expected.std()), float(measured.std())
     if max(moved) < least:
         return []

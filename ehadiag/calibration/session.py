@@ -65,7 +65,11 @@ class Session:
         if len(serials) > 1:
             words = ", ".join(str(serial) for serial in sorted(serials, key=str))
             out.append(f"the recordings are of units with different serial numbers: {words}")
-        return [*out, *objections_to_unit(self.recordings, self._start)]
+        return [
+            *out,
+            *_repeated(self.recordings),
+            *objections_to_unit(self.recordings, self._start),
+        ]
 
     def build(self, actuator: Actuator) -> list[Experiment]:
         """Experiments of all recordings."""
@@ -216,3 +220,21 @@ def _evidence(tried: Sequence[Learned]) -> tuple[Tried, ...]:
     return tuple(
         Tried(item.model.words, item.estimated.excess, item.criterion - best) for item in tried
     )
+
+
+def _repeated(recordings: Sequence[Recording]) -> list[str]:
+    """Say which recordings are others once more: what they show would count twice."""
+    seen: dict[bytes, str] = {}
+    out = []
+    for recording in recordings:
+        if recording.samples is None:
+            continue
+        samples = recording.samples
+        key = b"".join(
+            part.tobytes()
+            for part in (samples.current, samples.spool, samples.pressure, samples.position)
+        )
+        if key in seen:
+            out.append(f"{recording.source} has the samples of {seen[key]}: name each test once")
+        seen.setdefault(key, recording.source)
+    return out

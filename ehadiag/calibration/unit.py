@@ -13,7 +13,7 @@ from ehadiag.calibration.packing import lesson_of
 from ehadiag.calibration.result import Calibrated
 from ehadiag.calibration.session import Progress, Session
 from ehadiag.core.actuator import Actuator, Tolerance
-from ehadiag.core.calibration import Source
+from ehadiag.core.calibration import Calibration, Source
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, share_offsets
@@ -138,7 +138,7 @@ def update(
     session = Session(recordings, start, tests, default, seed, progress)
     if start.calibration is None:
         return session.refused([f"actuator {start.name!r} is not calibrated: nothing to update"])
-    reasons = session.objections()
+    reasons = [*session.objections(), *_known_already(start.calibration, sources or ())]
     if reasons:
         return session.refused(reasons)
     knowledge = knowledge_of(start)
@@ -153,6 +153,16 @@ def update(
         return session.refused(reasons, learned, [learned])
     lesson = lesson_of(found, _usual_std(learned))
     return session.done(lesson, learned, learned, [learned], sources)
+
+
+def _known_already(calibration: Calibration, sources: Sequence[Source]) -> list[str]:
+    """Say which recordings the calibration was learned from: they would count twice."""
+    known = {item.sha256: item.name for item in calibration.recordings if item.sha256}
+    return [
+        f"{item.name} is {known[item.sha256]}, which the calibration was learned from already"
+        for item in sources
+        if item.sha256 in known
+    ]
 
 
 def _refined(

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from firmware_iface.transport.frames import Frame
     from firmware_iface.transport.interface import Transport
 
-__all__ = ["STOPPED", "Heard", "acquire"]
+__all__ = ["STOPPED", "Heard", "acquire", "recording_path"]
 
 STOPPED = "stopped by the user"
 STOPPED_TWICE = "stopped by the user; the abort was requested, its answer not waited for"
@@ -60,21 +60,26 @@ def acquire(
     session: DiagnosisSession,
     stop: threading.Event,
     view: BitView,
+    shared: tuple[Transport, Path] | None = None,
 ) -> Heard:
-    """Run the test on the bus."""
+    """Run the test on the bus; `shared`: listen on one that is open, and recorded there already."""
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.session.limits import Limits  # noqa: PLC0415
     from firmware_iface.session.tester import run_test  # noqa: PLC0415
 
-    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-    path = Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
+    path = shared[1] if shared else recording_path(arguments, folder, test)
     assembler = Assembler(str(path), bus_map)
     outcome, why, listened = None, STOPPED, 0.0
     with working_ahead(session, assembler, test) as ahead:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            ours, recorder = _connect(arguments, actuator, test, bus_map, path, stack)
+            ours, recorder = (
+                (shared[0], None)
+                if shared
+                else _connect(arguments, actuator, test, bus_map, path, stack)
+            )
             bus = ours.name
-            say(f"test {test.name!r} on {bus}, recording to {path}")
+            if not shared:
+                say(f"test {test.name!r} on {bus}, recording to {path}")
             view.connected(ours)
 
             def tell(progress: Progress) -> None:
@@ -105,6 +110,7 @@ def acquire(
                     stop=stop,
                     progress=tell,
                     all_there=ahead.all_there,
+                    onboard_wait=arguments.onboard_wait,
                 )
             except InputOutputError as error:  # of the recording; the abort was requested
                 why = str(error)
@@ -118,6 +124,8 @@ def acquire(
             why = outcome.why
             if recording.serial is None:
                 recording = replace(recording, serial=outcome.serial)
+            if outcome.onboard is not None:
+                recording = replace(recording, onboard=outcome.onboard)
             if outcome.degraded:
                 view.notes = (outcome.degraded,)
         if outcome is None or not outcome.complete:
@@ -177,6 +185,12 @@ def _what_was_heard(recording: Recording, bus: str, listened: float) -> str:
         f"; {quality.foreign} frames heard on {bus} in {listened:.1f} s, none that the mapping "
         "knows: see ehadiag check-bus"
     )
+
+
+def recording_path(arguments: argparse.Namespace, folder: Path, test: StoredTest) -> Path:
+    """Return where the recording goes."""
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    return Path(arguments.record) if arguments.record else _unused(folder, test.name, stamp)
 
 
 def _unused(folder: Path, test: str, stamp: str) -> Path:

@@ -73,11 +73,10 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         raise ConfigurationError(
             "--simulate: a serial link has two ends, run ehadiag sim on the other one"
         )
-    options.refuse_two_buses(arguments)
-    if not arguments.simulate and not options.has_bus(arguments):
-        raise ConfigurationError(
-            "no bus named: give --interface and --channel, or --serial, or --simulate"
-        )
+    if arguments.simulate:
+        options.refuse_two_buses(arguments)
+    else:
+        options.need_one_bus(arguments)
 
 
 def _refuse_what_cannot_be_requested(test: StoredTest, bus_map: BusMap) -> None:

@@ -3,7 +3,8 @@
 An option on the command line wins over its variable, that over the project's file (in the working
 folder), that over the user's. A project's file may come from others: it sets only what cannot
 reach beyond a diagnosis (`PROJECT`), must belong to the caller or root, and is named when it is
-used. The user's own may set every option that has a value.
+used. Of a command that can transmit it names neither test nor bus: nobody shall move a surface by
+entering a folder. The user's own may set every option that has a value.
 """
 
 from __future__ import annotations
@@ -11,15 +12,16 @@ from __future__ import annotations
 import argparse
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from ehadiag.cli.option_keys import Called, key_of, keys_of
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.folder import refuse_foreign
 from ehadiag.core.toml_file import read_toml
 
-__all__ = ["NAME", "PREFIX", "apply_defaults", "user_file"]
+__all__ = ["NAME", "PREFIX", "Defaults", "apply_defaults", "user_file"]
 
 NAME = "ehadiag.toml"
 PREFIX = "EHADIAG_"
@@ -27,22 +29,29 @@ PROJECT = frozenset(
     {
         "actuator", "mapping", "dbc", "test", "log_channel", "solver", "nuisances", "seed",
         "advisory", "limit", "rule", "json", "json_version", "no_picture", "jobs", "interface",
-        "channel", "bitrate", "fd", "data_bitrate", "app_name",
+        "channel", "context", "bitrate", "fd", "data_bitrate", "app_name",
     }
 )  # fmt: skip
 """Options that a project's file may set."""
+LISTENING = frozenset({"check-bus", "monitor"})
+"""Commands with a bus that send nothing on it."""
+SENT = frozenset(
+    {"test", "interface", "channel", "bitrate", "fd", "data_bitrate", "app_name"}
+)  # fmt: skip
+"""What says of the other commands with a bus which test runs, and where."""
 NAMING = frozenset({"actuator", "mapping", "dbc", "test"})
 """Options whose values are files."""
 RESERVED = frozenset({"CACHE_DIR", "THREADS", "HISTORY"})
 """Variables of `EHADIAG_` that are no options."""
-BOOLEANS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 
 
-class _Replaced(list[Any]):
-    """Default of an option that may be repeated: gone with the first that the user gives."""
+class Defaults(NamedTuple):
+    """What defaults did."""
 
-    def __copy__(self) -> list[Any]:
-        return []
+    used: tuple[str, ...]
+    """Files and variables that set something."""
+    ignored: tuple[str, ...]
+    """Sentences on what was not taken."""
 
 
 def user_file() -> Path | None:
@@ -54,23 +63,26 @@ def user_file() -> Path | None:
     return Path(platformdirs.user_config_dir("ehadiag", appauthor=False)) / NAME
 
 
-def apply_defaults(parser: argparse.ArgumentParser, command: str) -> list[str]:
-    """Set the defaults of a command's options.
+def apply_defaults(
+    commands: Mapping[str, argparse.ArgumentParser], given: Sequence[str]
+) -> Defaults:
+    """Set the defaults of the options of the command that is called.
 
     A file has keys for all commands at its top, and for one in a table of its name:
-    `actuator = "left.toml"`, `[diagnose]`, `jobs = 2`. A key is an option's name with `_` or `-`.
+    `actuator = "left.toml"`, `[diagnose]`, `jobs = 2`. A key is an option's name with `_` or `-`;
+    the options of a command's verbs are its own.
 
     Parameters
     ----------
-    parser : argparse.ArgumentParser
-        Of the command; what was a required option is none where it has a default now.
-    command : str
-        Its name.
+    commands : Mapping[str, argparse.ArgumentParser]
+        All commands by name; what was a required option is none where it has a default now.
+    given : Sequence[str]
+        The command line.
 
     Returns
     -------
-    list[str]
-        Files and variables that set something.
+    Defaults
+        What was used, and what was not.
 
     Raises
     ------
@@ -79,41 +91,89 @@ def apply_defaults(parser: argparse.ArgumentParser, command: str) -> list[str]:
     InputOutputError
         A file cannot be read.
     """
-    actions = _options(parser)
+    command = next((item for item in given if not item.startswith("-")), "")
+    if command not in commands:
+        return Defaults((), ())
+    chosen = Called(commands[command], given)
+    known = {name: keys_of(parser) for name, parser in commands.items()}
     used: list[str] = []
-    for path, allowed in ((user_file(), None), (Path(NAME), PROJECT)):
+    ignored: list[str] = []
+    for path, of_project in ((user_file(), False), (Path(NAME), True)):
         if path is None or not os.path.lexists(path):
             continue
         where = f"defaults {path}"
         _refuse_others(path, where)
         tree = read_toml(path, dict[str, Any], "defaults")
-        values = _of_command(tree, command, where)
+        _refuse_unknown(tree, known, where)
+        values = _of_command(tree, command)
+        if of_project:
+            _refuse_what_is_not_for_projects(values, where)
+            if "interface" in known[command] and command not in LISTENING:
+                if sent := sorted(SENT & values.keys() & known[command]):
+                    ignored.append(
+                        f"{where}: {', '.join(sent)} ignored: {command} can transmit, and takes"
+                        " test and bus from no project's file; name them on the command line, in"
+                        f" {user_file()} or by {PREFIX}…"
+                    )
+                values = {key: value for key, value in values.items() if key not in SENT}
         for key, value in values.items():
-            if allowed is not None and key not in allowed:
-                raise ConfigurationError(
-                    f"{where}: {key} is not for a project's file; set it in {user_file()}, by"
-                    f" {PREFIX}{key.upper()}, or on the command line"
-                )
-            if key in actions:
-                _set(parser, actions[key], _beside(path, key, value), where)
-        if any(key in actions for key in values):
+            chosen.set(key, _beside(path, key, value), where)
+        if any(key in known[command] for key in values):
             used.append(str(path))
+    everywhere = set().union(*known.values())
     for name, text in _variables():
         key = name[len(PREFIX) :].lower()
-        if key in actions:
-            _set(parser, actions[key], text, f"variable {name}")
+        if chosen.set(key, text, f"variable {name}"):
             used.append(name)
-    return used
+        elif key not in everywhere:
+            near = _near(key, everywhere)
+            hint = f"; {PREFIX}{near.upper()}?" if near else ""
+            ignored.append(f"variable {name}: there is no option --{_spelt(key)}{hint}")
+    return Defaults(tuple(used), tuple(ignored))
 
 
-def _options(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
-    """Options by the keys that set them."""
-    return {
-        name[2:].replace("-", "_").lower(): action
-        for action in parser._actions
-        for name in action.option_strings
-        if name.startswith("--") and name != "--help"
-    }
+def _spelt(key: str) -> str:
+    return key.replace("_", "-")
+
+
+def _near(word: str, known: Iterable[str]) -> str | None:
+    from difflib import get_close_matches  # noqa: PLC0415 - only for what nobody knows
+
+    return next(iter(get_close_matches(word, sorted(known), n=1)), None)
+
+
+def _refuse_unknown(tree: Mapping[str, Any], known: Mapping[str, set[str]], where: str) -> None:
+    """Refuse the first key that no option has, the first table that no command has."""
+    everywhere = set().union(*known.values())
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            if name not in known:
+                raise _unknown(where, f"[{name}]", "command", _near(name, known), "[{}]")
+            for key in value:
+                if key_of(key) not in known[name]:
+                    near = _near(key_of(key), known[name])
+                    raise _unknown(where, f"[{name}] {key}", f"option of {name}", near, "{}")
+        elif key_of(name) not in everywhere:
+            if name in known:
+                raise ConfigurationError(f"{where}: {name} is a command, need a table [{name}]")
+            near = _near(key_of(name), everywhere)
+            raise _unknown(where, name, "option of any command", near, "{}")
+
+
+def _unknown(
+    where: str, what: str, kind: str, near: str | None, spelling: str
+) -> ConfigurationError:
+    hint = f", did you mean {spelling.format(near)}?" if near else ""
+    return ConfigurationError(f"{where}: {what} is no {kind}{hint}")
+
+
+def _refuse_what_is_not_for_projects(values: Mapping[str, Any], where: str) -> None:
+    for key in values:
+        if key not in PROJECT:
+            raise ConfigurationError(
+                f"{where}: {key} is not for a project's file; set it in {user_file()}, by"
+                f" {PREFIX}{key.upper()}, or on the command line"
+            )
 
 
 def _variables() -> Iterator[tuple[str, str]]:
@@ -122,13 +182,12 @@ def _variables() -> Iterator[tuple[str, str]]:
             yield name, text
 
 
-def _of_command(tree: Mapping[str, Any], command: str, where: str) -> dict[str, Any]:
+def _of_command(tree: Mapping[str, Any], command: str) -> dict[str, Any]:
     """What a file sets for a command: what it sets for all, then what for this one."""
     common = {key: value for key, value in tree.items() if not isinstance(value, dict)}
-    own = tree.get(command, {})
-    if not isinstance(own, dict):
-        raise ConfigurationError(f"{where}: {command} is a command, need a table [{command}]")
-    return {key.replace("-", "_").lower(): value for key, value in (common | own).items()}
+    own = tree.get(command)  # some commands are called like options
+    own = own if isinstance(own, dict) else {}
+    return {key_of(key): value for key, value in (common | own).items()}
 
 
 def _beside(path: Path, key: str, value: Any) -> Any:
@@ -139,41 +198,6 @@ def _beside(path: Path, key: str, value: Any) -> Any:
         return [_beside(path, key, item) for item in value]
     there = path.parent / str(value)
     return str(there) if there.exists() else value
-
-
-def _set(parser: argparse.ArgumentParser, action: argparse.Action, value: Any, where: str) -> None:
-    key = action.option_strings[-1]
-    checked = _checked(action, value, f"{where}: {key}")
-    parser.set_defaults(**{action.dest: checked})
-    action.required = False
-
-
-def _checked(action: argparse.Action, value: Any, at: str) -> Any:
-    """Read a value as the command line does."""
-    if action.nargs == 0:
-        flag = BOOLEANS.get(str(value).lower())
-        if flag is None:
-            raise ConfigurationError(f"{at}: need true or false, not {value!r}")
-        return flag
-    if isinstance(value, list) or isinstance(action, argparse._AppendAction):
-        items = value if isinstance(value, list) else [value]
-        many = [_single(action, item, at) for item in items]
-        return _Replaced(many) if isinstance(action, argparse._AppendAction) else many
-    return _single(action, value, at)
-
-
-def _single(action: argparse.Action, value: Any, at: str) -> Any:
-    if isinstance(value, dict | list | bool):
-        raise ConfigurationError(f"{at}: need one text or number, not {value!r}")
-    kind = action.type if callable(action.type) else str
-    try:
-        read = kind(str(value))
-    except (ValueError, argparse.ArgumentTypeError) as error:
-        raise ConfigurationError(f"{at}: {error}") from None
-    if action.choices is not None and read not in action.choices:
-        choice = ", ".join(map(str, action.choices))
-        raise ConfigurationError(f"{at}: {read!r} is none of {choice}")
-    return read
 
 
 def _refuse_others(path: Path, where: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import os
 from pathlib import Path
@@ -116,11 +117,12 @@ class Keeper:
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self._arguments = arguments
+        self._kept: set[bytes] | None = None
+        """Digests of what was in it when that was asked first."""
         self.place = self._place()
         """Of the history; None: nothing is kept."""
         if self.place is not None:
-            # Said before a test begins or a log is read.
-            self._open().close()
+            self._try()
         elif arguments.hours is not None or arguments.cycles is not None:
             raise ConfigurationError(
                 "--hours, --cycles: no health history to keep them in: name one by --history, or"
@@ -145,6 +147,20 @@ class Keeper:
         except ConfigurationError as error:  # exchanged since the call began
             raise InputOutputError(str(error)) from None
 
+    def has(self, line: str) -> bool:
+        """Whether a result need not be appended: it was, or there is no history.
+
+        line: its JSON result.
+        """
+        if self.place is None:
+            return True
+        if not self.place.exists():
+            return False
+        if self._kept is None:
+            with self._open() as history:
+                self._kept = {_digest(kept) for kept in history.results()}
+        return _digest(line) in self._kept
+
     @property
     def _simulated(self) -> bool:
         return bool(getattr(self._arguments, "simulate", False))
@@ -158,11 +174,25 @@ class Keeper:
             return None  # a simulated unit is none of the fleet's unless somebody wants it there
         return history_place(self._arguments)
 
+    def _try(self) -> None:
+        """Say before a test begins or a log is read what is wrong; make no file yet."""
+        assert self.place is not None
+        if os.path.lexists(self.place):
+            self._open().close()
+        elif not os.access(self.place.parent, os.W_OK | os.X_OK):
+            raise InputOutputError(
+                f"history {self.place}: cannot be opened: no such folder, or no right to it"
+            )
+
     def _open(self) -> History:
         from ehadiag.history.store import History  # noqa: PLC0415
 
         assert self.place is not None
         return History(self.place, create=True)
+
+
+def _digest(line: str) -> bytes:
+    return hashlib.sha256(line.encode()).digest()
 
 
 def _not_negative(text: str) -> float:

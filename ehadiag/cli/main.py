@@ -31,11 +31,12 @@ from ehadiag.cli.commands import (
 )
 from ehadiag.cli.commands import check_bus as checkbus
 from ehadiag.cli.defaults import NAME, apply_defaults
+from ehadiag.cli.exit_codes import FAILED, worst_code
 from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
 from ehadiag.cli.output import abandon, say
 from ehadiag.cli.verbose import tell_all
 from ehadiag.cli.version import ShowVersions
-from ehadiag.core.errors import EhadiagError, InputOutputError
+from ehadiag.core.errors import EhadiagError
 from ehadiag.core.printable import printable
 
 __all__ = ["main", "process"]
@@ -98,11 +99,11 @@ def _run(argv: Sequence[str] | None, interrupted: threading.Event) -> int:
     except BrokenPipeError:
         # Whoever read our output has gone.
         abandon(sys.stdout)
-        return max(code, InputOutputError.exit_code)
+        return worst_code((code, FAILED))
     except OSError as error:
         abandon(sys.stdout)
         say(f"{error.filename or 'standard output'}: {error.strerror or error}")
-        return max(code, InputOutputError.exit_code)
+        return worst_code((code, FAILED))
     except KeyboardInterrupt:
         say("interrupted")
         return INTERRUPTED
@@ -115,16 +116,17 @@ def _run(argv: Sequence[str] | None, interrupted: threading.Event) -> int:
 
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the command line; more logs may follow the options that follow logs."""
+    """Parse the command line; more logs (results) may follow the options that follow logs."""
     parser, commands = _parser_and_commands()
     given = sys.argv[1:] if argv is None else list(argv)
-    command = next((item for item in given if not item.startswith("-")), "")
-    used = apply_defaults(commands[command], command) if command in commands else []
+    used, ignored = apply_defaults(commands, given)
+    for text in ignored:
+        say(text)
     arguments, rest = parser.parse_known_args(given)
-    logs = getattr(arguments, "logs", None)
     late = [item for item in rest if item == "-" or not item.startswith("-")]
-    if logs is not None and len(late) == len(rest):
-        logs += late
+    files = _repeated(commands, given)
+    if files is not None and len(late) == len(rest):
+        getattr(arguments, files).extend(late)
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if used and (arguments.verbose or NAME in used):
@@ -132,6 +134,15 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     if arguments.verbose:
         tell_all(arguments)
     return arguments
+
+
+def _repeated(commands: Mapping[str, argparse.ArgumentParser], given: Sequence[str]) -> str | None:
+    """Where the arguments of the command are that may be repeated; None where it has none."""
+    command = next((item for item in given if not item.startswith("-")), "")
+    actions = commands[command]._actions if command in commands else []
+    return next(
+        (item.dest for item in actions if item.nargs == "+" and not item.option_strings), None
+    )
 
 
 def _print_whatever_comes() -> None:

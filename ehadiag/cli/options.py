@@ -54,6 +54,7 @@ __all__ = [
     "the_bus_map",
     "the_columns",
     "the_sought",
+    "unit_serial",
 ]
 
 TEST = "open|closed|NUMBER|FILE"
@@ -61,6 +62,8 @@ TEST = "open|closed|NUMBER|FILE"
 DEFAULT_BAUD = 921600
 DEFAULT_BITRATE = 1e6
 """Of the default bus (BUS-1)."""
+MOST_SERIAL = (1 << 63) - 1
+"""That a history can hold."""
 TIME_LIMIT_S = 600.0
 """Some ten thousand times what a sound recording takes."""
 
@@ -262,6 +265,12 @@ def add_bus_options(parser: argparse.ArgumentParser) -> None:
         default=os.environ.get("CAN_CHANNEL"),
         help="channel as the interface names it (default: CAN_CHANNEL)",
     )
+    group.add_argument(
+        "--context",
+        metavar="NAME",
+        help="section of python-can's configuration file, and end of its variables, that names the"
+        " bus (default: without --interface its default section)",
+    )
     group.add_argument("-b", "--bitrate", type=count, metavar="N", help="bit/s")
     group.add_argument("--fd", action="store_true", help="accept CAN FD frames")
     group.add_argument(
@@ -405,8 +414,12 @@ def the_budget(arguments: argparse.Namespace) -> Budget:
     )
 
 
-def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
-    """Return the options of a diagnosis, for its JSON result."""
+def the_asked(arguments: argparse.Namespace, bus_map: BusMap, tests: Sequence[StoredTest]) -> Asked:
+    """Return the options of a diagnosis, for its JSON result.
+
+    tests: that a recording may be of; the one that stands for all the others comes first.
+    """
+    columns = the_columns(arguments) if hasattr(arguments, "column") else None
     return Asked(
         solver=arguments.solver,
         seed=arguments.seed,
@@ -416,6 +429,11 @@ def the_asked(arguments: argparse.Namespace, bus_map: BusMap) -> Asked:
         every=getattr(arguments, "all", False),
         mapping=bus_map.name,
         mapping_sha256=fingerprint(bus_map),
+        mapping_file=arguments.mapping or None,
+        tests_sha256=fingerprint(tuple(tests)),
+        columns_sha256=None if columns is None else fingerprint(columns),
+        start_s=getattr(arguments, "start", None),
+        end_s=getattr(arguments, "end", None),
     )
 
 
@@ -445,21 +463,30 @@ def known_tests(names: list[str]) -> tuple[StoredTest, ...]:
 
 
 def has_bus(arguments: argparse.Namespace) -> bool:
-    """Whether a bus or a serial port was named."""
-    return bool(arguments.interface or arguments.serial)
+    """Whether a bus or a serial port was named; python-can's default one is not."""
+    return bool(arguments.interface or arguments.serial or arguments.context)
 
 
 def refuse_two_buses(arguments: argparse.Namespace) -> None:
     """Raise ConfigurationError where a serial port and a bus of python-can were both named."""
     if arguments.serial and arguments.interface not in (None, os.environ.get("CAN_INTERFACE")):
         raise ConfigurationError("--serial and --interface exclude each other: name one bus")
+    if arguments.serial and arguments.context:
+        raise ConfigurationError("--serial and --context exclude each other: name one bus")
 
 
 def need_one_bus(arguments: argparse.Namespace) -> None:
-    """Raise ConfigurationError unless one bus or serial port was named."""
+    """Raise ConfigurationError unless one bus or serial port was named, here or for python-can."""
     refuse_two_buses(arguments)
-    if not has_bus(arguments):
-        raise ConfigurationError("no bus named: give --interface and --channel, or --serial")
+    if has_bus(arguments):
+        return
+    from firmware_iface.transport.configuration import configures_a_bus  # noqa: PLC0415
+
+    if not configures_a_bus():
+        others = ", or --simulate" if hasattr(arguments, "simulate") else ""
+        raise ConfigurationError(
+            f"no bus named: give --interface and --channel, or --serial{others}"
+        )
 
 
 def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transport:
@@ -471,7 +498,7 @@ def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transpor
     from firmware_iface.transport.python_can import BusOptions, PythonCanTransport  # noqa: PLC0415
 
     options = BusOptions(
-        interface=arguments.interface,
+        interface=arguments.interface or "",
         channel=arguments.channel,
         bitrate=arguments.bitrate,
         data_bitrate=arguments.data_bitrate,
@@ -480,6 +507,10 @@ def open_transport(arguments: argparse.Namespace, *, transmit: bool) -> Transpor
         extra=_extra(arguments.bus_kwargs),
         allow_multicast=arguments.allow_multicast,
     )
+    if arguments.context or not arguments.interface:
+        from firmware_iface.transport.configuration import configured  # noqa: PLC0415
+
+        options = configured(options, arguments.context)
     return PythonCanTransport(options, transmit=transmit)
 
 
@@ -534,6 +565,15 @@ def count(text: str) -> int:
     """Read a whole number above zero."""
     if not (text.isascii() and text.isdigit()) or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
+    return int(text)
+
+
+def unit_serial(text: str) -> int:
+    """Read a serial number of a unit, as far as buses and histories carry them."""
+    if not (text.isascii() and text.isdigit()) or len(text) > 19 or int(text) > MOST_SERIAL:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: a serial number is a whole number, 0 … {MOST_SERIAL}"
+        )
     return int(text)
 
 

@@ -115,9 +115,9 @@ def rendered(draw: Callable[[Console], None]) -> str:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """Show stage and share done on standard error, where that is a terminal."""
-    if not sys.stderr.isatty():
+def progress_bar(*, shown: bool = True) -> Iterator[Callable[[str, float], None]]:
+    """Show stage and share done on standard error, where that is a terminal and it is `shown`."""
+    if not (shown and sys.stderr.isatty()):
         yield lambda _stage, _share: None
         return
     from rich.console import Console  # noqa: PLC0415

@@ -13,17 +13,18 @@ from ehadiag.core.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.calibration.result import Calibrated
     from ehadiag.report.page import Trend
 
-__all__ = ["add_report_option", "need_report_library", "report_of"]
+__all__ = ["add_report_option", "calibration_report", "need_report_library", "report_of"]
 
 
-def add_report_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--report`."""
+def add_report_option(parser: argparse.ArgumentParser, place: str = "to the output folder") -> None:
+    """Add `--report`; `place` says where the page goes."""
     parser.add_argument(
         "--report",
         action="store_true",
-        help="also write a report, one HTML page that needs no network, to the output folder"
+        help=f"also write a report, one HTML page that needs no network, {place}"
         " (needs ehadiag[report])",
     )
 
@@ -62,6 +63,27 @@ def report_of(
     result = json.loads(line)
     trend = None if history is None else _trend(result, levels, history)
     page = page_of(result, levels, __version__, now(), diagnosis, trend)
+    return page.encode("utf-8", errors="backslashreplace")
+
+
+def calibration_report(found: Calibrated) -> bytes:
+    """Return the page of a calibration.
+
+    Parameters
+    ----------
+    found : Calibrated
+        What was learned, or why nothing.
+
+    Returns
+    -------
+    bytes
+        HTML, UTF-8.
+    """
+    from ehadiag import __version__  # noqa: PLC0415
+    from ehadiag.history.keep import now  # noqa: PLC0415
+    from ehadiag.report.calibration_page import calibration_page  # noqa: PLC0415 - bokeh is slow
+
+    page = calibration_page(found, __version__, now())
     return page.encode("utf-8", errors="backslashreplace")
 
 

@@ -6,11 +6,12 @@ import argparse
 import contextlib
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels
+from ehadiag.cli.exit_codes import worst_code
 from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import emit, put, rendered, say
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 __all__ = ["Results", "make_folder"]
 
 MAX_RESULT_BYTES = 1 << 20
+BESIDE = (".png", ".html")
+"""Suffixes of what stands beside a result: picture and report."""
 
 
 def make_folder(name: str) -> Folder:
@@ -65,12 +68,16 @@ class Results:
         The parsed command line.
     folder : Folder | None
         For JSON and pictures; None: nothing is written.
+    taken : Iterable[str]
+        Names, without suffix, that other files of the call have there.
     """
 
-    def __init__(self, arguments: argparse.Namespace, folder: Folder | None) -> None:
+    def __init__(
+        self, arguments: argparse.Namespace, folder: Folder | None, taken: Iterable[str] = ()
+    ) -> None:
         self._arguments = arguments
         self._folder = folder
-        self._names: set[str] = set()
+        self._names = set(taken)
         self._keeper = Keeper(arguments)
         if arguments.report:
             need_report_library()
@@ -100,8 +107,9 @@ class Results:
     ) -> int:
         """Write and print one result; return its exit code.
 
-        That is the verdict's, or 3 where something could not be written and 3 is more. From here on
-        signals do not change it: the first leaves the picture out, the second what is not out yet.
+        That is the verdict's, or 3 where something could not be written and that is worse (see
+        `worst_code`). From here on signals do not change it: the first leaves the picture out, the
+        second what is not out yet.
 
         line: JSON object. name: of the files, without suffix; made safe, and numbered where it is
         taken. draw: makes the picture; None: there is none.
@@ -130,7 +138,7 @@ class Results:
             if self._folder is not None and written:
                 say("wrote " + ", ".join(str(self._folder.path / item) for item in written))
         self.stopped = self.stopped or came.is_set()
-        return max(codes)
+        return worst_code(codes)
 
     def refuse(self, line: str, error: str) -> None:
         """Say what is wrong with an input, and print its object; `ehadiag.diagnosis/1` has none."""
@@ -146,6 +154,28 @@ class Results:
             put(
                 f"{tree['verdict'].replace('_', ' ')}  {tree['source']}  (found by an earlier call)"
             )
+
+    def has(self, line: str, name: str) -> bool:
+        """Whether all that this call is to write of a result is there from an earlier one.
+
+        line: JSON object. name: of the files, without suffix, as for `deliver`.
+        """
+        return self._keeper.has(line) and self._has_files(line, plain_name(name))
+
+    def _has_files(self, line: str, wanted: str) -> bool:
+        folder = self._folder
+        if folder is None:
+            return True
+        content = self._said_as(line).encode() + b"\n"
+        suffixes = [".png"] * self.pictures + [".html"] * bool(self._arguments.report)
+        for stem in _numbered(wanted):
+            try:
+                there = folder.read(f"{stem}.json", MAX_RESULT_BYTES)
+            except OSError:
+                return False
+            if there == content:
+                return all(folder.exists(f"{stem}{suffix}") for suffix in suffixes)
+        raise AssertionError("numbers have no end")
 
     @property
     def pictures(self) -> bool:
@@ -172,17 +202,16 @@ class Results:
         if folder is None:
             return None
         content = line.encode() + b"\n"
-        candidates = (wanted if n == 1 else f"{wanted}-{n}" for n in itertools.count(1))
-        for stem in candidates:
+        for stem in _numbered(wanted):
             if stem in self._names:
                 continue
             name = f"{stem}.json"
             try:
                 if _same_recording(folder, name, line):
                     folder.write(name, content)
-                    for suffix in (".png", ".html"):  # of the result that is no more
+                    for suffix in BESIDE:  # of the result that is no more
                         folder.remove(f"{stem}{suffix}")
-                elif folder.exists(f"{stem}.png"):
+                elif any(folder.exists(f"{stem}{suffix}") for suffix in BESIDE):
                     continue
                 else:
                     folder.write_new(name, content)
@@ -223,6 +252,11 @@ def _said(codes: list[int]) -> Iterator[None]:
     except InputOutputError as error:
         codes.append(error.exit_code)
         say(str(error))
+
+
+def _numbered(name: str) -> Iterator[str]:
+    """Names to try one after another."""
+    return (name if n == 1 else f"{name}-{n}" for n in itertools.count(1))
 
 
 def _same_recording(folder: Folder, name: str, line: str) -> bool:

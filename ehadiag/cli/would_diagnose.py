@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.find_test import Sought
-from ehadiag.core.recording import Recording
+from ehadiag.core.recording import Recording, Samples
 from ehadiag.core.stored_test import StoredTest
 
 if TYPE_CHECKING:
@@ -31,11 +31,14 @@ class Outlook:
         The stored test that the frames hold whole; empty without one.
     refused : tuple[str, ...]
         Why it would not be judged.
+    heard : Samples | None
+        All that was heard, on ticks; None: no channel was.
     """
 
     units: tuple[str, ...]
     test: str
     refused: tuple[str, ...]
+    heard: Samples | None = None
 
 
 def outlook(
@@ -76,9 +79,10 @@ def outlook(
         if item.samples.ticks == test.ticks
     ]
     if not ran:
-        return Outlook(units, "", ())
+        return Outlook(units, "", (), whole.samples)
     recording, test = ran[-1]
-    return Outlook(units, test.name, tuple(_objections(recording, test, actuator)))
+    refused = tuple(_objections(recording, test, actuator))
+    return Outlook(units, test.name, refused, whole.samples)
 
 
 def _without_test(bus_map: BusMap) -> BusMap:

@@ -105,6 +105,9 @@ class Processor:
         Whether a product and a sum that the kernels let fuse are one instruction with one rounding.
     shared : bool
         Whether the code may be part of a shared library.
+    rounds : bool
+        Whether it rounds to whole numbers by an instruction. Where not, a function of the C library
+        would be called, and no Arm code can hand it a number in both calling conventions.
     """
 
     triple: str
@@ -113,6 +116,7 @@ class Processor:
     abi: str = ""
     fused: bool = True
     shared: bool = False
+    rounds: bool = True
 
 
 @dataclass(frozen=True, slots=True)

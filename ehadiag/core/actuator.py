@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from ehadiag.core.calibration import Calibration
+from ehadiag.core.converters import Converters
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.toml_file import decode_toml, read_toml
 
@@ -189,6 +190,8 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     second_stage: SecondStage = SecondStage()
     limits: Limits = Limits()
     tolerance: Tolerance = Tolerance()
+    converters: Converters | msgspec.UnsetType = msgspec.UNSET
+    """Behind the measured channels; unset: nothing is known of them."""
     calibration: Calibration | None = None
     """What was learned of this unit; None: the data are those of a type."""
 

@@ -85,6 +85,9 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         count = len(self.parameters)
         if len(set(self.parameters)) < count:
             return "calibration.parameters: a name stands twice"
+        unknown = sorted(set(self.effects) - set(self.parameters))
+        if unknown:
+            return f"calibration.effects: {', '.join(unknown)} not among calibration.parameters"
         if len(self.std) != count:
             return f"calibration.std: need {count} numbers, one of each parameter"
         if [len(row) for row in self.root] != list(range(1, count + 1)):

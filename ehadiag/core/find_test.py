@@ -8,6 +8,7 @@ the measured current does.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,7 +20,7 @@ from ehadiag.core.actuator import Controller
 from ehadiag.core.recording import CommandMode, Recording, Samples
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
 
-__all__ = ["Found", "Sought", "find_test", "found_tests", "rows_of_samples"]
+__all__ = ["Found", "Sought", "find_test", "found_tests", "played_tests", "rows_of_samples"]
 
 LEAST_COMMANDS = 100
 LEAST_SHARE = 0.75
@@ -98,7 +99,12 @@ class Found:
 
 
 def found_tests(
-    recording: Recording, search: Sought, *, within: bool = False, before: int = 0
+    recording: Recording,
+    search: Sought,
+    *,
+    within: bool = False,
+    before: int = 0,
+    others: bool = False,
 ) -> tuple[Recording, ...]:
     """Cut out of a recording the tests that it holds.
 
@@ -112,6 +118,8 @@ def found_tests(
         The recording is known to hold one test: only its instant is looked for.
     before : int
         Rows at the recording's beginning that its reader does not count.
+    others : bool
+        Other tests may have been played too: no start is taken at its word.
 
     Returns
     -------
@@ -126,18 +134,43 @@ def found_tests(
     if (low, high) != (0, samples.ticks):
         samples = rows_of_samples(samples, low, low, high - low)
     begin = low - before
-    found, nearest = [], None
-    for item in _each(samples, search, once=within):
-        if item.misfit > MOST_MISFIT:
-            nearest = item
-            break
-        found.append(item)
-    if not found and search.start_s is not None and len(search.tests) == 1:
+    found, nearest = played_tests(samples, search, once=within)
+    alone = len(search.tests) == 1 and not others
+    if not found and search.start_s is not None and alone:
         return (_taken_at(recording, samples, search.tests[0], begin),)
     if not found:
         return (_not_found(recording, nearest, samples.period_ns, begin),)
     found.sort(key=lambda item: item.first)
-    return tuple(_cut(recording, samples, item, begin) for item in found)
+    return tuple(_cut(recording, samples, item, begin, search.controller) for item in found)
+
+
+def played_tests(
+    samples: Samples, search: Sought, *, once: bool = False, most: float = MOST_MISFIT
+) -> tuple[list[Found], Found | None]:
+    """Find all tests in a stretch of samples.
+
+    Parameters
+    ----------
+    samples : Samples
+        On a tick grid.
+    search : Sought
+        What to look for; where to look does not count.
+    once : bool
+        It holds one test at most.
+    most : float
+        Misfit up to which a test is found: more where samples are placed roughly.
+
+    Returns
+    -------
+    tuple[list[Found], Found | None]
+        Those found, the best one first, and what came nearest where the next is none.
+    """
+    found: list[Found] = []
+    for item in _each(samples, search, once=once):
+        if item.misfit > most:
+            return found, item
+        found.append(item)
+    return found, None
 
 
 def _window(samples: Samples, search: Sought, before: int) -> tuple[int, int]:
@@ -304,12 +337,12 @@ def _beside(samples: Samples, found: Found, controller: Controller) -> int:
         return 0
     stored = found.test.command()
 
-    def misfit(shift: int) -> float:
+    def misfit(shift: int, late: int) -> float:
         at = ticks - shift
         inside = (at >= 0) & (at < len(stored))
         command = stored[np.clip(at, 0, len(stored) - 1)]
         if found.test.closed_loop:
-            before = np.concatenate([[np.nan], samples.position[:-1]])
+            before = _part(samples.position, late - 1, samples.ticks, np.nan)
             command = controller.GAP * (command - before)
         law = np.clip(command, -controller.IM, controller.IM)
         away = (samples.current - law)[inside & ~samples.saturated[0]]
@@ -320,15 +353,53 @@ def _beside(samples: Samples, found: Found, controller: Controller) -> int:
         return float(np.sqrt(np.mean(away**2)))
 
     tried = sorted(range(-FARTHEST, FARTHEST + 1), key=abs)
-    return min(tried, key=misfit) if np.isfinite(misfit(0)) else 0
+    if not np.isfinite(misfit(0, 0)):
+        return 0
+    best = min(tried, key=lambda shift: misfit(shift, 0))
+    if not found.test.closed_loop:
+        return best
+    # The jack's positions may come by another message than the currents, later than these.
+    pairs = sorted(itertools.product(tried, tried), key=lambda pair: abs(pair[0]) + abs(pair[1]))
+    shift, late = min(pairs, key=lambda pair: misfit(*pair))
+    return shift if CLEARLY * misfit(shift, late) < misfit(best, 0) else best
 
 
-def _cut(recording: Recording, samples: Samples, found: Found, begin: int) -> Recording:
+def _position_late(mine: Samples, found: Found, controller: Controller) -> int:
+    """Ticks by which the jack's positions come later than the currents, as the control law tells.
+
+    They may come by another message than the current.
+    """
+    if not found.test.closed_loop or not controller.GAP or controller.GAI or controller.GAD:
+        return 0
+    stored = found.test.command()
+
+    def misfit(late: int) -> float:
+        seen = _part(mine.position, late - 1, len(stored), np.nan)
+        law = np.clip(controller.GAP * (stored - seen), -controller.IM, controller.IM)
+        away = (mine.current - law)[~mine.saturated[0]]
+        away = away[np.isfinite(away)]
+        if len(away) < LEAST_COMMANDS:
+            return np.inf
+        away = np.sort(np.abs(away - np.median(away)))[: int(0.98 * len(away))]
+        return float(np.sqrt(np.mean(away**2)))
+
+    best = min(sorted(range(-FARTHEST, FARTHEST + 1), key=abs), key=misfit)
+    return best if CLEARLY * misfit(best) < misfit(0) < np.inf else 0
+
+
+def _cut(
+    recording: Recording, samples: Samples, found: Found, begin: int, controller: Controller
+) -> Recording:
     """The test's own rows, and what a reader should know of how it was found."""
     test, mode = found.test, CommandMode.POSITION
     if not found.test.closed_loop:
         mode = CommandMode.CURRENT
     mine = rows_of_samples(samples, found.first, found.command_first, test.ticks)
+    late = _position_late(mine, found, controller)
+    if late:
+        mine = replace(
+            mine, position=_part(samples.position, found.first + late, test.ticks, np.nan)
+        )
     if found.by != "command":
         mine = replace(mine, command=np.full(test.ticks, np.nan))
     tolerance = max(OUT_OF_PLACE[mode], 0.6 * _resolution(mine.command))
@@ -347,6 +418,10 @@ def _cut(recording: Recording, samples: Samples, found: Found, begin: int) -> Re
         beside = (found.first - found.command_first) * period / 1e6
         notes.append(
             f"the stamps of telemetry and command differ by {beside:g} ms more than a tick"
+        )
+    if late:
+        notes.append(
+            f"the jack's positions come {late * period / 1e6:g} ms later than the currents"
         )
     if strange.any():
         notes.append(f"{int(strange.sum())} commands out of place by their stamps are left out")

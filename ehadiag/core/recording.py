@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.channels import Stated
 from ehadiag.core.errors import NotTestedError
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ __all__ = [
     "CommandMode",
     "Environment",
     "MessageCounts",
+    "OnboardResult",
+    "OnboardState",
     "Outcome",
     "Quality",
     "Recording",
@@ -58,6 +61,16 @@ class BitReason(IntEnum):
     INTERLOCK_OPEN = 6
 
 
+class OnboardState(IntEnum):
+    """How far the computer's own identification is (BUS-17, `OnboardState`)."""
+
+    NOTHING = 0
+    RECORDING = 1
+    IDENTIFYING = 2
+    DONE = 3
+    GIVEN_UP = 4
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
     """Samples of one test on its own tick grid: row k is control tick k of the test.
@@ -86,6 +99,8 @@ class Samples:
         Shape (4, ticks), the channel's converter stood at its end.
     host_ns : NDArray[np.int64]
         Host time stamp of each telemetry row, ns; -1 where none arrived.
+    stated : tuple[Stated | None, ...]
+        What the mapping says of each channel's converter; empty: nothing of any.
     """
 
     period_ns: int
@@ -97,6 +112,7 @@ class Samples:
     command: NDArray[np.float64]
     saturated: NDArray[np.bool_]
     host_ns: NDArray[np.int64]
+    stated: tuple[Stated | None, ...] = ()
 
     @property
     def ticks(self) -> int:
@@ -192,6 +208,35 @@ class Outcome:
     reason: BitReason = BitReason.NONE
 
 
+@dataclass(frozen=True, slots=True)
+class OnboardResult:
+    """What the flight-control computer says that it has found itself in a test (BUS-18).
+
+    Attributes
+    ----------
+    test_id : int | None
+        Number of the test; None where it does not say.
+    verdict : int | None
+        0 healthy, 10 degraded, 20 fault, 30 not tested; None where it does not say.
+    runs : int | None
+        Runs of the model that it took; None where it does not say.
+    severities : Mapping[str, float]
+        Kintas, FSS, FDJ; 0 … 1.
+    std : Mapping[str, float]
+        Their standard deviations.
+    """
+
+    test_id: int | None
+    verdict: int | None
+    runs: int | None
+    severities: Mapping[str, float]
+    std: Mapping[str, float]
+
+    def is_of(self, test_id: int | None) -> bool:
+        """Whether it can be that of a test; None: the test's number is not known."""
+        return None in (test_id, self.test_id) or test_id == self.test_id
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """One test of one actuator, as acquired."""
@@ -209,6 +254,10 @@ class Recording:
     """Adapter channel of the recording; None where it has only one or does not say."""
     start_ns: int | None = None
     """Host time of the test's first sample, ns since the epoch (or the log's start)."""
+    onboard: OnboardResult | None = None
+    """What the computer has found itself; None where it did not say."""
+    by_time: bool = False
+    """No counter told the samples' ticks: one message's may be placed later than another's."""
 
     @property
     def duration(self) -> float:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import kernel
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS, POSITION, PRESSURE, SPOOL
+from ehadiag.core.channels import CHANNELS
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.recording import CommandMode, Environment, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment
@@ -80,6 +81,8 @@ def play(
     """
     # The control law runs here, so the monitor is told currents.
     monitor = Monitor(actuator, severities, mode=CommandMode.CURRENT, effects=effects)
+    channels = actuator_channels(actuator)
+    lsb = channels.position.lsb
     data = actuator.controller
     law = ControlLaw(data.IM, data.GAP, data.GAI, data.GAD, 1.0 / test.rate)
     commands = test.command()
@@ -92,10 +95,10 @@ def play(
             current, state = _next_current(law, state, command - place)
         answers[k] = monitor.push(Tick(current, LOST, LOST, LOST, LOST)).predicted
         # The next tick's control law works on the digitised position (BUS-7).
-        place = POSITION.lsb * round(float(answers[k, 2]) / POSITION.lsb + float(noise[k]))
+        place = lsb * round(float(answers[k, 2]) / lsb + float(noise[k]))
         seen[k] = place
     experiment = build_experiment(_samples(test, commands, answers, seen), AS_FILED, test, actuator)
-    noise_of = tuple(TYPICAL_NOISE_LSB * channel.lsb for channel in (SPOOL, PRESSURE, POSITION))
+    noise_of = tuple(TYPICAL_NOISE_LSB * channel.grain for channel in channels[1:])
     _, pressure, travel = np.abs(answers).max(axis=0)
     rate = float(np.abs(np.diff(answers[:, 2])).max()) * test.rate
     return Played(experiment.with_noise(noise_of), float(travel), rate, float(pressure))

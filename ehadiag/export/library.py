@@ -26,6 +26,7 @@ from ehadiag.core.folder import Folder
 from ehadiag.core.printable import plain_name
 from ehadiag.export.archive import archive
 from ehadiag.export.arm_attributes import either_convention
+from ehadiag.export.firmware import SOURCES, firmware
 from ehadiag.export.linking import c_compiler, link_shared
 from ehadiag.export.targets import Target
 from ehadiag.model.exponential import exponential, exponential_less_one
@@ -36,7 +37,8 @@ from ehadiag.monitor.kernel import push_tick
 from ehadiag.monitor.plan import monitor_plan
 from ehadiag.monitor.prepare import prepare, rest
 from ehadiag.onboard import layout as identification
-from ehadiag.onboard.elementary import cosine, logarithm
+from ehadiag.onboard.elementary import cosine, logarithm, round_down, round_even
+from ehadiag.onboard.environment import set_environment
 from ehadiag.onboard.kernels import begin_identification, identify_some
 
 __all__ = [
@@ -63,19 +65,26 @@ OWN_FUNCTIONS: Final[Mapping[str, Any]] = {
     "cos": cosine,
 }
 """What stands for functions of the C library, whose last digit differs from one to the next."""
+ROUNDING: Final[Mapping[str, Any]] = {"rint": round_even, "floor": round_down}
+"""The same for a processor without such instructions; exact, so that no digit depends on it."""
 PLAN: Final = "eha_plan"
+NOT_MEASURED: Final = dict.fromkeys(
+    ("bit_equality", "instructions_of_push", "instructions_of_identification"), "not measured"
+)
+NEEDED: Final = "in the sources of ehadiag, with the target's compiler and QEMU"
 
 MONITOR: Final = (
     Function("eha_monitor_init", prepare, (Pointer(), Table(PLAN), Pointer())),
     Function("eha_monitor_reset", rest, (Pointer(), Numbers(1))),
     Function("eha_monitor_push", push_tick, (Pointer(), Numbers(5))),
 )
+SURROUNDINGS: Final = (Function("eha_unit_environment", set_environment, (Pointer(), Numbers(3))),)
 
 IDENTIFICATION: Final = (
     Function("eha_identify_begin", begin_identification, (Pointer(), Table(PLAN), Pointer())),
     Function("eha_identify_run", identify_some, (Pointer(), Table(PLAN), Pointer(), Numbers(2))),
 )
-FUNCTIONS: Final = (*MONITOR, *IDENTIFICATION)
+FUNCTIONS: Final = (*MONITOR, *SURROUNDINGS, *IDENTIFICATION)
 
 
 def export_library(
@@ -110,9 +119,8 @@ def export_library(
     """
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
     plan = monitor_plan(actuator, plant_constants(actuator), design)
-    code = either_convention(
-        object_code(FUNCTIONS, {PLAN: plan.tolist()}, OWN_FUNCTIONS, target.processor)
-    )
+    own = OWN_FUNCTIONS if target.processor.rounds else {**OWN_FUNCTIONS, **ROUNDING}
+    code = either_convention(object_code(FUNCTIONS, {PLAN: plan.tolist()}, own, target.processor))
     library = archive("eha.o", code, [item.name for item in FUNCTIONS])
     names = {"version": metadata.version("ehadiag"), "target": target.name}
     files = {
@@ -125,8 +133,11 @@ def export_library(
             lanes=str(identification.MONITORS),
             **names,
         ),
-        "CMakeLists.txt": template("CMakeLists.txt.in", flags=";".join(target.flags), **names),
+        "CMakeLists.txt": template(
+            "CMakeLists.txt.in", flags=";".join(target.flags), firmware=" ".join(SOURCES), **names
+        ),
         "example.c": template("example.c"),
+        **firmware(),
     }
     compiler = c_compiler() if target.processor.shared else None
     if compiler is not None:
@@ -149,6 +160,7 @@ def export_library(
         monitor_bytes=layout.SIZE * layout.NUMBER,
         identification_bytes=identification.SIZE * layout.NUMBER,
         object_bytes=len(code),
+        measured=NOT_MEASURED | {"command": f"tools/onboard --into FOLDER LOG, {NEEDED}"},
     )
     write(folder, files)
     return list(files)

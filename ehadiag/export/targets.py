@@ -48,7 +48,7 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "cortex-r5",
         "Arm Cortex-R5F, bare; cannot fuse",
-        Processor("armv7r-none-eabihf", "cortex-r5", fused=False),
+        Processor("armv7r-none-eabihf", "cortex-r5", fused=False, rounds=False),
         ("-mcpu=cortex-r5", "-mfloat-abi=hard", "-mfpu=vfpv3-d16"),
     ),
     Target(
@@ -66,7 +66,7 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "powerpc-e500mc",
         "Freescale e500mc, 32 bits, big-endian, Linux; fuses otherwise, so not at all",
-        Processor("powerpc-unknown-linux-gnu", "e500mc", fused=False),
+        Processor("powerpc-unknown-linux-gnu", "e500mc", fused=False, rounds=False),
         ("-mcpu=e500mc",),
     ),
 )

@@ -199,6 +199,18 @@ class History:
             for row in rows
         ]
 
+    def results(self) -> Iterator[str]:
+        """Give the JSON result of each diagnosis, in the order in which they were appended.
+
+        Yields
+        ------
+        str
+            One line, without its end.
+        """
+        with self._told():
+            for row in self._connection.execute("SELECT result FROM diagnosis ORDER BY id"):
+                yield row["result"]
+
     def events(self, serial: int | None = None) -> list[Event]:
         """Return the maintenance events, in the order in which they were appended.
 
@@ -314,6 +326,10 @@ class History:
         except sqlite3.Error as error:
             why = WHY.get(_name(error), str(error))
             raise InputOutputError(f"history {self.path}: {why}") from None
+        except OverflowError:
+            raise InputOutputError(
+                f"history {self.path}: a number beyond what SQLite holds, 64 bits"
+            ) from None
         except ConfigurationError as error:
             raise ConfigurationError(f"history {self.path} {error}") from None
 

@@ -15,15 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Controller
-from ehadiag.core.channels import CURRENT, POSITION
+from ehadiag.core.channels import CHANNELS, CURRENT, POSITION, Channels
 from ehadiag.core.recording import CommandMode, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.model.control import ControlLaw, commanded_currents
 
 __all__ = ["CurrentTrace", "commanded_current"]
 
-FRAME_TOLERANCE = {CommandMode.CURRENT: 20e-6, CommandMode.POSITION: 50e-6}
-"""A command frame that far (A, m) from the stored test says that another command was played."""
+FRAME_TOLERANCE = {
+    CommandMode.CURRENT: 20e-6 / CURRENT.full_scale,
+    CommandMode.POSITION: 50e-6 / POSITION.full_scale,
+}
+"""A command frame that far from the stored test says that another command was played: shares of
+the converter's half range, 20 µA and 50 µm of the default ones."""
 LEAST_LEVELS = 100
 """Values sent that it takes to know their resolution."""
 LONG_HOLE = 50
@@ -48,6 +52,7 @@ class CurrentTrace:
     offset: constant error of the measured current, A.
     rebuilt: whether the measured current bears it out.
     command_deviation: largest distance of a command frame from the stored test, A or m.
+    command_step: resolution of the command frames, A or m; 0 where too few tell.
     guessed: share of ticks whose current follows from a position that was lost, and that the
         measured current does not tell either; of a hole at most `LONG_HOLE` ticks count.
     """
@@ -58,21 +63,25 @@ class CurrentTrace:
     rebuilt: bool
     command_deviation: float
     guessed: float = 0.0
+    command_step: float = 0.0
 
 
-def commanded_current(samples: Samples, test: StoredTest, controller: Controller) -> CurrentTrace:
-    """Rebuild the commanded current of a test from its samples."""
+def commanded_current(
+    samples: Samples, test: StoredTest, controller: Controller, channels: Channels = CHANNELS
+) -> CurrentTrace:
+    """Rebuild the commanded current of a test from its samples, and what converters they are of."""
     n = samples.ticks
     stored = _fit_length(test.command(), n)
     known = np.isfinite(samples.command)
     deviation = np.abs(samples.command - stored)[known]
     command_deviation = float(deviation.max()) if deviation.size else 0.0
-    command = np.where(known, samples.command, _as_sent(stored, samples.command[known]))
+    step = _resolution(samples.command[known])
+    command = np.where(known, samples.command, _as_sent(stored, step))
     guessed = 0.0
     if not test.closed_loop:
         current = np.clip(command, -controller.IM, controller.IM)
     else:
-        seen, unknown = _positions_seen(command, samples, controller)
+        seen, unknown = _positions_seen(command, samples, controller, channels)
         current = commanded_currents(
             ControlLaw(
                 controller.IM,
@@ -91,23 +100,23 @@ def commanded_current(samples: Samples, test: StoredTest, controller: Controller
     finite = np.isfinite(samples.current) & ~samples.saturated[0]
     difference = samples.current[finite] - current[finite]
     if difference.size == 0:
-        return CurrentTrace(current, float("nan"), 0.0, True, command_deviation, guessed)
+        return CurrentTrace(current, float("nan"), 0.0, True, command_deviation, guessed, step)
     offset = float(np.median(difference))
     # A handful of ticks may be far off where samples were lost: compare most of them.
     spread = np.sort(np.abs(difference - offset))[: max(1, int(0.98 * difference.size))]
-    residual_lsb = float(np.sqrt(np.mean(spread**2))) / CURRENT.lsb
+    residual_lsb = float(np.sqrt(np.mean(spread**2))) / channels.current.grain
     rebuilt = residual_lsb < CONTROL_LAW_LSB
-    return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed)
+    return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed, step)
 
 
-def _as_digitised(position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _as_digitised(position: NDArray[np.float64], lsb: float) -> NDArray[np.float64]:
     """Positions as the converter gave them, where a bus of another scale has rounded them again.
 
     The control law worked on the converter's codes. What lies near none of its steps was measured
     by something else, and stays.
     """
-    nearest = np.round(position / POSITION.lsb) * POSITION.lsb
-    away = np.abs(position - nearest)[np.isfinite(position)] / POSITION.lsb
+    nearest = np.round(position / lsb) * lsb
+    away = np.abs(position - nearest)[np.isfinite(position)] / lsb
     if away.size == 0 or away.max() < EXACTLY or np.quantile(away, 0.99) > ROUNDED_AGAIN:
         return position
     return np.asarray(nearest)
@@ -127,21 +136,24 @@ def _fit_length(command: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     return np.concatenate([command, np.full(n - len(command), command[-1])])
 
 
-def _as_sent(stored: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
+def _resolution(sent: NDArray[np.float64]) -> float:
+    """Smallest distance between two values sent; 0 of too few."""
+    levels = np.unique(sent)
+    return 0.0 if levels.size < LEAST_LEVELS else float(np.diff(levels).min())
+
+
+def _as_sent(stored: NDArray[np.float64], resolution: float) -> NDArray[np.float64]:
     """Round the stored command to the resolution of the command frames.
 
-    The flight-control computer acts on what the frame says; the resolution is the smallest
-    distance between two values sent.
+    The flight-control computer acts on what the frame says.
     """
-    levels = np.unique(sent)
-    if levels.size < LEAST_LEVELS:
+    if resolution == 0.0:
         return stored
-    resolution = float(np.diff(levels).min())
     return np.asarray(np.round(stored / resolution) * resolution)
 
 
 def _positions_seen(
-    command: NDArray[np.float64], samples: Samples, controller: Controller
+    command: NDArray[np.float64], samples: Samples, controller: Controller, channels: Channels
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Digitised jack position that each tick's control law worked on, m, shape (n,).
 
@@ -149,7 +161,8 @@ def _positions_seen(
     which the control law turned into current, cannot be told. A current at its limit is none of
     them: there the position did not matter.
     """
-    seen = np.concatenate([[np.nan], _as_digitised(samples.position[:-1])])
+    lsb = channels.position.lsb
+    seen = np.concatenate([[np.nan], _as_digitised(samples.position[:-1], lsb)])
     lost = np.flatnonzero(np.isnan(seen))
     unknown = np.zeros(len(seen), dtype=np.bool_)
     if lost.size == 0:
@@ -157,12 +170,12 @@ def _positions_seen(
     ticks = np.arange(len(seen))
     present = np.isfinite(seen)
     bridged = np.interp(ticks, ticks[present], seen[present]) if present.any() else 0.0 * command
-    seen = np.where(present, seen, np.round(bridged / POSITION.lsb) * POSITION.lsb)
-    clear = controller.GAP * POSITION.lsb > 6.0 * CURRENT.lsb
+    seen = np.where(present, seen, np.round(bridged / lsb) * lsb)
+    clear = controller.GAP * lsb > 6.0 * channels.current.lsb
     unknown[lost] = True
     if not clear or controller.GAI or controller.GAD:
         return seen, unknown
-    linear = np.abs(samples.current) < controller.IM - 3.0 * CURRENT.lsb
+    linear = np.abs(samples.current) < controller.IM - 3.0 * channels.current.grain
     linear &= ~samples.saturated[0]
     exact = present & linear
     offset = 0.0
@@ -172,5 +185,5 @@ def _positions_seen(
     for k in lost:
         if linear[k]:
             position = command[k] - (samples.current[k] - offset) / controller.GAP
-            seen[k] = np.round(position / POSITION.lsb) * POSITION.lsb
+            seen[k] = np.round(position / lsb) * lsb
     return seen, unknown & np.isnan(samples.current)

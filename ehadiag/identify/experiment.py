@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
+from ehadiag.core.channels import PRESSURE, Channels
+from ehadiag.core.conversion import conversion_of
 from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.commanded_current import CurrentTrace, commanded_current
@@ -19,8 +20,9 @@ from ehadiag.model.unit import unit_constants
 
 __all__ = ["Experiment", "build_experiment", "noise_is_judged_early", "share_offsets"]
 
-DISPLACED = 0.3e6
-"""Pressure at rest (Pa) above which it is none of the sensor's offset."""
+DISPLACED = 0.3e6 / PRESSURE.full_scale
+"""Pressure at rest, over the converter's half range, above which it is none of the sensor's
+offset: 0.3 MPa of the default range."""
 LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 LEAST_QUIET_BLOCKS = 20
@@ -60,6 +62,8 @@ class Experiment:
     """Whether the actuator rested long enough before the test to show them."""
     origin: float
     """Spool position before the test, m, as the pressure at rest tells."""
+    channels: Channels
+    """Converters that the samples went through."""
 
     @property
     def ticks(self) -> int:
@@ -81,10 +85,12 @@ def build_experiment(
     samples: Samples, environment: Environment, test: StoredTest, actuator: Actuator
 ) -> Experiment:
     """Prepare a recording for identification."""
+    channels, saturated = conversion_of(samples, actuator)
+    samples = replace(samples, saturated=saturated)
     spool = np.where(samples.saturated[1], np.nan, samples.spool)
     pressure = np.where(samples.saturated[2], np.nan, samples.pressure)
     position = np.where(samples.saturated[3], np.nan, samples.position)
-    trace = commanded_current(samples, test, actuator.controller)
+    trace = commanded_current(samples, test, actuator.controller, channels)
     rest = _ticks_at_rest(trace.current)
     constants = unit_constants(actuator, environment)
     spool_offset, pressure_offset = _mean(spool[:rest]), _mean(pressure[:rest])
@@ -92,7 +98,7 @@ def build_experiment(
     if constants.FR != 0.0:
         # What the jack's load asks for is no offset.
         pressure_offset = 0.0
-    elif abs(pressure_offset) > DISPLACED:
+    elif abs(pressure_offset) > DISPLACED * channels.pressure.full_scale:
         # So much pressure is that of a spool that friction holds beside the middle.
         leak = 1.0 + constants.GP / constants.GQ * constants.CLK
         origin = min(max(pressure_offset * leak / constants.GP, -constants.XSM), constants.XSM)
@@ -109,14 +115,15 @@ def build_experiment(
         spool=spool,
         pressure=pressure,
         position=position - position_offset,
-        spool_noise=noise_of_signal(spool[:quiet], SPOOL),
-        pressure_noise=noise_of_signal(pressure[:quiet], PRESSURE),
-        position_noise=noise_of_signal(position[:quiet], POSITION),
+        spool_noise=noise_of_signal(spool[:quiet], channels.spool),
+        pressure_noise=noise_of_signal(pressure[:quiet], channels.pressure),
+        position_noise=noise_of_signal(position[:quiet], channels.position),
         spool_offset=spool_offset,
         pressure_offset=pressure_offset,
         position_offset=position_offset,
         rested=rest >= LEAST_REST,
         origin=origin,
+        channels=channels,
     )
 
 

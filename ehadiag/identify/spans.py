@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
 from ehadiag.core.stored_test import Window
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.noise import TYPICAL_NOISE_LSB, relative_noise, rounding_noise
 from ehadiag.model.anchor import FREE_RUN, Anchor
 from ehadiag.model.batch import POSITION_ROW, Batch
+from ehadiag.model.parameter import sized
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, Unknowns
 
 __all__ = ["ANCHOR_LSB", "Spans", "judge_noise", "lay_out", "unknowns_of"]
@@ -123,7 +123,7 @@ def judge_noise(experiment: Experiment, residuals: NDArray[np.float64]) -> Exper
     shown = [
         max(noise * relative_noise(row), rounding_noise(channel))
         for noise, row, channel in zip(
-            experiment.noise, residuals, (SPOOL, PRESSURE, POSITION), strict=False
+            experiment.noise, residuals, experiment.channels[1:], strict=False
         )
     ]
     return experiment.with_noise((*shown, *experiment.noise[len(shown) :]))
@@ -132,5 +132,6 @@ def judge_noise(experiment: Experiment, residuals: NDArray[np.float64]) -> Exper
 def unknowns_of(
     experiments: Sequence[Experiment], free: Sequence[Parameter] = (*FAULTS, *OFFSETS)
 ) -> Unknowns:
-    """Space of the unknowns of experiments with one actuator."""
-    return Unknowns(tuple(free), tuple(item.constants for item in experiments), {})
+    """Space of the unknowns of experiments with one actuator, on the scales of its converters."""
+    mine = tuple(sized(item, experiments[0].channels) for item in free)
+    return Unknowns(mine, tuple(item.constants for item in experiments), {})

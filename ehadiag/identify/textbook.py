@@ -121,8 +121,10 @@ def attempt(
     if best is None:
         ends = [item.ticks for item in experiments]
         whole = refine_first_part(experiments, ends, first.refined.values)
-        judged, best = whole.judged(experiments), whole.refined
-        best = replace(best, evaluations=whole.evaluations)
+        judged = whole.judged(experiments)
+        best = add_last_part(judged, ends, whole)
+        assert best is not None
+        best = replace(best, evaluations=best.evaluations + whole.evaluations)
     evaluations = first.evaluations + best.evaluations
     weight = lay_out(judged).weight
     score = best.cost - 2.0 * float(np.log(weight[weight > 0.0]).sum())

@@ -39,6 +39,7 @@ NUISANCES: tuple[Parameter, ...] = (
         meaning="constant error of the spool's sensor",
         changes=lambda c, value: {"OXS": c.OXS + value},
         adds_to=SPOOL_ROW,
+        sized_by="spool",
     ),
     Parameter(
         name="pressure_offset",
@@ -52,6 +53,7 @@ NUISANCES: tuple[Parameter, ...] = (
         meaning="constant error of the sensor of differential pressure",
         changes=lambda c, value: {"OPD": c.OPD + value},
         adds_to=PRESSURE_ROW,
+        sized_by="pressure",
     ),
     Parameter(
         name="position_offset",
@@ -65,6 +67,7 @@ NUISANCES: tuple[Parameter, ...] = (
         meaning="constant error of the jack's sensor",
         changes=lambda c, value: {"OXJ": c.OXJ + value},
         adds_to=POSITION_ROW,
+        sized_by="position",
     ),
     _gain("spool", "GXS", "the spool's sensor"),
     _gain("pressure", "GPD", "the sensor of differential pressure"),
@@ -128,6 +131,7 @@ NUISANCES: tuple[Parameter, ...] = (
         short="null bias",
         meaning="current that the torque motor adds to the commanded one",
         changes=lambda c, value: {"IB": c.IB + value},
+        sized_by="current",
     ),
     Parameter(
         name="torque_motor_gain",
@@ -212,6 +216,7 @@ NUISANCES: tuple[Parameter, ...] = (
         short="feedback backlash",
         meaning="half-width of the backlash between spool and feedback spring",
         changes=lambda c, value: {"BKL": c.BKL + value},
+        sized_by="spool",
     ),
     Parameter(
         name="jack_stribeck",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
+from ehadiag.core.channels import CHANNELS, Channels
 from ehadiag.model.plant import PlantConstants, Value
 
-__all__ = ["Changes", "Kind", "Parameter"]
+__all__ = ["Changes", "Kind", "Parameter", "sized"]
 
 Changes = Mapping[str, Value]
 """Fields of `PlantConstants` with the values that they take."""
@@ -49,6 +50,8 @@ class Parameter:
     adds_to : int or None
         Row of the residuals to which the parameter is simply added (a constant error of a sensor):
         its derivative is known. None: it acts through the model.
+    sized_by : str or None
+        Channel with whose range bounds and scale grow: they are given for the default range.
     """
 
     name: str
@@ -62,3 +65,35 @@ class Parameter:
     meaning: str
     changes: Callable[[PlantConstants, Value], Changes]
     adds_to: int | None = None
+    sized_by: str | None = None
+
+
+def sized(item: Parameter, channels: Channels) -> Parameter:
+    """Return a parameter with bounds and scale for converters of these ranges.
+
+    Parameters
+    ----------
+    item : Parameter
+        As the registry has it, or already sized, which is then returned as it is.
+    channels : Channels
+        Converters of the unit.
+
+    Returns
+    -------
+    Parameter
+        The same one where the range is the default one.
+    """
+    if item.sized_by is None:
+        return item
+    names = [channel.name for channel in CHANNELS]
+    index = names.index(item.sized_by)
+    ratio = channels[index].full_scale / CHANNELS[index].full_scale
+    if ratio == 1.0:
+        return item
+    return replace(
+        item,
+        lower=item.lower * ratio,
+        upper=item.upper * ratio,
+        scale=item.scale * ratio,
+        sized_by=None,
+    )

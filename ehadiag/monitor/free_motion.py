@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import SPOOL
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.recording import CommandMode
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.severity import worn
@@ -125,5 +125,6 @@ def undecided_spool(actuator: Actuator, severity: float) -> float:
         m.
     """
     constants: PlantConstants = unit_constants(actuator)
+    step = actuator_channels(actuator).spool.grain
     friction = FRICTIONS * float(worn(constants.FDJ, constants.FDJ1, severity))
-    return friction / (actuator.jack.AJ * actuator.servovalve.GP) + STEPS * SPOOL.lsb
+    return friction / (actuator.jack.AJ * actuator.servovalve.GP) + STEPS * step

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.address import entry_point
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import Channels
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import CommandMode, Environment
 from ehadiag.model.anchor import Anchor
@@ -21,7 +23,7 @@ from ehadiag.model.unit import unit_constants
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
-from ehadiag.monitor.plan import ANCHOR, NOISE, monitor_plan
+from ehadiag.monitor.plan import monitor_plan, usual_noise
 from ehadiag.monitor.prepare import Unit, prepare, rest
 
 __all__ = ["Monitor", "Reading", "Tick"]
@@ -108,13 +110,16 @@ class Monitor:
     shift : float
         Of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
     noise : tuple[float, float] | None
-        Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22.
+        Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22 on the
+        converters, finer ones than 12 bits counted as 12.
     offsets : tuple[float, float]
         Constant errors of spool (m) and pressure sensor (Pa).
     effects : Mapping[str, float] | None
         Nuisances and errors of data by the registry's names, as last identified, SI; None: none.
-    anchor : Anchor
-        How the modelled spool is kept on the measured one.
+    anchor : Anchor | None
+        How the modelled spool is kept on the measured one; None: by the converters' steps.
+    channels : Channels | None
+        Converters of the unit; None: those of its actuator file.
 
     Raises
     ------
@@ -134,11 +139,13 @@ class Monitor:
         noise: tuple[float, float] | None = None,
         offsets: tuple[float, float] = (0.0, 0.0),
         effects: Mapping[str, float] | None = None,
-        anchor: Anchor = ANCHOR,
+        anchor: Anchor | None = None,
+        channels: Channels | None = None,
     ) -> None:
         law = actuator.controller
         tick = 1.0 / law.rate
-        noise = noise or NOISE
+        channels = channels or actuator_channels(actuator)
+        noise = noise or usual_noise(channels)
         values = _checked(faults, noise, offsets, tick)
         base = unit_constants(actuator, environment)
         constants = Unknowns((), (base,), _known(effects or {})).constants(np.empty(0))
@@ -146,7 +153,7 @@ class Monitor:
         """Reference value and threshold of the sums."""
         self.noise: tuple[float, float] = noise
         """Of spool (m) and pressure (Pa)."""
-        plan = monitor_plan(actuator, constants, self.design, noise, anchor)
+        plan = monitor_plan(actuator, constants, self.design, noise, anchor, channels)
         closed = float(mode is CommandMode.POSITION)
         start = Unit(*values, *offsets, 1.0, float(constants.PSR), closed)
         unit = np.array(start, dtype=np.float64)

@@ -41,7 +41,7 @@ from ehadiag.monitor.layout import (
     spool_law_of,
 )
 
-__all__ = ["PLAN_CONTROL", "PLAN_SETTINGS", "PLAN_SIZE", "Unit", "prepare", "rest"]
+__all__ = ["PLAN_CONTROL", "PLAN_SETTINGS", "PLAN_SIZE", "UNIT_SIZE", "Unit", "prepare", "rest"]
 
 PLAN_CONTROL: Final = FIELDS
 """A plan is a row of `PlantConstants`, a `ControlLaw` and `Settings`: what the unit's data fix."""

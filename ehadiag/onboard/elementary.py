@@ -7,7 +7,7 @@ import math
 from ehadiag.compile.kernels import inlined_exact
 from ehadiag.model.exponential import exponential
 
-__all__ = ["cosine", "logarithm", "normal_below"]
+__all__ = ["cosine", "logarithm", "normal_below", "round_down", "round_even"]
 
 LN2 = 0.6931471805599453
 ROOT_HALF, ROOT_TWO = 0.7071067811865476, 1.4142135623730951
@@ -16,6 +16,26 @@ TERMS = 14
 TURN = 6.283185307179586
 ORDER = 28
 """Highest power in the series of the cosine: the next is below 2e-15."""
+
+WHOLE = 4503599627370496.0
+"""2^52: a number from there on is whole, and so is one that it was added to."""
+
+
+@inlined_exact
+def round_even(x: float) -> float:
+    """Return the nearest whole number, of two the even one: exactly what C's `rint` returns."""
+    if not abs(x) < WHOLE:
+        return x
+    return math.copysign(abs(x) + WHOLE - WHOLE, x)
+
+
+@inlined_exact
+def round_down(x: float) -> float:
+    """Return the largest whole number that is not above: exactly what C's `floor` returns."""
+    if not abs(x) < WHOLE:
+        return x
+    nearest = math.copysign(abs(x) + WHOLE - WHOLE, x)
+    return nearest - 1.0 if nearest > x else nearest
 
 
 @inlined_exact

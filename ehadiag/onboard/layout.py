@@ -6,13 +6,18 @@ from typing import Final, NamedTuple
 
 from ehadiag.compile.rows import packer, unpacker
 from ehadiag.monitor.layout import SIZE as MONITOR_SIZE
+from ehadiag.monitor.prepare import UNIT_SIZE
 
 __all__ = [
     "ADVANCE",
+    "CONVERGED",
+    "DONE",
     "ELITE",
     "GENERATOR",
     "GENES",
     "GRADIENT",
+    "GRIDS",
+    "JACK",
     "LANES",
     "MEAN",
     "MONITORS",
@@ -21,12 +26,17 @@ __all__ = [
     "PARAMETERS",
     "POINT",
     "POPULATION",
+    "REFINEMENT",
+    "RUNS",
     "SAMPLES",
     "SCRATCH",
+    "SEARCH",
     "SIZE",
     "SPREAD",
+    "STEP",
     "TRIAL",
     "UNIT",
+    "VERDICT",
     "Advance",
     "Outcome",
     "advance_of",
@@ -118,15 +128,25 @@ class Advance(NamedTuple):
     damping: float
 
 
+GRIDS: Final = 0.0
+"""Phases, see `Advance`."""
+JACK, SEARCH, REFINEMENT, DONE = 1.0, 2.0, 3.0, 4.0
+STEP: Final = 5e-5
+"""Half-width of the differences, and distance from the ends of a severity's range."""
+
+
 def _behind(start: int, length: int) -> int:
     return start + length
 
 
 OUTCOME: Final = 0
+VERDICT: Final = OUTCOME + Outcome._fields.index("verdict")
+RUNS: Final = OUTCOME + Outcome._fields.index("runs")
+CONVERGED: Final = OUTCOME + Outcome._fields.index("converged")
 ADVANCE: Final = _behind(OUTCOME, len(Outcome._fields))
 UNIT: Final = _behind(ADVANCE, len(Advance._fields))
 """What the monitor's kernels are told of the unit, severities and offsets of the run."""
-POINT: Final = _behind(UNIT, 8)
+POINT: Final = _behind(UNIT, UNIT_SIZE)
 """Best point so far."""
 TRIAL: Final = _behind(POINT, PARAMETERS)
 """Point of the next run."""

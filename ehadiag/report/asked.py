@@ -45,3 +45,13 @@ class Asked:
     """Name of the DBC that gave the frames their meaning; None: the recording was at hand."""
     mapping_sha256: str | None = None
     """Fingerprint of that meaning."""
+    mapping_file: str | None = None
+    """File that names the signals; None: the default bus, or the recording was at hand."""
+    tests_sha256: str | None = None
+    """Fingerprint of the tests that a recording may be of; None: not said."""
+    columns_sha256: str | None = None
+    """Of the meaning of columns; None: frames, or columns by their usual names."""
+    start_s: float | None = None
+    """Where the test begins, s from the first sample of the log; None: it was looked for."""
+    end_s: float | None = None
+    """Where it has ended."""

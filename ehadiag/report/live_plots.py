@@ -6,7 +6,7 @@ from bokeh.layouts import column
 from bokeh.models import ColumnDataSource, DataRange1d, LayoutDOM
 from bokeh.plotting import figure
 
-from ehadiag.report.plots import COLOURS, MEASURED
+from ehadiag.report.plots import COLOURS, TEXT
 
 __all__ = ["plot_signals"]
 
@@ -41,7 +41,7 @@ def plot_signals() -> LayoutDOM:
         for place, (name, legend) in enumerate(lines):
             chart.line(
                 "time_s", name, source=source, legend_label=legend,
-                color=(COLOURS[0], MEASURED)[place], line_dash=("solid", "dashed")[place],
+                color=(COLOURS[0], TEXT)[place], line_dash=("solid", "dashed")[place],
                 line_width=2,
             )  # fmt: skip
         chart.legend.location = "top_left"

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.result import Identification
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.response import respond
 from ehadiag.model.sensors import sensor_law
+from ehadiag.report.events import NO_EVENTS, Events, events_of
 
 __all__ = ["Signal", "sensed", "signals_of"]
 
@@ -24,9 +24,15 @@ class Signal:
 
     name: str
     unit: str
+    small_unit: str
+    """A thousandth of it, in which people read residuals."""
     measured: Array
     """NaN where missing, or at the converter's end."""
     modelled: Array
+    events: Events = NO_EVENTS
+    """Of the modelled motion."""
+    beside: str = "modelled"
+    """What a legend calls the curve beside the measured one; empty: there is none."""
 
     @property
     def residual(self) -> Array:
@@ -61,16 +67,16 @@ def sensed(experiment: Experiment, constants: PlantConstants) -> tuple[Array, Ar
 
 
 def signals_of(
-    experiment: Experiment, found: Identification, measured_current: Array
+    experiment: Experiment, constants: PlantConstants, measured_current: Array
 ) -> tuple[Signal, ...]:
-    """Run the model from rest with severities, effects and offsets as identified.
+    """Run the model from rest, and set its response beside what was measured.
 
     Parameters
     ----------
     experiment : Experiment
-        What was identified from.
-    found : Identification
-        What was identified.
+        What was recorded.
+    constants : PlantConstants
+        Of the actuator as it was found, with the errors of its sensors.
     measured_current : Array
         A, shape (ticks,).
 
@@ -79,12 +85,14 @@ def signals_of(
     tuple[Signal, ...]
         Current (measured against commanded), spool, differential pressure, jack position.
     """
-    spool, pressure, position = sensed(experiment, found.constants(experiment.constants))
-    trace = experiment.trace
+    spool, pressure, position = sensed(experiment, constants)
+    law, trace = sensor_law(constants), experiment.trace
+    at_spool = events_of((spool - law.spool_offset) / law.spool_gain, float(constants.XSM))
+    at_jack = events_of((position - law.position_offset) / law.position_gain, float(constants.XJM))
     current = measured_current[: experiment.ticks] - trace.offset
     return (
-        Signal("servovalve current", "mA", current * 1e3, trace.current * 1e3),
-        Signal("spool position", "mm", experiment.spool * 1e3, spool * 1e3),
-        Signal("differential pressure", "MPa", experiment.pressure * 1e-6, pressure * 1e-6),
-        Signal("jack position", "mm", experiment.position * 1e3, position * 1e3),
+        Signal("servovalve current", "mA", "µA", current * 1e3, trace.current * 1e3),
+        Signal("spool position", "mm", "µm", experiment.spool * 1e3, spool * 1e3, at_spool),
+        Signal("differential pressure", "MPa", "kPa", experiment.pressure * 1e-6, pressure * 1e-6),
+        Signal("jack position", "mm", "µm", experiment.position * 1e3, position * 1e3, at_jack),
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ehadiag.core.dates import date_text
 from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.printable import valid_text
+from ehadiag.report.onboard import onboard_tree
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
@@ -58,9 +59,14 @@ def configuration(asked: Asked) -> dict[str, Any]:
         "nuisances": asked.nuisances,
         "time_limit_s": asked.time_limit_s,
         "every_test": asked.every,
+        "tests_sha256": asked.tests_sha256,
+        "columns_sha256": asked.columns_sha256,
+        "start_s": asked.start_s,
+        "end_s": asked.end_s,
         "mapping": {
             "name": None if asked.mapping is None else valid_text(asked.mapping),
             "sha256": asked.mapping_sha256,
+            "file": None if asked.mapping_file is None else valid_text(asked.mapping_file),
         },
     }
 
@@ -116,6 +122,7 @@ def _recording(item: Recording, test: StoredTest | None, log: LogFile | None) ->
         "supply_pressure_MPa": _mega(around.supply_pressure),
         "return_pressure_MPa": _mega(around.return_pressure),
         "log": log_tree(log),
+        "onboard": onboard_tree(item.onboard),
     }
 
 

@@ -1,28 +1,23 @@
 """The report: one HTML page that needs no network, from a JSON result and what is at hand with it.
 
-The page allows no source beyond itself: a Content-Security-Policy names the hashes of its own
-scripts. Every text of others is escaped by the template, and none is handed to a script.
+Every text of others is escaped by the template, and none is handed to a script.
 """
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
-
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from ehadiag.core.printable import printable
 from ehadiag.history.fingerprint import hash_of_file
 from ehadiag.model.parameters import parameter
-from ehadiag.report.modelled import signals_of
-from ehadiag.report.plots import embedded, plot_response, plot_severities, plot_trend
+from ehadiag.report.calibration import SHOWN_IN
+from ehadiag.report.html import fill
+from ehadiag.report.plots import plot_severities, plot_trend
 from ehadiag.report.prognosis_table import levels_named, remaining_text
+from ehadiag.report.responses import Drawn, draw_responses, expected, modelled
 
 if TYPE_CHECKING:
     from bokeh.models import LayoutDOM
@@ -34,14 +29,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Trend", "page_of"]
 
+LIBRARIES = ("python", "numpy", "numba")
+UNITS = ("mm", "MPa")
 MEANING = {
     "HEALTHY": "No severity is at or above the advisory level.",
     "DEGRADED": "A severity is, or may be, at or above the advisory level.",
     "FAULT": "A severity is at or above the limit.",
     "NOT_TESTED": "No verdict can be given.",
 }
-MOST_RESPONSES = 6
-"""Recordings whose responses are drawn: the page stays below three megabytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,27 +83,19 @@ def page_of(
     rows = _rows(result)
     if rows:
         plots["severities"] = plot_severities(rows, levels.advisory, levels.limit)
-    labels = _responses(diagnosis, plots)
+    responses = draw_responses(_drawn(diagnosis), plots)
     if trend is not None and any(entry.severities for entry in trend.entries):
         unit = trend.prognosis.unit if trend.prognosis.used else None
         plots["trend"] = plot_trend(
             trend.entries, trend.events, unit, (levels.advisory, levels.limit)
         )
-    scripts, elements = embedded(plots)
-    found = {name: Markup(element) for name, element in elements.items()}
     verdict = str(result.get("verdict"))
     serial = result.get("serial")
-    return _template().render(
-        policy=_policy(scripts),
-        scripts=[Markup(script) for script in scripts],
-        plots={"severities": found.get("severities"), "trend": found.get("trend")},
-        responses=[
-            {"source": source, "label": label, "plot": found[key]}
-            for key, (source, label) in labels.items()
-        ],
-        no_response=""
-        if labels
-        else "No responses are drawn: samples, or what was identified from them, are not at hand.",
+    return fill(
+        "report.html.j2",
+        plots,
+        responses=responses,
+        no_response="" if responses else "No responses are drawn: samples are not at hand.",
         verdict=verdict if verdict in MEANING else "NOT_TESTED",
         words=_text(verdict.replace("_", " ")),
         meaning=MEANING.get(verdict, ""),
@@ -128,52 +115,18 @@ def page_of(
     )
 
 
-@cache
-def _template() -> Any:
-    environment = Environment(
-        loader=PackageLoader("ehadiag.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
-    return environment.get_template("report.html.j2")
-
-
-def _policy(scripts: Sequence[str]) -> str:
-    """Nothing from anywhere but this page; of scripts only its own."""
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(item.encode()).digest()).decode()}'"
-        for item in scripts
-    )
-    allowed = hashes or "'none'"
-    return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
-        "img-src data:; font-src data:; base-uri 'none'; form-action 'none'"
-    )
-
-
-def _responses(
-    diagnosis: Diagnosis | None, plots: dict[str, LayoutDOM]
-) -> dict[str, tuple[str, str]]:
-    """Add a plot for each recording; return its source and its words for those who do not see."""
-    if diagnosis is None or diagnosis.identification is None:
-        return {}
+def _drawn(diagnosis: Diagnosis | None) -> list[Drawn]:
+    """Of each recording: what was identified, or what was to be expected, beside the measured."""
+    if diagnosis is None:
+        return []
     found = diagnosis.identification
-    out = {}
-    pairs = zip(diagnosis.experiments, diagnosis.recordings, strict=False)
-    for number, (experiment, recording) in enumerate(pairs):
-        if recording.samples is None or number == MOST_RESPONSES:
-            break
-        signals = signals_of(experiment, found, recording.samples.current)
-        key = f"response{number}"
-        plots[key] = plot_response(signals, experiment.tick, experiment.test)
-        out[key] = (
-            _text(recording.source),
-            "Measured and modelled current, spool position, differential pressure and jack"
-            f" position over {experiment.test.duration:g} s. Rms residual: spool"
-            f" {found.fit.spool_rms:.2f}, pressure {found.fit.pressure_rms:.2f} of the noise.",
-        )
-    return out
+    if found is None or not all(math.isfinite(item.value) for item in found.estimates):
+        pairs = zip(diagnosis.recordings, diagnosis.tests, strict=True)
+        return expected(pairs, diagnosis.actuator)
+    return modelled(
+        (item, found.constants(item.constants), recording)
+        for item, recording in zip(diagnosis.experiments, diagnosis.recordings, strict=False)
+    )
 
 
 def _rows(result: Mapping[str, Any]) -> list[tuple[str, float, float, float]]:
@@ -236,8 +189,13 @@ def _effects(diagnosis: Diagnosis | None) -> list[dict[str, str]]:
     out = []
     for name, item in diagnosis.identification.nuisances.items():
         known = parameter(name)
+        factor, unit = SHOWN_IN.get(known.unit, (1.0, known.unit))
         bound = " (at its bound)" if item.at_bound else ""
-        cells = {"value": f"{item.value:.4g}{bound}", "std": f"{item.std:.2g}", "unit": known.unit}
+        cells = {
+            "value": f"{factor * item.value:.4g}{bound}",
+            "std": f"{factor * item.std:.2g}",
+            "unit": unit,
+        }
         out.append({"name": known.short, **cells})
     return out
 
@@ -248,9 +206,20 @@ def _quality(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         for name, value in _part(result, part).items():
             if name == "notes":
                 continue
-            shown = json.dumps(value) if isinstance(value, dict) else _number(value)
-            out.append((_text(name.replace("_", " ")), _text(shown)))
+            if isinstance(value, dict):
+                shown = ", ".join(f"{key} {_number(count)}" for key, count in value.items())
+            else:
+                shown = _number(value)
+            out.append((_quantity(name), _text(shown)))
     return out
+
+
+def _quantity(key: str) -> str:
+    """Words for a key of the result: `spool_noise_mm` is the spool noise, mm."""
+    words = key.replace("crc", "CRC").replace("_", " ")
+    for unit in UNITS:
+        words = words.removesuffix(f" {unit}") + f", {unit}" * words.endswith(f" {unit}")
+    return _text(words)
 
 
 def _origin(
@@ -260,13 +229,17 @@ def _origin(
     out = [("recording", _text(result.get("source")))]
     for item in diagnosis.recordings if diagnosis is not None else ():
         out.append(("SHA-256 of the recording", hash_of_file(item.source) or "no file"))
+    package = _part(result, "package")
+    made_with = [f"{key} {_text(package[key])}" for key in LIBRARIES if key in package]
     out += [
+        ("date of the test", _text(result.get("date"))),
         ("actuator", _text(result.get("actuator"))),
+        ("SHA-256 of its data", _text(result.get("actuator_sha256"))),
         ("serial number", _text(result.get("serial"))),
         ("test", _text(result.get("test"))),
         ("search", f"{_text(solver.get('name'))}, seed {_text(solver.get('seed'))}"),
         ("result", _text(result.get("schema"))),
-        ("program", f"ehadiag {version}"),
+        ("program", ", ".join([f"ehadiag {version}", *made_with])),
     ]
     return out
 

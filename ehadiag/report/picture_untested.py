@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,12 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
-from ehadiag.core.actuator import Actuator
 from ehadiag.core.printable import printable
-from ehadiag.core.recording import CommandMode, Recording, Samples
-from ehadiag.core.stored_test import SAME_RATE, StoredTest
-from ehadiag.identify.experiment import build_experiment
-from ehadiag.model.scalar.response import respond
+from ehadiag.core.recording import Samples
+from ehadiag.core.stored_test import StoredTest
+from ehadiag.report.expected import Curves, expected_curves
 
 __all__ = ["draw_untested"]
 
@@ -25,10 +22,6 @@ APART = 0.05
 """Share of a signal's range by which measured and expected differ where they part."""
 LEAST_SPAN_S = 0.02
 """Shorter spans are not shown."""
-LEAST_CURRENT = 0.5
-"""Share of ticks whose current is known, for a response to be expected."""
-
-Curves = dict[str, NDArray[np.float64]]
 
 
 def draw_untested(figure: Figure, diagnosis: Diagnosis) -> None:
@@ -52,37 +45,8 @@ def draw_untested(figure: Figure, diagnosis: Diagnosis) -> None:
     ]
     grid = figure.subplots(4, len(shown), sharex="col", squeeze=False)
     for column, (recording, samples, test) in enumerate(shown):
-        expected = _expected(recording, samples, test, diagnosis.actuator)
+        expected = expected_curves(recording, samples, test, diagnosis.actuator)
         _draw_column([axes[column] for axes in grid], samples, test, expected)
-
-
-def _expected(
-    recording: Recording, samples: Samples, test: StoredTest | None, actuator: Actuator
-) -> Curves:
-    """What a unit as new would have done, as far as that can be told; engineering units."""
-    if test is None or abs(samples.period_ns * 1e-9 * test.rate - 1.0) > SAME_RATE:
-        return {}
-    out: Curves = {}
-    closed = samples.mode is CommandMode.POSITION
-    if test.closed_loop == closed:
-        ticks = min(test.ticks, samples.ticks)
-        name, scale = ("position", 1e3) if closed else ("current", 1e3)
-        out[name] = _as_long_as(test.command()[:ticks] * scale, samples.ticks)
-    if test.closed_loop != closed or np.isfinite(samples.current).mean() < LEAST_CURRENT:
-        return out
-    # Of a recording that is unlike its test nothing may be expected at all.
-    with contextlib.suppress(ValueError, IndexError, ZeroDivisionError):
-        experiment = build_experiment(samples, recording.environment, test, actuator)
-        response = respond(experiment.constants, experiment.trace.current, experiment.tick)
-        out["spool"] = _as_long_as(response.spool * 1e3, samples.ticks)
-        out["pressure"] = _as_long_as(response.pressure * 1e-6, samples.ticks)
-    return out
-
-
-def _as_long_as(values: NDArray[np.float64], ticks: int) -> NDArray[np.float64]:
-    out = np.full(ticks, np.nan)
-    out[: min(len(values), ticks)] = values[:ticks]
-    return out
 
 
 def _draw_column(

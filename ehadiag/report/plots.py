@@ -1,4 +1,4 @@
-"""Plots of the report: severities, responses with residuals, trend; by bokeh, script included."""
+"""Plots of the report: severities and trend; by bokeh, whose script goes into the page."""
 
 from __future__ import annotations
 
@@ -6,30 +6,22 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from bokeh.embed import components
-from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, LayoutDOM, Range1d
-from bokeh.models.annotations import BoxAnnotation, Label, Span, Whisker
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, LayoutDOM, Range1d
+from bokeh.models.annotations import Label, Span, Whisker
 from bokeh.plotting import figure
 from bokeh.resources import Resources
 
-from ehadiag.report.modelled import Signal
-
 if TYPE_CHECKING:
-    from ehadiag.core.stored_test import StoredTest
     from ehadiag.history.records import Entry, Event
 
-__all__ = ["Plots", "embedded", "plot_response", "plot_severities", "plot_trend"]
+__all__ = ["TEXT", "TOOLS", "Plots", "embedded", "new_figure", "plot_severities", "plot_trend"]
 
-MEASURED, MODELLED, GAP = "#555555", "#c2410c", "#1d4ed8"
 COLOURS = ("#0072b2", "#b34e00", "#007a5a")
 """Darkened from Okabe and Ito's: colour-blind people tell them apart, and from white."""
 DASHES = ("solid", "dashed", "dotdash")
 ADVISORY, LIMIT = "#8a5a00", "#b3001b"
-SHADE = "#fde68a"
 TEXT = "#333333"
-SPREAD = 99.5
 INTERVAL95 = 1.96
 TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 
@@ -73,7 +65,11 @@ def plot_severities(
             "high": [row[3] for row in rows],
         }
     )
-    out = _figure(height=70 + 45 * len(rows), y_range=names[::-1], tools="save")
+    out = new_figure(
+        height=90 + 45 * len(rows),
+        y_range=FactorRange(factors=names[::-1], range_padding=0.25),
+        tools="save",
+    )
     out.x_range = Range1d(start=0.0, end=1.02 * max(1.0, *(row[3] for row in rows)))
     out.hbar(y="name", right="value", height=0.5, color=COLOURS[0], source=source)
     out.add_layout(
@@ -102,70 +98,6 @@ def plot_severities(
     return out
 
 
-def plot_response(signals: Sequence[Signal], tick: float, test: StoredTest) -> LayoutDOM:
-    """Draw measured and modelled signals with their residuals, times linked.
-
-    Parameters
-    ----------
-    signals : Sequence[Signal]
-        Of one recording.
-    tick : float
-        s.
-    test : StoredTest
-        Whose parts are shaded.
-
-    Returns
-    -------
-    LayoutDOM
-        The plots, one below the other.
-    """
-    ticks = len(signals[0].measured)
-    columns: dict[str, Any] = {"time": (np.arange(ticks) * tick).astype(np.float32)}
-    for index, signal in enumerate(signals):
-        columns[f"measured{index}"] = signal.measured.astype(np.float32)
-        columns[f"modelled{index}"] = signal.modelled.astype(np.float32)
-        columns[f"residual{index}"] = signal.residual.astype(np.float32)
-    source = ColumnDataSource(columns)
-    x_range = Range1d(start=0.0, end=ticks * tick, bounds="auto")
-    cross = Span(dimension="height", line_dash="dotted")
-    out = []
-    for index, signal in enumerate(signals):
-        upper = _figure(height=210, x_range=x_range, tools=TOOLS)
-        upper.yaxis.axis_label = f"{signal.name}, {signal.unit}"
-        upper.scatter(
-            "time", f"measured{index}", source=source, size=2.5, color=MEASURED,
-            legend_label="measured",
-        )  # fmt: skip
-        upper.line(
-            "time", f"modelled{index}", source=source, color=MODELLED, line_width=1.5,
-            legend_label="modelled",
-        )  # fmt: skip
-        upper.legend.location = "top_left"
-        upper.legend.orientation = "horizontal"
-        upper.legend.label_text_font_size = "11px"
-        lower = _figure(height=120, x_range=x_range, tools=TOOLS)
-        lower.yaxis.axis_label = f"residual, {signal.unit}"
-        lower.line("time", f"residual{index}", source=source, color=GAP, line_width=0.8)
-        seen = np.abs(signal.residual[np.isfinite(signal.residual)])
-        if seen.size:
-            spread = 2.0 * float(np.percentile(seen, SPREAD)) or 1.0
-            lower.y_range = Range1d(start=-spread, end=spread)
-        for part in (upper, lower):
-            part.add_tools(CrosshairTool(overlay=cross, dimensions="height"))
-            for start, end in test.windows.refinement:
-                part.add_layout(
-                    BoxAnnotation(left=start, right=end, fill_color=SHADE, fill_alpha=0.35,
-                                  level="image")
-                )  # fmt: skip
-        out += [upper, lower]
-    for part in out[:-1]:
-        part.xaxis.visible = False
-    out[-1].xaxis.axis_label = "time, s"
-    out[-1].xaxis.visible = True
-    out[-1].height = 150
-    return column(*out, sizing_mode="stretch_width")
-
-
 def plot_trend(
     entries: Sequence[Entry], events: Sequence[Event], unit: str | None, levels: Sequence[float]
 ) -> LayoutDOM:
@@ -187,9 +119,10 @@ def plot_trend(
     LayoutDOM
         The plot.
     """
-    out = _figure(
+    out = new_figure(
         height=320, tools=TOOLS, x_axis_type="datetime" if unit is None else "linear"
     )  # fmt: skip
+    lows, highs = [0.0], [0.0]
     names = list(dict.fromkeys(item.name for entry in entries for item in entry.severities))
     for index, name in enumerate(names):
         rows = sorted(
@@ -206,6 +139,8 @@ def plot_trend(
             "low": [row[1] - row[2] for row in rows],
             "high": [row[1] + row[2] for row in rows],
         }
+        lows += data["low"]
+        highs += data["high"]
         source, colour = ColumnDataSource(data), COLOURS[index % 3]
         out.line(
             "at", "value", source=source, color=colour, line_dash=DASHES[index % 3],
@@ -224,6 +159,7 @@ def plot_trend(
                 Span(location=at, dimension="height", line_color=TEXT, line_dash="dotted")
             )
             out.add_layout(Label(x=at, y=0, y_units="screen", text=f" {number}"))
+    out.y_range = Range1d(start=min(0.0, *lows), end=1.05 * max(*levels, *highs))
     out.xaxis.axis_label = "time" if unit is None else unit
     out.yaxis.axis_label = "severity, 95 % interval"
     if out.legend:
@@ -237,8 +173,10 @@ def _place(item: Entry | Event, unit: str | None) -> float | None:
     return item.usage.hours if unit == "hours" else item.usage.cycles
 
 
-def _figure(**options: Any) -> figure:
-    out = figure(sizing_mode="stretch_width", toolbar_location="right", **options)
+def new_figure(**options: Any) -> figure:
+    """Make a figure as wide as its page, with axes that all figures of the report have."""
+    options = {"toolbar_location": "above"} | options
+    out = figure(sizing_mode="stretch_width", **options)
     out.toolbar.logo = None
     out.min_border_left = 70
     for axis in (*out.xaxis, *out.yaxis):

@@ -13,6 +13,7 @@ from ehadiag.assess.verdict import Verdict
 from ehadiag.core.printable import printable
 from ehadiag.report.faults import faults_of
 from ehadiag.report.json_line import source_name, test_name
+from ehadiag.report.onboard import alone, in_words
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
@@ -74,6 +75,11 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console, spent: Spent | None 
         _line(console, f"  {line}")
     if diagnosis.identification is not None:
         console.print(_constants(diagnosis), crop=False)
+    onboard = alone(diagnosis)
+    if onboard is not None:
+        known = diagnosis.identification is not None
+        own = {name: fault.value for name, fault in faults_of(diagnosis).items()} if known else {}
+        _line(console, in_words(onboard, own))
     if diagnosis.other:
         console.print(_others(diagnosis), crop=False)
     _line(console, _quality(diagnosis))

@@ -10,11 +10,16 @@ static const double SPOOL_LAG = 5e-3;   /* s */
 static const double JACK_GAIN = 300;    /* mm/s per mm */
 static const double DRAG = 0.02;        /* MPa per mm/s */
 
-static uint16_t convert(double value, double full_scale)
+/* Codes as the bus carries them: range and step are those of the generated signal. */
+static uint16_t convert(double value, double (*decode)(uint16_t), bool (*is_in_range)(uint16_t))
 {
-    double code = floor(value / full_scale * 2048.0 + 0.5) + 2048.0;
+    double low = decode(0), step = decode(1) - low, code = floor((value - low) / step + 0.5);
+    uint16_t top = UINT16_MAX;
 
-    return (uint16_t)fmin(fmax(code, 0.0), 4095.0);
+    while (!is_in_range(top)) {
+        top >>= 1;
+    }
+    return (uint16_t)fmin(fmax(code, 0.0), top);
 }
 
 void fcc_bench_tick(struct fcc_bench *bench, const struct fcc_command *command, uint16_t codes[4])
@@ -22,16 +27,21 @@ void fcc_bench_tick(struct fcc_bench *bench, const struct fcc_command *command, 
     double wanted;
 
     if (command->mode == EHA_FCC_SERVO_COMMAND_COMMAND_MODE_CURRENT_CHOICE) {
-        wanted = 0.0005 * command->value;
+        wanted = eha_fcc_servo_command_current_command_decode(command->value);
     } else {
-        wanted = LOOP_GAIN * (0.002 * command->value - bench->jack);
+        wanted = eha_fcc_servo_command_position_command_decode(command->value);
+        wanted = LOOP_GAIN * (wanted - bench->jack);
     }
     bench->current = fmin(fmax(wanted, -MOST_CURRENT), MOST_CURRENT);
     bench->spool += (SPOOL_GAIN * bench->current - bench->spool) * TICK / SPOOL_LAG;
     bench->speed = JACK_GAIN * bench->spool;
     bench->jack += bench->speed * TICK;
-    codes[0] = convert(bench->current, 12.0);
-    codes[1] = convert(bench->spool, 0.5);
-    codes[2] = convert(DRAG * bench->speed, 25.0);
-    codes[3] = convert(bench->jack, 60.0);
+    codes[0] = convert(bench->current, eha_fcc_servo_telemetry_servo_current_decode,
+                       eha_fcc_servo_telemetry_servo_current_is_in_range);
+    codes[1] = convert(bench->spool, eha_fcc_servo_telemetry_spool_position_decode,
+                       eha_fcc_servo_telemetry_spool_position_is_in_range);
+    codes[2] = convert(DRAG * bench->speed, eha_fcc_servo_telemetry_diff_pressure_decode,
+                       eha_fcc_servo_telemetry_diff_pressure_is_in_range);
+    codes[3] = convert(bench->jack, eha_fcc_servo_telemetry_jack_position_decode,
+                       eha_fcc_servo_telemetry_jack_position_is_in_range);
 }

@@ -2,6 +2,8 @@
 
 #include "check.h"
 
+#define MOST_FRACTION 0xFFFFFFu /* of 24 bits */
+
 /* Every message of this bus has its counter in byte 6 and its check sum in byte 7. */
 static void seal(struct fcc_frame *frame, uint16_t id, uint8_t *counter)
 {
@@ -72,6 +74,61 @@ void fcc_pack_request(struct fcc_frame *frame, uint8_t code, uint8_t test_id, ui
     message.request_test_id = test_id;
     (void)eha_fcc_bit_request_pack(frame->data, &message, sizeof frame->data);
     seal(frame, EHA_FCC_BIT_REQUEST_FRAME_ID, counter);
+}
+
+void fcc_pack_onboard_verdict(struct fcc_frame *frame, uint8_t state, uint8_t test_id,
+                              uint8_t verdict, uint16_t runs, uint8_t *counter)
+{
+    struct eha_fcc_onboard_verdict_t message = {0};
+
+    message.onboard_state = state;
+    message.onboard_test_id = test_id;
+    message.onboard_verdict = verdict;
+    message.onboard_runs = runs;
+    (void)eha_fcc_onboard_verdict_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_ONBOARD_VERDICT_FRAME_ID, counter);
+}
+
+/* Raw number of a severity or deviation, 1e-7, nearest; a NaN is 0. */
+static uint32_t fraction(double value)
+{
+    if (!(value > 0.0)) {
+        return 0;
+    }
+    return value < MOST_FRACTION * 1e-7 ? (uint32_t)(value * 1e7 + 0.5) : MOST_FRACTION;
+}
+
+void fcc_pack_onboard_kintas(struct fcc_frame *frame, double severity, double deviation,
+                             uint8_t *counter)
+{
+    struct eha_fcc_onboard_kintas_t message = {0};
+
+    message.severity_kintas = fraction(severity);
+    message.deviation_kintas = fraction(deviation);
+    (void)eha_fcc_onboard_kintas_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_ONBOARD_KINTAS_FRAME_ID, counter);
+}
+
+void fcc_pack_onboard_fss(struct fcc_frame *frame, double severity, double deviation,
+                          uint8_t *counter)
+{
+    struct eha_fcc_onboard_fss_t message = {0};
+
+    message.severity_fss = fraction(severity);
+    message.deviation_fss = fraction(deviation);
+    (void)eha_fcc_onboard_fss_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_ONBOARD_FSS_FRAME_ID, counter);
+}
+
+void fcc_pack_onboard_fdj(struct fcc_frame *frame, double severity, double deviation,
+                          uint8_t *counter)
+{
+    struct eha_fcc_onboard_fdj_t message = {0};
+
+    message.severity_fdj = fraction(severity);
+    message.deviation_fdj = fraction(deviation);
+    (void)eha_fcc_onboard_fdj_pack(frame->data, &message, sizeof frame->data);
+    seal(frame, EHA_FCC_ONBOARD_FDJ_FRAME_ID, counter);
 }
 
 bool fcc_intact(const struct fcc_frame *frame)

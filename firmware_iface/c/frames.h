@@ -22,6 +22,16 @@ void fcc_pack_environment(struct fcc_frame *frame, uint16_t supply, uint16_t ret
 void fcc_pack_status(struct fcc_frame *frame, uint8_t state, uint8_t reason, uint8_t test_id,
                      uint16_t elapsed, uint16_t serial, uint8_t *counter);
 void fcc_pack_request(struct fcc_frame *frame, uint8_t code, uint8_t test_id, uint8_t *counter);
+void fcc_pack_onboard_verdict(struct fcc_frame *frame, uint8_t state, uint8_t test_id,
+                              uint8_t verdict, uint16_t runs, uint8_t *counter);
+
+/* A severity and its standard deviation; what the signal cannot hold is cut at its end. */
+void fcc_pack_onboard_kintas(struct fcc_frame *frame, double severity, double deviation,
+                             uint8_t *counter);
+void fcc_pack_onboard_fss(struct fcc_frame *frame, double severity, double deviation,
+                          uint8_t *counter);
+void fcc_pack_onboard_fdj(struct fcc_frame *frame, double severity, double deviation,
+                          uint8_t *counter);
 
 /* Whether the check sum is that of identifier and payload. */
 bool fcc_intact(const struct fcc_frame *frame);

@@ -72,5 +72,7 @@ static bool open_bus(const char *channel, struct fcc_bus *bus)
 
 int main(int argc, char **argv)
 {
-    return fcc_run(argc, argv, "INTERFACE", open_bus);
+    struct fcc_rider rider = fcc_bench_rider();
+
+    return fcc_run(argc, argv, "INTERFACE", open_bus, &rider);
 }

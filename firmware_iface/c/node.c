@@ -1,6 +1,6 @@
 #include "node.h"
 
-#include <stdlib.h>
+#include <math.h>
 #include <string.h>
 
 #define CURRENT EHA_FCC_SERVO_COMMAND_COMMAND_MODE_CURRENT_CHOICE
@@ -40,7 +40,7 @@ static enum fcc_reason objection(const struct fcc_node *node, uint8_t test_id)
     if (node->rig.oil < FCC_COLDEST_OIL) {
         return FCC_OIL_COLD;
     }
-    if (abs((int)node->position - FCC_CENTRE) > FCC_OFF_CENTRE) {
+    if (fabs(eha_fcc_servo_telemetry_jack_position_decode(node->position)) > FCC_OFF_CENTRE) {
         return FCC_NOT_CENTRED;
     }
     return FCC_NO_REASON;
@@ -98,7 +98,7 @@ void fcc_node_init(struct fcc_node *node, uint16_t serial, const struct fcc_rig 
     node->rig = *rig;
     node->serial = serial;
     node->state = FCC_IDLE;
-    node->position = FCC_CENTRE;
+    node->position = eha_fcc_servo_telemetry_jack_position_encode(0.0);
     node->refusal = FCC_NO_REASON;
 }
 

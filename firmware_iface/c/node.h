@@ -26,8 +26,7 @@
 /* Most and least that a test may start with; raw numbers of the bus. */
 #define FCC_LEAST_SUPPLY 1500   /* 15 MPa above return */
 #define FCC_COLDEST_OIL 800     /* -20 degC */
-#define FCC_CENTRE 2048         /* code of the surface's middle */
-#define FCC_OFF_CENTRE 34       /* codes, 1 mm */
+#define FCC_OFF_CENTRE 1.0      /* mm */
 
 #define FCC_ARMING_TICKS 100u
 #define FCC_HOLD_TICKS 500u     /* how long an end, or a refusal, stays on the bus */

@@ -69,11 +69,29 @@ static bool parse(int argc, char **argv, struct options *options)
     return true;
 }
 
-/* One tick: requests in, command held, frames out. */
-static bool run_tick(struct fcc_node *node, struct fcc_bench *bench, const struct fcc_bus *bus,
-                     uint32_t time_us)
+static void convert(void *self, const struct fcc_command *command, uint16_t codes[4])
 {
-    struct fcc_frame frames[FCC_FRAMES_PER_TICK];
+    fcc_bench_tick((struct fcc_bench *)self, command, codes);
+}
+
+static void place(void *self, double jack)
+{
+    ((struct fcc_bench *)self)->jack = jack;
+}
+
+struct fcc_rider fcc_bench_rider(void)
+{
+    static struct fcc_bench bench;
+    const struct fcc_rider rider = {&bench, convert, NULL, NULL, place};
+
+    return rider;
+}
+
+/* One tick: requests in, command held, frames out. */
+static bool run_tick(struct fcc_node *node, const struct fcc_rider *rider,
+                     const struct fcc_bus *bus, uint32_t time_us)
+{
+    struct fcc_frame frames[FCC_FRAMES_PER_TICK + FCC_RIDER_FRAMES];
     struct fcc_command command;
     uint16_t codes[4];
     size_t i, count;
@@ -88,8 +106,11 @@ static bool run_tick(struct fcc_node *node, struct fcc_bench *bench, const struc
         }
     }
     command = fcc_node_begin(node);
-    fcc_bench_tick(bench, &command, codes);
+    rider->convert(rider->self, &command, codes);
     count = fcc_node_end(node, codes, frames);
+    if (rider->after != NULL) {
+        count += rider->after(rider->self, node, codes, frames + count);
+    }
     for (i = 0; i < count; i++) {
         if (!bus->send(bus->self, &frames[i], time_us + (uint32_t)i * FRAME_US)) {
             return false;
@@ -99,12 +120,12 @@ static bool run_tick(struct fcc_node *node, struct fcc_bench *bench, const struc
 }
 
 int fcc_run(int argc, char **argv, const char *channel,
-            bool (*open_bus)(const char *channel, struct fcc_bus *bus))
+            bool (*open_bus)(const char *channel, struct fcc_bus *bus),
+            const struct fcc_rider *rider)
 {
     struct options options = {{2070, 70, 1400, false}, 1, 0, 0};
     struct sigaction action;
     struct fcc_node node;
-    struct fcc_bench bench = {0, 0, 0, 0};
     struct fcc_bus bus;
     struct timespec due;
     uint32_t tick;
@@ -124,7 +145,9 @@ int fcc_run(int argc, char **argv, const char *channel,
     action.sa_handler = on_signal;
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
-    bench.jack = options.jack;
+    if (rider->place != NULL) {
+        rider->place(rider->self, options.jack);
+    }
     fcc_node_init(&node, (uint16_t)options.serial, &options.rig);
     clock_gettime(CLOCK_MONOTONIC, &due);
     for (tick = 0; !stopped && (options.ticks == 0 || tick < options.ticks); tick++) {
@@ -135,9 +158,12 @@ int fcc_run(int argc, char **argv, const char *channel,
         }
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL) == EINTR && !stopped) {
         }
-        if (!run_tick(&node, &bench, &bus, (tick + 1u) * FCC_TICK_US)) {
+        if (!run_tick(&node, rider, &bus, (tick + 1u) * FCC_TICK_US)) {
             fprintf(stderr, "%s: %s: bus lost: %s\n", argv[0], argv[1], strerror(errno));
             return 1;
+        }
+        if (rider->spare != NULL) {
+            rider->spare(rider->self);
         }
     }
     return 0;

@@ -74,7 +74,9 @@ static double polyline(const struct fcc_segment *segment, uint16_t ms)
 int16_t fcc_test_command(const struct fcc_test *test, uint16_t tick)
 {
     const struct fcc_segment *segment = test->segments;
-    double value, lsb = test->mode == CURRENT ? 0.0005 : 0.002;
+    double value, lsb = test->mode == CURRENT
+                            ? eha_fcc_servo_command_current_command_decode(1)
+                            : eha_fcc_servo_command_position_command_decode(1);
 
     while (segment->end_ms < tick && segment < test->segments + test->count - 1) {
         segment++;

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.channels import Stated
 from firmware_iface.codec.validity import rows_of, sound_rows
 from firmware_iface.mapping.bus_map import BusMap, MessageMap, Role
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.transport.frames import FrameTable
 
-__all__ = ["Decoded", "DecodedTable", "decode", "value_ends"]
+__all__ = ["Decoded", "DecodedTable", "decode", "raw_ends", "value_ends"]
 
 Rows = NDArray[np.int64]
 
@@ -105,6 +106,8 @@ def decode(table: FrameTable, bus_map: BusMap) -> DecodedTable:
             bus_map.policy.crc == "flag",
             bus_map.policy.range == "flag",
         )
+    for message in bus_map.onboard:
+        foreign[rows_of(table, message)] = False
     return DecodedTable(messages, np.flatnonzero(foreign), np.flatnonzero(table.error))
 
 
@@ -127,6 +130,8 @@ def _decode_message(
         if role.name.startswith("channels."):
             saturated[role.name] = _at_end(physical, role.signal)
         value = _to_si(physical, role)
+        if isinstance(role.stated, Stated):
+            saturated[role.name] |= _at_stated_end(value, role, role.stated)
         if wrong is not None and not keep_range:
             value[wrong] = np.nan
         if present is not None:
@@ -161,7 +166,7 @@ def _to_si(physical: NDArray[np.float64], role: Role) -> NDArray[np.float64]:
     return value
 
 
-def _raw_ends(signal: SignalLayout) -> tuple[float, float]:
+def raw_ends(signal: SignalLayout) -> tuple[float, float]:
     """Physical values of the smallest and the largest raw number, in ascending order."""
     low = -(1 << (signal.length - 1)) if signal.signed else 0
     high = low + (1 << signal.length) - 1
@@ -176,7 +181,7 @@ def _outside(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.
         wrong = ~np.isfinite(physical)
         slack = 0.0
     else:
-        ends = _raw_ends(signal)
+        ends = raw_ends(signal)
         if signal.minimum is None or signal.maximum is None:
             return None
         if signal.minimum - slack < ends[0] and ends[1] < signal.maximum + slack:
@@ -193,7 +198,7 @@ def value_ends(signal: SignalLayout) -> tuple[float, float]:
     slack = 0.0 if signal.is_float else 0.5 * abs(signal.scale)
     low, high = -np.inf, np.inf
     if not signal.is_float:
-        low, high = _raw_ends(signal)
+        low, high = raw_ends(signal)
     if signal.minimum is not None and signal.maximum is not None:
         low, high = max(low, signal.minimum), min(high, signal.maximum)
     return low + slack, high - slack
@@ -202,3 +207,11 @@ def value_ends(signal: SignalLayout) -> tuple[float, float]:
 def _at_end(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.bool_]:
     low, high = value_ends(signal)
     return (physical <= low) | (physical >= high)
+
+
+def _at_stated_end(value: NDArray[np.float64], role: Role, stated: Stated) -> NDArray[np.bool_]:
+    """Values at the ends that the mapping states, SI, but for half a step."""
+    if stated.low is None or stated.high is None:
+        return np.zeros(len(value), dtype=np.bool_)
+    slack = 0.5 * (stated.step or abs(role.signal.scale * role.gain))
+    return (value <= stated.low + slack) | (value >= stated.high - slack)

@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Mapping, Sequence
 
-from ehadiag.core.channels import CHANNELS
+from ehadiag.core.channels import CHANNELS, Channel, Channels
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitReason, BitState, CommandMode
 from firmware_iface.codec.protection import crc8
@@ -28,9 +28,16 @@ class Encoder:
     part belongs to the group is sent with the rest zero.
 
     Not for use from several threads at once.
+
+    Parameters
+    ----------
+    bus_map : BusMap | None
+        Which message and signal plays which role; None: the default bus.
+    channels : Channels
+        Converters of which telemetry sends the codes.
     """
 
-    def __init__(self, bus_map: BusMap | None = None) -> None:
+    def __init__(self, bus_map: BusMap | None = None, channels: Channels = CHANNELS) -> None:
         self._map = bus_map if bus_map is not None else default_map()
         self._counters: dict[str, int] = {}
         self._writers = {
@@ -43,13 +50,10 @@ class Encoder:
         }
         self._modes = {mode: number for number, mode in self._map.modes.items()}
         self._states = {state: number for number, state in self._map.states.items()}
-        # Codes to raw numbers, exactly, without arithmetic at run time.
+        # Codes to raw numbers, each worked out once, when it is first sent.
         self._codes = {
-            key: tuple(
-                _to_raw(role[1], (code - (1 << (channel.bits - 1))) * channel.lsb)
-                for code in range(1 << channel.bits)
-            )
-            for key, channel in zip(CHANNEL_KEYS, CHANNELS, strict=True)
+            key: _Codes(role[1], channel)
+            for key, channel in zip(CHANNEL_KEYS, channels, strict=True)
             if (role := self._map.find(key)) is not None
         }
 
@@ -61,8 +65,8 @@ class Encoder:
         Parameters
         ----------
         codes : Sequence[int]
-            Converter codes of current, spool, pressure, position (0 … 4095); they survive decoding
-            exactly.
+            Converter codes of current, spool, pressure, position (0 … 4095 of 12 bits); they
+            survive decoding exactly where the signals are as fine as the converters.
         time_ns : int
             Time stamp of the frames.
         counter : int | None
@@ -163,6 +167,22 @@ class Encoder:
         if not writers:
             raise ConfigurationError(f"bus {self._map.name}: the mapping has no [{section}]")
         return tuple(writer.frame(writer.raw(values), time_ns, counter) for writer in writers)
+
+
+class _Codes(dict[int, int]):
+    """Bit patterns by converter code."""
+
+    def __init__(self, role: Role, channel: Channel) -> None:
+        super().__init__()
+        self._role, self._channel = role, channel
+
+    def __missing__(self, code: int) -> int:
+        channel = self._channel
+        if not 0 <= code < 2 * channel.half:
+            raise IndexError(f"code {code} of {channel.name}: outside 0 … {2 * channel.half - 1}")
+        pattern = _to_raw(self._role, (code - channel.half) * channel.lsb)
+        self[code] = pattern
+        return pattern
 
 
 class _Writer:

@@ -93,8 +93,8 @@ class LogReader:
         if self._suffix not in SUFFIXES:
             kind = self._suffix or "without a suffix"
             raise ConfigurationError(
-                f"log {path}: unknown kind {kind}; known: {', '.join(SUFFIXES)}, and these packed"
-                " as .gz"
+                f"log {path}: unknown kind {kind}; known: {', '.join(SUFFIXES)}, .parquet of"
+                " decoded signals, and these packed as .gz"
             )
         self._spending.check_size(state.st_size)
         if self._suffix == ".mf4" and state.st_size > LARGEST_MF4:

@@ -6,13 +6,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
+import msgspec
+
+from ehadiag.core.channels import CHANNELS, Stated
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitState, CommandMode
 from ehadiag.core.small_file import read_small_file
 from ehadiag.core.toml_file import decode_toml, read_toml
 from firmware_iface.mapping.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, recall_dbc
-from firmware_iface.mapping.file import MappingFile, Policy, Protection, SignalRef
+from firmware_iface.mapping.file import (
+    ChannelRef,
+    MappingFile,
+    OnboardSignals,
+    Policy,
+    Protection,
+    SignalRef,
+)
 from firmware_iface.mapping.signal_layout import SignalLayout
 from firmware_iface.mapping.units import si_factor
 from firmware_iface.transport.frames import MAX_PAYLOAD
@@ -24,6 +35,18 @@ MAX_MULTIPLEXERS = 8
 
 SMALLEST, LARGEST = 1e-12, 1e12
 """Magnitudes of scales that a physical quantity can have; beyond them arithmetic overflows."""
+
+LEAST_STEPS = 1.0 / 64.0
+"""Resolution over range of a converter of 6 bits, the coarsest that is taken."""
+
+SEVERITIES = ("Kintas", "FSS", "FDJ")
+"""Keys of what a computer finds by itself, their standard deviations behind `std_`."""
+
+NEEDED = {
+    "onboard.state",
+    *(f"onboard.{prefix}{name}" for prefix in ("", "std_") for name in SEVERITIES),
+}
+"""Without which the rest of `onboard` says nothing."""
 
 DIMENSIONS: dict[str, dict[str, str | None]] = {
     "channels": {
@@ -46,7 +69,14 @@ DIMENSIONS: dict[str, dict[str, str | None]] = {
         "serial": None,
     },
     "request": {"code": None, "test_id": None},
+    "onboard": dict.fromkeys(
+        ("state", "test_id", "verdict", "runs", *SEVERITIES, *(f"std_{n}" for n in SEVERITIES))
+    ),
 }
+
+
+StatedOrUnset: TypeAlias = Stated | msgspec.UnsetType
+"""Unset where nothing is said, so that the fingerprint of a mapping is that of what it says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +88,8 @@ class Role:
     signal: SignalLayout
     gain: float = 1.0
     bias: float = 0.0
+    stated: StatedOrUnset = msgspec.UNSET
+    """What the mapping says of the converter behind a channel, SI."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +134,8 @@ class BusMap:
     policy: Policy
     channel: int | None = None
     """Adapter channel of a recording that is the actuator's, from 1; None: the only one."""
+    onboard: tuple[MessageMap, ...] = ()
+    """Messages of what the computer has found by itself; no part of a recording's samples."""
 
     def find(self, role: str) -> tuple[MessageMap, Role] | None:
         """Message and signal of a role (`command.mode`); None if the mapping leaves it out."""
@@ -110,6 +144,18 @@ class BusMap:
                 if item.name == role:
                     return message, item
         return None
+
+    @property
+    def stated(self) -> tuple[Stated | None, ...]:
+        """What the mapping says of each channel's converter; empty: nothing of any."""
+        roles = (self.find(f"channels.{channel.name}") for channel in CHANNELS)
+        said = tuple(
+            None
+            if found is None or isinstance(found[1].stated, msgspec.UnsetType)
+            else found[1].stated
+            for found in roles
+        )
+        return said if any(said) else ()
 
 
 def default_map(dbc: Path | str | None = None) -> BusMap:
@@ -139,6 +185,7 @@ def default_map(dbc: Path | str | None = None) -> BusMap:
         text = folder.joinpath(tree.dbc).read_bytes()
         return resolve(tree, recall_dbc(text, tree.dbc), where, tree.dbc)
     found = recall_dbc(read_small_file(Path(dbc), MAX_DBC_BYTES, "DBC file"), str(dbc))
+    tree = _without_onboard(tree, found)
     try:
         return resolve(tree, found, where, str(dbc))
     except ConfigurationError as error:
@@ -146,6 +193,16 @@ def default_map(dbc: Path | str | None = None) -> BusMap:
             f"DBC file {dbc}: names another bus than the default mapping ({error}): name a mapping"
             " file, --mapping"
         ) from None
+
+
+def _without_onboard(tree: MappingFile, database: Mapping[str, DbcMessage]) -> MappingFile:
+    """Leave out what a computer finds by itself, where a DBC knows no such messages."""
+    refs = [ref for ref in msgspec.structs.astuple(tree.onboard) if ref is not None]
+    named = {ref.message for ref in refs}
+    if named & database.keys():
+        return tree
+    guards = {name: item for name, item in tree.protection.items() if name not in named}
+    return msgspec.structs.replace(tree, onboard=OnboardSignals(), protection=guards)
 
 
 def load_map(path: Path | str, dbc: Path | str | None = None) -> BusMap:
@@ -204,10 +261,13 @@ def resolve(
         for name, items in roles.items()
     }
     seen: dict[tuple[int, bool], str] = {}
+    _refuse_half(roles, where)
     for item in messages.values():
         other = seen.setdefault((item.can_id, item.extended), item.name)
         if other != item.name:
             raise ConfigurationError(f"{where}: {other} and {item.name} share an identifier")
+    onboard = tuple(item for item in messages.values() if _onboard(item))
+    messages = {item.name: item for item in messages.values() if not _onboard(item)}
     moduli = {item.modulus for item in messages.values() if item.counts_ticks}
     if len(moduli) > 1:
         raise ConfigurationError(f"{where}: counters that count ticks must be equally wide")
@@ -223,7 +283,24 @@ def resolve(
         requests={str(key): value for key, value in tree.request.codes.items()},
         policy=tree.policy,
         channel=tree.channel,
+        onboard=onboard,
     )
+
+
+def _onboard(message: MessageMap) -> bool:
+    return message.roles[0].name.startswith("onboard.")
+
+
+def _refuse_half(roles: Mapping[str, list[Role]], where: str) -> None:
+    """Refuse findings without what makes them whole, or in a message with anything else."""
+    named = {item.name for items in roles.values() for item in items}
+    ours = {name for name in named if name.startswith("onboard.")}
+    missing = sorted(NEEDED - named) if ours else []
+    if missing:
+        raise ConfigurationError(f"{where}: onboard: {missing[0]} is needed beside the rest")
+    for name, items in roles.items():
+        if 0 < sum(item.name in ours for item in items) < len(items):
+            raise ConfigurationError(f"{where}: {name} carries onboard findings and other signals")
 
 
 def _fixed_mode(tree: MappingFile, where: str) -> CommandMode | None:
@@ -259,7 +336,26 @@ def _role(
         raise ConfigurationError(
             f"{at}: scale must lie within {SMALLEST:g} … {LARGEST:g}, offset within ±{LARGEST:g}"
         )
-    return Role(name, signal, gain * ref.scale, gain * ref.offset + bias)
+    stated = _stated(ref, gain, bias, at) if isinstance(ref, ChannelRef) else msgspec.UNSET
+    return Role(name, signal, gain * ref.scale, gain * ref.offset + bias, stated)
+
+
+def _stated(ref: ChannelRef, gain: float, bias: float, at: str) -> StatedOrUnset:
+    """What a mapping says of a converter, from the channel's unit to SI."""
+    if ref.range is None and ref.resolution is None:
+        return msgspec.UNSET
+    low, high = None, None
+    if ref.range is not None:
+        if not ref.range[0] < ref.range[1]:
+            raise ConfigurationError(f"{at}: range must be [least, most], not {list(ref.range)!r}")
+        low, high = (gain * value + bias for value in ref.range)
+        if ref.resolution is not None and ref.resolution > LEAST_STEPS * (
+            ref.range[1] - ref.range[0]
+        ):
+            raise ConfigurationError(
+                f"{at}: resolution {ref.resolution:g} is more than {LEAST_STEPS:g} of the range"
+            )
+    return Stated(low, high, None if ref.resolution is None else gain * ref.resolution)
 
 
 def _layout(message: DbcMessage, name: str, at: str, depth: int = 0) -> SignalLayout:

@@ -10,10 +10,12 @@ from typing import Annotated, Literal, get_args
 import msgspec
 
 __all__ = [
+    "ChannelRef",
     "ChannelSignals",
     "CommandSignals",
     "EnvironmentSignals",
     "MappingFile",
+    "OnboardSignals",
     "Policy",
     "PolicyLimits",
     "Protection",
@@ -41,13 +43,22 @@ class SignalRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: float = 0.0
 
 
+class ChannelRef(SignalRef, frozen=True, forbid_unknown_fields=True):
+    """A measured channel, and what is known of the converter behind it, in the signal's unit."""
+
+    range: tuple[float, float] | None = None
+    """Values at the converter's ends, after scale and offset."""
+    resolution: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    """One step of the converter; a bus signal may be finer."""
+
+
 class ChannelSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The four measured channels."""
 
-    current: SignalRef
-    spool: SignalRef
-    pressure: SignalRef
-    position: SignalRef
+    current: ChannelRef
+    spool: ChannelRef
+    pressure: ChannelRef
+    position: ChannelRef
 
 
 class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -91,6 +102,21 @@ class RequestSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     codes: dict[Literal["start", "abort"], Number] = msgspec.field(
         default_factory=lambda: {"start": 1, "abort": 2}
     )
+
+
+class OnboardSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a computer that identifies by itself says it has found."""
+
+    state: SignalRef | None = None
+    test_id: SignalRef | None = None
+    verdict: SignalRef | None = None
+    runs: SignalRef | None = None
+    Kintas: SignalRef | None = None
+    FSS: SignalRef | None = None
+    FDJ: SignalRef | None = None
+    std_Kintas: SignalRef | None = None
+    std_FSS: SignalRef | None = None
+    std_FDJ: SignalRef | None = None
 
 
 class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -145,5 +171,6 @@ class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     environment: EnvironmentSignals = EnvironmentSignals()
     status: StatusSignals = StatusSignals()
     request: RequestSignals = RequestSignals()
+    onboard: OnboardSignals = OnboardSignals()
     protection: Annotated[dict[Name, Protection], msgspec.Meta(max_length=256)] = {}
     policy: Policy = Policy()

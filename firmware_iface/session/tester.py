@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ehadiag.core.errors import BusLostError, ConfigurationError, EhadiagError
-from ehadiag.core.recording import Outcome
+from ehadiag.core.recording import OnboardResult, Outcome
 from firmware_iface.codec.encode import Encoder
 from firmware_iface.codec.live_decode import LiveDecoder
 from firmware_iface.codec.live_messages import BitStatus, Request, Sample
+from firmware_iface.codec.onboard import OnboardReader
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.mapping.bus_map import BusMap, default_map
 from firmware_iface.session.handshake import Action, Handshake, Phase, TimeLimits
@@ -69,6 +70,8 @@ class TesterOutcome:
         What the transport said of itself, empty if nothing.
     recorded : tuple[Path, ...]
         Files that hold the raw frames.
+    onboard : OnboardResult | None
+        What the computer has found itself; None where it did not say.
     """
 
     complete: bool
@@ -81,6 +84,7 @@ class TesterOutcome:
     dropped: int
     degraded: str
     recorded: tuple[Path, ...]
+    onboard: OnboardResult | None = None
 
 
 def run_test(
@@ -97,6 +101,7 @@ def run_test(
     stop: threading.Event | None = None,
     progress: Callable[[Progress], None] | None = None,
     all_there: Callable[[], bool] | None = None,
+    onboard_wait: float = 0.0,
 ) -> TesterOutcome:
     """Run one test, or with `transmit` false wait for one that someone else starts.
 
@@ -131,6 +136,9 @@ def run_test(
     all_there : Callable[[], bool] | None
         Asked once, when the computer has said that the test is complete: whether no frame of it
         may still come, so that there is nothing left to listen for.
+    onboard_wait : float
+        How long to listen on, s, for what the computer finds itself, where it says that it is at
+        it.
 
     Returns
     -------
@@ -158,6 +166,7 @@ def run_test(
     )
     session = _Session(transport, recorder, bus_map or default_map(), machine)
     session.on_frame, session.progress, session.all_there = on_frame, progress, all_there
+    session.onboard_wait = onboard_wait
     try:
         return session.run(stop or threading.Event())
     finally:
@@ -175,6 +184,7 @@ class _Session:
         self._recorder = recorder
         self._machine = machine
         self._decoder = LiveDecoder(bus_map)
+        self._onboard = OnboardReader(bus_map)
         self._encoder = Encoder(bus_map)
         self._frames = 0
         self._sample: Sample | None = None
@@ -184,6 +194,7 @@ class _Session:
         self.on_frame: Callable[[Frame], None] | None = None
         self.progress: Callable[[Progress], None] | None = None
         self.all_there: Callable[[], bool] | None = None
+        self.onboard_wait = 0.0
 
     def run(self, stop: threading.Event) -> TesterOutcome:
         """Run to the end of the handshake."""
@@ -195,6 +206,7 @@ class _Session:
         ) as source:
             try:
                 self._loop(source, stop)
+                self._listen_on(source, stop)
             except BusLostError as error:
                 self._machine.lost(f"bus lost: {error}")
             except BaseException:
@@ -219,12 +231,26 @@ class _Session:
             self._act(machine.on_time(now))
             self._report(now)
 
+    def _listen_on(self, source: FrameSource, stop: threading.Event) -> None:
+        """Hear what the computer finds itself in the complete test."""
+        verdict = self._machine.verdict
+        if verdict is None or not verdict.complete:
+            return
+        until = source.now_ns() + round(self.onboard_wait * 1e9)
+        while self._onboard.awaited and source.now_ns() < until and not stop.is_set():
+            frame = source.receive(POLL)
+            if frame is not None:
+                self._take(frame, source.now_ns())
+            elif source.at_end:
+                return
+
     def _take(self, frame: Frame, now: int) -> None:
         self._frames += 1
         if self.on_frame is not None:
             self.on_frame(frame)
         if frame.sent:
             return
+        self._onboard.take(frame)
         content = self._decoder.decode(frame)
         if self._decoder.second_sender:
             self._act(self._machine.on_second_sender(now, self._decoder.second_sender))
@@ -300,4 +326,5 @@ class _Session:
             dropped=source.overflow,
             degraded=source.detail,
             recorded=self._recorder.paths if self._recorder else (),
+            onboard=self._onboard.of_test(self._machine.test_id) if verdict.complete else None,
         )

@@ -9,11 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.find_test import Found, Sought, find_test, found_tests
+from ehadiag.core.find_test import Found, Sought, find_test, found_tests, played_tests
 from ehadiag.core.recording import CommandMode, Environment, Outcome, Quality, Recording, Samples
 from firmware_iface.logs.budget import Budget
 from firmware_iface.signals.columns import NEEDED, ColumnMap
-from firmware_iface.signals.resample import Clock, bend, held_on_ticks, interval, on_ticks
+from firmware_iface.signals.held import held_by_test, off_a_bus
+from firmware_iface.signals.resample import (
+    Clock,
+    bend,
+    held_on_ticks,
+    interval,
+    on_ticks,
+)
 from firmware_iface.signals.tables import Signal, joined, read_signals
 
 __all__ = ["recordings_of_signals"]
@@ -23,6 +30,9 @@ COARSE = (np.arange(-1.5, 1.51, 0.1), np.arange(-300e-6, 301e-6, 50e-6))
 FINE = (np.arange(-0.1, 0.101, 0.02), np.arange(-50e-6, 51e-6, 10e-6))
 """Phase in ticks and rate of the logger's clock, over which the test's own command is fitted."""
 LEAST_SAMPLES = 100
+MOST_FITTED = 20_000
+MOST_ROUGHLY = 0.25
+"""Misfit of a test's command that delays of some ticks make: it is judged anew afterwards."""
 CHANNELS = {"current": ("mA", 1e3), "spool": ("mm", 1e3), "pressure": ("MPa", 1e-6),
             "position": ("mm", 1e3)}  # fmt: skip
 
@@ -66,15 +76,20 @@ def recordings_of_signals(
     period = columns.tick_ns * 1e-9
     start = min(item.time[0] for item in signals.values())
     held = held_on_ticks(signals, period)
+    rows: Mapping[str, Floats]
     if held is not None:
         clock, rows = held
         rate = float(np.mean(np.diff(clock.begin))) / period - 1.0
         said: tuple[str, ...] = (f"ticks by the changes of held signals ({1e6 * rate:+.0f} ppm)",)
     else:
-        rows = {}
-        clock, said = _clock(signals, period, sought)
+        clock, rows, said = _clock(signals, period, sought)
     samples, rules = _samples(signals, rows, clock, columns.tick_ns, start)
-    notes = ("decoded signals: no check sum, no counter", *said, *rules)
+    jitter = max(item.jitter for item in signals.values())
+    even = (
+        f"time stamps jitter by {1e3 * jitter:.2g} ms: the rows' own even clock takes their place"
+    )
+    evened = (even,) if jitter > 0.0 else ()
+    notes = ("decoded signals: no check sum, no counter", *evened, *said, *rules)
     whole = Recording(
         source=source,
         samples=samples,
@@ -84,14 +99,15 @@ def recordings_of_signals(
         environment=_environment(signals),
         quality=Quality(notes=notes),
         start_ns=round((clock.begin[0]) * 1e9),
+        by_time=True,
     )
     return found_tests(whole, sought)
 
 
 def _clock(
     signals: Mapping[str, Signal], period: float, sought: Sought
-) -> tuple[Clock, tuple[str, ...]]:
-    """Ticks on the clock of a logger that measured by itself, and what a reader should know."""
+) -> tuple[Clock, Mapping[str, Floats], tuple[str, ...]]:
+    """Ticks on the clock of a logger, held values on them, and what a reader should know."""
     first = max(signals[role].time[0] for role in NEEDED)
     last = min(signals[role].time[-1] for role in NEEDED)
     ticks = min(max(int((last - first) / period), 1), MOST_TICKS)
@@ -100,11 +116,27 @@ def _clock(
     found = find_test(samples, sought.tests, sought.controller)
     led = None if found is None else _led(signals, found)
     if found is None or led is None:
-        return even, ("nothing shows where in a tick the signals were sampled: half a tick unsure",)
+        unsure = "nothing shows where in a tick the signals were sampled: half a tick unsure"
+        return even, {}, (unsure,)
     phase, rate = _fitted(led, even, period, found)
     begin = first + period * (1.0 + rate) * (np.arange(ticks + 1)) + phase * period
+    held = off_a_bus(signals, period)
+    tests, _ = played_tests(samples, sought, most=MOST_ROUGHLY)
+    if held and tests:
+        placed = held_by_test(held, Clock(begin), tests, sought.controller)
+        if placed is not None:
+            late = placed.late * period * 1e3
+            return (
+                placed.clock,
+                placed.rows,
+                (
+                    f"values reach the logger late by {late:.1f} ms rms, some overtaken:"
+                    " the current against the test's command tells their ticks",
+                ),
+            )
     word = f"{phase % 1.0:.2f} of a tick, {1e6 * rate:+.0f} ppm"
-    return Clock(begin), (f"ticks by the {found.by} against test {found.test.name!r} ({word})",)
+    said = f"ticks by the {found.by} against test {found.test.name!r} ({word})"
+    return Clock(begin), {}, (said,)
 
 
 def _led(signals: Mapping[str, Signal], found: Found) -> Signal | None:
@@ -120,6 +152,8 @@ def _fitted(signal: Signal, even: Clock, period: float, found: Found) -> tuple[f
     begin = even.begin[0] + found.first * period
     inside = (signal.time >= begin - 2 * period) & (signal.time <= begin + len(stored) * period)
     time, value = signal.time[inside], signal.value[inside]
+    every = max(len(time) // MOST_FITTED, 1)
+    time, value = time[::every], value[::every]
     if len(time) < LEAST_SAMPLES:
         return 0.0, 0.0
 
@@ -182,7 +216,10 @@ def _samples(
     samples = Samples(
         period_ns=tick_ns,
         mode=mode,
-        **filled,
+        current=filled["current"],
+        spool=filled["spool"],
+        pressure=filled["pressure"],
+        position=filled["position"],
         command=command,
         saturated=np.zeros((len(CHANNELS), ticks), dtype=np.bool_),
         host_ns=np.rint((clock.begin[:-1] - start) * 1e9).astype(np.int64),

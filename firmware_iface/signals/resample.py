@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 
 from firmware_iface.signals.tables import Signal
 
-__all__ = ["Clock", "bend", "held_on_ticks", "interval", "on_ticks"]
+__all__ = [
+    "DENSE",
+    "Clock",
+    "Group",
+    "bend",
+    "forward",
+    "groups_of",
+    "held_on_ticks",
+    "holds",
+    "interval",
+    "on_ticks",
+]
 
 MOST_CHANGES = 1.1
 """Changes a tick, where there are most, of a signal that holds each value for a tick."""
@@ -121,15 +132,18 @@ def held_on_ticks(
     tuple[Clock, dict[str, Floats]] | None
         The computer's clock on the logger's, and values by role, shape (ticks,): NaN in ticks in
         which none of several channels that change together has changed; None where no signal
-        holds its values.
+        holds its values, or changes come too late to be told by their order alone.
     """
     held = {role: item for role, item in signals.items() if holds(item, period)}
     if not held:
         return None
-    groups = _groups(held, period)
+    groups = groups_of(held, period)
     lead = groups[0]
     tick = _counted((lead.at - lead.at[0]) / period)
     rate = float(np.polyfit(tick, lead.at, 1)[0])
+    step = max(interval(held[role]) for role in lead.roles)
+    if _scatter(lead.at - rate * tick) > step + EARLY * period:
+        return None
     last = max(item.time[-1] for item in held.values())
     after = max(int((last - lead.at[-1]) / rate), 0)
     grid = np.arange(int(tick[-1]) + after + 2)
@@ -144,13 +158,21 @@ def held_on_ticks(
             item = held[role]
             value = np.full(clock.ticks, np.nan)
             value[place[inside]] = item.value[np.searchsorted(item.time, group.at[inside])]
-            rows[role] = value if group.complete else _forward(value, item.value[0])
+            rows[role] = value if group.complete else forward(value, item.value[0])
     return clock, rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Group:
-    """Held signals that change together, and when: first samples of new values, s."""
+class Group:
+    """Held signals that change together.
+
+    Attributes
+    ----------
+    roles : tuple[str, ...]
+        Which.
+    at : Floats
+        Times of the first samples of new values, s.
+    """
 
     roles: tuple[str, ...]
     at: Floats
@@ -166,8 +188,21 @@ class _Group:
         return len(self.roles) >= LEAST_TOGETHER
 
 
-def _groups(held: Mapping[str, Signal], period: float) -> list[_Group]:
-    """Channels that change together first, then what changes alone."""
+def groups_of(held: Mapping[str, Signal], period: float) -> list[Group]:
+    """Channels that change together first, then what changes alone.
+
+    Parameters
+    ----------
+    held : Mapping[str, Signal]
+        Signals that hold their values, by role.
+    period : float
+        Length of a tick, s.
+
+    Returns
+    -------
+    list[Group]
+        Each role in one of them.
+    """
     channels = tuple(role for role in held if role.startswith("channels."))
     alone = [role for role in held if role not in channels]
     out = []
@@ -175,18 +210,37 @@ def _groups(held: Mapping[str, Signal], period: float) -> list[_Group]:
         together = np.unique(np.concatenate([_changes(held[role]) for role in channels]))
         span = max(float(together[-1] - together[0]), period)
         if len(together) * period <= MOST_CHANGES * span:
-            out.append(_Group(channels, together))
+            out.append(Group(channels, together))
         else:
             alone = [*channels, *alone]
-    singles = [_Group((role,), _changes(held[role])) for role in alone]
+    singles = [Group((role,), _changes(held[role])) for role in alone]
     return out + sorted(singles, key=lambda item: -len(item.at))
 
 
-def _forward(values: Floats, first: float) -> Floats:
-    """Each value until the next one."""
+def forward(values: Floats, first: float) -> Floats:
+    """Each value until the next one; `first` before there is any.
+
+    Parameters
+    ----------
+    values : Floats
+        NaN where there is none, shape (n,).
+    first : float
+        Value before the first one.
+
+    Returns
+    -------
+    Floats
+        Without NaN, shape (n,).
+    """
     known = np.isfinite(values)
     index = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.where(index >= 0, values[np.maximum(index, 0)], first)
+
+
+def _scatter(values: Floats) -> float:
+    """Width of a distribution but for its outermost hundredths."""
+    low, high = np.quantile(values, [0.01, 0.99])
+    return float(high - low)
 
 
 def _counted(since: Floats) -> NDArray[np.int64]:
@@ -207,7 +261,7 @@ def _counted(since: Floats) -> NDArray[np.int64]:
     return tick
 
 
-def _beside(group: _Group, lead: _Group, tick: NDArray[np.int64]) -> NDArray[np.int64]:
+def _beside(group: Group, lead: Group, tick: NDArray[np.int64]) -> NDArray[np.int64]:
     """Ticks of a group's changes: a command's is that of the telemetry that follows it."""
     if group is lead:
         return tick

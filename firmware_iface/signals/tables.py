@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.printable import printable
 from firmware_iface.logs.budget import Budget
 from firmware_iface.logs.packed import kind_of, unpacked
 from firmware_iface.signals.columns import TIME, ColumnMap, missing, unit_of
+from firmware_iface.signals.row_clock import even_times
 
 __all__ = ["DECODED_SUFFIXES", "Signal", "holds_signals", "joined", "read_signals"]
 
@@ -26,6 +28,8 @@ FRAMES_HEADER = "timestamp,arbitration_id"
 HEADER_BYTES = 1 << 16
 DELIMITERS = ";\t,"
 LEAST_ROWS = 10
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Resolutions in which pandas holds dates."""
 EXTRA = "pip install 'ehadiag[daq]'"
 
 
@@ -39,10 +43,13 @@ class Signal:
         s, ascending, shape (n,).
     value : NDArray[np.float64]
         SI, finite, shape (n,).
+    jitter : float
+        Deviation of the stamps from the even clock that took their place, s; 0: they are as read.
     """
 
     time: NDArray[np.float64]
     value: NDArray[np.float64]
+    jitter: float = 0.0
 
 
 def holds_signals(path: Path | str, *, mapped: bool) -> bool:
@@ -199,14 +206,43 @@ def _signals(
     def numbers(role: str) -> NDArray[np.float64]:
         column = found[role]
         gain, bias = unit_of(column, units.get(column.column, ""), role, f"log {path}")
-        series = table[column.column]
-        if role == TIME and pandas.api.types.is_datetime64_any_dtype(series):
-            return np.asarray(series.astype("int64"), dtype=np.float64) * 1e-9
-        plain = pandas.to_numeric(series, errors="coerce")
+        plain = pandas.to_numeric(table[column.column], errors="coerce")
         return np.asarray(plain, dtype=np.float64) * gain + bias
 
-    time = numbers(TIME)
+    series = table[found[TIME].column]
+    instants = _instants(series)
+    time = numbers(TIME) if instants is None else instants
+    if not np.isfinite(time).any():
+        begins = "" if series.dropna().empty else f" ({printable(str(series.dropna().iloc[0]))}, …)"
+        raise InputOutputError(
+            f"log {path}: no time stamp in column {printable(found[TIME].column)!r}{begins}: need"
+            " numbers, in s or the unit that --column time=NAME:UNIT says, or ISO 8601 such as"
+            " 2026-03-01T12:00:00.001"
+        )
     return _checked({role: (time, numbers(role)) for role in found if role != TIME}, path)
+
+
+def _instants(series: Any) -> NDArray[np.float64] | None:
+    """Return dates and times of day, or spans of time, in s; None for numbers.
+
+    Dates count from 1970, UTC; without a zone they are taken for UTC.
+    """
+    import pandas  # noqa: PLC0415 - read by now
+
+    kinds = pandas.api.types
+    if kinds.is_object_dtype(series) or kinds.is_string_dtype(series):
+        if np.isfinite(np.asarray(pandas.to_numeric(series, errors="coerce"), np.float64)).any():
+            return None
+        text = series.astype("string").str.replace(",", ".")  # of decimals
+        series = pandas.to_datetime(text, format="ISO8601", errors="coerce", utc=True)
+    if kinds.is_datetime64_any_dtype(series):
+        series = series.dt.tz_convert(None) if series.dt.tz is not None else series
+    elif not kinds.is_timedelta64_dtype(series):
+        return None
+    values = series.to_numpy()
+    unit, many = np.datetime_data(values.dtype)
+    whole = values.astype(np.int64).astype(np.float64)
+    return np.where(np.isnat(values), np.nan, whole * (many / PER_SECOND[unit]))
 
 
 def _checked(
@@ -214,14 +250,15 @@ def _checked(
 ) -> dict[str, Signal]:
     """In order of time, once for each instant, numbers alone."""
     out: dict[str, Signal] = {}
-    for role, (time, value) in found.items():
+    for role, (stamps, value) in found.items():
+        time, jitter = even_times(stamps)
         known = np.isfinite(time) & np.isfinite(value)
         at, values = time[known], value[known]
         order = np.argsort(at, kind="stable")
         at, values = at[order], values[order]
-        once = np.concatenate([np.diff(at) > 0.0, [True]]) if len(at) else known[:0]
-        if once.sum() >= LEAST_ROWS or role.startswith("environment."):
-            out[role] = Signal(at[once], values[once])
+        once = np.diff(at, append=np.inf) > 0.0
+        if once.sum() >= LEAST_ROWS or (role.startswith("environment.") and once.any()):
+            out[role] = Signal(at[once], values[once], jitter)
         elif role.startswith("channels."):
             raise InputOutputError(f"log {path}: {role} has {int(once.sum())} numbers in all")
     return out
@@ -276,5 +313,5 @@ def joined(parts: Iterable[dict[str, Signal]]) -> dict[str, Signal]:
         order = np.argsort(time, kind="stable")
         time, value = time[order], value[order]
         once = np.concatenate([np.diff(time) > 0.0, [True]])
-        out[role] = Signal(time[once], value[once])
+        out[role] = Signal(time[once], value[once], max(piece.jitter for piece in pieces))
     return out

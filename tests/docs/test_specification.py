@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from enum import IntEnum
 
 import cantools
 import numpy as np
@@ -12,7 +13,7 @@ from cantools.database.can import Message
 from places import ROOT
 
 from ehadiag.core.channels import CHANNELS
-from ehadiag.core.recording import BitReason, BitState
+from ehadiag.core.recording import BitReason, BitState, OnboardState
 from ehadiag.core.stored_test import bundled_tests
 from ehadiag_tools.accuracy.cases import PAPER
 
@@ -53,7 +54,7 @@ def test_ranges_are_those_of_the_converters_and_of_the_bus(messages: dict[str, M
         assert channel.full_scale / channel.per_unit == pytest.approx(float(half))
         assert channel.lsb / channel.per_unit == pytest.approx(int(width) / 4096)
         assert signal.scale == pytest.approx(int(width) / 4096)
-        assert signal.length == channel.bits
+        assert 2.0**signal.length == channel.levels
 
 
 @pytest.mark.parametrize(
@@ -118,13 +119,21 @@ def test_messages_are_those_of_the_database(messages: dict[str, Message]) -> Non
 
 
 @pytest.mark.parametrize(
-    ("number", "signal", "kind"),
-    [("BUS-10", "BitState", BitState), ("BUS-11", "BitReason", BitReason)],
+    ("number", "message", "signal", "kind"),
+    [
+        ("BUS-10", "BitStatus", "BitState", BitState),
+        ("BUS-11", "BitStatus", "BitReason", BitReason),
+        ("BUS-17", "OnboardVerdict", "OnboardState", OnboardState),
+    ],
 )
 def test_states_and_reasons_are_those_of_the_bus(
-    number: str, signal: str, kind: type[BitState] | type[BitReason], messages: dict[str, Message]
+    number: str,
+    message: str,
+    signal: str,
+    kind: type[IntEnum],
+    messages: dict[str, Message],
 ) -> None:
-    choices = messages["BitStatus"].get_signal_by_name(signal).choices
+    choices = messages[message].get_signal_by_name(signal).choices
     assert choices is not None
     assert set(choices) == {int(item) for item in kind}
     said = {int(code) for code in re.findall(r"\b(\d) [a-z]", requirement(number))}

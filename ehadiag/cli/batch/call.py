@@ -6,8 +6,8 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.batch.inputs import Input
@@ -76,7 +76,7 @@ def add_batch_options(parser: argparse.ArgumentParser) -> None:
 
 
 def diagnose_all(
-    arguments: argparse.Namespace, job: Job, results: Results, inputs: Sequence[Input]
+    arguments: argparse.Namespace, jobs: Sequence[Job], results: Results, inputs: Sequence[Input]
 ) -> int:
     """Diagnose each recording by itself; return the exit code of all.
 
@@ -84,8 +84,8 @@ def diagnose_all(
     ----------
     arguments : argparse.Namespace
         The parsed command line.
-    job : Job
-        What is wanted.
+    jobs : Sequence[Job]
+        What is wanted, of each actuator on the bus.
     results : Results
         Where each result goes.
     inputs : Sequence[Input]
@@ -96,7 +96,7 @@ def diagnose_all(
     int
         That of one; the worst of several, see `worst_code`.
     """
-    call = _Call(arguments, job, results, inputs)
+    call = _Call(arguments, jobs, results, inputs)
     return call.run()
 
 
@@ -131,7 +131,7 @@ def finish(
     Returns
     -------
     int
-        The verdict's, or 3 where something could not be written and 3 is more.
+        The verdict's, or 3 where something could not be written and that is worse.
     """
     from ehadiag.report.json_line import json_line  # noqa: PLC0415 - loads the model's names
 
@@ -152,23 +152,34 @@ def finish(
     return code
 
 
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One recording to diagnose for one of the actuators on its bus."""
+
+    job: int
+    """Place of the actuator's job."""
+    item: Input
+
+
 class _Call:
     """What the recordings of one call share."""
 
     def __init__(
         self,
         arguments: argparse.Namespace,
-        job: Job,
+        jobs: Sequence[Job],
         results: Results,
         inputs: Sequence[Input],
     ) -> None:
         self._arguments = arguments
-        self._job = job
+        self._jobs = tuple(jobs)
         self._results = results
-        self._inputs = inputs
-        self._summary = Summary(len(inputs))
+        self._inputs = [_Task(number, item) for item in inputs for number in range(len(jobs))]
+        self._summary = Summary(len(self._inputs))
         self._takes: list[Take] = [self._summary.take]
         self._journals: list[Journal] = []
+        self._reusable: dict[tuple[int, str], bool] = {}
+        """Logs that were asked for, by whether an earlier call's results stand for them."""
         self._came = 0
 
     def run(self) -> int:
@@ -203,42 +214,44 @@ class _Call:
         tables = {name: kind_of_table(name) for name in self._arguments.results}
         for name, kind in tables.items():
             if kind == ".jsonl":
-                journal = Journal(name, self._job, resume=False)
+                journal = Journal(name, self._jobs, resume=False)
                 self._journals.append(stack.enter_context(journal))
             else:
                 self._takes.append(stack.enter_context(TABLES[kind](name)))
         if self._arguments.resume:
-            journal = Journal(self._arguments.resume, self._job, resume=True)
+            journal = Journal(self._arguments.resume, self._jobs, resume=True)
+            if journal.replaced:
+                say(journal.replaced)
             self._journals.insert(0, stack.enter_context(journal))
         if self._arguments.junit:
             self._takes.append(stack.enter_context(junit_report(self._arguments.junit)))
 
     def _here(self) -> None:
         """Diagnose one after the other in this process, each result out before the next is read."""
-        for at, item in enumerate(self._inputs):
+        for at, task in enumerate(self._inputs):
+            job, item = self._jobs[task.job], task.item
             if self._results.stopped:
                 self._stop(at)
                 return
-            if self._reuse(item):
+            if self._reuse(task):
                 continue
             try:
                 interrupt_on_signals()
                 if item.why:
                     raise InputOutputError(item.why)
-                reading = self._job.read(item.name)
+                reading = job.read(item.name)
             except EhadiagError as error:
-                found = failure(self._job, item.name, str(error), error.exit_code)
-                self._fail(found)
+                self._fail(failure(job, item.name, str(error), error.exit_code))
                 continue
             for recording, file, suffix in reading.each():
                 code = finish(
-                    self._job,
+                    job,
                     self._results,
                     [recording],
                     [file],
                     Spent(reading.seconds),
-                    Path(item.name).stem + suffix,
-                    self._take,
+                    job.name(item.name, suffix),
+                    partial(self._take, job=task.job),
                 )
                 self._summary.codes.add(code)
             self._came += 1
@@ -247,18 +260,21 @@ class _Call:
         """Diagnose in workers; return how many there were."""
         interrupt_on_signals()
         self._compile_once()
-        new = [item for item in self._inputs if not (item.why or self._known(item))]
+        new = [task for task in self._inputs if not (task.item.why or self._known(task))]
         with (
             Workers(jobs, self._arguments.cluster) as workers,
             counting_bar(len(self._inputs)) as tell,
         ):
-            made = workers.over(partial(_in_worker, self._job), new, partial(_given_up, self._job))
+            made = workers.over(
+                partial(_in_worker, self._jobs), new, partial(_given_up, self._jobs)
+            )
             try:
-                for item in self._inputs:
+                for task in self._inputs:
+                    item = task.item
                     if item.why:
-                        self._fail(failure(self._job, item.name, item.why, FAILED))
-                    elif not self._reuse(item):
-                        self._deliver(next(made))
+                        self._fail(failure(self._jobs[task.job], item.name, item.why, FAILED))
+                    elif not self._reuse(task):
+                        self._deliver(task, next(made))
                     tell()
                     if self._results.stopped:
                         raise KeyboardInterrupt
@@ -276,11 +292,12 @@ class _Call:
             return
         from ehadiag.identify.warmup import warm_up  # noqa: PLC0415 - loads numba
 
-        for test in {test.rate: test for test in self._job.tests}.values():
-            if abs(test.rate / self._job.actuator.controller.rate - 1.0) <= SAME_RATE:
-                warm_up(self._job.actuator, test)
+        job = self._jobs[0]
+        for test in {test.rate: test for test in job.tests}.values():
+            if abs(test.rate / job.actuator.controller.rate - 1.0) <= SAME_RATE:
+                warm_up(job.actuator, test)
 
-    def _deliver(self, findings: Sequence[Finding]) -> None:
+    def _deliver(self, task: _Task, findings: Sequence[Finding]) -> None:
         for found in findings:
             if found.diagnosis is None or found.spent is None:
                 self._fail(found)
@@ -288,25 +305,34 @@ class _Call:
             picture = found.picture
             draw = None if picture is None else lambda content=picture: content
             code = self._results.deliver(found.diagnosis, found.line, found.spent, found.name, draw)
-            self._take(json.loads(found.line), found.line)
+            self._take(json.loads(found.line), found.line, job=task.job)
             self._summary.codes.add(code)
         self._came += 1
 
-    def _known(self, item: Input) -> list[str]:
-        """Return what an earlier call found of a log; nothing where it must be diagnosed."""
+    def _known(self, task: _Task) -> list[str]:
+        """Return what an earlier call found of a log; nothing where it must be diagnosed.
+
+        That is also where something that this call is to write of it is not there yet: pictures,
+        reports and entries of a history are not made from a line of results.
+        """
         if not self._arguments.resume:
             return []
-        return self._journals[0].found(item.name)
+        name, job = task.item.name, self._jobs[task.job]
+        lines = self._journals[0].found(name, task.job)
+        if (task.job, name) not in self._reusable:
+            names = [job.name(name, _suffix(line)) for line in lines]
+            self._reusable[task.job, name] = all(map(self._results.has, lines, names))
+        return lines if self._reusable[task.job, name] else []
 
-    def _reuse(self, item: Input) -> bool:
+    def _reuse(self, task: _Task) -> bool:
         """Bring out what an earlier call found, if it did."""
         from ehadiag.assess.verdict import Verdict  # noqa: PLC0415
 
-        lines = self._known(item)
+        lines = self._known(task)
         for line in lines:
             tree = json.loads(line)
             self._results.repeat(line, tree)
-            self._take(tree, line, reused=True)
+            self._take(tree, line, job=task.job, reused=True)
             self._summary.reused += 1
             self._summary.codes.add(int(Verdict[tree["verdict"]]))
         self._came += bool(lines)
@@ -318,10 +344,10 @@ class _Call:
         self._summary.codes.add(found.exit_code)
         self._came += 1
 
-    def _take(self, tree: dict[str, Any], line: str, *, reused: bool = False) -> None:
+    def _take(self, tree: dict[str, Any], line: str, *, job: int = 0, reused: bool = False) -> None:
         """Hand a result to all files."""
         for number, journal in enumerate(self._journals):
-            journal.add(line, reused=reused and number == 0)
+            journal.add(line, job, reused=reused and number == 0)
         for take in self._takes:
             take(tree)
 
@@ -332,12 +358,11 @@ class _Call:
         if not left:
             return
         if len(left) < TOLD_FROM:
-            for item in left:
-                say(f"stopped by the user: log {item.name} is not diagnosed")
+            for task in left:
+                say(f"stopped by the user: log {task.item.name} is not diagnosed")
         else:
-            say(
-                f"stopped by the user: {len(left)} logs are not diagnosed, {left[0].name} the first"
-            )
+            first = left[0].item.name
+            say(f"stopped by the user: {len(left)} logs are not diagnosed, {first} the first")
         self._summary.codes.add(NotTestedError.exit_code)
 
     def _conclude(self, workers: int) -> int:
@@ -359,10 +384,17 @@ class _Call:
         return code
 
 
-def _in_worker(job: Job, item: Input) -> tuple[Finding, ...]:
-    return work(job, item.name)
+def _suffix(line: str) -> str:
+    """What the files of a result are called more than its log, see `Reading.each`."""
+    log = json.loads(line)["recordings"][0]["log"]
+    return f"-{log['result']}" if log["results"] > 1 else ""
 
 
-def _given_up(job: Job, item: Input) -> tuple[Finding, ...]:
-    text = f"log {item.name}: the process that diagnosed it ended, twice; not enough memory?"
-    return (failure(job, item.name, text, FAILED),)
+def _in_worker(jobs: Sequence[Job], task: _Task) -> tuple[Finding, ...]:
+    return work(jobs[task.job], task.item.name)
+
+
+def _given_up(jobs: Sequence[Job], task: _Task) -> tuple[Finding, ...]:
+    name = task.item.name
+    text = f"log {name}: the process that diagnosed it ended, twice; not enough memory?"
+    return (failure(jobs[task.job], name, text, FAILED),)

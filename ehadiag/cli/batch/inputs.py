@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from ehadiag.cli.batch.own_tables import is_table_of_results
+from ehadiag.cli.output import say
 from ehadiag.core.errors import ConfigurationError
 
 __all__ = ["Input", "expand"]
@@ -31,7 +33,8 @@ class Input:
 def expand(names: Iterable[str]) -> list[Input]:
     """Return the recordings that arguments stand for, in their order and as often as named.
 
-    A folder stands for all recordings in it and below, in the order of their names; a pattern
+    A folder stands for all recordings in it and below, in the order of their names, but not for
+    hidden ones, what lies in hidden folders or behind links, and tables of results; a pattern
     (`*`, `?`, `[…]`, `**`), where there is no file of that name, for what it matches; `-` for the
     names on standard input, one a line, or ended by null characters.
 
@@ -77,16 +80,33 @@ def _found(name: str) -> Iterator[Input]:
 def _in_folder(folder: str) -> Iterator[Input]:
     from firmware_iface.logs.blocks import SUFFIXES  # noqa: PLC0415 - loads numpy
     from firmware_iface.logs.packed import kind_of  # noqa: PLC0415
+    from firmware_iface.signals.tables import DECODED_SUFFIXES  # noqa: PLC0415
 
-    inside = sorted(
-        os.path.join(place, name)
-        for place, _, names in os.walk(folder)
-        for name in names
-        if not name.startswith(".") and kind_of(Path(name)) in SUFFIXES
-    )
-    if not inside:
-        yield Input(folder, f"folder {folder}: no recording in it ({', '.join(sorted(SUFFIXES))})")
-    yield from map(Input, inside)
+    known = {*SUFFIXES, *DECODED_SUFFIXES}
+    links: list[str] = []
+    inside = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        links += [path for name in folders if os.path.islink(path := os.path.join(place, name))]
+        inside += [
+            os.path.join(place, name)
+            for name in names
+            if not name.startswith(".") and kind_of(Path(name)) in known
+        ]
+    ours = [name for name in inside if is_table_of_results(Path(name))]
+    _tell(folder, links, "a link to a folder is not followed, name the folder to read it")
+    _tell(folder, ours, "a table of results is no recording")
+    recordings = sorted(set(inside).difference(ours))
+    if not recordings:
+        yield Input(folder, f"folder {folder}: no recording in it ({', '.join(sorted(known))})")
+    yield from map(Input, recordings)
+
+
+def _tell(folder: str, left_out: list[str], why: str) -> None:
+    """Say what of a folder is left out."""
+    if left_out:
+        more = f" and {len(left_out) - 1} more" if len(left_out) > 1 else ""
+        say(f"folder {folder}: {why}: {min(left_out)}{more}")
 
 
 def _listed() -> list[str]:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.signals.columns import ColumnMap
 
-__all__ = ["Finding", "Job", "Reading", "failure", "work"]
+__all__ = ["Finding", "Job", "Reading", "failure", "labelled", "work"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,8 @@ class Job:
     """Whether a picture is wanted."""
     folder: str
     """Working folder of the call, which names of logs start from."""
+    label: str = ""
+    """Tells its results from those of other actuators on the same bus; empty of the only one."""
 
     def read(self, *logs: str) -> Reading:
         """Read what is to be diagnosed of one recording.
@@ -83,6 +85,8 @@ class Job:
         found = tuple(recorded_tests(logs, meaning, self.budget))
         if not self.every:
             found = (choose(found),)
+        if self.label:
+            found = tuple(labelled(item, self.label) for item in found)
         return Reading(found, log_file(logs[0]), time.perf_counter() - begin)
 
     def diagnose(
@@ -136,6 +140,10 @@ class Job:
 
         tests = match_tests(recordings, self.tests, self.default)
         return not_tested(recordings, tests, self.actuator, [why], elapsed)
+
+    def name(self, log: str, suffix: str = "") -> str:
+        """Return the name of a recording's files, without suffix."""
+        return Path(log).stem + suffix + (f"-{self.label}" if self.label else "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,7 +217,7 @@ def failure(job: Job, log: str, error: str, exit_code: int) -> Finding:
     from ehadiag.report.json_line import error_line  # noqa: PLC0415 - loads the model's names
 
     line = error_line(log, error, exit_code, job.asked, job.actuator, log_file(log))
-    return Finding(line, Path(log).stem, error, exit_code)
+    return Finding(line, job.name(log), error, exit_code)
 
 
 def _findings(job: Job, log: str) -> tuple[Finding, ...]:
@@ -227,9 +235,16 @@ def _findings(job: Job, log: str) -> tuple[Finding, ...]:
             recordings=tuple(replace(item, samples=None) for item in found.recordings),
             experiments=(),
         )
-        name = Path(log).stem + suffix
-        out.append(Finding(line, name, "", int(found.verdict), small, spent, picture))
+        out.append(
+            Finding(line, job.name(log, suffix), "", int(found.verdict), small, spent, picture)
+        )
     return tuple(out)
+
+
+def labelled(recording: Recording, label: str) -> Recording:
+    """Return a recording with a note that tells it from those of other actuators on its bus."""
+    notes = (*recording.quality.notes, f"actuator of mapping {label}")
+    return replace(recording, quality=replace(recording.quality, notes=notes))
 
 
 def _picture(diagnosis: Diagnosis, job: Job) -> bytes | None:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from ehadiag.cli.batch.own_tables import MARK
 from ehadiag.cli.batch.row import COLUMNS, row_of
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
@@ -110,7 +111,8 @@ def parquet_table(name: str) -> Iterator[Take]:
             f"results {name}: Parquet needs pyarrow, pip install 'ehadiag[parquet]'"
         ) from None
     kinds = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
-    schema = pyarrow.schema([(key, kinds[kind]) for key, kind in COLUMNS.items()])
+    fields = [(key, kinds[kind]) for key, kind in COLUMNS.items()]
+    schema = pyarrow.schema(fields, metadata={b"schema": MARK})
     with (
         whole_file(name, "results") as file,
         parquet.ParquetWriter(file, schema) as writer,

@@ -8,6 +8,7 @@ from collections import Counter
 from typing import Any
 
 from ehadiag.cli.batch.sinks import whole_file
+from ehadiag.cli.exit_codes import FAILED, worst_code
 from ehadiag.core.printable import printable
 from ehadiag.report.origin import package
 
@@ -17,18 +18,6 @@ SCHEMA = "ehadiag.summary/1"
 MOST_NAMED = 100
 """Failures that are kept with their reasons."""
 MOST_WORST = 10
-FAILED = 3
-ORDER = (20, FAILED, 30, 10, 0)
-"""Exit codes of several recordings, the worst first."""
-
-
-def worst_code(codes: set[int]) -> int:
-    """Return the exit code of several recordings: the worst of theirs.
-
-    FAULT (20), an input or output that failed (3, 2), NOT TESTED (30), DEGRADED (10), HEALTHY.
-    """
-    known = {FAILED if code == 2 else code for code in codes}
-    return next((code for code in ORDER if code in known), 0)
 
 
 class Summary:

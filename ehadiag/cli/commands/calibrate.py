@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from ehadiag.cli import options
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
 from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import emit, progress_bar, rendered, say, say_if_compiling
+from ehadiag.cli.report_page import add_report_option, calibration_report, need_report_library
 from ehadiag.cli.results import make_folder
 from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError
 from ehadiag.core.stored_test import resolve_test
@@ -65,6 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_log_options(parser)
     options.add_seed_option(parser, "seed of the search")
     options.add_json_option(parser)
+    add_report_option(parser, "beside the actuator file, also where nothing was learned")
     parser.set_defaults(run=run)
 
 
@@ -72,17 +75,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate; return the exit code."""
     start = options.the_actuator(arguments)
     out = _place(arguments)
-    say_if_compiling()
-    recordings, digests = _read(arguments)
-    found = _learn(arguments, start, recordings, digests)
-    keep_signals()
-    written = []
-    if found.actuator is not None:
-        with make_folder(str(out.parent)) as folder:
-            _write(folder, out.name, found.actuator, replaced=arguments.update)
-            written.append(out)
-            _draw(folder, f"{out.stem}.png", found)
-            written.append(out.with_suffix(".png"))
+    if arguments.report:
+        need_report_library()
+    # What cannot be written is said before anything slow.
+    with make_folder(str(out.parent)) as folder:
+        say_if_compiling()
+        recordings, digests = _read(arguments)
+        found = _learn(arguments, start, recordings, digests)
+        keep_signals()
+        written = _bring_out(arguments, folder, out, found)
     if arguments.json:
         from ehadiag.report.calibration import calibration_json  # noqa: PLC0415
 
@@ -96,6 +97,26 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if found.actuator is not None else NotTestedError.exit_code
 
 
+def _bring_out(
+    arguments: argparse.Namespace, folder: Folder, out: Path, found: Calibrated
+) -> list[Path]:
+    """Write file and picture of what was learned, and the report; return what was written."""
+    written = []
+    if found.actuator is not None:
+        _write(folder, out.name, found.actuator, replaced=arguments.update)
+        written.append(out)
+        _draw(folder, _picture(out).name, found)
+        written.append(_picture(out))
+    if arguments.report:
+        page = out.with_suffix(".html")
+        try:
+            folder.write(page.name, calibration_report(found))
+        except OSError as error:
+            raise InputOutputError(f"report {page}: {error.strerror or error}") from None
+        written.append(page)
+    return written
+
+
 def _place(arguments: argparse.Namespace) -> Path:
     """Where to write: refused before anything slow where that cannot be."""
     out = Path(arguments.out)
@@ -105,10 +126,21 @@ def _place(arguments: argparse.Namespace) -> Path:
         raise ConfigurationError("--update: needs --actuator, the calibrated file to refine")
     if arguments.update and arguments.compare:
         raise ConfigurationError("--update keeps the model that was chosen: --compare does nothing")
-    same = arguments.update and out.absolute() == Path(arguments.actuator).absolute()
-    if out.exists() and not same:
-        raise ConfigurationError(f"--out {arguments.out}: exists; name another file, or remove it")
+    same = arguments.update and _is_same(out, Path(arguments.actuator))
+    for path in () if same else (out, _picture(out)):
+        if os.path.lexists(path):
+            raise ConfigurationError(
+                f"--out {arguments.out}: {path.name} exists; name another file, or remove it"
+            )
     return out
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.samefile(other)
+
+
+def _picture(out: Path) -> Path:
+    return out.with_suffix(".png")
 
 
 def _read(arguments: argparse.Namespace) -> tuple[list[Recording], list[str]]:

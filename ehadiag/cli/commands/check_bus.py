@@ -7,13 +7,20 @@ import dataclasses
 import json
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.cli import options
 from ehadiag.cli.interrupt import stop_on_signals
-from ehadiag.cli.output import progress_bar, put
+from ehadiag.cli.matplotlib_alone import matplotlib_alone
+from ehadiag.cli.output import progress_bar, put, say
 from ehadiag.cli.would_diagnose import Outlook, outlook
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import conversion_of
+from ehadiag.core.errors import InputOutputError
+from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import valid_text
+from ehadiag.core.recording import Samples
 
 if TYPE_CHECKING:
     from firmware_iface.session.bus_report import BusReport
@@ -44,6 +51,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="how long to listen (default 3)",
     )
     parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw each channel over time, PNG; a file there is replaced"
+    )
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_log_options(parser)
@@ -90,7 +100,25 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         put(heard)
         put(render(report))
-    return NOT_USABLE if report.problems else 0
+    code = NOT_USABLE if report.problems else 0
+    if arguments.plot and seen.heard is None:
+        say(f"--plot {arguments.plot}: no sample of a channel was heard, nothing is drawn")
+    elif arguments.plot and seen.heard is not None:
+        _plot(Path(arguments.plot), seen.heard, actuator, heard)
+    return code
+
+
+def _plot(path: Path, samples: Samples, actuator: Actuator, heard: str) -> None:
+    """Draw what was heard, and say where."""
+    with matplotlib_alone():
+        from ehadiag.report.picture_bus import draw_bus  # noqa: PLC0415 - matplotlib is slow
+    content = draw_bus(samples, conversion_of(samples, actuator), heard)
+    try:
+        with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
+            folder.write(path.name, content)
+    except OSError as error:
+        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+    say(f"wrote {path}")
 
 
 def _as_diagnosed(report: BusReport, seen: Outlook) -> BusReport:

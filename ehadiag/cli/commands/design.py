@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -84,8 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
             f"{actuator.controller.rate:g} Hz: give both the same"
         )
     named = _named(arguments, test)
-    if arguments.out and Path(arguments.out).exists():
-        raise InputOutputError(f"{arguments.out}: exists already; name another file")
+    if arguments.out:
+        _refuse_place(Path(arguments.out))
     say_if_compiling()
     from ehadiag.design.score import score  # noqa: PLC0415 - loads the kernels
 
@@ -156,6 +157,14 @@ def _named(arguments: argparse.Namespace, test: StoredTest) -> tuple[str, int]:
     if not 1 <= len(name) <= 64:
         raise ConfigurationError("--name: need 1 to 64 characters")
     return name, number
+
+
+def _refuse_place(path: Path) -> None:
+    """Say before anything slow what could not be written."""
+    if os.path.lexists(path):
+        raise InputOutputError(f"{path}: exists already; name another file")
+    if not path.parent.is_dir():
+        raise InputOutputError(f"{path}: there is no folder {path.parent}")
 
 
 def _write(path: Path, content: bytes) -> None:

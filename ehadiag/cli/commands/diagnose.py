@@ -11,11 +11,14 @@ from ehadiag.cli import options
 from ehadiag.cli.batch.call import add_batch_options, diagnose_all, finish
 from ehadiag.cli.batch.inputs import Input, expand
 from ehadiag.cli.batch.job import Job
+from ehadiag.cli.exit_codes import code_of_inputs, worst_code
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, names_taken, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
+from ehadiag.cli.units import Unit, add_unit_options, units_of
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.report.spent import Spent
@@ -25,6 +28,12 @@ if TYPE_CHECKING:
     from ehadiag.report.asked import LogFile
 
 __all__ = ["add_parser", "run"]
+
+NOT_LISTED = (
+    "joint", "out", "report", "history", "hours", "cycles", "results", "resume", "junit", "summary",
+)  # fmt: skip
+"""Options that say what becomes of a diagnosis."""
+UNUSED: tuple[object, ...] = (None, False, [])
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -61,8 +70,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     options.add_when_options(parser)
     parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
-    options.add_actuator_options(parser)
-    options.add_mapping_options(parser)
+    add_unit_options(parser)
     options.add_column_options(parser)
     options.add_log_options(parser)
     options.add_diagnosis_options(parser)
@@ -79,18 +87,26 @@ def run(arguments: argparse.Namespace) -> int:
     if not inputs:
         raise ConfigurationError("no recording named: the list on standard input is empty")
     if arguments.list:
-        return _list(arguments, inputs)
+        return code_of_inputs([_list(unit, inputs) for unit in units_of(arguments)])
     # What is wrong with the options is said before anything slow is loaded.
     _refuse_contradictions(arguments)
-    job = _job(arguments)
-    results = Results(arguments, make_folder(arguments.out) if arguments.out else None)
+    jobs = [_job(unit) for unit in units_of(arguments)]
+    if arguments.joint and len(jobs) > 1:
+        raise ConfigurationError("--mapping: --joint is of one actuator, name one mapping")
+    outputs = _outputs(arguments)
+    reads = [("the log", item.name) for item in inputs]
+    reads += [("the DBC", job.bus_map.name) for job in jobs]
+    refuse_overwriting(arguments, outputs, reads)
+    folder = make_folder(arguments.out) if arguments.out else None
+    results = Results(arguments, folder, names_taken(folder.path, outputs) if folder else ())
     say_if_compiling()
     if arguments.merge:
-        code = _merged(job, results, inputs)
+        codes = {_merged(job, results, inputs) for job in jobs}
+        code = worst_code(codes) if len(codes) > 1 else codes.pop()
     elif arguments.joint:
-        code = _joint(job, results, inputs)
+        code = _joint(jobs[0], results, inputs)
     else:
-        code = diagnose_all(arguments, job, results, inputs)
+        code = diagnose_all(arguments, jobs, results, inputs)
     keep_signals()
     return code
 
@@ -117,14 +133,22 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
 
 
-def _job(arguments: argparse.Namespace) -> Job:
-    """Return what all logs of the call have in common."""
+def _outputs(arguments: argparse.Namespace) -> list[Output]:
+    """Files that hold the results of the whole call."""
+    named = [("--results", name) for name in arguments.results]
+    named += [(f"--{key}", getattr(arguments, key)) for key in ("resume", "junit", "summary")]
+    return [Output(option, name) for option, name in named if name]
+
+
+def _job(unit: Unit) -> Job:
+    """Return what all logs of the call have in common for one actuator."""
+    arguments = unit.arguments
     only = arguments.test[0] if len(arguments.test) == 1 else None
     default = resolve_test(only) if only else None
     bus_map, actuator = options.the_bus_map(arguments), options.the_actuator(arguments)
     tests = options.known_tests(arguments.test)
     return Job(
-        asked=options.the_asked(arguments, bus_map),
+        asked=options.the_asked(arguments, bus_map, (default,) if default else tests),
         actuator=actuator,
         tests=tests,
         default=default,
@@ -135,6 +159,7 @@ def _job(arguments: argparse.Namespace) -> Job:
         every=arguments.all,
         draw=arguments.out is not None and not arguments.no_picture,
         folder=str(Path.cwd()),
+        label=unit.label,
     )
 
 
@@ -142,7 +167,7 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
     """Make one estimate from all logs."""
     together: list[Recording] = []
     files: list[LogFile | None] = []
-    spent, codes = 0.0, [0]
+    spent, codes = 0.0, []
     for item in inputs:
         try:
             if item.why:
@@ -152,12 +177,13 @@ def _joint(job: Job, results: Results, inputs: Sequence[Input]) -> int:
             say(str(error))
             codes.append(error.exit_code)
             continue
+        codes.append(0)
         together += reading.recordings
         files += [file for _, file, _ in reading.each()]
         spent += reading.seconds
-    if max(codes) > 0:
+    if any(codes):
         say("no joint estimate: not all of the logs could be read")
-        return max(codes)
+        return code_of_inputs(codes)
     return finish(job, results, together, files, Spent(spent), "joint")
 
 
@@ -167,24 +193,28 @@ def _merged(job: Job, results: Results, inputs: Sequence[Input]) -> int:
         if item.why:
             raise InputOutputError(item.why)
     reading = job.read(*(item.name for item in inputs))
-    name = Path(inputs[0].name).stem
+    first = inputs[0].name
     codes = [
-        finish(job, results, [recording], [file], Spent(reading.seconds), name + suffix)
+        finish(job, results, [recording], [file], Spent(reading.seconds), job.name(first, suffix))
         for recording, file, suffix in reading.each()
     ]
-    return max(codes)
+    return worst_code(codes)
 
 
-def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
-    """Print what the logs hold."""
+def _list(unit: Unit, inputs: Sequence[Input]) -> int:
+    """Print what the logs hold of one actuator."""
+    arguments, of = unit.arguments, f" ({unit.label})" if unit.label else ""
     from ehadiag.cli.listing import print_list  # noqa: PLC0415
     from firmware_iface.logs.any_recording import Meaning, recorded_tests  # noqa: PLC0415
 
+    if unused := [name for name in NOT_LISTED if getattr(arguments, name) not in UNUSED]:
+        told = ", ".join(f"--{name}" for name in unused)
+        say(f"--list diagnoses none, and has no use for {told}")
     bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
     tests = options.known_tests(arguments.test)
     sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
     meaning = Meaning(bus_map, options.the_columns(arguments), sought)
-    code = 0
+    codes = []
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:
         try:
@@ -192,10 +222,11 @@ def _list(arguments: argparse.Namespace, inputs: Sequence[Input]) -> int:
                 if item.why:
                     raise InputOutputError(item.why)
             names = [item.name for item in group]
-            print_list(
-                ", ".join(names), recorded_tests(names, meaning, budget), as_json=arguments.json
-            )
+            found = recorded_tests(names, meaning, budget)
+            print_list(", ".join(names) + of, found, as_json=arguments.json)
         except EhadiagError as error:
             say(str(error))
-            code = max(code, error.exit_code)
-    return code
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    return code_of_inputs(codes)

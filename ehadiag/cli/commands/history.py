@@ -14,7 +14,9 @@ from ehadiag.cli.history_file import (
     open_history,
     the_usage,
 )
+from ehadiag.cli.options import unit_serial
 from ehadiag.cli.output import emit, put, rendered, say
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import printable, valid_text
@@ -77,6 +79,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what the verb says."""
+    if getattr(arguments, "out", None):
+        refuse_overwriting(arguments, [Output("--out", arguments.out)])
     {
         "init": _init,
         "list": _list,
@@ -90,7 +94,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _add_serial(parser: argparse.ArgumentParser, *, required: bool) -> None:
     parser.add_argument(
-        "--serial", type=int, metavar="N", required=required, help="serial number of the unit"
+        "--serial",
+        type=unit_serial,
+        metavar="N",
+        required=required,
+        help="serial number of the unit",
     )
 
 

@@ -50,6 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the files; none that is there is changed."""
     folder = Path(arguments.folder)
     files = TEMPLATES[arguments.kind]
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise InputOutputError(f"{folder}: is no folder; name the one to write {files[0][2]} into")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with Folder.at(folder, RESULT_MODE, follow=True) as place:

@@ -13,6 +13,7 @@ from ehadiag.cli import options
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.screen.show import add_screen_options, shown
 from ehadiag.core.errors import ConfigurationError
 
@@ -57,7 +58,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     group.add_argument(
         "--serial-number",
-        type=int,
+        type=options.unit_serial,
         metavar="N",
         help="of the unit, to find it in the health history (default: as the bus says)",
     )
@@ -67,7 +68,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=options.positive,
         default=100.0,
         metavar="H",
-        help="mean time between false alarms (default 100)",
+        help="mean time between false alarms of the sums (default 100); between tests only what"
+        " lasts is an alarm",
     )
     group.add_argument(
         "--log-file", metavar="FILE", help="append alarms to this file, JSON lines with their time"
@@ -120,6 +122,9 @@ def run(arguments: argparse.Namespace) -> int:
         options.need_one_bus(arguments)
     actuator, bus_map = options.the_actuator(arguments), options.the_bus_map(arguments)
     tests = options.known_tests(arguments.test)
+    reads = [("the log", arguments.log), ("--from", arguments.from_result)]
+    outputs = [Output("--log-file", arguments.log_file)] if arguments.log_file else []
+    refuse_overwriting(arguments, outputs, [(kind, name) for kind, name in reads if name])
     say_if_compiling(identification=False)
     unit, find = _known(arguments, actuator)
     from ehadiag.cli.watch.alarm_log import AlarmLog  # noqa: PLC0415

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
+from ehadiag.cli.exit_codes import code_of_inputs
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.output import say, say_if_compiling
+from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import need_report_library, report_of
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
@@ -58,16 +60,22 @@ def run(arguments: argparse.Namespace) -> int:
     need_report_library()
     levels = Levels(arguments.advisory, arguments.limit)
     options.the_actuator(arguments)
-    options.the_bus_map(arguments)
+    bus_map = options.the_bus_map(arguments)
+    results = list(dict.fromkeys(arguments.results))
+    pages = [Output("report", str(_page_of(Path(name)))) for name in results]
+    reads = [("the result", name) for name in results]
+    refuse_overwriting(arguments, pages, [*reads, ("the DBC", bus_map.name)])
     options.known_tests(arguments.test)
-    code = 0
-    for name in arguments.results:
+    codes = []
+    for name in results:
         try:
             _write(arguments, Path(name), levels)
         except EhadiagError as error:
             say(str(error))
-            code = max(code, error.exit_code)
-    return code
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    return code_of_inputs(codes)
 
 
 def _write(arguments: argparse.Namespace, path: Path, levels: Levels) -> None:
@@ -79,13 +87,17 @@ def _write(arguments: argparse.Namespace, path: Path, levels: Levels) -> None:
         say(f"{error}; no responses are drawn")
         diagnosis = None
     page = report_of(line, levels, history_place(arguments), diagnosis)
-    target = path.with_suffix(".html")
+    target = _page_of(path)
     try:
         with Folder.at(target.parent, RESULT_MODE, follow=True) as folder:
             folder.write(target.name, page)
     except OSError as error:
         raise InputOutputError(f"report {target}: {error.strerror or error}") from None
     say(f"wrote {target}")
+
+
+def _page_of(result: Path) -> Path:
+    return result.with_suffix(".html")
 
 
 def _result(path: Path, line: str) -> dict[str, Any]:

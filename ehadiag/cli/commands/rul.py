@@ -24,7 +24,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         allow_abbrev=False,
     )
     parser.add_argument(
-        "--serial", type=int, required=True, metavar="N", help="serial number of the unit"
+        "--serial",
+        type=options.unit_serial,
+        required=True,
+        metavar="N",
+        help="serial number of the unit",
     )
     parser.add_argument(
         "--unit",

@@ -11,6 +11,9 @@ import sys
 
 __all__ = ["main"]
 
+ECHO = 2
+"""Columns left free: the terminal shows `^C` at the end of the last line, which must not wrap."""
+
 
 def main() -> int:
     """Draw each snapshot of standard input on standard error; the last one stays.
@@ -38,7 +41,8 @@ def main() -> int:
         with Live(console=console, auto_refresh=False, redirect_stderr=False) as live:
             for line in sys.stdin.buffer:
                 snapshot = Snapshot.from_json(line)
-                live.update(drawn(snapshot, console.width, unicode=unicode), refresh=True)
+                width = console.width - ECHO
+                live.update(drawn(snapshot, width, unicode=unicode), refresh=True)
     except OSError:
         return 0  # the terminal has gone
     return 0

@@ -157,6 +157,7 @@ class WatchSession:
             "end",
             alarms=watcher.alarms,
             again=watcher.again,
+            passing=watcher.passing,
             ticks=watcher.ticks,
             monitored=watcher.pushed,
             lost=watcher.lost,

@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from ehadiag.cli.watch.known import KnownUnit
+from ehadiag.cli.watch.persistence import Persistence
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import stated_channels
 from ehadiag.core.recording import BitState, CommandMode, Environment
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.live.snapshot import Residuals, RunningTest, known
 from ehadiag.live.trace import Trace
 from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
-from ehadiag.monitor.plan import NOISE
+from ehadiag.monitor.plan import usual_noise
 from firmware_iface.alignment.live_ticks import LiveTick, LiveTicks
 from firmware_iface.codec.live_decode import LiveDecoder, checked_values
 from firmware_iface.codec.live_messages import BitStatus
@@ -105,6 +107,7 @@ class Watcher:
         self._missing = 0
         self._breaks = 0
         self._last: dict[int, int] = {}
+        self._persistence = Persistence(self._rate)
         self._sums = [0.0] * len(SIDES)
         self._threshold = 1.0
         self._status: BitStatus | None = None
@@ -122,6 +125,8 @@ class Watcher:
         """Raised; those that belong to the one before are not counted."""
         self.again = 0
         """Those that belong to the one before."""
+        self.passing = 0
+        """Alarms of the sums in free motion that did not last, or have not yet."""
         self._build()
 
     @property
@@ -242,6 +247,11 @@ class Watcher:
         for place, value in enumerate(reading.cusum.ravel().tolist()):
             sums[place] = max(sums[place], value)
         if reading.alarmed.any():
+            lasts = self._persistence.take(self.ticks)
+            tested = self._status is not None and self._status.state is BitState.RUNNING
+            if not (lasts or tested):
+                self.passing += 1
+                return
             for place, raised in enumerate(reading.alarmed.ravel().tolist()):
                 if raised:
                     self._raise(place, time_ns)
@@ -267,7 +277,8 @@ class Watcher:
         if waits and self.ticks < PATIENCE_S * self._rate and self.ticks:
             return
         actuator, effects = self.unit.unit(self._actuator)
-        noise = self.unit.noise
+        noise, channels = self.unit.noise, stated_channels(self._map.stated, actuator)
+        least = usual_noise(channels)
         monitor = Monitor(
             actuator,
             self.unit.faults,
@@ -275,9 +286,10 @@ class Watcher:
             mode=self._live.mode,
             hours=self._hours,
             # A fit may take some of the noise for its own.
-            noise=None if noise is None else (max(noise[0], NOISE[0]), max(noise[1], NOISE[1])),
+            noise=None if noise is None else (max(noise[0], least[0]), max(noise[1], least[1])),
             offsets=self.unit.offsets,
             effects=effects,
+            channels=channels,
         )
         self._made_for, self._other = told, False
         self._threshold = monitor.design.threshold

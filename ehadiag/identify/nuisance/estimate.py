@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ from ehadiag.identify.nuisance.prior import (
     small_effects,
 )
 from ehadiag.identify.nuisance.starts import Found, robust_cost, search
-from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives, capped
-from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.refine.derivatives import Considered, Derivatives
+from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
 from ehadiag.identify.refine.posterior import sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
@@ -37,8 +38,6 @@ LOOK = 3.0
 """Spread of the last look, with the noise as judged, in spreads of the search's end."""
 RELAXED = 100.0
 """Weight of the spool over the pressure while the spool is explained first."""
-CLEAR = 1.0
-"""Scatter about the linear model, in variances of the noise, from which a row tells nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +143,8 @@ def estimate(
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
     before = belief_of(fine, known, joint), information_of(fine, known, joint)
     belief = _last_look(fine, model, found, before, seed)
-    refined = _described(fine, belief, before[1], settled=found.explained, seed=seed)
+    linear = linearised(fine, belief, np.random.default_rng(seed))
+    refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
     return Estimated(
         refined=refined,
         experiments=judged,
@@ -214,40 +214,9 @@ def _last_look(
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    again, _ = sharpen(fine, before[0], wider, before[1], rng)
+    again = sharpen(fine, before[0], wider, before[1], partial(linearised, rng=rng)).belief
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
-
-
-def _described(
-    model: Derivatives,
-    belief: Belief,
-    information: NDArray[np.float64],
-    *,
-    settled: bool,
-    seed: int,
-) -> Refinement:
-    """Put together what is known at the optimum."""
-    linear = linearised(model, belief, np.random.default_rng(seed))
-    residuals, considered, anchored, _ = model.at(belief.x)
-    weighted = model.model.batch.weight > 0.0
-    used = (linear.scatter < CLEAR) & (residuals**2 < CAP) & weighted
-    return Refinement(
-        parameters=model.estimated,
-        x=belief.x,
-        scale=model.scale,
-        cost=capped(residuals),
-        residuals=residuals,
-        jacobian=np.where(used, linear.jacobian, 0.0),
-        considered=considered,
-        used=used,
-        weighted=weighted,
-        evaluations=model.evaluations,
-        converged=settled,
-        jagged=not settled,
-        anchored=anchored,
-        information=information,
-    )
 
 
 def spread_of_optima(found: Found, scale: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.calibration import Calibration
+from ehadiag.core.channels import Channels
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.identify.nuisance.explained import Explains, is_noise, leaves_no_more
 from ehadiag.identify.nuisance.prior import Joint, Known, nuisances_of, usual
+from ehadiag.model.parameter import sized
 from ehadiag.model.parameters import REGISTRY, Kind, Parameter, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
 
@@ -164,7 +167,7 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
         A calibration has a parameter that the model does not have.
     """
     if actuator.calibration is not None:
-        return _calibrated(actuator.calibration)
+        return _calibrated(actuator.calibration, actuator_channels(actuator))
     free, known, aliases = [], {}, []
     for symbol in actuator.tolerance.names:
         half_width = actuator.tolerance.of(symbol)
@@ -181,15 +184,17 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
     return Knowledge(tuple(free), known, None, tuple(aliases))
 
 
-def _calibrated(calibration: Calibration) -> Knowledge:
+def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:
     """What a calibration says: of deviations from the values that it found, so about 0."""
     for name in (*calibration.effects, *calibration.parameters):
         if name not in _NAMES:
             raise ConfigurationError(f"actuator file: calibration: no parameter {name!r} is known")
     free = []
     for name in calibration.parameters:
-        item, value = parameter(name), calibration.effects.get(name, 0.0)
-        free.append(replace(item, lower=item.lower - value, upper=item.upper - value))
+        item, value = sized(parameter(name), channels), calibration.effects.get(name, 0.0)
+        free.append(
+            replace(item, lower=item.lower - value, upper=item.upper - value, sized_by=None)
+        )
     joint = Joint(calibration.parameters, np.zeros(len(free)), covariance_of(calibration))
     free += [parameter(name) for name in OF_THE_DAY]
     left = UNEXPLAINED_STD * math.sqrt(calibration.fit.left)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
-from ehadiag.identify.refine.linearisation import BLOCK, Belief
+from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
 from ehadiag.identify.refine.posterior import TAIL, sharpen
 
 __all__ = ["Found", "Place", "robust_cost", "search"]
@@ -116,7 +117,8 @@ def search(
         else:
             begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
         rng = np.random.default_rng([seed, len(places)])
-        belief, settled = sharpen(model, known, begin, information, rng)
+        sharpened = sharpen(model, known, begin, information, partial(linearised, rng=rng))
+        belief, settled = sharpened.belief, sharpened.settled
         residuals = model.many(belief.x[None, :])[0]
         cost = float(robust_cost(residuals))
         places.append(Place(belief.x, cost))

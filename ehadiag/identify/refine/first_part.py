@@ -6,16 +6,14 @@ What is left for the whole test is one step (`ehadiag.identify.refine.update`), 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.refine.derivatives import Considered, Derivatives, capped
-from ehadiag.identify.refine.least_squares import Refinement, describe, median_offsets, refine
-from ehadiag.identify.refine.linearisation import Belief
-from ehadiag.identify.refine.posterior import sharpen
+from ehadiag.identify.refine.derivatives import Considered, Derivatives
+from ehadiag.identify.refine.least_squares import SPREAD, Refinement, median_offsets, refine
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
@@ -31,15 +29,13 @@ __all__ = [
     "residuals_at",
 ]
 
-POLISH_REACH = 6.0
-"""Deviations, of each severity, over which the polish begins to look."""
-POLISH_SPREAD = (2e-4, 2e-3)
-"""Severities: out of a narrow basin, which looks well known, and not further than is shown."""
 FREE_LEVEL = 2
 """Halvings of the jack's ticks in a model that runs free, for noise and medians."""
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
+AGAIN = 3e-4
+"""Spread of the severities about an optimum, of a look with the noise judged anew."""
 CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6, (SPOOL_ROW,)),)
 """Half a step of a plant that is integrated at 0.25 µs is of this size; sized on the spool, which
 moves fastest."""
@@ -82,7 +78,7 @@ def refine_first_part(
     start = {**start, **median_offsets(free, residuals)}
     experiments = _judged(experiments, until, residuals)
     levels = anchored_model(experiments, spans).levels
-    best = _refine(experiments, spans, start, levels)
+    best = _refine(experiments, spans, start, levels, SPREAD)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [item.noise for item in experiments]
@@ -91,10 +87,7 @@ def refine_first_part(
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
-        best = _refine(experiments, spans, best.values, levels)
-        evaluations += best.evaluations
-    if best.jagged:
-        best = _polish(experiments, spans, best, levels)
+        best = _refine(experiments, spans, best.values, levels, AGAIN)
         evaluations += best.evaluations
     noise = tuple(item.noise for item in experiments)
     return FirstPart(best, noise, levels, evaluations)
@@ -112,41 +105,17 @@ def residuals_at(
     return model, model.residuals(point)[0][0]
 
 
-def _polish(
-    experiments: Sequence[Experiment], spans: Spans, best: Refinement, levels: NDArray[np.int64]
-) -> Refinement:
-    """Search the neighbourhood where steps in the cost may have held up the descent.
-
-    A belief as wide as the steps is sharpened until the noise stops it; its mean is taken where
-    the cost is lower. The seed is fixed: the answer depends on the recording, not on the search
-    before.
-    """
-    batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
-    model = Derivatives(
-        SimdModel(batch, unknowns_of(experiments), levels=levels), experiments[0].noise
-    )
-    x, curved = best.x * best.scale / model.scale, model.curved
-    deviation = np.sqrt(np.diag(np.linalg.pinv(best.normal, hermitian=True))) * best.scale
-    spread = np.clip(POLISH_REACH * deviation[curved], *POLISH_SPREAD) / model.scale[curved]
-    begin = Belief(x, np.diag(spread))
-    nothing_known = np.zeros(len(x))
-    found, _ = sharpen(model, begin, begin, nothing_known, np.random.default_rng(0))
-    costs = [capped(run) for run in model.many(np.vstack([x, found.x]))]
-    chosen = (x if costs[0] <= costs[1] else found.x) * model.scale
-    values = {item.name: float(value) for item, value in zip(best.parameters, chosen, strict=True)}
-    other = describe(
-        anchored_derivatives(experiments, spans, levels=levels), values, converged=best.converged
-    )
-    return replace(other, evaluations=other.evaluations + model.evaluations)
-
-
 def _refine(
     experiments: Sequence[Experiment],
     spans: Spans,
     start: Mapping[str, float],
     levels: NDArray[np.int64],
+    spread: NDArray[np.float64] | float,
 ) -> Refinement:
-    return refine(anchored_derivatives(experiments, spans, levels=levels), start)
+    batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
+    # What is considered is worked out with the last part.
+    model = SimdModel(batch, unknowns_of(experiments), levels=levels)
+    return refine(Derivatives(model, experiments[0].noise), start, spread)
 
 
 def anchored_derivatives(

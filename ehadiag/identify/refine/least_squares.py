@@ -1,38 +1,34 @@
-"""Deterministic refinement: robust least squares from the optimum of a search.
+"""Refinement: robust least squares from the optimum of a search.
 
-Damped Gauss-Newton on the weighted residuals of spool and pressure, the model re-anchored on the
-measured spool. Residuals beyond three times the noise are left out of a step (their square is
-capped), and so are rows whose two-sided differences disagree: there a break-away goes one way on
-one side and the other way on the other. Constant errors of both sensors are estimated beside the
-severities; being constant they are told apart from the faults, which act alike in both directions.
+A belief about the optimum is sharpened (`ehadiag.identify.refine.posterior`) on the weighted
+residuals of spool and pressure, the model re-anchored on the measured spool. Linearising over the
+width of what is not yet known looks past the steps that break-aways make in the cost, and where
+there are none it is a Gauss-Newton descent. Constant errors of both sensors are estimated beside
+the severities; being constant they are told apart from the faults, which act alike in both
+directions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.identify.refine.bounded_step import bounded_step
-from ehadiag.identify.refine.derivatives import CAP, Derivatives, Slope, capped
-from ehadiag.identify.refine.plateau import centre, vertex
+from ehadiag.identify.refine.derivatives import CAP, Derivatives, capped
+from ehadiag.identify.refine.linearisation import Belief, Linearised, crossed
+from ehadiag.identify.refine.posterior import FEW, sharpen
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Parameter
 
-__all__ = ["Refinement", "describe", "median_offsets", "refine"]
+__all__ = ["SPREAD", "Refinement", "described", "median_offsets", "refine"]
 
-ITERATIONS = 20
-CONVERGED = 1e-6
-LEAST_GAIN = 1e-3
-"""Cost; the optimum is then nearer than some hundredths of a deviation."""
-LEAST_DAMPING = 1e-6
-CAUTIOUS_DAMPING = 0.3
-"""Two steps are tried at once, the second one damped at least so much."""
-MORE = 100.0
-"""Ratio of their damping at least."""
-MOST_DAMPING = 10.0
+SPREAD = np.array([2e-3, 1e-3, 4e-4])
+"""Of the severities, in the order of `FAULTS`, about the optimum of a search, which is mostly
+nearer."""
+CLEAR = 1.0
+"""Scatter about the linear model, in variances of the noise, from which a row tells nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,9 +57,7 @@ class Refinement:
     evaluations : int
         Runs of the model.
     converged : bool
-        Whether the last step was below 1e-6.
-    jagged : bool
-        Break-aways make steps in the cost about the optimum: a descent may stop beside it.
+        Whether the search came to rest.
     anchored : int
         How often the model was re-anchored at the optimum.
     information : shape (k, k), optional
@@ -81,7 +75,6 @@ class Refinement:
     weighted: NDArray[np.bool_]
     evaluations: int
     converged: bool
-    jagged: bool
     anchored: int
     information: NDArray[np.float64] | None = None
 
@@ -98,90 +91,52 @@ class Refinement:
         return np.asarray(rows @ rows.T)
 
 
-def refine(model: Derivatives, start: Mapping[str, float]) -> Refinement:
-    """Minimise the capped sum of squares from a start, values by name (0 where not named)."""
-    x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
-    slope = model.slopes([np.clip(x, model.lower, model.upper)])[0]
-    damping = LEAST_DAMPING
-    converged = False
-    for _ in range(ITERATIONS):
-        cautious = max(MORE * damping, CAUTIOUS_DAMPING)
-        trials = _stepped(model, slope, (damping, cautious))
-        size = float(np.abs(trials[0] - slope.x)[model.curved].max())
-        if size < CONVERGED:
-            converged = True
-            break
-        best = min(model.slopes(trials), key=lambda trial: trial.cost)
-        gained = slope.cost - best.cost
-        if gained > 0.0:
-            slope = best
-            if gained < LEAST_GAIN:
-                converged = True
-                break
-            damping = max(damping / 10.0, LEAST_DAMPING)
-        elif damping >= MOST_DAMPING:
-            # No step improves: the optimum, to within the jumps that break-aways make.
-            converged = True
-            break
-        else:
-            damping = MOST_DAMPING
-    bowl = vertex(model, slope)
-    return _described(model, bowl.x, bowl.slope, converged=converged, jagged=not bowl.smooth)
+def refine(
+    model: Derivatives, start: Mapping[str, float], spread: NDArray[np.float64] | float = SPREAD
+) -> Refinement:
+    """Sharpen a belief about a start, values by name (0 where not named).
 
-
-def _stepped(
-    model: Derivatives, slope: Slope, dampings: Sequence[float]
-) -> list[NDArray[np.float64]]:
-    """Points that damped Gauss-Newton steps lead to, within the bounds."""
-    x, used = slope.x, slope.used
-    rows = slope.jacobian[:, used]
-    normal, gradient = rows @ rows.T, rows @ slope.residuals[used]
-    return [
-        bounded_step(
-            x,
-            normal + np.diag(damping * np.diag(normal) + 1e-12),
-            gradient,
-            model.lower,
-            model.upper,
-        )
-        for damping in dampings
-    ]
-
-
-def describe(model: Derivatives, start: Mapping[str, float], *, converged: bool) -> Refinement:
-    """What `refine` returns, for a point beside steps in the cost that something else has found.
-
-    The point is moved to the middle of the plateau that the steps leave.
+    spread: of the severities about it, shape (c,), or of each of them.
     """
     x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
-    slope = model.trusted_slope(x)
-    x = centre(model, slope)
-    if x is not slope.x:
-        slope = model.trusted_slope(x)
-    return _described(model, x, slope, converged=converged, jagged=True)
+    curved = model.curved
+    begin = Belief(
+        np.clip(x, model.lower, model.upper),
+        np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
+    )
+    found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, FEW)
+    return described(model, found.belief.x, found.linear, settled=found.settled)
 
 
-def _described(
-    model: Derivatives, x: NDArray[np.float64], slope: Slope, *, converged: bool, jagged: bool
+def described(
+    model: Derivatives,
+    x: NDArray[np.float64],
+    linear: Linearised,
+    *,
+    settled: bool,
+    information: NDArray[np.float64] | None = None,
 ) -> Refinement:
-    """Put together what is known at x; `slope` is that of a point so near that it holds there."""
+    """Put together what is known at an optimum.
+
+    linear: the model about it, over the width of what is known.
+    """
     residuals, considered, anchored, _ = model.at(x)
     weighted = model.model.batch.weight > 0.0
-    used = slope.smooth & (residuals**2 < CAP) & weighted
+    used = (linear.scatter < CLEAR) & (residuals**2 < CAP) & weighted
     return Refinement(
         parameters=model.estimated,
         x=x,
         scale=model.scale,
         cost=capped(residuals),
         residuals=residuals,
-        jacobian=np.where(used, slope.jacobian, 0.0),
+        jacobian=np.where(used, linear.jacobian, 0.0),
         considered=considered,
         used=used,
         weighted=weighted,
         evaluations=model.evaluations,
-        converged=converged,
-        jagged=jagged,
+        converged=settled,
         anchored=anchored,
+        information=information,
     )
 
 

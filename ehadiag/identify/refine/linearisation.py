@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
 
-__all__ = ["Belief", "Linearised", "linearised"]
+__all__ = ["Belief", "Linearised", "crossed", "linearised"]
 
 BLOCK = 16
 """Runs come in blocks of that size."""
+REACH = np.sqrt(3.0)
+"""Deviations of a belief from its mean to the points on a coordinate."""
+ONE_SIDED = 0.25
+"""Share of that distance to a bound from which the points lie on its other side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +89,38 @@ def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> 
     jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
     mean = (along[0] * basis[0, 0]).reshape(shape)
     return Linearised(x, mean, jacobian, scatter.reshape(shape))
+
+
+def crossed(model: Derivatives, belief: Belief) -> Linearised:
+    """Fit a line to the residuals along each coordinate through the mean of a belief.
+
+    For few unknowns, which are told apart: a middle and two points on each coordinate. What a
+    coordinate does not move at all has exactly no slope by it, which a regression on all points at
+    once does not give. At a bound both points are on the same side.
+    """
+    curved, count = model.curved, len(model.curved)
+    reach = REACH * np.sqrt((belief.root**2).sum(axis=1))
+    points = np.repeat(belief.x[None, :], 1 + 2 * count, axis=0)
+    offsets = np.zeros((count, 3))
+    for k, j in enumerate(curved):
+        there, width = belief.x[j], reach[k]
+        above, below = min(width, model.upper[j] - there), min(width, there - model.lower[j])
+        if below < ONE_SIDED * width:
+            below = -0.5 * above
+        elif above < ONE_SIDED * width:
+            above = -0.5 * below
+        points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
+        offsets[k, 1:] = above, -below
+    runs = model.many(points)
+    jacobian = model.additive_slopes()
+    scatter = np.zeros(runs.shape[1:])
+    for k, j in enumerate(curved):
+        line = runs[[0, 1 + 2 * k, 2 + 2 * k]]
+        along = offsets[k] - offsets[k].mean()
+        jacobian[j] = np.tensordot(along / (along @ along), line, 1)
+        left = line - line.mean(axis=0) - along[:, None, None] * jacobian[j]
+        scatter += np.einsum("ijk,ijk->jk", left, left)
+    return Linearised(points.mean(axis=0), runs.mean(axis=0), jacobian, scatter / count)
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

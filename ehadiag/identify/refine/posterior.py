@@ -9,28 +9,73 @@ the smooth outline first and the fine structure last, each sample in its own tim
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
-from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
+from ehadiag.identify.refine.linearisation import Belief, Linearised
 
-__all__ = ["TAIL", "robust_weights", "sharpen"]
+__all__ = ["FEW", "MANY", "TAIL", "Pace", "Sharpened", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
-MOST_ROUNDS = 18
-LEAST_RATIO = 0.5
-"""By which the belief may become narrower in a round, in any direction."""
+LEAST_RATIO_OF_LINEAR = 0.05
+"""By which a belief may become narrower in a round where the model is linear over it: there is
+nothing to look past."""
+LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
+"""Scatter, in variances of the noise; share of samples with more of it, up to which it is so."""
 WIDTH = 2.0
 """Of the belief, in deviations of what the linear problem leaves."""
-SETTLED_RATIO = 0.85
-SETTLED_STEP = 0.5
-"""Of a round after which nothing changes: ratio of the widths, step in units of them."""
 HELD_BACK = 0.1
 """Share of the belief's information that a round's step is held back by."""
 FREE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast a belief is sharpened.
+
+    Attributes
+    ----------
+    least_ratio : float
+        By which it may become narrower in a round, in any direction.
+    settled_ratio, settled_step : float
+        Of a round after which nothing changes: ratio of the widths, step in units of them.
+    most_rounds : int
+    """
+
+    least_ratio: float
+    settled_ratio: float
+    settled_step: float
+    most_rounds: int
+
+
+MANY = Pace(least_ratio=0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=18)
+"""For many unknowns."""
+FEW = Pace(least_ratio=0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12)
+"""For few ones, which are told apart at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sharpened:
+    """What a search ends with.
+
+    Attributes
+    ----------
+    belief : Belief
+    linear : Linearised
+        The model about it, of the last round.
+    settled : bool
+        Whether the belief came to rest.
+    """
+
+    belief: Belief
+    linear: Linearised
+    settled: bool
 
 
 def sharpen(
@@ -38,9 +83,10 @@ def sharpen(
     known: Belief,
     begin: Belief,
     information: NDArray[np.float64],
-    rng: np.random.Generator,
-) -> tuple[Belief, bool]:
-    """Sharpen a belief until the noise stops it; also whether it came to rest.
+    linearise: Callable[[Derivatives, Belief], Linearised],
+    pace: Pace = MANY,
+) -> Sharpened:
+    """Sharpen a belief until the noise stops it.
 
     Parameters
     ----------
@@ -52,13 +98,17 @@ def sharpen(
         Where the search begins.
     information : shape (k, k)
         What was known: inverse covariance, 0 where nothing.
+    linearise : callable
+        How the model is made linear over a belief.
+    pace : Pace
     """
-    belief = begin
-    for _ in range(MOST_ROUNDS):
-        belief, ratio, step = _round(model, known, belief, information, rng)
-        if ratio > SETTLED_RATIO and step < SETTLED_STEP:
-            return belief, True
-    return belief, False
+    belief, rounds, settled = begin, 0, False
+    while not settled and rounds < pace.most_rounds:
+        linear = linearise(model, belief)
+        belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
+        settled = ratio > pace.settled_ratio and step < pace.settled_step
+        rounds += 1
+    return Sharpened(belief, linear, settled)
 
 
 def robust_weights(linear: Linearised) -> NDArray[np.float64]:
@@ -67,15 +117,20 @@ def robust_weights(linear: Linearised) -> NDArray[np.float64]:
     return np.asarray(1.0 / (variance + linear.residuals**2 / TAIL**2))
 
 
-def _round(
+def _is_linear(linear: Linearised) -> bool:
+    """Whether next to no sample leaves the line by more than its noise."""
+    return float(np.mean(linear.scatter > LINEAR_SCATTER)) < LINEAR_SHARE
+
+
+def _narrowed(
     model: Derivatives,
+    linear: Linearised,
     known: Belief,
     belief: Belief,
     information: NDArray[np.float64],
-    rng: np.random.Generator,
+    pace: Pace,
 ) -> tuple[Belief, float, float]:
-    """One linearisation; also the ratio by which the belief would narrow most, and the step."""
-    linear = linearised(model, belief, rng)
+    """Belief after a round; also the ratio by which it would narrow most, and the step."""
     weights = robust_weights(linear).ravel()
     rows = linear.jacobian.reshape(len(belief.x), -1)
     weighed = rows * weights
@@ -93,6 +148,7 @@ def _round(
     spread *= WIDTH**2 * max(excess, 1.0)
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
-    kept = np.clip(ratios, LEAST_RATIO, 1.0)
+    least = LEAST_RATIO_OF_LINEAR if _is_linear(linear) else pace.least_ratio
+    kept = np.clip(ratios, least, 1.0)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
     return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step

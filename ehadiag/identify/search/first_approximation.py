@@ -43,6 +43,8 @@ RANGES = ((0.2, 0.06), (0.05, 0.02))
 """Half-widths of the repeated searches, Kintas and FSS."""
 FINER_GRID = 16
 TOLERANCE = 6e-4
+FSS_SPACINGS = (0.04, 0.01, TOLERANCE)
+"""The same of the three searches for FSS, whose runs are the dearest."""
 """Spacing of the last grid."""
 LEAD_S = 0.05
 PRECISION: Mapping[str, float] = {"Kintas": 1.0, "FSS": 1.0, "FDJ": 0.2}
@@ -126,8 +128,8 @@ def first_approximation(inputs: FirstInputs) -> FirstApproximation:
 
     fdj = _search(counter, fdj_cost, 0.0, 1.0, GRID)
     kintas = _search(counter, lambda grid: kintas_cost(grid, 0.0), 0.0, 1.0, GRID)
-    fss = _search(counter, lambda grid: fss_cost(grid, kintas), 0.0, 1.0, GRID)
-    for kintas_range, fss_range in RANGES:
+    fss = _search(counter, lambda grid: fss_cost(grid, kintas), 0.0, 1.0, GRID, FSS_SPACINGS[0])
+    for (kintas_range, fss_range), spacing in zip(RANGES, FSS_SPACINGS[1:], strict=True):
         kintas = _search(
             counter,
             functools.partial(kintas_cost, fss=fss),
@@ -141,6 +143,7 @@ def first_approximation(inputs: FirstInputs) -> FirstApproximation:
             fss - fss_range,
             fss + fss_range,
             FINER_GRID,
+            spacing,
         )
     return FirstApproximation({"Kintas": kintas, "FSS": fss, "FDJ": fdj}, counter.count)
 
@@ -162,11 +165,12 @@ def _search(
     low: float,
     high: float,
     points: int,
+    coarsest: float = TOLERANCE,
 ) -> float:
     """Minimum of a scalar function on [low, high] within 0 … 1.
 
-    Ever finer grids about the lowest point, all points of one at once; at last the vertex of the
-    parabola through the three lowest neighbours.
+    Ever finer grids about the lowest point, down to a spacing of `coarsest`, all points of one at
+    once; at last the vertex of the parabola through the three lowest neighbours.
     """
     while True:
         grid = np.linspace(max(low, 0.0), min(high, 1.0), points)
@@ -174,7 +178,7 @@ def _search(
         counter.count += points
         best = int(np.argmin(values))
         spacing = float(grid[1] - grid[0])
-        if spacing <= TOLERANCE:
+        if spacing <= coarsest:
             return _vertex(grid, values, best)
         low, high = float(grid[best]) - spacing, float(grid[best]) + spacing
         points = FINER_GRID

@@ -288,8 +288,12 @@ def _event_tick(
             else:
                 event = _event(t, s, new_xf, new_xs, new_vs)
         steps = whole if first >= whole else first + 1 if fine else first
-        for n in range(steps):
-            o = INSTANTS + n
+        n = 0
+        while n < steps:
+            # On to the next node of the path, or to the last step.
+            taken = min(steps - n, (QUARTER - (done & (QUARTER - 1))) >> shift)
+            n += taken
+            o = INSTANTS + n - 1
             s = SpoolState(
                 path[o],
                 path[o + WIDTH],
@@ -303,9 +307,9 @@ def _event_tick(
                 vs = s.vs - less * s.direction
                 s = SpoolState(s.xf, s.wf, s.xs, vs, s.wire, s.direction, s.clamped)
             end_vs = s.vs
-            done += 1 << shift
-            since += 1 << shift
-            switches = event > NOTHING and n == steps - 1
+            done += taken << shift
+            since += taken << shift
+            switches = event > NOTHING and n == steps
             if switches:
                 s = switch(t, event, s)
                 kinks = kinks or event == SPOOL_STOP or (s.direction != 0 and s.vs == 0.0)

@@ -50,8 +50,24 @@ static inline uint8_t pack_left_shift_u16(
     return (uint8_t)((uint8_t)(value << shift) & mask);
 }
 
+static inline uint8_t pack_left_shift_u32(
+    uint32_t value,
+    uint8_t shift,
+    uint8_t mask)
+{
+    return (uint8_t)((uint8_t)(value << shift) & mask);
+}
+
 static inline uint8_t pack_right_shift_u16(
     uint16_t value,
+    uint8_t shift,
+    uint8_t mask)
+{
+    return (uint8_t)((uint8_t)(value >> shift) & mask);
+}
+
+static inline uint8_t pack_right_shift_u32(
+    uint32_t value,
     uint8_t shift,
     uint8_t mask)
 {
@@ -64,6 +80,14 @@ static inline uint16_t unpack_left_shift_u16(
     uint8_t mask)
 {
     return (uint16_t)((uint16_t)(value & mask) << shift);
+}
+
+static inline uint32_t unpack_left_shift_u32(
+    uint8_t value,
+    uint8_t shift,
+    uint8_t mask)
+{
+    return (uint32_t)((uint32_t)(value & mask) << shift);
 }
 
 static inline uint8_t unpack_right_shift_u8(
@@ -80,6 +104,14 @@ static inline uint16_t unpack_right_shift_u16(
     uint8_t mask)
 {
     return (uint16_t)((uint16_t)(value & mask) >> shift);
+}
+
+static inline uint32_t unpack_right_shift_u32(
+    uint8_t value,
+    uint8_t shift,
+    uint8_t mask)
+{
+    return (uint32_t)((uint32_t)(value & mask) >> shift);
 }
 
 static uint64_t cantools_unsigned_from_double(double value)
@@ -954,6 +986,598 @@ bool eha_fcc_bit_status_status_crc8_is_in_range(uint8_t value)
 }
 
 bool eha_fcc_bit_status_status_crc8_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+int eha_fcc_onboard_verdict_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_verdict_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u8(src_p->onboard_state, 0u, 0x0fu);
+    dst_p[1] |= pack_left_shift_u8(src_p->onboard_test_id, 0u, 0xffu);
+    dst_p[2] |= pack_left_shift_u8(src_p->onboard_verdict, 0u, 0xffu);
+    dst_p[3] |= pack_left_shift_u16(src_p->onboard_runs, 0u, 0xffu);
+    dst_p[4] |= pack_right_shift_u16(src_p->onboard_runs, 8u, 0xffu);
+    dst_p[6] |= pack_left_shift_u8(src_p->verdict_counter, 0u, 0xffu);
+    dst_p[7] |= pack_left_shift_u8(src_p->verdict_crc8, 0u, 0xffu);
+
+    return (8);
+}
+
+int eha_fcc_onboard_verdict_unpack(
+    struct eha_fcc_onboard_verdict_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->onboard_state = unpack_right_shift_u8(src_p[0], 0u, 0x0fu);
+    dst_p->onboard_test_id = unpack_right_shift_u8(src_p[1], 0u, 0xffu);
+    dst_p->onboard_verdict = unpack_right_shift_u8(src_p[2], 0u, 0xffu);
+    dst_p->onboard_runs = unpack_right_shift_u16(src_p[3], 0u, 0xffu);
+    dst_p->onboard_runs |= unpack_left_shift_u16(src_p[4], 8u, 0xffu);
+    dst_p->verdict_counter = unpack_right_shift_u8(src_p[6], 0u, 0xffu);
+    dst_p->verdict_crc8 = unpack_right_shift_u8(src_p[7], 0u, 0xffu);
+
+    return (0);
+}
+
+int eha_fcc_onboard_verdict_init(struct eha_fcc_onboard_verdict_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct eha_fcc_onboard_verdict_t));
+
+    return 0;
+}
+
+uint8_t eha_fcc_onboard_verdict_onboard_state_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_verdict_onboard_state_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_verdict_onboard_state_is_in_range(uint8_t value)
+{
+    return (value <= 15u);
+}
+
+bool eha_fcc_onboard_verdict_onboard_state_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 15.0));
+}
+
+uint8_t eha_fcc_onboard_verdict_onboard_test_id_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_verdict_onboard_test_id_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_verdict_onboard_test_id_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_verdict_onboard_test_id_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+uint8_t eha_fcc_onboard_verdict_onboard_verdict_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_verdict_onboard_verdict_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_verdict_onboard_verdict_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_verdict_onboard_verdict_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+uint16_t eha_fcc_onboard_verdict_onboard_runs_encode(double value)
+{
+    return (uint16_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_verdict_onboard_runs_decode(uint16_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_verdict_onboard_runs_is_in_range(uint16_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_verdict_onboard_runs_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 65535.0));
+}
+
+uint8_t eha_fcc_onboard_verdict_verdict_counter_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_verdict_verdict_counter_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_verdict_verdict_counter_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_verdict_verdict_counter_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+uint8_t eha_fcc_onboard_verdict_verdict_crc8_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_verdict_verdict_crc8_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_verdict_verdict_crc8_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_verdict_verdict_crc8_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+int eha_fcc_onboard_kintas_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_kintas_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u32(src_p->severity_kintas, 0u, 0xffu);
+    dst_p[1] |= pack_right_shift_u32(src_p->severity_kintas, 8u, 0xffu);
+    dst_p[2] |= pack_right_shift_u32(src_p->severity_kintas, 16u, 0xffu);
+    dst_p[3] |= pack_left_shift_u32(src_p->deviation_kintas, 0u, 0xffu);
+    dst_p[4] |= pack_right_shift_u32(src_p->deviation_kintas, 8u, 0xffu);
+    dst_p[5] |= pack_right_shift_u32(src_p->deviation_kintas, 16u, 0xffu);
+    dst_p[6] |= pack_left_shift_u8(src_p->kintas_counter, 0u, 0xffu);
+    dst_p[7] |= pack_left_shift_u8(src_p->kintas_crc8, 0u, 0xffu);
+
+    return (8);
+}
+
+int eha_fcc_onboard_kintas_unpack(
+    struct eha_fcc_onboard_kintas_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->severity_kintas = unpack_right_shift_u32(src_p[0], 0u, 0xffu);
+    dst_p->severity_kintas |= unpack_left_shift_u32(src_p[1], 8u, 0xffu);
+    dst_p->severity_kintas |= unpack_left_shift_u32(src_p[2], 16u, 0xffu);
+    dst_p->deviation_kintas = unpack_right_shift_u32(src_p[3], 0u, 0xffu);
+    dst_p->deviation_kintas |= unpack_left_shift_u32(src_p[4], 8u, 0xffu);
+    dst_p->deviation_kintas |= unpack_left_shift_u32(src_p[5], 16u, 0xffu);
+    dst_p->kintas_counter = unpack_right_shift_u8(src_p[6], 0u, 0xffu);
+    dst_p->kintas_crc8 = unpack_right_shift_u8(src_p[7], 0u, 0xffu);
+
+    return (0);
+}
+
+int eha_fcc_onboard_kintas_init(struct eha_fcc_onboard_kintas_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct eha_fcc_onboard_kintas_t));
+
+    return 0;
+}
+
+uint32_t eha_fcc_onboard_kintas_severity_kintas_encode(double value)
+{
+    return (uint32_t)(cantools_unsigned_from_double(round(value / 1e-07)));
+}
+
+double eha_fcc_onboard_kintas_severity_kintas_decode(uint32_t value)
+{
+    return ((double)value * 1e-07);
+}
+
+bool eha_fcc_onboard_kintas_severity_kintas_is_in_range(uint32_t value)
+{
+    return (value <= 10000000u);
+}
+
+bool eha_fcc_onboard_kintas_severity_kintas_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.0));
+}
+
+uint32_t eha_fcc_onboard_kintas_deviation_kintas_encode(double value)
+{
+    return (uint32_t)(cantools_unsigned_from_double(round(value / 1e-07)));
+}
+
+double eha_fcc_onboard_kintas_deviation_kintas_decode(uint32_t value)
+{
+    return ((double)value * 1e-07);
+}
+
+bool eha_fcc_onboard_kintas_deviation_kintas_is_in_range(uint32_t value)
+{
+    return (value <= 16777215u);
+}
+
+bool eha_fcc_onboard_kintas_deviation_kintas_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.6777215));
+}
+
+uint8_t eha_fcc_onboard_kintas_kintas_counter_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_kintas_kintas_counter_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_kintas_kintas_counter_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_kintas_kintas_counter_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+uint8_t eha_fcc_onboard_kintas_kintas_crc8_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_kintas_kintas_crc8_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_kintas_kintas_crc8_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_kintas_kintas_crc8_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+int eha_fcc_onboard_fss_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_fss_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u32(src_p->severity_fss, 0u, 0xffu);
+    dst_p[1] |= pack_right_shift_u32(src_p->severity_fss, 8u, 0xffu);
+    dst_p[2] |= pack_right_shift_u32(src_p->severity_fss, 16u, 0xffu);
+    dst_p[3] |= pack_left_shift_u32(src_p->deviation_fss, 0u, 0xffu);
+    dst_p[4] |= pack_right_shift_u32(src_p->deviation_fss, 8u, 0xffu);
+    dst_p[5] |= pack_right_shift_u32(src_p->deviation_fss, 16u, 0xffu);
+    dst_p[6] |= pack_left_shift_u8(src_p->fss_counter, 0u, 0xffu);
+    dst_p[7] |= pack_left_shift_u8(src_p->fss_crc8, 0u, 0xffu);
+
+    return (8);
+}
+
+int eha_fcc_onboard_fss_unpack(
+    struct eha_fcc_onboard_fss_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->severity_fss = unpack_right_shift_u32(src_p[0], 0u, 0xffu);
+    dst_p->severity_fss |= unpack_left_shift_u32(src_p[1], 8u, 0xffu);
+    dst_p->severity_fss |= unpack_left_shift_u32(src_p[2], 16u, 0xffu);
+    dst_p->deviation_fss = unpack_right_shift_u32(src_p[3], 0u, 0xffu);
+    dst_p->deviation_fss |= unpack_left_shift_u32(src_p[4], 8u, 0xffu);
+    dst_p->deviation_fss |= unpack_left_shift_u32(src_p[5], 16u, 0xffu);
+    dst_p->fss_counter = unpack_right_shift_u8(src_p[6], 0u, 0xffu);
+    dst_p->fss_crc8 = unpack_right_shift_u8(src_p[7], 0u, 0xffu);
+
+    return (0);
+}
+
+int eha_fcc_onboard_fss_init(struct eha_fcc_onboard_fss_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct eha_fcc_onboard_fss_t));
+
+    return 0;
+}
+
+uint32_t eha_fcc_onboard_fss_severity_fss_encode(double value)
+{
+    return (uint32_t)(cantools_unsigned_from_double(round(value / 1e-07)));
+}
+
+double eha_fcc_onboard_fss_severity_fss_decode(uint32_t value)
+{
+    return ((double)value * 1e-07);
+}
+
+bool eha_fcc_onboard_fss_severity_fss_is_in_range(uint32_t value)
+{
+    return (value <= 10000000u);
+}
+
+bool eha_fcc_onboard_fss_severity_fss_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.0));
+}
+
+uint32_t eha_fcc_onboard_fss_deviation_fss_encode(double value)
+{
+    return (uint32_t)(cantools_unsigned_from_double(round(value / 1e-07)));
+}
+
+double eha_fcc_onboard_fss_deviation_fss_decode(uint32_t value)
+{
+    return ((double)value * 1e-07);
+}
+
+bool eha_fcc_onboard_fss_deviation_fss_is_in_range(uint32_t value)
+{
+    return (value <= 16777215u);
+}
+
+bool eha_fcc_onboard_fss_deviation_fss_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.6777215));
+}
+
+uint8_t eha_fcc_onboard_fss_fss_counter_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_fss_fss_counter_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_fss_fss_counter_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_fss_fss_counter_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+uint8_t eha_fcc_onboard_fss_fss_crc8_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_fss_fss_crc8_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_fss_fss_crc8_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_fss_fss_crc8_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+int eha_fcc_onboard_fdj_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_fdj_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    memset(&dst_p[0], 0, 8);
+
+    dst_p[0] |= pack_left_shift_u32(src_p->severity_fdj, 0u, 0xffu);
+    dst_p[1] |= pack_right_shift_u32(src_p->severity_fdj, 8u, 0xffu);
+    dst_p[2] |= pack_right_shift_u32(src_p->severity_fdj, 16u, 0xffu);
+    dst_p[3] |= pack_left_shift_u32(src_p->deviation_fdj, 0u, 0xffu);
+    dst_p[4] |= pack_right_shift_u32(src_p->deviation_fdj, 8u, 0xffu);
+    dst_p[5] |= pack_right_shift_u32(src_p->deviation_fdj, 16u, 0xffu);
+    dst_p[6] |= pack_left_shift_u8(src_p->fdj_counter, 0u, 0xffu);
+    dst_p[7] |= pack_left_shift_u8(src_p->fdj_crc8, 0u, 0xffu);
+
+    return (8);
+}
+
+int eha_fcc_onboard_fdj_unpack(
+    struct eha_fcc_onboard_fdj_t *dst_p,
+    const uint8_t *src_p,
+    size_t size)
+{
+    if (size < 8u) {
+        return (-EINVAL);
+    }
+
+    dst_p->severity_fdj = unpack_right_shift_u32(src_p[0], 0u, 0xffu);
+    dst_p->severity_fdj |= unpack_left_shift_u32(src_p[1], 8u, 0xffu);
+    dst_p->severity_fdj |= unpack_left_shift_u32(src_p[2], 16u, 0xffu);
+    dst_p->deviation_fdj = unpack_right_shift_u32(src_p[3], 0u, 0xffu);
+    dst_p->deviation_fdj |= unpack_left_shift_u32(src_p[4], 8u, 0xffu);
+    dst_p->deviation_fdj |= unpack_left_shift_u32(src_p[5], 16u, 0xffu);
+    dst_p->fdj_counter = unpack_right_shift_u8(src_p[6], 0u, 0xffu);
+    dst_p->fdj_crc8 = unpack_right_shift_u8(src_p[7], 0u, 0xffu);
+
+    return (0);
+}
+
+int eha_fcc_onboard_fdj_init(struct eha_fcc_onboard_fdj_t *msg_p)
+{
+    if (msg_p == NULL) return -1;
+
+    memset(msg_p, 0, sizeof(struct eha_fcc_onboard_fdj_t));
+
+    return 0;
+}
+
+uint32_t eha_fcc_onboard_fdj_severity_fdj_encode(double value)
+{
+    return (uint32_t)(cantools_unsigned_from_double(round(value / 1e-07)));
+}
+
+double eha_fcc_onboard_fdj_severity_fdj_decode(uint32_t value)
+{
+    return ((double)value * 1e-07);
+}
+
+bool eha_fcc_onboard_fdj_severity_fdj_is_in_range(uint32_t value)
+{
+    return (value <= 10000000u);
+}
+
+bool eha_fcc_onboard_fdj_severity_fdj_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.0));
+}
+
+uint32_t eha_fcc_onboard_fdj_deviation_fdj_encode(double value)
+{
+    return (uint32_t)(cantools_unsigned_from_double(round(value / 1e-07)));
+}
+
+double eha_fcc_onboard_fdj_deviation_fdj_decode(uint32_t value)
+{
+    return ((double)value * 1e-07);
+}
+
+bool eha_fcc_onboard_fdj_deviation_fdj_is_in_range(uint32_t value)
+{
+    return (value <= 16777215u);
+}
+
+bool eha_fcc_onboard_fdj_deviation_fdj_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.6777215));
+}
+
+uint8_t eha_fcc_onboard_fdj_fdj_counter_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_fdj_fdj_counter_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_fdj_fdj_counter_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_fdj_fdj_counter_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 255.0));
+}
+
+uint8_t eha_fcc_onboard_fdj_fdj_crc8_encode(double value)
+{
+    return (uint8_t)(cantools_unsigned_from_double(round(value)));
+}
+
+double eha_fcc_onboard_fdj_fdj_crc8_decode(uint8_t value)
+{
+    return ((double)value);
+}
+
+bool eha_fcc_onboard_fdj_fdj_crc8_is_in_range(uint8_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool eha_fcc_onboard_fdj_fdj_crc8_is_in_phys_range(double value)
 {
     return ((value >= 0.0) && (value <= 255.0));
 }

@@ -50,6 +50,10 @@ extern "C" {
 #define EHA_FCC_ENVIRONMENT_FRAME_ID (0x120u)
 #define EHA_FCC_BIT_REQUEST_FRAME_ID (0x200u)
 #define EHA_FCC_BIT_STATUS_FRAME_ID (0x201u)
+#define EHA_FCC_ONBOARD_VERDICT_FRAME_ID (0x210u)
+#define EHA_FCC_ONBOARD_KINTAS_FRAME_ID (0x211u)
+#define EHA_FCC_ONBOARD_FSS_FRAME_ID (0x212u)
+#define EHA_FCC_ONBOARD_FDJ_FRAME_ID (0x213u)
 
 /* Frame lengths in bytes. */
 #define EHA_FCC_SERVO_TELEMETRY_LENGTH (8u)
@@ -57,6 +61,10 @@ extern "C" {
 #define EHA_FCC_ENVIRONMENT_LENGTH (8u)
 #define EHA_FCC_BIT_REQUEST_LENGTH (8u)
 #define EHA_FCC_BIT_STATUS_LENGTH (8u)
+#define EHA_FCC_ONBOARD_VERDICT_LENGTH (8u)
+#define EHA_FCC_ONBOARD_KINTAS_LENGTH (8u)
+#define EHA_FCC_ONBOARD_FSS_LENGTH (8u)
+#define EHA_FCC_ONBOARD_FDJ_LENGTH (8u)
 
 /* Extended or standard frame types. */
 #define EHA_FCC_SERVO_TELEMETRY_IS_EXTENDED (0)
@@ -64,12 +72,20 @@ extern "C" {
 #define EHA_FCC_ENVIRONMENT_IS_EXTENDED (0)
 #define EHA_FCC_BIT_REQUEST_IS_EXTENDED (0)
 #define EHA_FCC_BIT_STATUS_IS_EXTENDED (0)
+#define EHA_FCC_ONBOARD_VERDICT_IS_EXTENDED (0)
+#define EHA_FCC_ONBOARD_KINTAS_IS_EXTENDED (0)
+#define EHA_FCC_ONBOARD_FSS_IS_EXTENDED (0)
+#define EHA_FCC_ONBOARD_FDJ_IS_EXTENDED (0)
 
 /* Frame cycle times in milliseconds. */
 #define EHA_FCC_SERVO_TELEMETRY_CYCLE_TIME_MS (1u)
 #define EHA_FCC_SERVO_COMMAND_CYCLE_TIME_MS (1u)
 #define EHA_FCC_ENVIRONMENT_CYCLE_TIME_MS (100u)
 #define EHA_FCC_BIT_STATUS_CYCLE_TIME_MS (20u)
+#define EHA_FCC_ONBOARD_VERDICT_CYCLE_TIME_MS (100u)
+#define EHA_FCC_ONBOARD_KINTAS_CYCLE_TIME_MS (100u)
+#define EHA_FCC_ONBOARD_FSS_CYCLE_TIME_MS (100u)
+#define EHA_FCC_ONBOARD_FDJ_CYCLE_TIME_MS (100u)
 
 /* Signal choices. */
 #define EHA_FCC_SERVO_COMMAND_COMMAND_MODE_CURRENT_CHOICE (1u)
@@ -93,12 +109,27 @@ extern "C" {
 #define EHA_FCC_BIT_STATUS_BIT_REASON_ALREADY_RUNNING_CHOICE (5u)
 #define EHA_FCC_BIT_STATUS_BIT_REASON_INTERLOCK_OPEN_CHOICE (6u)
 
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_STATE_NOTHING_CHOICE (0u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_STATE_RECORDING_CHOICE (1u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_STATE_IDENTIFYING_CHOICE (2u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_STATE_DONE_CHOICE (3u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_STATE_GIVEN_UP_CHOICE (4u)
+
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_VERDICT_HEALTHY_CHOICE (0u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_VERDICT_DEGRADED_CHOICE (10u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_VERDICT_FAULT_CHOICE (20u)
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_VERDICT_NOT_TESTED_CHOICE (30u)
+
 /* Frame Names. */
 #define EHA_FCC_SERVO_TELEMETRY_NAME "ServoTelemetry"
 #define EHA_FCC_SERVO_COMMAND_NAME "ServoCommand"
 #define EHA_FCC_ENVIRONMENT_NAME "Environment"
 #define EHA_FCC_BIT_REQUEST_NAME "BitRequest"
 #define EHA_FCC_BIT_STATUS_NAME "BitStatus"
+#define EHA_FCC_ONBOARD_VERDICT_NAME "OnboardVerdict"
+#define EHA_FCC_ONBOARD_KINTAS_NAME "OnboardKintas"
+#define EHA_FCC_ONBOARD_FSS_NAME "OnboardFSS"
+#define EHA_FCC_ONBOARD_FDJ_NAME "OnboardFDJ"
 
 /* Signal Names. */
 #define EHA_FCC_SERVO_TELEMETRY_SERVO_CURRENT_NAME "ServoCurrent"
@@ -129,6 +160,24 @@ extern "C" {
 #define EHA_FCC_BIT_STATUS_ACTUATOR_SERIAL_NAME "ActuatorSerial"
 #define EHA_FCC_BIT_STATUS_STATUS_COUNTER_NAME "StatusCounter"
 #define EHA_FCC_BIT_STATUS_STATUS_CRC8_NAME "StatusCrc8"
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_STATE_NAME "OnboardState"
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_TEST_ID_NAME "OnboardTestId"
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_VERDICT_NAME "OnboardVerdict"
+#define EHA_FCC_ONBOARD_VERDICT_ONBOARD_RUNS_NAME "OnboardRuns"
+#define EHA_FCC_ONBOARD_VERDICT_VERDICT_COUNTER_NAME "VerdictCounter"
+#define EHA_FCC_ONBOARD_VERDICT_VERDICT_CRC8_NAME "VerdictCrc8"
+#define EHA_FCC_ONBOARD_KINTAS_SEVERITY_KINTAS_NAME "SeverityKintas"
+#define EHA_FCC_ONBOARD_KINTAS_DEVIATION_KINTAS_NAME "DeviationKintas"
+#define EHA_FCC_ONBOARD_KINTAS_KINTAS_COUNTER_NAME "KintasCounter"
+#define EHA_FCC_ONBOARD_KINTAS_KINTAS_CRC8_NAME "KintasCrc8"
+#define EHA_FCC_ONBOARD_FSS_SEVERITY_FSS_NAME "SeverityFSS"
+#define EHA_FCC_ONBOARD_FSS_DEVIATION_FSS_NAME "DeviationFSS"
+#define EHA_FCC_ONBOARD_FSS_FSS_COUNTER_NAME "FSSCounter"
+#define EHA_FCC_ONBOARD_FSS_FSS_CRC8_NAME "FSSCrc8"
+#define EHA_FCC_ONBOARD_FDJ_SEVERITY_FDJ_NAME "SeverityFDJ"
+#define EHA_FCC_ONBOARD_FDJ_DEVIATION_FDJ_NAME "DeviationFDJ"
+#define EHA_FCC_ONBOARD_FDJ_FDJ_COUNTER_NAME "FDJCounter"
+#define EHA_FCC_ONBOARD_FDJ_FDJ_CRC8_NAME "FDJCrc8"
 
 /**
  * Signals in message ServoTelemetry.
@@ -365,6 +414,162 @@ struct eha_fcc_bit_status_t {
      * Offset: 0
      */
     uint8_t status_crc8;
+};
+
+/**
+ * Signals in message OnboardVerdict.
+ *
+ * What the computer has made of its last test, if it identifies by itself.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct eha_fcc_onboard_verdict_t {
+    /**
+     * Range: 0..15 (0..15 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t onboard_state;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t onboard_test_id;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t onboard_verdict;
+
+    /**
+     * Range: 0..65535 (0..65535 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint16_t onboard_runs;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t verdict_counter;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t verdict_crc8;
+};
+
+/**
+ * Signals in message OnboardKintas.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct eha_fcc_onboard_kintas_t {
+    /**
+     * Range: 0..10000000 (0..1 -)
+     * Scale: 1e-07
+     * Offset: 0
+     */
+    uint32_t severity_kintas;
+
+    /**
+     * Range: 0..16777215 (0..1.67772 -)
+     * Scale: 1e-07
+     * Offset: 0
+     */
+    uint32_t deviation_kintas;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t kintas_counter;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t kintas_crc8;
+};
+
+/**
+ * Signals in message OnboardFSS.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct eha_fcc_onboard_fss_t {
+    /**
+     * Range: 0..10000000 (0..1 -)
+     * Scale: 1e-07
+     * Offset: 0
+     */
+    uint32_t severity_fss;
+
+    /**
+     * Range: 0..16777215 (0..1.67772 -)
+     * Scale: 1e-07
+     * Offset: 0
+     */
+    uint32_t deviation_fss;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t fss_counter;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t fss_crc8;
+};
+
+/**
+ * Signals in message OnboardFDJ.
+ *
+ * All signal values are as on the CAN bus.
+ */
+struct eha_fcc_onboard_fdj_t {
+    /**
+     * Range: 0..10000000 (0..1 -)
+     * Scale: 1e-07
+     * Offset: 0
+     */
+    uint32_t severity_fdj;
+
+    /**
+     * Range: 0..16777215 (0..1.67772 -)
+     * Scale: 1e-07
+     * Offset: 0
+     */
+    uint32_t deviation_fdj;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t fdj_counter;
+
+    /**
+     * Range: 0..255 (0..255 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t fdj_crc8;
 };
 
 /**
@@ -1671,6 +1876,874 @@ bool eha_fcc_bit_status_status_crc8_is_in_range(uint8_t value);
  * @return true if in range, false otherwise.
  */
 bool eha_fcc_bit_status_status_crc8_is_in_phys_range(double value);
+
+/**
+ * Pack message OnboardVerdict.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int eha_fcc_onboard_verdict_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_verdict_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message OnboardVerdict.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int eha_fcc_onboard_verdict_unpack(
+    struct eha_fcc_onboard_verdict_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from OnboardVerdict.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int eha_fcc_onboard_verdict_init(struct eha_fcc_onboard_verdict_t *msg_p);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_verdict_onboard_state_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_verdict_onboard_state_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_state_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_state_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_verdict_onboard_test_id_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_verdict_onboard_test_id_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_test_id_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_test_id_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_verdict_onboard_verdict_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_verdict_onboard_verdict_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_verdict_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_verdict_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint16_t eha_fcc_onboard_verdict_onboard_runs_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_verdict_onboard_runs_decode(uint16_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_runs_is_in_range(uint16_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_onboard_runs_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_verdict_verdict_counter_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_verdict_verdict_counter_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_verdict_counter_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_verdict_counter_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_verdict_verdict_crc8_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_verdict_verdict_crc8_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_verdict_crc8_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_verdict_verdict_crc8_is_in_phys_range(double value);
+
+/**
+ * Pack message OnboardKintas.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int eha_fcc_onboard_kintas_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_kintas_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message OnboardKintas.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int eha_fcc_onboard_kintas_unpack(
+    struct eha_fcc_onboard_kintas_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from OnboardKintas.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int eha_fcc_onboard_kintas_init(struct eha_fcc_onboard_kintas_t *msg_p);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint32_t eha_fcc_onboard_kintas_severity_kintas_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_kintas_severity_kintas_decode(uint32_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_severity_kintas_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_severity_kintas_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint32_t eha_fcc_onboard_kintas_deviation_kintas_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_kintas_deviation_kintas_decode(uint32_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_deviation_kintas_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_deviation_kintas_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_kintas_kintas_counter_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_kintas_kintas_counter_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_kintas_counter_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_kintas_counter_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_kintas_kintas_crc8_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_kintas_kintas_crc8_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_kintas_crc8_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_kintas_kintas_crc8_is_in_phys_range(double value);
+
+/**
+ * Pack message OnboardFSS.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int eha_fcc_onboard_fss_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_fss_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message OnboardFSS.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int eha_fcc_onboard_fss_unpack(
+    struct eha_fcc_onboard_fss_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from OnboardFSS.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int eha_fcc_onboard_fss_init(struct eha_fcc_onboard_fss_t *msg_p);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint32_t eha_fcc_onboard_fss_severity_fss_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fss_severity_fss_decode(uint32_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_severity_fss_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_severity_fss_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint32_t eha_fcc_onboard_fss_deviation_fss_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fss_deviation_fss_decode(uint32_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_deviation_fss_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_deviation_fss_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_fss_fss_counter_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fss_fss_counter_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_fss_counter_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_fss_counter_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_fss_fss_crc8_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fss_fss_crc8_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_fss_crc8_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fss_fss_crc8_is_in_phys_range(double value);
+
+/**
+ * Pack message OnboardFDJ.
+ *
+ * @param[out] dst_p Buffer to pack the message into.
+ * @param[in] src_p Data to pack.
+ * @param[in] size Size of dst_p.
+ *
+ * @return Size of packed data, or negative error code.
+ */
+int eha_fcc_onboard_fdj_pack(
+    uint8_t *dst_p,
+    const struct eha_fcc_onboard_fdj_t *src_p,
+    size_t size);
+
+/**
+ * Unpack message OnboardFDJ.
+ *
+ * @param[out] dst_p Object to unpack the message into.
+ * @param[in] src_p Message to unpack.
+ * @param[in] size Size of src_p.
+ *
+ * @return zero(0) or negative error code.
+ */
+int eha_fcc_onboard_fdj_unpack(
+    struct eha_fcc_onboard_fdj_t *dst_p,
+    const uint8_t *src_p,
+    size_t size);
+
+/**
+ * Init message fields to default values from OnboardFDJ.
+ *
+ * @param[in] msg_p Message to init.
+ *
+ * @return zero(0) on success or (-1) in case of nullptr argument.
+ */
+int eha_fcc_onboard_fdj_init(struct eha_fcc_onboard_fdj_t *msg_p);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint32_t eha_fcc_onboard_fdj_severity_fdj_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fdj_severity_fdj_decode(uint32_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_severity_fdj_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_severity_fdj_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint32_t eha_fcc_onboard_fdj_deviation_fdj_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fdj_deviation_fdj_decode(uint32_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_deviation_fdj_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_deviation_fdj_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_fdj_fdj_counter_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fdj_fdj_counter_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_fdj_counter_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_fdj_counter_is_in_phys_range(double value);
+
+/**
+ * Encode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to encode.
+ *
+ * @return Encoded signal.
+ */
+uint8_t eha_fcc_onboard_fdj_fdj_crc8_encode(double value);
+
+/**
+ * Decode given signal by applying scaling and offset.
+ *
+ * @param[in] value Signal to decode.
+ *
+ * @return Decoded signal.
+ */
+double eha_fcc_onboard_fdj_fdj_crc8_decode(uint8_t value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_fdj_crc8_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool eha_fcc_onboard_fdj_fdj_crc8_is_in_phys_range(double value);
 
 
 #ifdef __cplusplus

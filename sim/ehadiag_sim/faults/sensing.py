@@ -10,7 +10,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from ehadiag.core.channels import CHANNELS
+from ehadiag.core.channels import Channels
 
 __all__ = [
     "Constant",
@@ -33,9 +33,9 @@ class Constant:
     channel: int
     share: float = 0.0
 
-    def __call__(self, _tick: int, values: list[float]) -> None:
+    def __call__(self, _tick: int, values: list[float], channels: Channels) -> None:
         """Overwrite the reading."""
-        values[self.channel] = self.share * CHANNELS[self.channel].full_scale
+        values[self.channel] = self.share * channels[self.channel].full_scale
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class Scaled:
     channel: int
     factor: float
 
-    def __call__(self, _tick: int, values: list[float]) -> None:
+    def __call__(self, _tick: int, values: list[float], _channels: Channels) -> None:
         """Scale the reading."""
         values[self.channel] *= self.factor
 
@@ -57,9 +57,9 @@ class Drift:
     channel: int
     per_tick: float
 
-    def __call__(self, tick: int, values: list[float]) -> None:
+    def __call__(self, tick: int, values: list[float], channels: Channels) -> None:
         """Add what has gathered."""
-        values[self.channel] += self.per_tick * tick * CHANNELS[self.channel].full_scale
+        values[self.channel] += self.per_tick * tick * channels[self.channel].full_scale
 
 
 @dataclass(slots=True)
@@ -70,7 +70,7 @@ class Frozen:
     since: int
     _held: float | None = None
 
-    def __call__(self, tick: int, values: list[float]) -> None:
+    def __call__(self, tick: int, values: list[float], _channels: Channels) -> None:
         """Hold the reading."""
         if tick >= self.since:
             if self._held is None:
@@ -86,7 +86,7 @@ class Late:
     ticks: int
     _past: deque[float] = field(default_factory=deque)
 
-    def __call__(self, _tick: int, values: list[float]) -> None:
+    def __call__(self, _tick: int, values: list[float], _channels: Channels) -> None:
         """Give the old reading."""
         self._past.append(values[self.channel])
         values[self.channel] = self._past[0]
@@ -101,9 +101,9 @@ class Swapped:
     first: int
     second: int
 
-    def __call__(self, _tick: int, values: list[float]) -> None:
+    def __call__(self, _tick: int, values: list[float], channels: Channels) -> None:
         """Exchange the readings, each as a share of its half range."""
-        ratio = CHANNELS[self.first].full_scale / CHANNELS[self.second].full_scale
+        ratio = channels[self.first].full_scale / channels[self.second].full_scale
         one, other = values[self.first], values[self.second]
         values[self.first], values[self.second] = other * ratio, one / ratio
 
@@ -117,7 +117,7 @@ class LooseContact:
     length: int
     since: int = 0
 
-    def __call__(self, tick: int, values: list[float]) -> None:
+    def __call__(self, tick: int, values: list[float], _channels: Channels) -> None:
         """Drop the reading while the contact is open."""
         if (tick - self.since) % self.every < self.length and tick >= self.since:
             values[self.channel] = 0.0
@@ -130,9 +130,9 @@ class Stepped:
     channel: int
     codes: int
 
-    def __call__(self, _tick: int, values: list[float]) -> None:
+    def __call__(self, _tick: int, values: list[float], channels: Channels) -> None:
         """Round the reading."""
-        step = self.codes * CHANNELS[self.channel].lsb
+        step = self.codes * channels[self.channel].lsb
         values[self.channel] = step * round(values[self.channel] / step)
 
 
@@ -144,11 +144,11 @@ class Spikes:
     every: int
     share: float
 
-    def __call__(self, tick: int, values: list[float]) -> None:
+    def __call__(self, tick: int, values: list[float], channels: Channels) -> None:
         """Add a spike when its tick has come."""
         if tick % self.every == self.every - 1:
             sign = 1.0 if tick // self.every % 2 else -1.0
-            values[self.channel] += sign * self.share * CHANNELS[self.channel].full_scale
+            values[self.channel] += sign * self.share * channels[self.channel].full_scale
 
 
 @dataclass(slots=True)
@@ -159,7 +159,7 @@ class Hum:
     per_tick: float
     share: float
 
-    def __call__(self, tick: int, values: list[float]) -> None:
+    def __call__(self, tick: int, values: list[float], channels: Channels) -> None:
         """Add the sine."""
         sine = math.sin(2.0 * math.pi * self.per_tick * tick)
-        values[self.channel] += self.share * CHANNELS[self.channel].full_scale * sine
+        values[self.channel] += self.share * channels[self.channel].full_scale * sine

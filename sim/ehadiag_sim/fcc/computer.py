@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import POSITION
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import BitReason, BitState, CommandMode
 from ehadiag.core.stored_test import StoredTest
@@ -20,6 +19,7 @@ from firmware_iface.codec.encode import Encoder
 from firmware_iface.codec.live_decode import LiveDecoder
 from firmware_iface.codec.live_messages import Request
 from firmware_iface.mapping.bus_map import BusMap, default_map
+from firmware_iface.mapping.scales import scales_of
 from firmware_iface.transport.frames import Frame
 
 __all__ = ["FccCore", "Preconditions"]
@@ -83,8 +83,8 @@ class FccCore:
     Raises
     ------
     ConfigurationError
-        Two tests with one number, a test at another rate than the controller, a serial number
-        that the bus cannot carry.
+        Two tests with one number, a test at another rate than the controller; a serial number,
+        a converter's range or the rated current that the bus cannot carry.
     """
 
     def __init__(
@@ -114,7 +114,8 @@ class FccCore:
         self._demands = preconditions or Preconditions()
         self._idle_telemetry = idle_telemetry
         bus_map = bus_map or default_map()
-        self._encoder = Encoder(bus_map)
+        self._scales = scales_of(bus_map, actuator)
+        self._encoder = Encoder(bus_map, self._scales.channels)
         self._decoder = LiveDecoder(bus_map)
         self._rate = actuator.controller.rate
         self.period_ns = round(1e9 / self._rate)
@@ -205,7 +206,8 @@ class FccCore:
     def _objection(self, test_id: int) -> BitReason:
         demands = self._demands
         supply, drain, degc = self._plant.probed
-        position = float(POSITION.decode(np.asarray(self._plant.codes[3:]))[0])
+        codes = np.asarray(self._plant.codes[3:])
+        position = float(self._scales.channels.position.decode(codes)[0])
         checks = (
             (self._state in (BitState.ARMING, BitState.RUNNING), BitReason.ALREADY_RUNNING),
             (test_id not in self._tests, BitReason.UNKNOWN_TEST),
@@ -276,6 +278,7 @@ class FccCore:
             self._sensors,
             seed,
             channel_faults=self._channel_faults,
+            scales=self._scales,
         )
 
 

@@ -10,21 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS
+from ehadiag.core.channels import CHANNELS, Channels
 from ehadiag_sim.plant.conditions import Sensors, Strangers
 
 __all__ = ["ChannelFault", "Converters"]
-
-LSB = np.array([channel.lsb for channel in CHANNELS])
-HALF = np.array([1 << (channel.bits - 1) for channel in CHANNELS])
-TOP = 2 * HALF - 1
 
 
 class ChannelFault(Protocol):
     """Damage to sensors or wires."""
 
-    def __call__(self, tick: int, values: list[float], /) -> None:
-        """Change the four readings of a tick in place: A, m, Pa, m."""
+    def __call__(self, tick: int, values: list[float], channels: Channels, /) -> None:
+        """Change the four readings of a tick in place: A, m, Pa, m; by shares of the ranges."""
 
 
 class Converters:
@@ -42,6 +38,8 @@ class Converters:
         Of the noise.
     faults : Sequence[ChannelFault]
         Damage to sensors and wires, in turn; copied.
+    channels : Channels
+        Ranges and steps.
     """
 
     def __init__(
@@ -51,7 +49,12 @@ class Converters:
         strangers: Strangers,
         seed: int,
         faults: Sequence[ChannelFault] = (),
+        channels: Channels = CHANNELS,
     ) -> None:
+        self._channels = channels
+        self._lsb = np.array([channel.lsb for channel in channels])
+        self._half = np.array([channel.half for channel in channels])
+        self._top = 2 * self._half - 1
         self._noise_lsb = sensors.noise_lsb
         self._offsets = np.array(sensors.offsets_lsb)
         self._gains = 1.0 + np.array(sensors.gains)
@@ -81,7 +84,7 @@ class Converters:
 
     def read(self, seen: tuple[float, float, float, float]) -> NDArray[np.float64]:
         """Current (A), spool (m), pressure (Pa), jack (m) as read without noise, shape (4,)."""
-        return self._curved(seen) + self._offsets * LSB
+        return self._curved(seen) + self._offsets * self._lsb
 
     def digitise(self, seen: tuple[float, float, float, float]) -> NDArray[np.int64]:
         """ADC codes of the four channels, shape (4,); the noise goes on from call to call."""
@@ -89,10 +92,10 @@ class Converters:
         readings = self._curved(seen)
         if self._faults:
             readings = self._damaged(readings)
-        volts = readings + (self._offsets + noise) * LSB
+        volts = readings + (self._offsets + noise) * self._lsb
         # `Channel.encode` for the four at once: the emulator does this a thousand times a second.
-        codes = np.floor(volts / LSB + 0.5).astype(np.int64) + HALF
-        return np.minimum(np.maximum(codes, 0), TOP)
+        codes = np.floor(volts / self._lsb + 0.5).astype(np.int64) + self._half
+        return np.minimum(np.maximum(codes, 0), self._top)
 
     def _curved(self, seen: tuple[float, float, float, float]) -> NDArray[np.float64]:
         values = np.array(seen)
@@ -103,6 +106,6 @@ class Converters:
     def _damaged(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         values: list[float] = readings.tolist()
         for fault in self._faults:
-            fault(self._ticks, values)
+            fault(self._ticks, values, self._channels)
         self._ticks += 1
         return np.array(values)

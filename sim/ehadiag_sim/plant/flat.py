@@ -18,7 +18,8 @@ from ehadiag.compile.address import array_at
 from ehadiag.compile.kernels import brief_kernel
 from ehadiag.compile.rows import packer, unpacker
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS
+from ehadiag.core.channels import SCALES
+from ehadiag.core.conversion import actuator_channels
 from ehadiag_sim.fcc.controller import PositionLaw, position_law
 from ehadiag_sim.plant import coefficients as laws
 from ehadiag_sim.plant.coefficients import Coefficients, Condition, UnitData, unit_data
@@ -145,16 +146,17 @@ MEMORY: Final = CONTROL + 2
 """Numbers that the unit keeps: coefficients, state, plays, integral and error of the controller."""
 
 PLAN_LAW = len(UnitData._fields)
-PLAN_SIZE: Final = PLAN_LAW + len(PositionLaw._fields)
+PLAN_LSB = PLAN_LAW + len(PositionLaw._fields)
+PLAN_HALF = PLAN_LSB + 4
+PLAN_SIZE: Final = PLAN_HALF + 4
+"""Of the plan: data, control law, steps of the converters, their codes of zero."""
 
 _condition_of, _settings_of = unpacker(Condition), unpacker(Settings, SETTINGS)
 _data_of, _law_of = unpacker(UnitData), unpacker(PositionLaw, PLAN_LAW)
 _coefficients_of, _keep_coefficients = unpacker(Coefficients), packer(Coefficients)
 _keep_outputs = packer(Outputs, OUTPUTS)
 NUMBER = 8
-LSB = tuple(channel.lsb for channel in CHANNELS)
-HALF = tuple(float(1 << (channel.bits - 1)) for channel in CHANNELS)
-RESOLUTION = (0.5e-6, 2e-6)
+RESOLUTION = (SCALES.current_step, SCALES.position_step)
 """Of commands on the bus, A and m."""
 
 
@@ -180,7 +182,9 @@ def plant_plan(actuator: Actuator) -> list[float]:
     """What the kernels need of an actuator's data, PLAN_SIZE numbers."""
     law = actuator.controller
     gains = PositionLaw(law.IM, law.GAP, law.GAI, law.GAD, 1.0 / law.rate)
-    return [float(value) for value in (*unit_data(actuator), *gains)]
+    channels = actuator_channels(actuator)
+    steps = (*(item.lsb for item in channels), *(item.half for item in channels))
+    return [float(value) for value in (*unit_data(actuator), *gains, *steps)]
 
 
 @_compiled
@@ -190,15 +194,16 @@ def _digitised(value: float, gain: float, offset: float, lsb: float, half: float
 
 
 @_compiled
-def _show(values: Any, current: float, state: Any) -> None:
+def _show(values: Any, current: float, state: Any, plan: Any) -> None:
     s = _settings_of(values)
+    lsb, half = plan[PLAN_LSB:PLAN_HALF], plan[PLAN_HALF:PLAN_SIZE]
     _keep_outputs(
         values,
         Outputs(
-            _digitised(current, s.gain_current, s.offset_current, LSB[0], HALF[0]),
-            _digitised(state[XS_SEEN], s.gain_spool, s.offset_spool, LSB[1], HALF[1]),
-            _digitised(state[P12_SEEN], s.gain_pressure, s.offset_pressure, LSB[2], HALF[2]),
-            _digitised(state[XJ], s.gain_position, s.offset_position, LSB[3], HALF[3]),
+            _digitised(current, s.gain_current, s.offset_current, lsb[0], half[0]),
+            _digitised(state[XS_SEEN], s.gain_spool, s.offset_spool, lsb[1], half[1]),
+            _digitised(state[P12_SEEN], s.gain_pressure, s.offset_pressure, lsb[2], half[2]),
+            _digitised(state[XJ], s.gain_position, s.offset_position, lsb[3], half[3]),
             current,
             state[XS],
             state[P12],
@@ -245,10 +250,11 @@ def start_plant(address: int, plan_address: int, values_address: int) -> int:
         return 1
     for i in range(MEMORY):
         memory[i] = 0.0
-    data = _data_of(array_at(plan_address, (PLAN_SIZE,)))
+    plan = array_at(plan_address, (PLAN_SIZE,))
+    data = _data_of(plan)
     _keep_coefficients(memory, _scaled(data, c))
     memory[CONTROL + 1] = math.nan
-    _show(values, 0.0, array_at(address + NUMBER * STATE, (STATES,)))
+    _show(values, 0.0, array_at(address + NUMBER * STATE, (STATES,)), plan)
     return 0
 
 
@@ -271,7 +277,8 @@ def tick_plant(address: int, plan_address: int, values_address: int) -> int:
         0; 1: the command is no number.
     """
     memory, values = array_at(address, (MEMORY,)), array_at(values_address, (VALUES,))
-    law = _law_of(array_at(plan_address, (PLAN_SIZE,)))
+    plan = array_at(plan_address, (PLAN_SIZE,))
+    law = _law_of(plan)
     state = array_at(address + NUMBER * STATE, (STATES,))
     s, p = _settings_of(values), _coefficients_of(memory)
     command = values[INPUTS]
@@ -294,5 +301,5 @@ def tick_plant(address: int, plan_address: int, values_address: int) -> int:
         total += memory[HELD + i]
     substeps = math.ceil(law.tick / DEFAULT_STEP - 1e-6)
     advance(state, p, p.GM * total / count, law.tick / substeps, substeps)
-    _show(values, current, state)
+    _show(values, current, state, plan)
     return 0

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS, POSITION
+from ehadiag.core.channels import CHANNELS, SCALES, Channels, Scales, Stated
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import (
     BitState,
@@ -38,9 +39,6 @@ __all__ = [
     "simulate",
 ]
 
-COMMAND_STEP = {CommandMode.CURRENT: 0.5e-6, CommandMode.POSITION: 2e-6}
-"""Resolution of commands (A, m): the computer acts on what its bus shows (`ServoCommand`)."""
-
 
 class Plant:
     """One actuator with its converters and control law, at rest in the middle to begin with.
@@ -64,6 +62,9 @@ class Plant:
         Integration step, s.
     channel_faults : Sequence[ChannelFault]
         Damage to the readings of the channels; None: none.
+    scales : Scales | None
+        Converters, and resolution of commands; None: the converters of the actuator's file, the
+        resolution of the default bus.
 
     Raises
     ------
@@ -82,7 +83,9 @@ class Plant:
         *,
         step: float = DEFAULT_STEP,
         channel_faults: Sequence[ChannelFault] = (),
+        scales: Scales | None = None,
     ) -> None:
+        self._scales = scales or Scales(actuator_channels(actuator))
         sensors, effects = sensors or Sensors(), effects or Effects()
         self._dynamics = Dynamics(
             actuator,
@@ -92,7 +95,9 @@ class Plant:
             filter_time=sensors.filter_time,
             early=sensors.early,
         )
-        self._converters = Converters(actuator, sensors, effects.strangers, seed, channel_faults)
+        self._converters = Converters(
+            actuator, sensors, effects.strangers, seed, channel_faults, self._scales.channels
+        )
         self._effects, self._sensors = effects, sensors
         self._controller = PositionController(actuator.controller)
         self._current = 0.0
@@ -103,13 +108,17 @@ class Plant:
 
         `command` in A (current mode) or m (position mode), taken at the bus's resolution.
         """
-        resolution = COMMAND_STEP[mode]
-        command = round(command / resolution) * resolution
-        measured = float(POSITION.decode(self._codes[3:])[0])
+        command = _rounded(command, _resolution(self._scales, mode))
+        measured = float(self._scales.channels.position.decode(self._codes[3:])[0])
         self._current = self._controller.current(command, mode, measured)
         self._dynamics.advance(self._current)
         self._codes = self._converters.digitise(self._dynamics.seen)
         return self._codes
+
+    @property
+    def scales(self) -> Scales:
+        """Converters, and resolution of commands."""
+        return self._scales
 
     @property
     def codes(self) -> NDArray[np.int64]:
@@ -157,6 +166,8 @@ class SimulatedRun:
         ADC codes of the four channels as sampled in each tick, shape (4, ticks).
     environment : Environment
         What the probes read half-way through the test, at the bus's resolution.
+    channels : Channels
+        Converters that made the codes.
     """
 
     test: StoredTest
@@ -168,14 +179,15 @@ class SimulatedRun:
     position: NDArray[np.float64]
     codes: NDArray[np.int64]
     environment: Environment
+    channels: Channels = CHANNELS
 
     @property
     def samples(self) -> Samples:
         """The samples as a bus without losses delivers them; time stamps from zero."""
         decoded = [
-            channel.decode(codes) for channel, codes in zip(CHANNELS, self.codes, strict=True)
+            channel.decode(codes) for channel, codes in zip(self.channels, self.codes, strict=True)
         ]
-        ends = np.array([(1 << channel.bits) - 1 for channel in CHANNELS])[:, None]
+        ends = np.array([2 * channel.half - 1 for channel in self.channels])[:, None]
         period_ns = round(1e9 / self.test.rate)
         return Samples(
             period_ns=period_ns,
@@ -187,6 +199,7 @@ class SimulatedRun:
             command=self.command.copy(),
             saturated=(self.codes == 0) | (self.codes == ends),
             host_ns=np.arange(1, self.test.ticks + 1, dtype=np.int64) * period_ns,
+            stated=tuple(Stated(-c.full_scale, c.full_scale - c.lsb, c.lsb) for c in self.channels),
         )
 
     def recording(self, source: str, serial: int | None = None) -> Recording:
@@ -206,7 +219,7 @@ class SimulatedRun:
             environment=self.environment,
             quality=Quality(
                 messages={"ServoTelemetry": perfect, "ServoCommand": perfect},
-                saturated={c.name: int(n) for c, n in zip(CHANNELS, counts, strict=True)},
+                saturated={c.name: int(n) for c, n in zip(self.channels, counts, strict=True)},
             ),
         )
 
@@ -221,6 +234,7 @@ def simulate(
     seed: int = 0,
     step: float = DEFAULT_STEP,
     channel_faults: Sequence[ChannelFault] = (),
+    scales: Scales | None = None,
 ) -> SimulatedRun:
     """Run a stored test from rest; the same seed gives the same run.
 
@@ -245,6 +259,8 @@ def simulate(
         Integration step, s.
     channel_faults : Sequence[ChannelFault]
         Damage to the readings of the channels; None: none.
+    scales : Scales | None
+        Converters, and resolution of commands, as `Plant` takes them.
 
     Returns
     -------
@@ -263,9 +279,16 @@ def simulate(
         )
     effects = effects or Effects()
     plant = Plant(
-        actuator, faults, effects, sensors, seed, step=step, channel_faults=channel_faults
+        actuator,
+        faults,
+        effects,
+        sensors,
+        seed,
+        step=step,
+        channel_faults=channel_faults,
+        scales=scales,
     )
-    command, mode = bus_command(test), _mode(test)
+    command, mode = bus_command(test, plant.scales), _mode(test)
     truth = np.empty((4, test.ticks))
     codes = np.empty((4, test.ticks), dtype=np.int64)
     probed = plant.probed
@@ -284,16 +307,19 @@ def simulate(
         position=truth[3],
         codes=codes,
         environment=_on_the_bus(*probed),
+        channels=plant.scales.channels,
     )
 
 
-def bus_command(test: StoredTest) -> NDArray[np.float64]:
+def bus_command(test: StoredTest, scales: Scales = SCALES) -> NDArray[np.float64]:
     """Command of each tick as the control computer holds it, SI (A or m), shape (ticks,).
 
     It has the resolution of the bus signal. The reference recordings show this: their currents
     follow the rounded command, and 2 µm of it are 0.6 LSB of current.
     """
-    step = COMMAND_STEP[_mode(test)]
+    step = _resolution(scales, _mode(test))
+    if step == 0.0:
+        return test.command()
     rounded: NDArray[np.float64] = np.rint(test.command() / step) * step
     return rounded
 
@@ -309,3 +335,12 @@ def _on_the_bus(supply: float, drain: float, degc: float) -> Environment:
 
 def _mode(test: StoredTest) -> CommandMode:
     return CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+
+
+def _resolution(scales: Scales, mode: CommandMode) -> float:
+    """Return that of commands, A or m: the computer acts on what its bus shows (BUS-8)."""
+    return scales.current_step if mode is CommandMode.CURRENT else scales.position_step
+
+
+def _rounded(command: float, step: float) -> float:
+    return command if step == 0.0 else round(command / step) * step

@@ -48,6 +48,11 @@ def test_what_cannot_be_diagnosed_cannot_be_learned_from():
     assert "no telemetry" in refusal([recording("open"), bad])[0]
 
 
+def test_a_recording_counts_once():
+    both = [recording("open"), recording("open")]
+    assert "name each test once" in refusal(both)[0]
+
+
 def test_only_a_calibrated_unit_can_be_updated():
     found = update([recording("open")], default_actuator(), TESTS.values())
     assert "not calibrated" in found.reasons[0]

@@ -71,3 +71,31 @@ def test_listening_needs_a_status_and_says_so_at_once(run: Run, tmp_path: Path) 
     came = run("bit", "--listen", "--test", "open", "--mapping", path, "-i", "virtual", "-c", "x")
     assert came.code == 2
     assert "has no status.state" in came.err
+
+
+def test_the_bus_of_a_context_of_python_cans_file(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "can.conf"
+    file.write_text("[default]\ninterface = virtual\nchannel = low\n[HS]\nchannel = high\n")
+    monkeypatch.setattr("can.util.CONFIG_FILES", [str(file)])
+    for options, channel in (([], "low"), (["--context", "HS"], "high")):
+        result = run("check-bus", *options, "--duration", "0.05")
+        assert result.out.startswith(f"listened to virtual {channel} for ")
+    result = run("check-bus", "--context", "MS")
+    assert (result.code, "no section [MS]" in result.message) == (2, True)
+
+
+def test_a_picture_of_what_was_heard(run: Run, tmp_path: Path) -> None:
+    log = LOGS / "paper-closed-1.blf"
+    came = run("check-bus", "--log", log, "--plot", "bus.png")
+    assert (came.code, came.err) == (0, "ehadiag: wrote bus.png\n")
+    assert (tmp_path / "bus.png").read_bytes().startswith(b"\x89PNG")
+    came = run("check-bus", "--log", log, "--plot", "none/bus.png")
+    assert (came.code, "picture none/bus.png: " in came.message) == (3, True)
+    empty = tmp_path / "empty.log"
+    empty.write_text("(1.0) can0 7FF#00\n")
+    came = run("check-bus", "--log", empty, "--plot", "nothing.png")
+    assert came.code == 30
+    assert "nothing is drawn" in came.message
+    assert not (tmp_path / "nothing.png").exists()

@@ -73,6 +73,10 @@ def test_files_are_looked_for_beside_the_users_own_defaults(run: Run, own: Path)
         ("seed = [\n", "not valid TOML"),
         ("out = 'x'\n", "out is not for a project's file"),
         ("max_frames = 3\n", "max_frames is not for a project's file"),
+        ("jbos = 2\n", "jbos is no option of any command, did you mean jobs?"),
+        ("[diagnos]\njobs = 2\n", "[diagnos] is no command, did you mean [diagnose]?"),
+        ("[bit]\njobs = 2\n", "[bit] jobs is no option of bit"),
+        ("[diagnose]\nsolvr = 'cga'\n", "solvr is no option of diagnose, did you mean solver?"),
     ],
 )
 def test_wrong_defaults(text: str, why: str, run: Run, tmp_path: Path) -> None:
@@ -81,6 +85,94 @@ def test_wrong_defaults(text: str, why: str, run: Run, tmp_path: Path) -> None:
     assert result.code == 2
     assert why in result.message
     assert "ehadiag.toml" in result.message
+
+
+def test_unknown_keys_of_the_users_own_file_are_refused_too(run: Run, own: Path) -> None:
+    own.write_text("jbos = 2\n")
+    result = run("tests")
+    assert result.code == 2
+    assert f"{own}: jbos is no option of any command, did you mean jobs?" in result.message
+
+
+def test_an_option_may_be_called_like_a_command(run: Run, own: Path) -> None:
+    own.write_text('history = "none.sqlite"\nreport = true\n')
+    assert "no history none.sqlite" in run("history", "list").message
+    assert "is a command" not in run("report", "none.json").err
+
+
+def test_a_variable_that_is_no_option_is_said(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EHADIAG_JBOS", "2")
+    result = run("tests")
+    assert result.code == 0
+    assert result.message == (
+        "ehadiag: variable EHADIAG_JBOS: there is no option --jbos; EHADIAG_JOBS?"
+    )
+
+
+def test_verbs_and_options_that_exclude_each_other_have_defaults(
+    run: Run, own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("history", "init", "--history", "h.sqlite")
+    monkeypatch.setenv("EHADIAG_SERIAL", "7")
+    own.write_text('[history]\nhistory = "h.sqlite"\n[export]\nfmu = true\nlist = false\n')
+    result = run("history", "plot", "--out", "x.png")
+    assert "serial 7: no diagnosis with severities" in result.message
+    assert run("history", "event", "oiled").code == 0
+    assert run("history", "list", "--json").objects[0]["serial"] == 7
+    assert run("history", "--history", "none.sqlite", "list").code == 2
+    assert "need --out DIR" in run("export").message
+    assert run("export", "--list").code == 0
+    monkeypatch.setenv("EHADIAG_TARGET", "nothing-like-it")
+    assert "nothing-like-it" in run("export", "--out", "x").err  # the variable is nearer
+    assert run("export", "--list").code == 0
+    assert "another-one" in run("export", "--target", "another-one", "--out", "x").err
+
+
+TRANSMITTING = {
+    "bit": ("no bus named", 'interface = "virtual"\nchannel = "x"\n', ["--test", "open"]),
+    "sim": ("no bus named", 'interface = "virtual"\n', []),
+    "serve": ("no bus named", 'interface = "virtual"\n', ["--allow-tests"]),
+    "replay": ("no bus named", 'interface = "virtual"\nchannel = "x"\n', [HEALTHY]),
+}
+
+
+@pytest.mark.parametrize("command", TRANSMITTING)
+def test_a_project_makes_nobody_transmit(
+    command: str, run: Run, own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    why, text, more = TRANSMITTING[command]
+    for content in (text, f"[{command}]\n{text}"):
+        (tmp_path / "ehadiag.toml").write_text(content)
+        result = run(command, *more)
+        assert result.code == 2
+        assert f"ignored: {command} can transmit" in result.err
+        assert "interface" in result.err.splitlines()[0]
+        assert why in result.err
+    # What the user says, in a file or a variable of his own, counts.
+    (tmp_path / "ehadiag.toml").unlink()
+    if command == "serve":  # would begin to serve
+        return
+    own.write_text('interface = "none-such"\n')
+    assert "none-such" in run(command, *more).err
+    monkeypatch.setenv("EHADIAG_INTERFACE", "nor-this")
+    assert "nor-this" in run(command, *more).err
+
+
+def test_a_project_starts_no_test(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "ehadiag.toml").write_text('test = "open"\nlimit = 0.8\n')
+    result = run("bit", "--simulate", "--fast")
+    assert result.code == 2
+    assert "test ignored: bit can transmit" in result.err
+    assert "required: --test" in result.err
+    result = run("bit", "--simulate", "--fast", "--test", "open", "--json", "--no-picture")
+    assert result.objects[0]["verdict"] == "HEALTHY"
+    assert result.objects[0]["configuration"]["levels"]["limit"] == 0.8
+
+
+def test_who_only_listens_takes_the_bus_of_a_project(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "ehadiag.toml").write_text('interface = "none-such"\n')
+    for command in ("check-bus", "monitor"):
+        assert "none-such" in run(command).err
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")

@@ -143,6 +143,14 @@ def test_plot_draws_a_picture(run: Run) -> None:
     assert Path("h.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+def test_the_largest_serial(run: Run) -> None:
+    largest = (1 << 63) - 1
+    run("history", "init", *GOOD)
+    assert run("history", "event", "--serial", largest, "oiled", *GOOD).code == 0
+    listed = run("history", "list", "--serial", largest, "--json", *GOOD).objects
+    assert [item["serial"] for item in listed] == [largest]
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
@@ -166,6 +174,11 @@ def test_plot_draws_a_picture(run: Run) -> None:
         ),
         (("history", "event", "--serial", "5", "a", "--when", "x", *GOOD), 2, "8601"),
         (("history", "export", "--out", "no/x.csv", *GOOD), 3, "No such file"),
+        (("history", "list", "--serial", "9" * 20, *GOOD), 2, "serial number is a whole number"),
+        (("history", "list", "--serial", 1 << 63, *GOOD), 2, "0 … 9223372036854775807"),
+        (("history", "event", "--serial", "-1", "a", *GOOD), 2, "whole number"),
+        (("history", "event", "--serial", "9" * 5000, "a", *GOOD), 2, "whole number"),
+        (("rul", "--serial", "9" * 20, *GOOD), 2, "serial number is a whole number"),
     ],
 )
 def test_wrong_usage_is_one_line(

@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 from cli_result import Run
 from places import LOGS, ROOT
+from two_actuators import write_log, write_mappings
 
 from ehadiag.cli.batch.row import COLUMNS
 from ehadiag.cli.batch.summary import Summary, worst_code
@@ -138,16 +139,51 @@ def test_a_call_goes_on_where_another_stopped(folder: Path, run: Run) -> None:
     assert again.code == 10
 
 
-def test_results_of_other_options_are_not_taken(folder: Path, run: Run) -> None:
+def test_results_of_other_options_are_found_anew(folder: Path, run: Run) -> None:
     run("diagnose", "--resume", "r.jsonl", "rig/a.blf")
+    result = run("diagnose", "--resume", "r.jsonl", "--seed", 1, "--summary", "s.json", "rig/a.blf")
+    assert "1 of an earlier call do not count here" in result.err
+    assert "another seed (1)" in result.err
+    assert json.loads(Path("s.json").read_text())["reused"] == 0
+    (line,) = Path("r.jsonl").read_text().splitlines()
+    assert json.loads(line)["configuration"]["seed"] == 1
     before = Path("r.jsonl").read_bytes()
-    result = run("diagnose", "--resume", "r.jsonl", "--seed", 1, "rig/a.blf")
-    assert result.code == 2
-    assert "found with other options" in result.message
     result = run("diagnose", "--results", "r.jsonl", "rig/a.blf")
     assert result.code == 3
     assert "--resume" in result.err
     assert Path("r.jsonl").read_bytes() == before
+
+
+DECISIVE = (
+    (["--start", 0.5], "another start (--start) (1)"),
+    (["--end", 9.0], "another end (--end) (1)"),
+    (["--test", "mine.toml"], "another test file (1)"),
+    (["--mapping", "bus.toml"], "another mapping (1)"),
+    (["--actuator", "unit.toml"], "another actuator (1)"),
+    (["--tolerance", 0.05, "--seed", 3], "another seed and actuator (1)"),
+    (["--limit", 0.8], "another level of verdicts (1)"),
+    (["--time-limit", 99], "another time limit (1)"),
+)
+
+
+def test_whatever_decides_a_result_decides_whether_it_is_taken(run: Run) -> None:
+    (tree,) = run("diagnose", "--json", HEALTHY).objects
+    log = Path("d.blf")
+    log.write_bytes(b"no recording")
+    for name, package, source, word in (
+        ("mine.toml", "ehadiag", "tests/open.toml", ("0.7, 1.5", "0.7, 1.6")),
+        ("unit.toml", "ehadiag", "actuator.toml", ("MJ  = 150", "MJ  = 151")),
+        ("bus.toml", "firmware_iface", "eha_fcc.toml", ("tick_ms = 1.0", "tick_ms = 1.5")),
+        ("eha_fcc.dbc", "firmware_iface", "eha_fcc.dbc", ("", "")),
+    ):
+        text = resources.files(package).joinpath("data", source).read_text()
+        Path(name).write_text(text.replace(*word))
+    earlier = json.dumps(tree) + "\n"
+    for options, why in DECISIVE:
+        Path("r.jsonl").write_text(earlier)
+        assert why in run("diagnose", "--resume", "r.jsonl", *options, log).err
+    Path("r.jsonl").write_text(earlier)
+    assert "another" not in run("diagnose", "--resume", "r.jsonl", log).err
 
 
 @pytest.mark.parametrize(
@@ -204,13 +240,16 @@ def test_the_page_works_as_typed(run: Run, tmp_path: Path, monkeypatch: pytest.M
         shutil.copy(log, tmp_path / "recordings")
     page = (ROOT / "docs" / "how-to" / "many-recordings.md").read_text()
     commands = re.findall(r"```sh\n(.*)\n```", page)
-    assert len(commands) == 4
+    assert len(commands) == 5
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"recordings/{WORN.name}\n"))
     for command in commands[:3]:
         _, _, typed = command.rpartition("| ")
         program, *arguments = shlex.split(typed)
         assert program == "ehadiag"
         assert run(*arguments).code == 10
+    write_mappings(tmp_path)
+    write_log(tmp_path / "both.blf", HEALTHY, WORN)
+    assert run(*shlex.split(commands[3])[1:]).code == 10
     names = ("all.jsonl", "all.csv", "report.xml", "summary.json")
     assert all(Path(name).stat().st_size for name in names)
     assert len(Path("all.jsonl").read_text().splitlines()) == 2

@@ -176,7 +176,15 @@ def test_closed_loop_with_lost_positions_is_judged_up_to_a_stated_share(
         assert came.verdict is Verdict.DEGRADED
     else:
         assert came.verdict is Verdict.NOT_TESTED
-        assert came.reasons == (
+        (reason,) = came.reasons
+        assert reason.startswith(
             "5.0% of the jack positions that the control law worked on are lost (limit 1.5%): "
-            "the servovalve current cannot be rebuilt",
+            "the servovalve current cannot be rebuilt: Kintas, FSS not observable, but FDJ "
         )
+        assert came.identification is not None
+        clogging, friction, jack = came.identification.estimates
+        assert clogging.interval95 == friction.interval95 == (0.0, 1.0)
+        assert not clogging.shown
+        assert jack.shown
+        assert jack.interval95[0] < 0.3 < jack.interval95[1]
+        assert jack.interval95[1] - jack.interval95[0] < 0.05

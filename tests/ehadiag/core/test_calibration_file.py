@@ -47,6 +47,7 @@ def test_nothing_is_lost_in_the_file(tmp_path):
         ({"root": ((1.0,), (1.0, 0.0), (0.0, 0.0, 1.0))}, "above 0"),
         ({"parameters": ("null_bias", "null_bias", "datum_KF")}, "stands twice"),
         ({"std": (1e-7, -1e-5, 0.01)}, "std"),
+        ({"effects": {"backlash": 1e-6}}, "backlash not among"),
     ],
 )
 def test_a_covariance_that_is_none_is_refused(tmp_path, changes, text):

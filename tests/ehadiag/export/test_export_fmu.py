@@ -1,9 +1,12 @@
 """Co-simulation units in FMPy, against the simulator and the monitor of the package."""
 
+import importlib.util
+import json
 import math
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,3 +147,60 @@ def test_without_a_compiler_it_says_so(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(ConfigurationError, match="no C compiler"):
         export_fmus(default_actuator(), None)
+
+
+def in_ecos(path, parameters, inputs, outputs):
+    """What Ecos, the second importer, reads; its library stays in a process of its own."""
+    there = importlib.util.find_spec("ecospy") is not None
+    if not there or not Path(sys.prefix, "lib", "libtbb.so.12").exists():
+        pytest.skip("no ecospy with its tbb here")
+    told = json.dumps([str(path), parameters, inputs, outputs])
+    done = subprocess.run(
+        [sys.executable, "-c", ECOS], input=told, capture_output=True, text=True, check=True
+    )
+    (found,) = (line for line in done.stdout.splitlines() if line.startswith("[["))
+    return np.array(json.loads(found))
+
+
+ECOS = """
+import ctypes, json, pathlib, sys
+# The library of Ecos needs one that its package does not bring.
+ctypes.CDLL(str(pathlib.Path(sys.prefix, "lib", "libtbb.so.12")), mode=ctypes.RTLD_GLOBAL)
+from ecospy import EcosSimulation, EcosSimulationStructure
+path, parameters, inputs, outputs = json.load(sys.stdin)
+structure = EcosSimulationStructure()
+structure.add_model("unit", path)
+structure.add_parameter_set("told", {f"unit::{name}": value for name, value in parameters.items()})
+with EcosSimulation(structure=structure, step_size=1e-3) as run:
+    run.init(parameter_set="told")
+    found = []
+    for values in inputs:
+        for name, value in values.items():
+            run.set_real(f"unit::{name}", value)
+        run.step(1)
+        found.append([run.get_real(f"unit::{name}") for name in outputs])
+    print(json.dumps(found))
+"""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_second_importer_reads_the_same_digits(units, tmp_path, name):
+    if "actuator" in name:
+        parameters = {"Kintas": 0.2, "FDJ": 0.5, "supply_pressure": 20e6}
+        outputs = ["spool", "true_pressure", "true_position"]
+        inputs = [{"command": 8e-3 * math.sin(0.1 * tick)} for tick in range(150)]
+    else:
+        parameters = dict.fromkeys(("Kintas", "FSS"), 0.1)
+        outputs = ["predicted_spool", "residual_pressure", "alarms"]
+        named = ("command", "current", "spool", "pressure", "position")
+        ticks = ticks_of(read_recording(LOGS / "paper-open-1.blf"))[700:850]
+        inputs = [dict(zip(named, row, strict=True)) for row in ticks.tolist()]
+    ours = Running(units / f"{name}.fmu", tmp_path / "unit", parameters)
+    own = []
+    for values in inputs:
+        ours.put(values)
+        ours.step()
+        own.append(ours.read(*outputs))
+    theirs = in_ecos(units / f"{name}.fmu", parameters, inputs, outputs)
+    assert np.array(own).tobytes() == theirs.tobytes()
+    assert np.ptp(theirs[:, 0]) > 0.0

@@ -204,3 +204,12 @@ def test_no_file_is_no_history(tmp_path: Path) -> None:
 def test_hours_are_numbers(hours: float) -> None:
     with pytest.raises(ConfigurationError, match="hours"):
         Usage(hours)
+
+
+def test_a_number_beyond_64_bits_is_said(tmp_path: Path) -> None:
+    with History(tmp_path / "h", create=True) as history:
+        with pytest.raises(InputOutputError, match="beyond what SQLite holds"):
+            history.append(an_entry(1 << 63))
+        assert history.entries() == []
+        with pytest.raises(InputOutputError, match="beyond what SQLite holds"):
+            history.events(1 << 64)

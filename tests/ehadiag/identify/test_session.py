@@ -12,7 +12,6 @@ from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import Samples
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.search.solvers import CompactGa
 from ehadiag.identify.search.stages import STAGES, first_ends_at, stage_ends_at
 from ehadiag.identify.session import Session, identify
 from ehadiag_sim.plant.conditions import Faults
@@ -116,7 +115,7 @@ def test_stages_follow_the_second_part():
 
 def test_other_samples_are_not_answered_from_memory():
     experiment = own_experiment(FAULTS)
-    session = Session(CompactGa(budget=128))
+    session = Session()
     session.feed([experiment])
     assert session.reused == 0
     experiment.spool[4200] += 1e-6  # after the first stage's window, in the others

@@ -41,7 +41,6 @@ def linear_problem(seed, noise):
         weighted=used,
         evaluations=0,
         converged=True,
-        jagged=False,
         anchored=0,
     )
 

@@ -5,13 +5,21 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from places import LOGS
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.model.plant import plant_constants
 from ehadiag.monitor.cusum import design_cusum
 from ehadiag.monitor.plan import monitor_plan
-from ehadiag.onboard.elementary import cosine, logarithm, normal_below
+from ehadiag.onboard.elementary import (
+    cosine,
+    logarithm,
+    normal_below,
+    round_down,
+    round_even,
+)
 from ehadiag.onboard.kernels import begin_identification, identify_some
 from ehadiag.onboard.layout import SIZE, Outcome
 from ehadiag_tools.onboard.replay import ticks_of, unit_of
@@ -88,6 +96,12 @@ def test_logarithm(x):
 @pytest.mark.parametrize("x", np.linspace(-12.0, 12.0, 49).tolist())
 def test_cosine(x):
     assert cosine(x) == pytest.approx(math.cos(x), abs=1e-13)
+
+
+@given(st.floats(allow_nan=False) | st.integers(-(2**40), 2**40).map(lambda n: n / 2.0))
+def test_rounding_is_that_of_the_c_library(x):
+    for own, library in ((round_even, np.rint), (round_down, np.floor)):
+        assert np.float64(own(x)).tobytes() == library(np.float64(x)).tobytes()
 
 
 @pytest.mark.parametrize("z", np.linspace(-6.0, 6.0, 25).tolist())

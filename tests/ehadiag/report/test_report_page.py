@@ -7,60 +7,23 @@ import hashlib
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from typing import Any
 
 import pytest
 from history_cases import an_entry, an_event
 from places import LOGS
+from report_html import Page
 
 import ehadiag
 from ehadiag.assess.verdict import Levels
 from ehadiag.prognosis.unit import prognosis_of
 from ehadiag.report.page import Trend, page_of
+from ehadiag.report.responses import MOST_RESPONSES
 
 NOW = "2026-03-01T12:00:00.000Z"
 HOSTILE = (
     "</script><script>alert(1)</script><img src=http://x/ onerror=alert(1)>\"'&{{7*7}}\x1b[31m"
 )
-
-
-class Page(HTMLParser):
-    """Elements, attributes and visible text of a page."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.scripts: list[str] = []
-        self.text = ""
-        self._in: str | None = None
-        self.feed(html)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attrs)))
-        self._in = tag if tag in ("script", "style") else None
-        if tag == "script":
-            self.scripts.append("")
-
-    def handle_endtag(self, _tag: str) -> None:
-        self._in = None
-
-    def handle_data(self, data: str) -> None:
-        if self._in == "script":
-            self.scripts[-1] += data
-        elif self._in is None:
-            self.text += data
-
-    def attributes(self, name: str) -> list[str]:
-        return [attrs[name] or "" for _, attrs in self.elements if name in attrs]
-
-    @property
-    def policy(self) -> str:
-        return next(
-            attrs["content"] or ""
-            for _, attrs in self.elements
-            if attrs.get("http-equiv") == "Content-Security-Policy"
-        )
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +111,26 @@ def test_what_was_not_tested_has_no_plots() -> None:
     assert "script-src 'none'" in page.policy
     for words in ("NOT TESTED", "the test was aborted", "nothing was identified", "not at hand"):
         assert words in page.text
+
+
+def test_what_was_not_tested_is_drawn_beside_what_was_expected(worn: ehadiag.Result) -> None:
+    diagnosis = replace(worn.diagnosis, identification=None, verdict=ehadiag.Verdict.NOT_TESTED)
+    html = page_of({"verdict": "NOT_TESTED"}, Levels(), "1", NOW, diagnosis)
+    assert "expected of a unit as new" in html
+    assert "Measured and expected" in Page(html).text
+    unknown = replace(diagnosis, tests=(None,))
+    assert "expected of a unit as new" not in page_of({}, Levels(), "1", NOW, unknown)
+
+
+def test_a_long_test_keeps_the_page_small(worn: ehadiag.Result) -> None:
+    recordings = worn.diagnosis.recordings * 9
+    many = replace(
+        worn.diagnosis, recordings=recordings, experiments=worn.diagnosis.experiments * 9
+    )
+    html = page_of(json.loads(worn.to_json()), Levels(), "1", NOW, many)
+    assert len(html.encode()) < 3_000_000
+    assert html.count('role="img"') == 1 + MOST_RESPONSES
+    assert f"Of {worn.diagnosis.experiments[0].ticks} samples at most" in html
 
 
 def test_the_trend_shows_remaining_life_events_and_alarms(worn: ehadiag.Result) -> None:

@@ -10,7 +10,10 @@ import pytest
 
 from ehadiag.core.recording import CommandMode
 from firmware_iface.alignment import align
-from firmware_iface.alignment.align import FROZEN_TICKS, STUCK_FRAMES
+from firmware_iface.alignment import grid as grid_module
+from firmware_iface.alignment.align import STUCK_FRAMES
+from firmware_iface.alignment.bounds import Bounds
+from firmware_iface.alignment.grid import FROZEN_TICKS, Filled, Grid, samples_of
 from firmware_iface.alignment.ticks import TickAxis
 
 MS = 1_000_000
@@ -51,7 +54,7 @@ def test_a_test_reaches_from_its_neighbour_before_to_its_neighbour_after() -> No
             begin = row[hits[0] - 1] + 1
         if hits and hits[-1] + 1 < count:
             end = row[hits[-1] + 1]
-        bounds = align._Bounds.of(axis_of(row, tick))
+        bounds = Bounds.of(axis_of(row, tick))
         assert bounds.rows(span(first, length), 70) == (begin, end)
         ended = int(rng.integers(0, 70))
         if hits:
@@ -60,12 +63,12 @@ def test_a_test_reaches_from_its_neighbour_before_to_its_neighbour_after() -> No
 
 
 def test_the_bounds_of_an_axis_are_running_extremes() -> None:
-    bounds = align._Bounds.of(axis_of([0, 1, 2, 3], [5, 3, 8, 7]))
+    bounds = Bounds.of(axis_of([0, 1, 2, 3], [5, 3, 8, 7]))
     assert bounds.highest.tolist() == [5, 5, 8, 8]
     assert bounds.lowest.tolist() == [3, 3, 7, 7]
 
 
-def grid(tick: list[int], value: list[float], **other: Any) -> align._Grid:
+def grid(tick: list[int], value: list[float], **other: Any) -> Grid:
     """A test of four ticks from tick 10 on; frames of message M in every second row."""
     count = len(tick)
     item = SimpleNamespace(
@@ -75,7 +78,7 @@ def grid(tick: list[int], value: list[float], **other: Any) -> align._Grid:
         saturated=other.get("saturated", {}),
     )
     known = {"channels.spool": (SimpleNamespace(name="M"), None)}
-    return align._Grid(
+    return Grid(
         episode=span(10, 4),
         decoded=SimpleNamespace(messages={"M": item}),
         axis=axis_of([], [], other.get("ticks", {"M": tick})),
@@ -119,7 +122,7 @@ def test_a_role_that_no_frame_brings_fills_nothing() -> None:
 def frozen(value: np.ndarray, saturated: list[int] | None = None) -> int:
     flags = np.zeros(len(value), dtype=np.bool_)
     flags[saturated or []] = True
-    return align._frozen(value, flags)
+    return grid_module._frozen(value, flags)
 
 
 def stretch(before: int, still: int, after: int) -> np.ndarray:
@@ -186,7 +189,7 @@ def test_the_mode_that_most_commands_name_counts() -> None:
         "command.position": [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0],
         "command.current": [0.0] * 8,
     }
-    mode, value, notes = align._command(commands(roles))
+    mode, value, notes = grid_module._command(commands(roles), None)
     assert mode is CommandMode.POSITION
     np.testing.assert_array_equal(value, [10.0, NAN, 12.0, 13.0, 14.0, NAN, NAN, NAN])
     assert notes == ["4 commands of another mode left out"]
@@ -194,14 +197,14 @@ def test_the_mode_that_most_commands_name_counts() -> None:
 
 def test_commands_of_one_mode_need_no_note() -> None:
     roles = {"command.mode": [1.0, 1.0, NAN], "command.current": [1.0, 2.0, 3.0]}
-    mode, value, notes = align._command(commands(roles))
+    mode, value, notes = grid_module._command(commands(roles), None)
     assert (mode, value.tolist(), notes) == (CommandMode.CURRENT, [1.0, 2.0, 3.0], [])
 
 
 @pytest.mark.parametrize("modes", [None, [NAN, NAN, NAN], [7.0, NAN, NAN]])
 def test_commands_that_name_no_mode_are_taken_as_currents(modes: list[float] | None) -> None:
     roles = {"command.current": [1.0, 2.0, 3.0]} | ({"command.mode": modes} if modes else {})
-    mode, value, notes = align._command(commands(roles))
+    mode, value, notes = grid_module._command(commands(roles), None)
     assert mode is CommandMode.CURRENT
     assert notes[0] == "no command says its mode; taken as a current"
     assert value.tolist()[1:] == [2.0, 3.0]
@@ -209,12 +212,12 @@ def test_commands_that_name_no_mode_are_taken_as_currents(modes: list[float] | N
 
 def test_the_mapping_may_fix_the_mode() -> None:
     roles = {"command.position": [1.0, 2.0, 3.0]}
-    mode, value, notes = align._command(commands(roles, CommandMode.POSITION))
+    mode, value, notes = grid_module._command(commands(roles, CommandMode.POSITION), None)
     assert (mode, value.tolist(), notes) == (CommandMode.POSITION, [1.0, 2.0, 3.0], [])
 
 
 def test_a_test_without_commands_says_so() -> None:
-    mode, value, notes = align._command(commands({}, CommandMode.CURRENT))
+    mode, value, notes = grid_module._command(commands({}, CommandMode.CURRENT), None)
     np.testing.assert_array_equal(value, [NAN] * 3)
     assert (mode, notes) == (CommandMode.CURRENT, ["no command frames"])
 
@@ -272,16 +275,16 @@ def partial(roles: dict[str, list[float]], saturated: list[bool]) -> Any:
         if role not in roles:
             return None
         host = 50 + np.arange(count)
-        return align._Filled(np.array(roles[role]), np.array(saturated), host)
+        return Filled(np.array(roles[role]), np.array(saturated), host)
 
-    bus_map = SimpleNamespace(tick_ns=2 * MS, fixed_mode=CommandMode.CURRENT, modes={})
+    bus_map = SimpleNamespace(tick_ns=2 * MS, fixed_mode=CommandMode.CURRENT, modes={}, stated=())
     return SimpleNamespace(fill=fill, episode=span(0, count), bus_map=bus_map)
 
 
 def test_channels_that_no_frame_brings_are_empty_and_noted() -> None:
     flags = [False, True, False]
     roles = {"channels.current": [1.0, 2.0, 3.0], "channels.position": [4.0, 5.0, 6.0]}
-    samples, notes = align._samples(partial(roles, flags))
+    samples, notes = samples_of(partial(roles, flags))
     assert notes == [
         "no frame brings the spool",
         "no frame brings the pressure",
@@ -300,7 +303,7 @@ def test_channels_that_no_frame_brings_are_empty_and_noted() -> None:
 
 def test_a_frozen_channel_is_noted_with_its_time() -> None:
     roles = {"channels.spool": stretch(100, 130, 100).tolist(), "command.current": [0.0] * 329}
-    samples, notes = align._samples(partial(roles, [False] * 329))
+    samples, notes = samples_of(partial(roles, [False] * 329))
     assert notes == [
         "no frame brings the current",
         "spool stood at one code for 0.26 s though it moves elsewhere",

@@ -184,3 +184,24 @@ def test_a_slow_signal_leaves_holes():
     got, rule = on_ticks(Signal(time, time), Clock.even(0.0, 1e-3, 990), 1e-3, hold=False)
     assert np.isfinite(got).sum() == pytest.approx(495, abs=3)
     assert "nearest tick" in rule
+
+
+@pytest.mark.parametrize(("rate", "jitter", "seen"), [(1000.0, 0.5, 0.8), (2000.0, 1.0, 0.75)])
+def test_values_that_come_late_are_placed_by_the_test(tmp_path, source, rate, jitter, seen):
+    command = np.round(bundled_tests()["open"].command() / 0.5e-6) * 0.5e-6
+    this = played(source.samples, command, 1.3)
+    how = Disturbance(jitter, drift_ppm=100.0)
+    path = tmp_path / "late.csv"
+    columns = logged(this, how, rate, 1_000_000, 1)
+    pandas.DataFrame(columns).to_csv(path, index=False, float_format="%.9g")
+    found = read(path)
+    assert found.test_id == 1
+    assert found.by_time
+    assert "late" in " ".join(found.quality.notes)
+    # The last sine moves all signals from tick to tick.
+    fast = slice(4600, 5400)
+    got, true = found.samples.spool[fast], source.samples.spool[fast]
+    known = np.isfinite(got)
+    assert known.mean() > seen
+    wrong = np.abs(got - true)[known] > 1e-6 * np.abs(true).max()
+    assert wrong.mean() < 0.05

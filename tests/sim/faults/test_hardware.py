@@ -111,7 +111,7 @@ def channel_after(fault, ticks=200):
     out = []
     for tick in range(ticks):
         values = [0.001 * (index + 1) * tick * c.full_scale for index, c in enumerate(CHANNELS)]
-        fault(tick, values)
+        fault(tick, values, CHANNELS)
         out.append([value / c.full_scale for value, c in zip(values, CHANNELS, strict=True)])
     return np.array(out).T
 

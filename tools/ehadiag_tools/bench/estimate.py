@@ -7,7 +7,7 @@ import time
 
 from ehadiag.identify.session import identify
 from ehadiag_tools.bench.figures import Figure, Sizes
-from ehadiag_tools.bench.problem import LOG, TRUTH, experiment
+from ehadiag_tools.bench.problem import HEALTHY, LOG, TRUTH, experiment, healthy_experiment
 from ehadiag_tools.bench.rivals import rivals
 
 __all__ = ["measure"]
@@ -39,6 +39,12 @@ def measure(sizes: Sizes) -> list[Figure]:
     for index, name in enumerate(names):
         out.append(_ms(f"  {name}, wall", [stage[index] for stage in stages]))
     whole = statistics.median(cpus)
+    healthy, item = [], healthy_experiment(sizes.logs)
+    for _ in range(max(1, sizes.repeats // 3)):
+        cpu = time.process_time()
+        identify([item])
+        healthy.append(time.process_time() - cpu)
+    out.append(_ms("a healthy actuator in closed loop, CPU", healthy, f"of {HEALTHY}"))
     return [
         *out,
         Figure(SECTION, "largest error of the three constants", 100.0 * error, "%"),

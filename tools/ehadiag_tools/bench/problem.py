@@ -19,10 +19,12 @@ from ehadiag.model.simd.model import SimdModel
 from firmware_iface.logs.reader import read_recording
 
 __all__ = [
+    "HEALTHY",
     "LOG",
     "TRUTH",
     "all_tests",
     "experiment",
+    "healthy_experiment",
     "population",
     "recording",
     "samples",
@@ -33,6 +35,7 @@ __all__ = [
 LOG = "paper-open-2.blf"
 TRUTH = (0.3, 0.6, 0.3)
 """Of that recording."""
+HEALTHY = "healthy-closed.blf"
 
 
 @lru_cache(maxsize=1)
@@ -52,6 +55,15 @@ def experiment(logs: Path) -> Experiment:
     """Prepare it for the identification."""
     return build_experiment(
         samples(logs), recording(logs).environment, resolve_test("open"), default_actuator()
+    )
+
+
+def healthy_experiment(logs: Path) -> Experiment:
+    """Prepare that of a healthy actuator in closed loop, whose spool keeps breaking away."""
+    found = read_recording(logs / HEALTHY)
+    assert found.samples is not None
+    return build_experiment(
+        found.samples, found.environment, resolve_test("closed"), default_actuator()
     )
 
 

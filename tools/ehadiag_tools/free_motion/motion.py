@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS
+from ehadiag.core.channels import CHANNELS, SCALES
 from ehadiag.core.recording import CommandMode
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_sim.plant.simulator import COMMAND_STEP, Plant
+from ehadiag_sim.plant.simulator import Plant
 
 __all__ = ["free_motion", "random_command"]
 
@@ -26,7 +26,7 @@ CENTRING_A_M = 0.1
 CENTRING_S = 0.5
 """In current mode the jack would walk off: gain and time constant of what brings it back."""
 LSB = np.array([channel.lsb for channel in CHANNELS])
-HALF = np.array([1 << (channel.bits - 1) for channel in CHANNELS])
+HALF = np.array([channel.half for channel in CHANNELS])
 
 
 def random_command(rng: np.random.Generator, ticks: int, rate: float, reach: float) -> list[float]:
@@ -107,7 +107,8 @@ def free_motion(
     commands = random_command(rng, round(seconds * rate), rate, REACH[mode])
     plant = Plant(actuator, faults, seed=int(rng.integers(1 << 31)))
     centring = CENTRING_A_M if mode is CommandMode.CURRENT else 0.0
-    step, share, away = COMMAND_STEP[mode], 1.0 / (CENTRING_S * rate), 0.0
+    step = SCALES.position_step if mode is CommandMode.POSITION else SCALES.current_step
+    share, away = 1.0 / (CENTRING_S * rate), 0.0
     codes = np.empty((len(commands), 4), dtype=np.int64)
     sent = np.empty(len(commands))
     for k, command in enumerate(commands):

@@ -21,6 +21,8 @@ import joblib
 import numpy as np
 from scipy.stats import chi2
 
+from ehadiag.cli.watch.persistence import Persistence
+from ehadiag.cli.watch.watcher import QUIET_S
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import CommandMode
 from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
@@ -58,7 +60,9 @@ class Outcome:
     """What the monitor said in one minute."""
 
     alarms: tuple[tuple[int, int], ...]
-    """Tick and sum (see `SIGNALS`) of each."""
+    """Tick and sum (see `SIGNALS`) of each alarm of the sums."""
+    lasting: tuple[int, ...]
+    """Ticks of the alarms that `ehadiag monitor` raises: of what lasts, ten seconds apart."""
     resting: float
     """Share of ticks in which the pressure said nothing."""
     cost_s: float
@@ -83,13 +87,18 @@ def watch(case: Case) -> Outcome:
     rows = free_motion(actuator, Faults(*case.true), case.mode, case.seconds, case.seed)
     inner = Monitor(actuator, case.known, mode=case.mode, hours=case.hours)
     monitor = FreeMotionMonitor(inner, undecided_spool(actuator, case.known[2]))
-    alarms, resting = [], 0
+    alarms, resting, persistence = [], 0, Persistence(actuator.controller.rate)
+    lasting: list[int] = []
     for tick, row in enumerate(rows.tolist()):
         reading = monitor.push(tuple(row))
         resting += bool(np.isnan(reading.residual[1]))
         if monitor.settled and reading.alarmed.any():
             alarms += [(tick, int(item)) for item in np.flatnonzero(reading.alarmed)]
-    return Outcome(tuple(alarms), resting / len(rows), time.process_time() - began)
+            apart = not lasting or tick - lasting[-1] >= QUIET_S * actuator.controller.rate
+            if persistence.take(tick) and apart:
+                lasting.append(tick)
+    cost = time.process_time() - began
+    return Outcome(tuple(alarms), tuple(lasting), resting / len(rows), cost)
 
 
 def garwood(count: int) -> tuple[float, float]:
@@ -110,7 +119,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--delays", action="store_true", help="study delays instead")
     parser.add_argument(
-        "--minutes", type=int, default=2, metavar="N", help="of each delay (default 2)"
+        "--pieces", type=int, default=2, metavar="N", help="of motion, for each delay (default 2)"
+    )
+    parser.add_argument(
+        "--piece", type=float, default=MINUTE_S, metavar="S", help="length of one (default 60)"
     )
     parser.add_argument("--seed", type=int, default=1, metavar="N")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
@@ -123,35 +135,41 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _false_alarms(arguments: argparse.Namespace) -> None:
-    minutes = max(round(arguments.motion_hours * 60.0), 1)
+    minutes = max(round(arguments.motion_hours * 3600.0 / arguments.piece), 1)
     rng = np.random.default_rng(arguments.seed)
     cases = []
     for number in range(minutes):
         known = tuple(float(value) for value in rng.uniform(0.0, WORST, 3))
         mode = CommandMode.POSITION if number % 2 else CommandMode.CURRENT
         severities = (known[0], known[1], known[2])
-        cases.append(Case(mode, severities, severities, arguments.seed + number, arguments.hours))
+        seed = arguments.seed + number
+        cases.append(Case(mode, severities, severities, seed, arguments.hours, arguments.piece))
     found = _run(cases, arguments.jobs)
     for mode in (*CommandMode, None):
         chosen = [b for a, b in zip(cases, found, strict=True) if mode in (None, a.mode)]
         if chosen:
-            _tell(mode.name.lower() if mode else "both", chosen, arguments.hours)
+            hours = len(chosen) * arguments.piece / 3600.0
+            _tell(mode.name.lower() if mode else "both", chosen, hours, arguments.hours)
     spent = sum(item.cost_s for item in found)
-    print(f"seed {arguments.seed}; processor time {spent:.0f} s, {spent / minutes * 60.0:.0f} s/h")
+    each = spent / minutes * 3600.0 / arguments.piece
+    print(f"seed {arguments.seed}; processor time {spent:.0f} s, {each:.0f} s an hour of motion")
     for case, outcome in zip(cases, found, strict=True):
-        for tick, which in outcome.alarms:
+        if outcome.alarms:
             told = ", ".join(f"{value:.2f}" for value in case.known)
-            print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {SIGNALS[which]} {tick}")
+            sums = ", ".join(sorted({SIGNALS[which] for _, which in outcome.alarms}))
+            spans = f"{outcome.alarms[0][0]} … {outcome.alarms[-1][0]}"
+            print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {sums}; ticks {spans}")
 
 
-def _tell(label: str, found: Sequence[Outcome], hours: float) -> None:
-    alarms, length = sum(len(item.alarms) for item in found), len(found) / 60.0
+def _tell(label: str, found: Sequence[Outcome], length: float, hours: float) -> None:
+    alarms = sum(len(item.lasting) for item in found)
+    pieces = sum(bool(item.alarms) for item in found)
     low, high = garwood(alarms)
     resting = float(np.mean([item.resting for item in found]))
     print(
         f"{label:8s} {length:6.2f} h: {alarms} alarms, {alarms / length:.2f}/h"
         f" [{low / length:.2f}, {high / length:.2f}], stated {1.0 / hours:.2f}/h;"
-        f" pressure rests {resting:.0%}"
+        f" sums alarm in {pieces} of {len(found)} pieces; pressure rests {resting:.0%}"
     )
 
 
@@ -159,7 +177,7 @@ def _delays(arguments: argparse.Namespace) -> None:
     kinds = list(itertools.product(CommandMode, range(len(NAMES)), GROWTHS))
     cases = []
     for mode, fault, growth in kinds:
-        for number in range(arguments.minutes):
+        for number in range(arguments.pieces):
             true = [BASE] * len(NAMES)
             true[fault] += growth
             cases.append(
@@ -169,16 +187,26 @@ def _delays(arguments: argparse.Namespace) -> None:
                     (true[0], true[1], true[2]),
                     arguments.seed + number,
                     arguments.hours,
+                    arguments.piece,
                 )
             )
     found = _run(cases, arguments.jobs)
-    print(f"delay to the first alarm, s, in {arguments.minutes} minutes of motion each")
+    length = f"{arguments.pieces} × {arguments.piece:g} s"
+    print(f"s to the first alarm of a sum; to that of what lasts; {length} of motion each")
     for place, (mode, fault, growth) in enumerate(kinds):
-        part = found[place * arguments.minutes : (place + 1) * arguments.minutes]
-        delays = [f"{item.alarms[0][0] / 1e3:.2f}" if item.alarms else "none" for item in part]
-        print(f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}: {', '.join(delays)}")
+        part = found[place * arguments.pieces : (place + 1) * arguments.pieces]
+        sums = [_first(item.alarms[0][0] if item.alarms else None) for item in part]
+        raised = [_first(item.lasting[0] if item.lasting else None) for item in part]
+        print(
+            f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}:"
+            f" {', '.join(sums)}; {', '.join(raised)}"
+        )
     spent = sum(item.cost_s for item in found)
     print(f"seed {arguments.seed}; processor time {spent:.0f} s")
+
+
+def _first(tick: int | None) -> str:
+    return "none" if tick is None else f"{tick / 1e3:.2f}"
 
 
 def _run(cases: Sequence[Case], jobs: int) -> list[Outcome]:

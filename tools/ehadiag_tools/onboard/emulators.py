@@ -13,7 +13,10 @@ from ehadiag.export.targets import Target, target
 __all__ = ["EMULATED", "Emulator", "missing", "run_program"]
 
 HERE = Path(__file__).parent
+FIRMWARE = HERE.parents[2] / "firmware_iface" / "c"
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2")
+MOST_S = 3600.0
+"""An emulated identification takes minutes."""
 BARE = ("--specs=rdimon.specs", "-Wl,--no-warn-execstack", "-Wl,--no-warn-rwx-segments")
 
 
@@ -32,7 +35,7 @@ class Emulator:
     command : tuple[str, ...]
         What runs a program, its name behind.
     extra : tuple[str, ...]
-        C sources beside this file that belong to every program.
+        C sources that belong to every program.
     """
 
     target: str
@@ -53,9 +56,9 @@ EMULATED: tuple[Emulator, ...] = (
     Emulator(
         "cortex-m7",
         "arm-none-eabi-gcc",
-        (*BARE, "-DCOUNTED", "-T", str(HERE / "cortex_m7.ld")),
+        (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
         MPS2,
-        ("cortex_m7.c",),
+        (str(FIRMWARE / "mps2.c"),),
     ),
     Emulator("cortex-r5", "arm-none-eabi-gcc", BARE, ("qemu-arm", "-cpu", "max")),
     Emulator("cortex-a53", "aarch64-linux-gnu-gcc", ("-static",), ("qemu-aarch64",)),
@@ -111,6 +114,6 @@ def run_program(emulator: Emulator, export: Path, program: str, work: Path) -> s
         check=True, stderr=sys.stderr,
     )  # fmt: skip
     done = subprocess.run(
-        [*emulator.command, str(made)], check=True, capture_output=True, text=True, timeout=600
+        [*emulator.command, str(made)], check=True, capture_output=True, text=True, timeout=MOST_S
     )
     return done.stdout

@@ -9,14 +9,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import default_actuator
+from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.recording import CommandMode, Recording
 from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.monitor import Monitor
 from ehadiag.monitor.prepare import Unit
+from ehadiag.onboard.environment import set_environment
+from ehadiag.onboard.layout import Outcome
 from ehadiag_tools.onboard.emulators import Emulator, run_program
 
-__all__ = ["Replay", "identified", "own_lines", "replayed", "ticks_of", "unit_of"]
+__all__ = [
+    "Identified",
+    "Replay",
+    "identified",
+    "own_lines",
+    "replayed",
+    "surrounded",
+    "ticks_of",
+    "unit_of",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +55,31 @@ class Replay:
     worst_push: int
 
 
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """What an exported identification printed.
+
+    Attributes
+    ----------
+    bits : str
+        What it returned, and its results in bits.
+    stack : int
+        Bytes of stack that its calls took at most.
+    millions : int
+        Instructions, in millions; 0 where they are not counted.
+    """
+
+    bits: str
+    stack: int
+    millions: int
+
+    @property
+    def outcome(self) -> Outcome:
+        """The results as numbers."""
+        words = np.array([int(word, 16) for word in self.bits.split()[1:]], dtype=np.uint64)
+        return Outcome(*words.view(np.float64).tolist())
+
+
 def ticks_of(recording: Recording) -> NDArray[np.float64]:
     """Ticks of a recording as a monitor takes them.
 
@@ -62,15 +98,27 @@ def ticks_of(recording: Recording) -> NDArray[np.float64]:
     return np.column_stack([s.command, s.current, s.spool, s.pressure, s.position])
 
 
-def unit_of(recording: Recording, faults: Sequence[float]) -> Unit:
-    """Return what a monitor is told of the unit on a recording."""
+def unit_of(
+    recording: Recording, faults: Sequence[float], actuator: Actuator | None = None
+) -> Unit:
+    """Return what a monitor is told of the unit on a recording; None: the reference actuator."""
     environment, samples = recording.environment, recording.samples
-    constants = plant_constants(default_actuator(), environment)
+    constants = plant_constants(actuator or default_actuator(), environment)
     degc = None if environment is None else environment.oil_temperature
     closed = samples is not None and samples.mode is CommandMode.POSITION
     viscosity = 1.0 if degc is None else relative_viscosity(degc)
     a, b, c = faults
     return Unit(a, b, c, 0.0, 0.0, viscosity, constants.PSR, float(closed))
+
+
+def surrounded(recording: Recording, actuator: Actuator | None = None) -> Unit:
+    """Return what a computer that identifies by itself makes of a recording's surroundings."""
+    around = recording.environment
+    numbers = np.array(unit_of(recording, (0.0, 0.0, 0.0), actuator), dtype=np.float64)
+    oil, supply, back = around.oil_temperature, around.supply_pressure, around.return_pressure
+    if oil is not None and supply is not None and back is not None:
+        set_environment(numbers.ctypes.data, (oil, supply, back))
+    return Unit(*numbers.tolist())
 
 
 def own_lines(
@@ -123,8 +171,8 @@ def replayed(
 
 def identified(
     emulator: Emulator, export: Path, unit: Unit, ticks: NDArray[np.float64], work: Path
-) -> str:
-    """Identify ticks by an export on its target; return what it found, in bits.
+) -> Identified:
+    """Identify ticks by an export on its target.
 
     Parameters
     ----------
@@ -141,11 +189,15 @@ def identified(
 
     Returns
     -------
-    str
-        One line.
+    Identified
+        What was printed.
     """
     _write_ticks(unit, ticks, work)
-    return run_program(emulator, export, "identify.c", work).strip()
+    said = dict(
+        line.split(maxsplit=1)
+        for line in run_program(emulator, export, "identify.c", work).splitlines()
+    )
+    return Identified(said["outcome"], int(said["stack"]), int(said["millions"]))
 
 
 def _write_ticks(unit: Unit, ticks: NDArray[np.float64], work: Path) -> None:

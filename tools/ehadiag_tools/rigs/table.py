@@ -1,7 +1,8 @@
 """Diagnoses the reference recordings on foreign buses beside the default one: verdicts, errors.
 
 tools/foreign_buses tests/data/logs
-tools/foreign_buses --bus psi29 --jitter 0 1 --lead-in 0 10 tests/data/logs
+tools/foreign_buses --bus psi29 --jitter 0 1 --lead-in 0 10 -- tests/data/logs
+tools/foreign_buses --calibrated FOLDER UNITS      (FOLDER holds A.toml … of `ehadiag calibrate`)
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose
-from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
+from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest, bundled_tests
@@ -30,10 +32,10 @@ from firmware_iface.logs.any_recording import Meaning, recorded_tests
 from firmware_iface.logs.reader import choose, read_recording
 from firmware_iface.mapping.bus_map import default_map
 
-__all__ = ["main", "on_bus"]
+__all__ = ["as_sent", "main", "on_bus"]
 
-DAQ, DAQ_RATE = "daq", 2000.0
-"""Decoded signals at that rate, Hz."""
+DAQ = "daq"
+"""Decoded signals."""
 NAMES = ("Kintas", "FSS", "FDJ")
 
 
@@ -44,7 +46,25 @@ class Line:
     verdict: str
     error: float
     """Largest difference of an estimate from the truth, 1."""
+    covered: tuple[bool, ...]
+    """Whether the 95 % interval of each severity holds the truth; empty without estimates."""
     why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is known of a recording.
+
+    Attributes
+    ----------
+    severities : tuple[float, float, float]
+        In the order of `NAMES`.
+    actuator : Actuator
+        The unit that it is of.
+    """
+
+    severities: tuple[float, float, float]
+    actuator: Actuator
 
 
 def on_bus(
@@ -58,7 +78,7 @@ def on_bus(
     """Play a recording on a bus, and read it there as a log of that bus is read."""
     if recording.samples is None:
         raise ValueError(f"{recording.source}: nothing to play")
-    this = played(recording.samples, _as_sent(test), how.lead_in_s)
+    this = played(recording.samples, as_sent(test), how.lead_in_s)
     table, bus_map = frames_on(bus, recording, this, how, seed)
     sought = Sought(tuple(bundled_tests().values()), actuator.controller)
     name = f"{Path(recording.source).stem} on {bus.name}"
@@ -66,15 +86,20 @@ def on_bus(
 
 
 def on_daq(
-    recording: Recording, test: StoredTest, how: Disturbance, actuator: Actuator, seed: int
+    recording: Recording,
+    test: StoredTest,
+    how: Disturbance,
+    actuator: Actuator,
+    seed: int,
+    rate: float,
 ) -> Recording:
-    """Write a recording as a decoded CSV at 2 kHz, and read it as `diagnose` does."""
+    """Write a recording as a decoded CSV at a rate (Hz), and read it as `diagnose` does."""
     import pandas  # noqa: PLC0415 - optional, and slow
 
     if recording.samples is None:
         raise ValueError(f"{recording.source}: nothing to play")
-    this = played(recording.samples, _as_sent(test), how.lead_in_s)
-    columns = logged(this, how, DAQ_RATE, recording.samples.period_ns, seed)
+    this = played(recording.samples, as_sent(test), how.lead_in_s)
+    columns = logged(this, how, rate, recording.samples.period_ns, seed)
     known = recording.environment
     for name in ("supply_pressure", "return_pressure", "oil_temperature"):
         columns[name] = np.full(len(columns["time"]), getattr(known, name))
@@ -85,7 +110,8 @@ def on_daq(
         return choose(recorded_tests([path], Meaning(default_map(), None, sought)))
 
 
-def _as_sent(test: StoredTest) -> NDArray[np.float64]:
+def as_sent(test: StoredTest) -> NDArray[np.float64]:
+    """Command of a test as the default bus's frames carry it, A or m."""
     step = 2e-6 if test.closed_loop else 0.5e-6
     return np.asarray(np.round(test.command() / step) * step)
 
@@ -101,15 +127,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--batch", type=float, default=0.0, help="ms")
     parser.add_argument("--lost", type=float, default=0.0, help="share of the frames")
     parser.add_argument("--unordered", action="store_true", help="log sorted by its stamps")
+    parser.add_argument("--rate", type=float, default=2000.0, help="of the decoded signals, Hz")
+    parser.add_argument("--calibrated", type=Path, help="folder of the units' actuator files")
     parser.add_argument("--only", nargs="*", help="recordings by name")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("-v", "--verbose", action="store_true", help="a line a recording")
     given = parser.parse_args(arguments)
-    actuator, tests = default_actuator(), bundled_tests()
-    truth = _truth(given.folder)
+    tests = bundled_tests()
+    truth = _truth(given.folder, given.calibrated)
     names = [name for name in truth if not given.only or Path(name).stem in given.only]
     read = {name: read_recording(given.folder / name) for name in names}
-    usual = {name: _line(item, actuator, tests, truth[name]) for name, item in read.items()}
+    usual = {name: _line(item, tests, truth[name]) for name, item in read.items()}
     _show("default", "", usual, usual)
     buses: list[ForeignBus | None] = [*BUSES, None]
     chosen = [bus for bus in buses if not given.bus or _name(bus) in given.bus]
@@ -120,12 +148,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines = {}
         begin = time.perf_counter()
         for name in names:
+            actuator = truth[name].actuator
             test = next(item for item in tests.values() if item.id == read[name].test_id)
             if bus is None:
-                got = on_daq(read[name], test, how, actuator, given.seed)
+                got = on_daq(read[name], test, how, actuator, given.seed, given.rate)
             else:
                 got = on_bus(bus, read[name], test, how, actuator, given.seed)
-            lines[name] = _line(got, actuator, tests, truth[name])
+            lines[name] = _line(got, tests, truth[name])
             if given.verbose:
                 line = lines[name]
                 print(f"    {name:<24}{line.verdict:<12}{100 * line.error:8.2f} %  {line.why}")
@@ -142,38 +171,48 @@ def _name(bus: ForeignBus | None) -> str:
     return DAQ if bus is None else bus.name
 
 
-def _truth(folder: Path) -> dict[str, tuple[float, float, float]]:
+def _truth(folder: Path, calibrated: Path | None) -> dict[str, Truth]:
+    """What is known of each recording; without those of units that are not calibrated."""
     with (folder / "truth.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    return {
-        row["file"]: (float(row["Kintas"]), float(row["FSS"]), float(row["FDJ"])) for row in rows
-    }
+    out = {}
+    for row in rows:
+        path = calibrated / f"{row['unit']}.toml" if calibrated is not None else None
+        if path is None or path.is_file():
+            actuator = load_actuator(path) if path is not None else default_actuator()
+            severities = (float(row["Kintas"]), float(row["FSS"]), float(row["FDJ"]))
+            out[row["file"]] = Truth(severities, actuator)
+    return out
 
 
-def _line(
-    recording: Recording,
-    actuator: Actuator,
-    tests: dict[str, StoredTest],
-    truth: tuple[float, float, float],
-) -> Line:
-    result = diagnose([recording], actuator, tests.values())
-    return Line(result.verdict.name, _error(result, truth), "; ".join(result.reasons))
-
-
-def _error(result: Diagnosis, truth: tuple[float, float, float]) -> float:
+def _line(recording: Recording, tests: dict[str, StoredTest], truth: Truth) -> Line:
+    result = diagnose([recording], truth.actuator, tests.values())
+    why = "; ".join(result.reasons)
     if result.identification is None:
-        return float("nan")
-    found = {item.name: item.value for item in result.identification.estimates}
-    return max(abs(found[name] - value) for name, value in zip(NAMES, truth, strict=True))
+        return Line(result.verdict.name, float("nan"), (), why)
+    found = {item.name: item for item in result.identification.estimates}
+    pairs = [(found[name], value) for name, value in zip(NAMES, truth.severities, strict=True)]
+    return Line(
+        result.verdict.name,
+        max(abs(item.value - value) for item, value in pairs),
+        tuple(item.interval95[0] <= value <= item.interval95[1] for item, value in pairs),
+        why,
+    )
 
 
 def _show(bus: str, how: str, lines: dict[str, Line], usual: dict[str, Line]) -> None:
-    """One line: verdicts that agree with the default bus, mean and greatest error."""
+    """One line: verdicts that agree with the default bus, mean and greatest error, coverage.
+
+    Errors and coverage are of the recordings that got a verdict.
+    """
     same = sum(line.verdict == usual[name].verdict for name, line in lines.items())
-    errors = np.array([line.error for line in lines.values()])
-    known = errors[np.isfinite(errors)]
-    mean, most = (100 * known.mean(), 100 * known.max()) if len(known) else (np.nan, np.nan)
+    told = [line for line in lines.values() if line.verdict != Verdict.NOT_TESTED.name]
+    errors = np.array([line.error for line in told])
+    mean, most = (100 * errors.mean(), 100 * errors.max()) if told else (np.nan, np.nan)
+    covered = [item for line in told for item in line.covered]
+    wrong = sum(line.verdict != usual[name].verdict for name, line in lines.items() if line in told)
     print(
-        f"{bus:<10}{how:<16}{same:>3} of {len(lines)} verdicts{mean:>9.2f} %{most:>9.2f} %",
+        f"{bus:<10}{how:<16}{same:>3} of {len(lines)} verdicts, {wrong} wrong,"
+        f"{mean:>8.2f} %{most:>8.2f} %{sum(covered):>5} of {len(covered)} covered",
         flush=True,
     )

@@ -1,0 +1,40 @@
+"""The documentation site: built without a warning, with every public name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ehadiag
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_has_every_public_name(tmp_path: Path) -> None:
+    for name in ("sphinx", "myst_parser", "numpydoc", "furo"):
+        pytest.importorskip(name)
+    options = ["-q", "-W", "--keep-going", "-b", "html", "-d", str(tmp_path / "trees")]
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "sphinx",
+            *options,
+            str(REPOSITORY / "docs"),
+            str(tmp_path / "site"),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "site" / "reference" / "api.html").read_text()
+    names = set(ehadiag.__all__) - {"__version__"}
+    assert {name for name in names if f'id="ehadiag.{name}"' not in page} == set()
+    first = (tmp_path / "site" / "index.html").read_text()
+    assert "explanation/method.html" in first
+    assert 'src="http' not in first

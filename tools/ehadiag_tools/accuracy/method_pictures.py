@@ -1,0 +1,198 @@
+"""Draws the pictures that explain the method: what faults do, why they are found, intervals."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+import ehadiag
+from ehadiag.identify.experiment import Experiment
+from ehadiag.model.parameters import FAULTS, Unknowns
+from ehadiag.report.modelled import sensed
+from ehadiag_sim.plant.conditions import Faults
+
+__all__ = ["PICTURES", "WORN", "draw_method", "gap_of", "main"]
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73")
+"""Okabe and Ito's, which colour-blind people tell apart; the dashes differ too."""
+DASHES = ("-", "--", "-.")
+DPI = 100
+SEVERITIES = (0.0, 0.5, 1.0)
+WORN = Faults(Kintas=0.4, FSS=0.3, FDJ=0.5)
+CANDIDATES = np.linspace(0.0, 1.0, 81)
+SEEDS = 20
+FIRST_SEED = 100
+SPOOL, PRESSURE = 0, 1
+SIGNAL_OF = {"Kintas": SPOOL, "FSS": SPOOL, "FDJ": PRESSURE}
+"""What the search for each fault compares (docs/explanation/method.md)."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw the pictures into a folder."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="where the PNG files go, such as docs/img")
+    parser.add_argument(
+        "--only", choices=list(PICTURES), help="one of them (default: all)", default=None
+    )
+    asked = parser.parse_args(arguments)
+    names = list(PICTURES) if asked.only is None else [asked.only]
+    for path in draw_method(asked.folder, names):
+        print(f"wrote {path}")
+    return 0
+
+
+def draw_method(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Write pictures by their names; return the files."""
+    mpl.use("Agg")
+    folder.mkdir(parents=True, exist_ok=True)
+    out = []
+    for name in names:
+        figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+        PICTURES[name](figure)
+        path = folder / f"method-{name}.png"
+        figure.savefig(path, dpi=DPI)
+        out.append(path)
+    return out
+
+
+def _spool_friction(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    for current, spool, _, _, style, label in _responses("FSS"):
+        window = slice(0, 2300)
+        left.plot(_time(window), 1e3 * spool[window], **style, label=label)
+        right.plot(1e3 * current[window], 1e3 * spool[window], **style)
+    left.set(xlabel="time, s", ylabel="spool position, mm", title="slow ramps of current")
+    right.set(xlabel="current, mA", ylabel="spool position, mm", title="the same over the current")
+    left.legend(title="FSS")
+
+
+def _filter_clogging(figure: Figure) -> None:
+    axes = figure.subplots(1, 2)
+    for _, spool, _, place, style, label in _responses("Kintas"):
+        near, far = slice(2395, 2440), slice(2350, 3000)
+        axes[0].plot(_time(near), 1e3 * spool[near], **style, marker=".", label=label)
+        axes[1].plot(_time(far), 1e3 * place[far], **style)
+    axes[0].set(xlabel="time, s", ylabel="spool position, mm", title="step of current at 2.4 s")
+    axes[1].set(xlabel="time, s", ylabel="jack position, mm", title="what the jack makes of it")
+    axes[0].legend(title="Kintas")
+
+
+def _jack_friction(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    for _, _, pressure, place, style, label in _responses("FDJ"):
+        window = slice(0, 2300)
+        left.plot(_time(window), 1e-6 * pressure[window], **style, label=label)
+        right.plot(_time(window), 1e3 * place[window], **style)
+    left.set(xlabel="time, s", ylabel="differential pressure, MPa", title="slow ramps of current")
+    right.set(xlabel="time, s", ylabel="jack position, mm", title="the jack meanwhile")
+    left.legend(title="FDJ")
+
+
+class _Response(NamedTuple):
+    """An open-loop test, SI, and how to draw it."""
+
+    current: NDArray[np.float64]
+    spool: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    place: NDArray[np.float64]
+    style: dict[str, Any]
+    label: str
+
+
+def _responses(name: str) -> list[_Response]:
+    """One for each severity of a fault alone."""
+    out = []
+    for value, colour, dash in zip(SEVERITIES, COLOURS, DASHES, strict=True):
+        samples = ehadiag.simulate("open", faults=Faults(**{name: value}), noise_lsb=0.0).samples
+        assert samples is not None
+        style = {"color": colour, "ls": dash, "lw": 1.3}
+        out.append(
+            _Response(
+                samples.current,
+                samples.spool,
+                samples.pressure,
+                samples.position,
+                style,
+                f"{value:g}",
+            )
+        )
+    return out
+
+
+def _time(window: slice) -> NDArray[np.float64]:
+    return np.arange(window.start, window.stop) * 1e-3
+
+
+def _searches(figure: Figure) -> None:
+    recording = ehadiag.simulate("open", faults=WORN, seed=1)
+    (experiment,) = ehadiag.diagnose(recording).diagnosis.experiments
+    axes = figure.subplots(1, len(FAULTS), sharey=True)
+    for index, (axis, fault) in enumerate(zip(axes, FAULTS, strict=True)):
+        name = fault.name
+        gaps = [
+            gap_of(experiment, replace(WORN, **{name: value}), name)
+            for value in CANDIDATES.tolist()
+        ]
+        axis.semilogy(CANDIDATES, gaps, color=COLOURS[index], ls=DASHES[index])
+        truth = getattr(WORN, name)
+        axis.axvline(truth, color="#333333", ls=":", label=f"truth {truth:g}")
+        axis.set(xlabel=f"candidate {name}", title=_part(experiment, name))
+        axis.legend()
+    axes[0].set_ylabel("rms gap to the measured, in noise")
+
+
+def _part(experiment: Experiment, name: str) -> str:
+    start, end = getattr(experiment.test.windows, name)[0]
+    return f"{('spool', 'pressure')[SIGNAL_OF[name]]}, {start:g} … {end:g} s"
+
+
+def gap_of(experiment: Experiment, severities: Faults, name: str) -> float:
+    """Rms difference of model and measured in the part of a fault's search, over the noise."""
+    unknowns = Unknowns(tuple(FAULTS), (experiment.constants,), {})
+    constants = unknowns.constants(np.array([getattr(severities, item.name) for item in FAULTS]))
+    modelled = sensed(experiment, constants)[SIGNAL_OF[name]]
+    measured = (experiment.spool, experiment.pressure)[SIGNAL_OF[name]]
+    start, end = (round(t / experiment.tick) for t in getattr(experiment.test.windows, name)[0])
+    gap = (measured - modelled)[start:end]
+    return float(np.sqrt(np.nanmean(gap**2)) / experiment.noise[SIGNAL_OF[name]])
+
+
+def _intervals(figure: Figure) -> None:
+    axes: Sequence[Axes] = figure.subplots(1, len(FAULTS))
+    found = [
+        ehadiag.diagnose(ehadiag.simulate("closed", faults=WORN, seed=FIRST_SEED + number)).faults
+        for number in range(SEEDS)
+    ]
+    for axis, fault in zip(axes, FAULTS, strict=True):
+        truth = getattr(WORN, fault.name)
+        for number, faults in enumerate(found):
+            item = faults[fault.name]
+            inside = item.interval[0] <= truth <= item.interval[1]
+            value = 100.0 * (item.value - truth)
+            low, high = (100.0 * (end - truth) for end in item.interval)
+            axis.errorbar(
+                number + 1, value, yerr=[[value - low], [high - value]],
+                fmt="o" if inside else "s", color=COLOURS[0] if inside else COLOURS[1], ms=4,
+            )  # fmt: skip
+        axis.axhline(0.0, color="#333333", ls=":")
+        axis.set(xlabel="test of the same unit", title=f"{fault.name} = {truth:g}")
+    axes[0].set_ylabel("estimate less truth, % of full damage")
+
+
+PICTURES: dict[str, Callable[[Figure], None]] = {
+    "FSS": _spool_friction,
+    "Kintas": _filter_clogging,
+    "FDJ": _jack_friction,
+    "searches": _searches,
+    "intervals": _intervals,
+}
+"""By name."""
