@@ -303,7 +303,7 @@ def _event_tick(
                 s.direction,
                 s.clamped,
             )
-            if less != 0.0 and first >= whole and n == steps - 1:
+            if less != 0.0 and first >= whole and n == steps:
                 vs = s.vs - less * s.direction
                 s = SpoolState(s.xf, s.wf, s.xs, vs, s.wire, s.direction, s.clamped)
             end_vs = s.vs
