@@ -17,6 +17,7 @@ from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
+from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
     CONSIDERED,
     FirstPart,
@@ -51,7 +52,7 @@ from ehadiag.identify.textbook import (
     unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance
-from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
+from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, parameter
 
 __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 
@@ -59,6 +60,8 @@ __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 BEYOND_RESCUE = 0.05
 """Share of residuals beyond three deviations after a refinement from which on no further search is
 made: 0.04 at most on a textbook's actuator after the search before."""
+BEYOND_STEPS = 15.0
+"""Excess after all nuisances at once from which on they are not tried one after another."""
 LASTING = 1.2
 """Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
 1.15 at most in 80 recordings of units without any."""
@@ -218,10 +221,35 @@ class Session:
         """Estimate with all nuisances free."""
         tell("nuisances", 0.0)
         found = self._estimated(experiments, self.knowledge, hint, tell)
-        if self.knowledge.joint is None or found.explained:
+        if found.explained:
+            return found
+        if not self.knowledge.doubts:
+            return self._stepwise(experiments, found, tell)
+        if self.knowledge.joint is None:
             return found
         loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
         return min(found, loose, key=lambda item: item.excess)
+
+    def _stepwise(
+        self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
+    ) -> Estimated:
+        """Estimate one effect after another where that explains what all at once do not."""
+        if found.excess > BEYOND_STEPS:
+            return found
+        few = stepwise(
+            experiments,
+            (*nuisances_of(REGISTRY), parameter("load")),
+            considered=CONSIDERED,
+            seed=self.seed,
+            tell=lambda share: tell("nuisances", share),
+        )
+        if few is None:
+            return found
+        return replace(
+            few,
+            evaluations=found.evaluations + few.evaluations,
+            starts=found.starts + few.starts,
+        )
 
     def _estimated(
         self,

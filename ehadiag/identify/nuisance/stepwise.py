@@ -1,0 +1,97 @@
+"""Estimates effects one after another where all of them at once lead astray.
+
+A unit often has one effect that matters, or two. Where break-aways make many optima, as in closed
+loop with little friction, a search over all effects may end in none of use, while one over few
+finds its way; what it finds is where a last look with all effects begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.refine.derivatives import Considered
+from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter
+
+__all__ = ["stepwise"]
+
+BUDGET = 300
+"""Runs of the model after which no further start is made with few effects."""
+WORTH = 0.8
+"""Excess that a further effect must leave, over that of the step before."""
+ONE_START = 1
+
+
+def stepwise(
+    experiments: Sequence[Experiment],
+    effects: Sequence[Parameter],
+    *,
+    considered: Sequence[Considered],
+    seed: int,
+    tell: Callable[[float], None],
+) -> Estimated | None:
+    """Add one effect after another, each time the one that leaves the least.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    effects : sequence of Parameter
+        To choose from.
+    considered : sequence of Considered
+        What is held, with a tolerance that counts in the interval.
+    seed : int
+        The same seed gives the same answer.
+    tell : callable
+        Called with the share of the effects that were tried.
+
+    Returns
+    -------
+    Estimated or None
+        With all effects where these explain the recordings from there, else with the few that do;
+        None where nothing does.
+    """
+    chosen: list[Parameter] = []
+    best: Estimated | None = None
+    evaluations = starts = 0
+
+    def tried(
+        free: Sequence[Parameter], budget: int, hint: Mapping[str, float] | None
+    ) -> Estimated:
+        nonlocal evaluations, starts
+        found = estimate(
+            experiments,
+            (*FAULTS, *OFFSETS, *free),
+            considered=considered,
+            hint=hint,
+            budget=budget,
+            seed=seed,
+            give_up=True,
+        )
+        evaluations += found.evaluations
+        starts += found.starts
+        return found
+
+    while len(chosen) < len(effects) and (best is None or not best.explained):
+        rest = [item for item in effects if item not in chosen]
+        hint = None if best is None else best.refined.values
+        now: Estimated | None = None
+        for item in rest:
+            found = tried((*chosen, item), BUDGET, hint)
+            if now is None or found.excess < now.excess:
+                now, added = found, item
+            if found.explained:
+                break
+        tell(len(chosen) / len(effects))
+        assert now is not None
+        if best is not None and now.excess > WORTH * best.excess and not now.explained:
+            return None
+        best = now
+        chosen.append(added)
+    if best is None or not best.explained:
+        return None
+    whole = tried(effects, ONE_START, best.refined.values)
+    if whole.explained:
+        best = whole
+    return replace(best, evaluations=evaluations, starts=starts)
