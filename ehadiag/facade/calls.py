@@ -241,6 +241,8 @@ def diagnose(
         levels=levels or Levels(),
         mapping=None if bus_map is None else bus_map.name,
         mapping_sha256=None if bus_map is None else fingerprint(bus_map),
+        mapping_file=str(mapping) if isinstance(mapping, str | os.PathLike) else None,
+        tests_sha256=fingerprint(tuple(tests)),
     )
     return Result(diagnosis, asked, spent, tuple(logs))
 

@@ -12,7 +12,12 @@
 static void receive(struct fcc_frame *telemetry, struct fcc_frame *command)
 {
     static uint8_t counters[2];
-    const uint16_t codes[4] = {FCC_CENTRE, FCC_CENTRE, FCC_CENTRE, FCC_CENTRE};
+    const uint16_t codes[4] = {
+        eha_fcc_servo_telemetry_servo_current_encode(0.0),
+        eha_fcc_servo_telemetry_spool_position_encode(0.0),
+        eha_fcc_servo_telemetry_diff_pressure_encode(0.0),
+        eha_fcc_servo_telemetry_jack_position_encode(0.0),
+    };
 
     fcc_pack_telemetry(telemetry, codes, &counters[0]);
     fcc_pack_command(command, EHA_FCC_SERVO_COMMAND_COMMAND_MODE_CURRENT_CHOICE, 0, 0,

@@ -77,6 +77,23 @@ def events(port, count):
     return out
 
 
+def until(port, wanted):
+    """Read the stream until an event is wanted; a reader that hangs ends by its time limit."""
+    connection = http.client.HTTPConnection(HOST, port, timeout=60)
+    connection.request("GET", "/live")
+    answer, kind = connection.getresponse(), ""
+    for line in answer:
+        text = line.decode().rstrip("\n")
+        kind = text[7:] if text.startswith("event: ") else kind
+        if text.startswith("data: ") and wanted(kind, json.loads(text[6:])):
+            break
+    connection.close()
+
+
+def is_of(command):
+    return lambda kind, item: kind == "snapshot" and item and item["command"] == command
+
+
 def test_snapshots_of_the_watch_are_streamed_with_texts_as_texts(tmp_path):
     with site(tmp_path) as (port, _):
         came = events(port, 60)
@@ -99,13 +116,11 @@ def test_a_test_starts_and_aborts_by_token_only(tmp_path):
         assert ask(port, "/start", "POST", '{"test": "other"}', X_Ehadiag_Token=TOKEN)[0] == 404
         assert sessions.running is None
         assert ask(port, "/start", "POST", body, X_Ehadiag_Token=TOKEN)[0] == 202
-        snapshots = (item for kind, item in events(port, 200) if kind == "snapshot" and item)
-        assert any(item["command"] == "bit" for item in snapshots)
+        until(port, is_of("bit"))
         assert sessions.running == "open"
         assert ask(port, "/start", "POST", body, X_Ehadiag_Token=TOKEN)[0] == 409
         assert ask(port, "/abort", "POST", "{}", X_Ehadiag_Token=TOKEN)[0] == 202
-        kinds = [item["command"] for kind, item in events(port, 300) if kind == "snapshot" and item]
-        assert kinds[-1] == "monitor"
+        until(port, is_of("monitor"))
         said = sessions.wait(0, 1.0).said
         assert "abort asked for" in said
         assert "ended with exit code 30" in said
@@ -115,8 +130,7 @@ def test_a_test_starts_where_nothing_is_watched(tmp_path):
     with site(tmp_path, watch=None) as (port, _):
         body = json.dumps({"test": "open"})
         assert ask(port, "/start", "POST", body, X_Ehadiag_Token=TOKEN)[0] == 202
-        snapshots = (item for kind, item in events(port, 100) if kind == "snapshot" and item)
-        assert any(item["command"] == "bit" for item in snapshots)
+        until(port, is_of("bit"))
 
 
 def test_without_allowing_tests_none_starts(tmp_path):
