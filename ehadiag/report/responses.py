@@ -23,7 +23,7 @@ from ehadiag.report.response_plot import plot_response
 __all__ = ["Drawn", "Response", "draw_responses", "expected", "modelled"]
 
 MOST_RESPONSES = 4
-"""That are drawn: the page is written within two seconds."""
+"""That are drawn: some two seconds of processor time, and less than three megabytes."""
 MOST_TICKS = 16_000
 """Of all responses together: the page stays below three megabytes."""
 
