@@ -15,6 +15,7 @@ from ehadiag.cli.output import say, say_if_compiling
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import need_report_library, report_of
 from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
+from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.small_file import read_small_file
 
@@ -58,7 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Write the reports; return the worst exit code."""
     need_report_library()
-    levels = Levels(arguments.advisory, arguments.limit)
+    asked = Levels(arguments.advisory, arguments.limit)
     options.the_actuator(arguments)
     bus_map = options.the_bus_map(arguments)
     results = list(dict.fromkeys(arguments.results))
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     codes = []
     for name in results:
         try:
-            _write(arguments, Path(name), levels)
+            _write(arguments, Path(name), asked)
         except EhadiagError as error:
             say(str(error))
             codes.append(error.exit_code)
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     return code_of_inputs(codes)
 
 
-def _write(arguments: argparse.Namespace, path: Path, levels: Levels) -> None:
+def _write(arguments: argparse.Namespace, path: Path, asked: Levels) -> None:
     line = read_small_file(path, MOST_BYTES, "result").decode("utf-8", errors="replace")
     result = _result(path, line)
     try:
@@ -86,6 +87,7 @@ def _write(arguments: argparse.Namespace, path: Path, levels: Levels) -> None:
     except EhadiagError as error:
         say(f"{error}; no responses are drawn")
         diagnosis = None
+    levels = asked if asked != Levels() else _levels_of(result)
     page = report_of(line, levels, history_place(arguments), diagnosis)
     target = _page_of(path)
     try:
@@ -104,7 +106,8 @@ def _result(path: Path, line: str) -> dict[str, Any]:
     try:
         result = json.loads(line)
         known = isinstance(result, dict) and str(result.get("schema")).startswith(SCHEMA)
-        if known and all(_is_fault(item) for item in result["faults"].values()):
+        faults = result["faults"].values() if known else ()
+        if known and all(map(_is_fault, faults)) and _is_solver(result.get("solver")):
             return dict(result)
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
         pass
@@ -114,9 +117,30 @@ def _result(path: Path, line: str) -> dict[str, Any]:
 def _is_fault(item: dict[str, Any]) -> bool:
     """Whether estimate and interval are numbers, or null."""
     numbers = [item["estimate"], *(item["interval95"] or ())]
-    return all(value is None or isinstance(value, int | float) for value in numbers) and (
-        item["interval95"] is None or len(item["interval95"]) == 2
+    flags = item.get("flags") or []
+    return (
+        all(value is None or isinstance(value, int | float) for value in numbers)
+        and (item["interval95"] is None or len(item["interval95"]) == 2)
+        and isinstance(flags, list)
+        and all(isinstance(flag, str) for flag in flags)
     )
+
+
+def _is_solver(item: Any) -> bool:
+    """Whether the search is named, if at all, and its seed one that can be given."""
+    if item is None:
+        return True
+    seed = item.get("seed")
+    return seed is None or (isinstance(seed, int) and 0 <= seed < 1 << 32)
+
+
+def _levels_of(result: dict[str, Any]) -> Levels:
+    """Return the levels that the verdict goes by; the usual ones where the result is of old."""
+    stored = (result.get("configuration") or {}).get("levels") or {}
+    try:
+        return Levels(float(stored["advisory"]), float(stored["limit"]))
+    except (KeyError, TypeError, ValueError, ConfigurationError):
+        return Levels()
 
 
 def _again(arguments: argparse.Namespace, path: Path, result: dict[str, Any]) -> Diagnosis | None:
@@ -125,6 +149,13 @@ def _again(arguments: argparse.Namespace, path: Path, result: dict[str, Any]) ->
     log = next((item for item in (Path(source), path.parent / source) if item.is_file()), None)
     if log is None:
         say(f"result {path}: its recording {source} is not at hand; no responses are drawn")
+        return None
+    actuator = options.the_actuator(arguments)
+    if result.get("actuator_sha256") not in (None, fingerprint(actuator)):
+        say(
+            f"result {path}: it goes by other actuator data than {actuator.name!r} has: name its"
+            " file by --actuator; no responses are drawn"
+        )
         return None
     from ehadiag.assess.diagnosis import diagnose  # noqa: PLC0415 - loads numba
     from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
@@ -139,7 +170,7 @@ def _again(arguments: argparse.Namespace, path: Path, result: dict[str, Any]) ->
     for recording in found:
         again = diagnose(
             [recording],
-            options.the_actuator(arguments),
+            actuator,
             tests,
             default=default,
             solver=make_solver(name if name in ("cga", "pygad") else "cga"),

@@ -73,10 +73,39 @@ def test_what_is_no_result_is_refused(run: Run, content: str) -> None:
     assert not Path("r.html").exists()
 
 
-def test_a_result_with_keys_of_the_wrong_kind_ends_in_one_line(run: Run) -> None:
+def test_the_page_goes_by_the_levels_of_its_result(run: Run) -> None:
+    assert run("diagnose", "--out", "o", "--limit", 0.5, WORN).code == 20
+    run("report", "o/paper-open-4.json")
+    page = Path("o/paper-open-4.html").read_text()
+    assert "limit 0.5" in page
+    assert "limit 0.75" not in page
+
+
+def test_other_actuator_data_draw_no_responses(run: Run) -> None:
+    run("diagnose", "--out", "o", HEALTHY)
+    run("init", "actuator", ".")
+    text = Path("actuator.toml").read_text()
+    Path("other.toml").write_text(text.replace("511.6", "511.7"))
+    found = run("report", "o/healthy-open.json", "--actuator", "other.toml")
+    assert found.code == 0
+    assert "it goes by other actuator data" in found.err
+    assert "No responses are drawn" in Path("o/healthy-open.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tree: tree["faults"]["FSS"].update(estimate="much"),
+        lambda tree: tree["faults"]["FSS"].update(flags=5),
+        lambda tree: tree.update(solver="cga"),
+        lambda tree: tree["solver"].update(seed=-5),
+        lambda tree: tree["solver"].update(seed=1 << 80),
+    ],
+)
+def test_a_result_with_keys_of_the_wrong_kind_ends_in_one_line(run: Run, change) -> None:  # type: ignore[no-untyped-def]
     run("diagnose", "--out", "o", HEALTHY)
     tree = json.loads(Path("o/healthy-open.json").read_text())
-    tree["faults"]["FSS"]["estimate"] = "much"
+    change(tree)
     Path("r.json").write_text(json.dumps(tree))
     found = run("report", "r.json")
     assert found.code == 2
