@@ -31,7 +31,7 @@ class Prognosis:
     diagnoses: int
     """That count, of this unit."""
     used: int
-    """Of these, those that say hours (or cycles)."""
+    """Of these, those of the same actuator as the last that say hours (or cycles)."""
     levels: tuple[float, ...]
     forecasts: tuple[Forecast, ...]
     seed: int
@@ -86,7 +86,7 @@ def prognosis_of(
         ages = [life.age[-1] for life in (present, *others) if len(life.age)]
         fleet = learn_fleet(others, float(np.median(ages)) if ages else 1.0, seed)
         forecasts.append(forecast(name, unit, present, fleet, levels, seed))
-    used = sum(_amount(item.usage, unit) is not None for item in mine)
+    used = sum(_amount(item.usage, unit) is not None for item in mine if item in alike)
     return Prognosis(serial, actuator, unit, len(mine), used, tuple(levels), tuple(forecasts), seed)
 
 

@@ -37,8 +37,8 @@ def print_prognosis(prognosis: Prognosis, console: Console) -> None:
     table.add_column("severity", no_wrap=True)
     table.add_column("now", justify="right", no_wrap=True)
     for name, level in levels_named(prognosis):
-        table.add_column(f"{prognosis.unit} to {name} {level:g}", no_wrap=True)
-    table.add_column("wear", no_wrap=True)
+        table.add_column(f"{prognosis.unit} to {name} {level:g}", overflow="fold")
+    table.add_column("wear", overflow="fold")
     for item in prognosis.forecasts:
         cells = [remaining_text(left) for left in item.remaining]
         now = "-" if item.value is None else f"{item.value:.4f}"
