@@ -59,6 +59,13 @@ def run(arguments: argparse.Namespace) -> int:
     names = _units(arguments, actuator) if arguments.fmu else _library(arguments, actuator)
     for name in names:
         put(printable(str(Path(arguments.out) / name)))
+    effects = actuator.calibration.effects if actuator.calibration else {}
+    if any(effects.values()) and not arguments.fmu:
+        say(
+            "the exported code goes by the calibrated data, but knows none of the effects that the"
+            f" calibration learned ({', '.join(sorted(effects))}): on this unit it will mostly find"
+            " NOT TESTED"
+        )
     return 0
 
 
