@@ -239,6 +239,7 @@ class Session:
         few = stepwise(
             experiments,
             (*nuisances_of(REGISTRY), parameter("load")),
+            least=found.excess,
             considered=CONSIDERED,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.nuisance.prior import usual
 from ehadiag.identify.refine.derivatives import Considered
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter
 
@@ -22,12 +23,15 @@ BUDGET = 300
 WORTH = 0.8
 """Excess that a further effect must leave, over that of the step before."""
 ONE_START = 1
+HELD = 0.05
+"""What is not known of an effect that is held at none, in deviations of its usual size."""
 
 
 def stepwise(
     experiments: Sequence[Experiment],
     effects: Sequence[Parameter],
     *,
+    least: float,
     considered: Sequence[Considered],
     seed: int,
     tell: Callable[[float], None],
@@ -39,6 +43,9 @@ def stepwise(
     experiments : sequence of Experiment
     effects : sequence of Parameter
         To choose from.
+    least : float
+        Excess with all effects at once. Where the first effect alone leaves more, all at once have
+        not gone astray, and no more is tried.
     considered : sequence of Considered
         What is held, with a tolerance that counts in the interval.
     seed : int
@@ -49,21 +56,24 @@ def stepwise(
     Returns
     -------
     Estimated or None
-        With all effects where these explain the recordings from there, else with the few that do;
-        None where nothing does.
+        With all effects where these explain the recordings from there, else with the few that do,
+        and what is not known of the others in the intervals; None where nothing does.
     """
     chosen: list[Parameter] = []
     best: Estimated | None = None
     evaluations = starts = 0
 
     def tried(
-        free: Sequence[Parameter], budget: int, hint: Mapping[str, float] | None
+        free: Sequence[Parameter],
+        budget: int,
+        hint: Mapping[str, float] | None,
+        held: Sequence[Considered] = (),
     ) -> Estimated:
         nonlocal evaluations, starts
         found = estimate(
             experiments,
             (*FAULTS, *OFFSETS, *free),
-            considered=considered,
+            considered=(*considered, *held),
             hint=hint,
             budget=budget,
             seed=seed,
@@ -85,7 +95,8 @@ def stepwise(
                 break
         tell(len(chosen) / len(effects))
         assert now is not None
-        if best is not None and now.excess > WORTH * best.excess and not now.explained:
+        most = least if best is None else WORTH * best.excess
+        if now.excess > most and not now.explained:
             return None
         best = now
         chosen.append(added)
@@ -94,4 +105,8 @@ def stepwise(
     whole = tried(effects, ONE_START, best.refined.values)
     if whole.explained:
         best = whole
+    else:
+        held = [Considered(item, HELD * usual(item).std) for item in effects if item not in chosen]
+        again = tried(chosen, ONE_START, best.refined.values, held)
+        best = again if again.explained else best
     return replace(best, evaluations=evaluations, starts=starts)
