@@ -26,7 +26,12 @@ from ehadiag.assess.other_faults import (
     other_faults,
 )
 from ehadiag.assess.plausible import objections_to_actuator
-from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
+from ehadiag.assess.position import (
+    PositionFit,
+    most_gain_error,
+    objections_to_position,
+    position_fit,
+)
 from ehadiag.assess.supply import objections_to_supply
 from ehadiag.assess.travel import objections_to_travel
 from ehadiag.assess.unobservable import lost_positions, observable, what_is_left
@@ -188,7 +193,7 @@ class DiagnosisSession:
             else:
                 why = (
                     *_of_supplies(experiments, modelled, identification.fit.pressure_offset),
-                    *_of_positions(positions),
+                    *_of_positions(positions, most_gain_error(self._actuator)),
                 )
             if not why:
                 verdict, why = degraded_by(others, *judge(identification, self._levels))
@@ -326,11 +331,10 @@ def _of_supplies(
     return list(dict.fromkeys(why for reasons in found for why in reasons))
 
 
-def _of_positions(positions: Sequence[PositionFit | None]) -> list[str]:
+def _of_positions(positions: Sequence[PositionFit | None], most: float) -> list[str]:
     """Why the position sensor cannot be believed, each reason once."""
-    return list(
-        dict.fromkeys(why for fit in positions if fit for why in objections_to_position(fit))
-    )
+    found = (objections_to_position(fit, most) for fit in positions if fit)
+    return list(dict.fromkeys(why for reasons in found for why in reasons))
 
 
 def _unchecked(positions: Sequence[PositionFit | None]) -> tuple[str, ...]:

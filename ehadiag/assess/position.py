@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import SPOOL
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.scalar.response import Response
 
-__all__ = ["PositionFit", "objections_to_position", "position_fit"]
+__all__ = ["PositionFit", "most_gain_error", "objections_to_position", "position_fit"]
 
 SPAN_S = 0.1
 LEAST_SAMPLES = 0.25
@@ -25,6 +26,9 @@ LEAST_TRAVEL_LSB = 10.0
 """Rms travel over the span (LSB) below which a gain is not judged."""
 MOST_GAIN_ERROR = 0.1
 """Twice what flow gain and jack area, each 5 % off, make of it."""
+STANDS_IN = 0.25
+"""The same for a unit that was calibrated with effects of its own: flow gain and jack area, which
+the pressure shows by their ratio to others, may stand in for what the model does not have."""
 MOST_DRIFT = 0.8e-3
 """m/s; a spool offset of 1 µm that goes unseen makes half of it. So on a spool of the default
 range; of another one it is greater in proportion."""
@@ -104,8 +108,27 @@ def position_fit(experiment: Experiment, modelled: Response) -> PositionFit | No
     )
 
 
-def objections_to_position(fit: PositionFit) -> list[str]:
-    """Why the position sensor cannot be believed; empty if it can."""
+def most_gain_error(actuator: Actuator) -> float:
+    """Gain of the sensor that is not told from data of the actuator, as a share."""
+    calibration = actuator.calibration
+    return STANDS_IN if calibration is not None and calibration.plays > 1 else MOST_GAIN_ERROR
+
+
+def objections_to_position(fit: PositionFit, most: float = MOST_GAIN_ERROR) -> list[str]:
+    """Why the position sensor cannot be believed; empty if it can.
+
+    Parameters
+    ----------
+    fit : PositionFit
+        What the sensor shows.
+    most : float
+        Largest error of its gain, see `most_gain_error`.
+
+    Returns
+    -------
+    list[str]
+        Reasons.
+    """
     if fit.gain < REVERSED:
         return ["the position sensor reads with the wrong sign"]
     if fit.gain < DEAD:
@@ -117,10 +140,10 @@ def objections_to_position(fit: PositionFit) -> list[str]:
             f"more than {OUTLIER:g} times (limit {MOST_OUTLIERS:.0%})"
         ]
     off = abs(fit.gain - 1.0)
-    if off > MOST_GAIN_ERROR:
+    if off > most:
         side = "high" if fit.gain > 1.0 else "low"
         return [
-            f"the position sensor reads {off:.0%} too {side} (limit {MOST_GAIN_ERROR:.0%}), or "
+            f"the position sensor reads {off:.0%} too {side} (limit {most:.0%}), or "
             "flow gain and jack area are not those of the actuator file"
         ]
     if abs(fit.drift) > fit.most_drift:

@@ -9,7 +9,12 @@ import pytest
 
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.modelled import response_of
-from ehadiag.assess.position import PositionFit, objections_to_position, position_fit
+from ehadiag.assess.position import (
+    PositionFit,
+    most_gain_error,
+    objections_to_position,
+    position_fit,
+)
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.stored_test import bundled_tests, resolve_test
@@ -123,3 +128,10 @@ def test_the_verdict_is_not_tested_and_says_so(sound):
     assert silent.verdict is Verdict.HEALTHY
     assert silent.positions == (None,)
     assert any("jack position" in note for note in silent.notes)
+
+
+def test_a_unit_with_effects_of_its_own_may_have_another_gain(sound):
+    found = fit(sound, 0.82 * sound[2].position)
+    assert objections_to_position(found)
+    assert objections_to_position(found, 0.25) == []
+    assert most_gain_error(default_actuator()) < 0.2
