@@ -30,8 +30,10 @@ __all__ = [
 
 LATEST_S = 0.05
 """A frame that comes later than this after its tick does not come."""
-MOST_LOST = 0.4
+MOST_LOST = 0.25
 """Share of samples of a channel that may be missing."""
+MOST_LOST_BY_TIME = 0.4
+"""The same where no counter tells the ticks: of two samples a tick late one counts as lost."""
 MOST_SPACING = 2
 """Ticks between two samples: half the control rate is enough to diagnose from."""
 LONGEST_GAP_S = 0.25
@@ -101,7 +103,7 @@ def objections_to_recording(
     return [
         *recording.quality.refused,
         *_unlike_the_test(samples, test, actuator),
-        *_gaps(samples, test),
+        *_gaps(samples, test, MOST_LOST_BY_TIME if recording.by_time else MOST_LOST),
         *out_of_range(recording.environment, samples, actuator),
     ]
 
@@ -140,15 +142,15 @@ def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> 
     return out
 
 
-def _gaps(samples: Samples, test: StoredTest) -> list[str]:
+def _gaps(samples: Samples, test: StoredTest, most: float) -> list[str]:
     out = []
     for name, values in (("spool", samples.spool), ("pressure", samples.pressure)):
         present = np.flatnonzero(np.isfinite(values[: test.ticks]))
         share = 1.0 - len(present) * _spacing(present) / test.ticks
         edges = np.concatenate([[-1], present, [test.ticks]])
         longest = float(np.diff(edges).max() - 1) / test.rate
-        if share > MOST_LOST:
-            out.append(f"{share:.0%} of the {name} samples are missing (limit {MOST_LOST:.0%})")
+        if share > most:
+            out.append(f"{share:.0%} of the {name} samples are missing (limit {most:.0%})")
         elif longest > LONGEST_GAP_S:
             out.append(f"no {name} sample for {longest:.2f} s (limit {LONGEST_GAP_S:g} s)")
     both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])

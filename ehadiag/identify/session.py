@@ -42,11 +42,13 @@ from ehadiag.identify.search.stages import (
 )
 from ehadiag.identify.spans import lay_out
 from ehadiag.identify.textbook import (
+    GUESSED_STD,
     HOPELESS,
     Attempt,
     attempt,
     explains,
     first_ticks,
+    is_guessed,
     named,
     rescued,
     unlikeness,
@@ -189,7 +191,7 @@ class Session:
                 first,
                 best.found,
                 best.refined,
-                covariance(best.refined),
+                covariance(best.refined) + _guessed(best.refined),
                 best.experiments,
                 first.evaluations + best.evaluations + (freed.evaluations if freed else 0),
                 best.count + (freed.starts if freed else 0),
@@ -336,6 +338,13 @@ def identify(
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
     return Session(solver, seed, nuisances, knowledge).finish(experiments, progress)
+
+
+def _guessed(refinement: Refinement) -> NDArray[np.float64]:
+    """Covariance that a guessed current adds to the severities'."""
+    names = [item.name for item in FAULTS]
+    std = GUESSED_STD if is_guessed(refinement) else 0.0
+    return np.diag([std**2 if item.name in names else 0.0 for item in refinement.parameters])
 
 
 def _nearer(

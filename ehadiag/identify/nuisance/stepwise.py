@@ -23,6 +23,8 @@ BUDGET = 300
 WORTH = 0.8
 """Excess that a further effect must leave, over that of the step before."""
 ONE_START = 1
+MOST_DEVIATIONS = 4.0
+"""Of an effect's usual size; a larger one is a fault, to be named."""
 HELD = 0.05
 """What is not known of an effect that is held at none, in deviations of its usual size."""
 
@@ -100,7 +102,7 @@ def stepwise(
             return None
         best = now
         chosen.append(added)
-    if best is None or not best.explained:
+    if best is None or not best.explained or not _is_usual(best, chosen):
         return None
     whole = tried(effects, ONE_START, best.refined.values)
     if whole.explained:
@@ -110,3 +112,11 @@ def stepwise(
         again = tried(chosen, ONE_START, best.refined.values, held)
         best = again if again.explained else best
     return replace(best, evaluations=evaluations, starts=starts)
+
+
+def _is_usual(found: Estimated, effects: Sequence[Parameter]) -> bool:
+    """Whether all effects are of a size that sound units have."""
+    return all(
+        abs(found.refined.values[item.name] - usual(item).mean) <= MOST_DEVIATIONS * usual(item).std
+        for item in effects
+    )
