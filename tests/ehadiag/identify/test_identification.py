@@ -146,7 +146,7 @@ def test_random_cases_of_the_cube(test):
     from ehadiag_tools.accuracy.figures import figures_of
     from ehadiag_tools.accuracy.runs import Run, perform
 
-    cases = random_faults(40, 11)
+    cases = random_faults(20, 11)
     records = [perform(Run(test, faults, noise_seed=i)) for i, faults in enumerate(cases)]
     figures = figures_of(records)
     mean, p95, largest = {"open": (0.02, 0.04, 0.3), "closed": (0.03, 0.06, 0.6)}[test]
