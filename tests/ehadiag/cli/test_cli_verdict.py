@@ -81,7 +81,7 @@ def test_missing_samples(channel: str, recording: Recording) -> None:
     rng = np.random.default_rng(4)
     scattered = without(values, rng.permutation(5500)[:2255])
     assert reasons(with_samples(recording, **{channel: scattered})) == (
-        f"41% of the {channel} samples are missing (limit 40%)",
+        f"41% of the {channel} samples are missing (limit 25%)",
     )
     gap = without(values, slice(2000, 2251))
     assert reasons(with_samples(recording, **{channel: gap})) == (
