@@ -17,9 +17,19 @@ from ehadiag.core.channels import SPOOL
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.scalar.response import Response
 
-__all__ = ["PositionFit", "most_gain_error", "objections_to_position", "position_fit"]
+__all__ = [
+    "LEAST_SAMPLES",
+    "LEAST_TRAVEL_LSB",
+    "SPAN_S",
+    "PositionFit",
+    "middle_of_three",
+    "most_gain_error",
+    "objections_to_position",
+    "position_fit",
+]
 
 SPAN_S = 0.1
+"""Over which travel is taken."""
 LEAST_SAMPLES = 0.25
 """Share of the travels that must be known, else the sensor is not judged."""
 LEAST_TRAVEL_LSB = 10.0
@@ -97,7 +107,7 @@ def position_fit(experiment: Experiment, modelled: Response) -> PositionFit | No
     columns = [travel, np.ones_like(travel)] if moves else [np.ones_like(travel)]
     values = measured[seen] / unit - (0.0 if moves else travel)
     solution, left = _robust(np.column_stack(columns), values)
-    lasting = np.abs(_middle_of_three(left))
+    lasting = np.abs(middle_of_three(left))
     most = np.minimum(left**2, OUTLIER**2)
     return PositionFit(
         gain=float(solution[0]) if moves else float("nan"),
@@ -167,6 +177,17 @@ def _robust(
     return solution, left
 
 
-def _middle_of_three(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Median of each value and its neighbours: a single bad one leaves no trace."""
+def middle_of_three(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Take the median of each value and its neighbours: a single bad one leaves no trace.
+
+    Parameters
+    ----------
+    values : NDArray[np.float64]
+        Shape (n,), n at least 3.
+
+    Returns
+    -------
+    NDArray[np.float64]
+        Shape (n - 2,), of all but the first and the last.
+    """
     return np.asarray(np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.assess.position import LEAST_SAMPLES, LEAST_TRAVEL_LSB, SPAN_S, middle_of_three
 from ehadiag.assess.wrong_units import relations
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels
@@ -13,12 +14,6 @@ from ehadiag.core.recording import Samples
 
 __all__ = ["objections_to_travel"]
 
-SPAN_S = 0.1
-"""Over which travel is taken."""
-LEAST_SHARE = 0.25
-"""Share of the travels that must be known, else nothing is said."""
-LEAST_TRAVEL_LSB = 10.0
-"""Rms of either travel, in LSB of the position, from which on there is a motion to compare."""
 LEAST_CORRELATION = 0.7
 """0.988 at least over 80 sound units with all effects, data 5 % off, orifices and strangers, and
 0.84 with a sensor 50 ms late, whatever the severities; 0.33 to -1 with another signal."""
@@ -83,7 +78,7 @@ def _travels(samples: Samples, actuator: Actuator) -> tuple[Floats, Floats] | No
     tick = samples.period_ns * 1e-9
     span = round(SPAN_S / tick)
     seen = np.flatnonzero(np.isfinite(samples.spool))
-    if len(seen) < LEAST_SHARE * len(samples.spool) or len(samples.spool) <= span + 2:
+    if len(seen) < LEAST_SAMPLES * len(samples.spool) or len(samples.spool) <= span + 2:
         return None
     spool = np.interp(np.arange(len(samples.spool)), seen, samples.spool[seen])
     gain = actuator.servovalve.GQ / actuator.jack.AJ
@@ -92,7 +87,7 @@ def _travels(samples: Samples, actuator: Actuator) -> tuple[Floats, Floats] | No
     position = _without_spikes(samples.position)
     measured = position[span:] - position[:-span]
     known = np.isfinite(measured)
-    if known.mean() < LEAST_SHARE:
+    if known.mean() < LEAST_SAMPLES:
         return None
     return expected[known], measured[known]
 
@@ -102,5 +97,5 @@ def _without_spikes(values: Floats) -> Floats:
     out, seen = values.copy(), np.flatnonzero(np.isfinite(values))
     known = values[seen]
     if len(seen) > 2:
-        out[seen[1:-1]] = np.median(np.stack([known[:-2], known[1:-1], known[2:]]), axis=0)
+        out[seen[1:-1]] = middle_of_three(known)
     return out

@@ -14,7 +14,9 @@ from markupsafe import Markup
 
 from ehadiag.report.plots import embedded
 
-__all__ = ["fill"]
+__all__ = ["fill", "script_sources", "templates_of"]
+
+PACKAGE = "ehadiag.report"
 
 
 def fill(template: str, plots: Mapping[str, LayoutDOM], **texts: Any) -> str:
@@ -38,7 +40,7 @@ def fill(template: str, plots: Mapping[str, LayoutDOM], **texts: Any) -> str:
     if scripts:
         scripts = [*scripts, _source("print.js")]
     return str(
-        _environment()
+        templates_of(PACKAGE)
         .get_template(template)
         .render(
             policy=_policy(scripts),
@@ -51,29 +53,56 @@ def fill(template: str, plots: Mapping[str, LayoutDOM], **texts: Any) -> str:
 
 def _source(name: str) -> str:
     """Read a script of the templates' folder as the template engine finds it."""
-    loader = _environment().loader
-    assert loader is not None
-    return loader.get_source(_environment(), name)[0]
+    templates = templates_of(PACKAGE)
+    assert templates.loader is not None
+    return templates.loader.get_source(templates, name)[0]
 
 
 @cache
-def _environment() -> Environment:
+def templates_of(package: str) -> Environment:
+    """Give the templates of a package; what they are filled with is escaped, whatever it is.
+
+    Parameters
+    ----------
+    package : str
+        With a folder `templates`.
+
+    Returns
+    -------
+    Environment
+        Its templates; a name that is not filled in is an error.
+    """
     return Environment(
-        loader=PackageLoader("ehadiag.report"),
+        loader=PackageLoader(package),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
     )
 
 
-def _policy(scripts: Sequence[str]) -> str:
-    """Nothing from anywhere but this page; of scripts only its own."""
+def script_sources(scripts: Sequence[str]) -> str:
+    """Name a page's own scripts for its Content-Security-Policy, so that no other runs.
+
+    Parameters
+    ----------
+    scripts : Sequence[str]
+        That the page has inline.
+
+    Returns
+    -------
+    str
+        Sources of `script-src`.
+    """
     hashes = " ".join(
         f"'sha256-{base64.b64encode(hashlib.sha256(item.encode()).digest()).decode()}'"
         for item in scripts
     )
-    allowed = hashes or "'none'"
+    return hashes or "'none'"
+
+
+def _policy(scripts: Sequence[str]) -> str:
+    """Nothing from anywhere but this page; of scripts only its own."""
     return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
+        f"default-src 'none'; script-src {script_sources(scripts)}; style-src 'unsafe-inline'; "
         "img-src data:; font-src data:; base-uri 'none'; form-action 'none'"
     )

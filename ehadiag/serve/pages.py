@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ehadiag.core.dates import utc_text
@@ -23,6 +19,7 @@ from ehadiag.core.small_file import read_small_file
 from ehadiag.history.counted import counted
 from ehadiag.history.store import History
 from ehadiag.prognosis.unit import prognosis_of
+from ehadiag.report.html import script_sources, templates_of
 from ehadiag.report.live_plots import plot_signals
 from ehadiag.report.plots import embedded, plot_trend
 from ehadiag.report.prognosis_table import levels_named, remaining_text
@@ -247,25 +244,11 @@ def _diagnosed(entry: Entry) -> list[Cell]:
 
 
 def _page(template: str, scripts: Sequence[str], **values: Any) -> Page:
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(item.encode()).digest()).decode()}'"
-        for item in scripts
-    )
     policy = (
-        f"default-src 'none'; script-src {hashes or repr('none')}; style-src 'unsafe-inline'; "
+        f"default-src 'none'; script-src {script_sources(scripts)}; style-src 'unsafe-inline'; "
         "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
         "frame-ancestors 'none'"
     )
-    html = _templates().get_template(template)
+    html = templates_of("ehadiag.serve").get_template(template)
     body = html.render(scripts=[Markup(script) for script in scripts], **values)
     return Page(body.encode("utf-8", errors="backslashreplace"), policy=policy)
-
-
-@cache
-def _templates() -> Environment:
-    return Environment(
-        loader=PackageLoader("ehadiag.serve"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
