@@ -269,7 +269,7 @@ class Session:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *knowledge.beside(effects)),
+            (*knowledge.severities, *OFFSETS, *knowledge.beside(effects)),
             known=knowledge.known,
             joint=knowledge.joint,
             considered=CONSIDERED,
