@@ -24,7 +24,7 @@ from ehadiag.identify.nuisance.starts import Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
-from ehadiag.identify.refine.posterior import robust_cost, sharpen
+from ehadiag.identify.refine.posterior import LAST, robust_cost, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
@@ -225,7 +225,8 @@ def _last_look(
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    again = sharpen(fine, before[0], wider, before[1], partial(linearised, rng=rng)).belief
+    draw = partial(linearised, rng=rng)
+    again = sharpen(fine, before[0], wider, before[1], draw, LAST).belief
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
 

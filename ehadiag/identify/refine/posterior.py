@@ -19,7 +19,17 @@ from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import Belief, Linearised
 
-__all__ = ["FEW", "MANY", "TAIL", "Pace", "Sharpened", "robust_cost", "robust_weights", "sharpen"]
+__all__ = [
+    "FEW",
+    "LAST",
+    "MANY",
+    "TAIL",
+    "Pace",
+    "Sharpened",
+    "robust_cost",
+    "robust_weights",
+    "sharpen",
+]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
@@ -30,9 +40,9 @@ LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
 """Scatter, in variances of the noise; share of samples with more of it, up to which it is so."""
 WIDTH = 2.0
 """Of the belief, in deviations of what the linear problem leaves."""
-FLAT_ROUNDS, FLAT_PLACES, FLAT = 6, 3, 2.0
-"""Rounds of which so many end with the same objective, as nearly as that (a parameter one deviation
-off costs 1): no more is to be gained. Between them a break-away may come at another tick."""
+FLAT_ROUNDS, FLAT_PLACES = 6, 3
+"""Rounds of which so many end with the same objective: no more is to be gained. Between them a
+break-away may come at another tick."""
 STUCK_ROUNDS, STUCK_SHARE, STUCK_ABOVE = 5, 0.01, 1.5
 """Rounds in which the objective must fall by that share, where it is above so much a sample (noise
 alone leaves 0.86, a break-away that comes at another tick 0.3 more)."""
@@ -55,20 +65,23 @@ class Pace:
     settled_ratio, settled_step : float
         Of a round after which nothing changes: ratio of the widths, step in units of them.
     most_rounds : int
-    by_cost : bool
-        Whether it ends, too, where the objective stays the same, and at the best place seen.
+    flat : float
+        By how much the objective differs where it is the same (a parameter one deviation off costs
+        1), so that the search ends, and at the best place seen; 0: it does not go by the objective.
     """
 
     least_ratio: float
     settled_ratio: float
     settled_step: float
     most_rounds: int
-    by_cost: bool
+    flat: float
 
 
-MANY = Pace(0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=24, by_cost=True)
+MANY = Pace(0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
 """For many unknowns."""
-FEW = Pace(0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12, by_cost=False)
+LAST = replace(MANY, flat=2.0)
+"""The same, of a last look that nothing follows."""
+FEW = Pace(0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12, flat=0.0)
 """For few ones, which are told apart at once."""
 
 
@@ -115,17 +128,17 @@ def sharpen(
     pace : Pace
     """
     belief, rounds, settled = begin, 0, False
-    course = _Course(known, information)
+    course = _Course(known, information, pace.flat)
     while not settled and rounds < pace.most_rounds:
         linear = linearise(model, belief)
         rounds += 1
-        if pace.by_cost:
+        if pace.flat:
             course.passed(belief.x, linear.middle)
             if course.is_flat or course.is_stuck:
                 return Sharpened(replace(belief, x=course.x), linear, course.is_flat)
         belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
-    if pace.by_cost:
+    if pace.flat:
         course.passed(belief.x, model.many(belief.x[None, :])[0])
         belief = replace(belief, x=course.x)
     return Sharpened(belief, linear, settled)
@@ -138,10 +151,12 @@ class _Course:
     ----------
     known, information
         See `sharpen`.
+    flat : float
+        See `Pace`.
     """
 
-    def __init__(self, known: Belief, information: NDArray[np.float64]) -> None:
-        self._known, self._information = known, information
+    def __init__(self, known: Belief, information: NDArray[np.float64], flat: float) -> None:
+        self._known, self._information, self._flat = known, information, flat
         self._course: list[float] = []
         self._unit = 1.0
         self.x = known.x
@@ -160,7 +175,7 @@ class _Course:
     def is_flat(self) -> bool:
         """Whether the search came to the same objective again and again of late."""
         late = sorted(self._course[-FLAT_ROUNDS:])[:FLAT_PLACES]
-        return len(late) == FLAT_PLACES and late[-1] - late[0] < FLAT * max(self._unit, 1.0)
+        return len(late) == FLAT_PLACES and late[-1] - late[0] < self._flat * max(self._unit, 1.0)
 
     @property
     def is_stuck(self) -> bool:
@@ -207,7 +222,7 @@ def _narrowed(
     inverse_root = np.linalg.inv(belief.root)
     held = FREE * np.eye(len(belief.x))
     is_linear = _bent(linear) < LINEAR_SHARE
-    back = HELD_BACK_WHERE_LINEAR if is_linear and pace.by_cost else HELD_BACK
+    back = HELD_BACK_WHERE_LINEAR if is_linear and pace.flat else HELD_BACK
     held[np.ix_(curved, curved)] += back * inverse_root.T @ inverse_root
     x = bounded_step(linear.x, normal + held, gradient, model.lower, model.upper)
     # What is left unexplained widens the belief.
