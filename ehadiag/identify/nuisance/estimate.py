@@ -20,11 +20,11 @@ from ehadiag.identify.nuisance.prior import (
     information_of,
     small_effects,
 )
-from ehadiag.identify.nuisance.starts import Found, robust_cost, search
+from ehadiag.identify.nuisance.starts import Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
-from ehadiag.identify.refine.posterior import sharpen
+from ehadiag.identify.refine.posterior import LAST, robust_cost, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
@@ -121,7 +121,14 @@ def estimate(
     if any(item.constants.OIL > 0.0 for item in experiments):
         guide = _spool_guide(experiments, free, coarse.levels)
         guided = search(
-            guide, first, information, origins, _spool_is_noise, budget=budget // 2, seed=seed
+            guide,
+            first,
+            information,
+            origins,
+            _spool_is_noise,
+            budget=budget // 2,
+            seed=seed,
+            hopeless=_spool_is_hopeless if give_up else None,
         )
         there = guided.belief.x * guide.scale
         names = [item.name for item in guide.estimated]
@@ -192,6 +199,10 @@ def _spool_is_noise(residuals: NDArray[np.float64]) -> bool:
     return is_noise(residuals[SPOOL_ROW : SPOOL_ROW + 1])
 
 
+def _spool_is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
+    return is_hopeless(residuals[SPOOL_ROW : SPOOL_ROW + 1], starts)
+
+
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:
     """Weigh the experiments by the noise that residuals of all their ticks show."""
     ends = np.cumsum([item.ticks for item in experiments])[:-1]
@@ -214,7 +225,8 @@ def _last_look(
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    again = sharpen(fine, before[0], wider, before[1], partial(linearised, rng=rng)).belief
+    draw = partial(linearised, rng=rng)
+    again = sharpen(fine, before[0], wider, before[1], draw, LAST).belief
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
 
