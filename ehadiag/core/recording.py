@@ -159,6 +159,8 @@ class Environment:
     """Pa."""
     oil_temperature: float | None = None
     """degC: the scale of the viscosity laws."""
+    temperature_std: float = 0.0
+    """Standard deviation of rounding it to another scale than the computer's own, K."""
 
 
 @dataclass(frozen=True, slots=True)

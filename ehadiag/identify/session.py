@@ -19,8 +19,8 @@ from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
-    CONSIDERED,
     FirstPart,
+    considered_in,
     first_spans,
     refine_first_part,
 )
@@ -242,7 +242,7 @@ class Session:
             experiments,
             (*nuisances_of(REGISTRY), parameter("load")),
             least=found.excess,
-            considered=CONSIDERED,
+            considered=considered_in(experiments),
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
         )
@@ -262,12 +262,13 @@ class Session:
         tell: Progress,
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        free = (*FAULTS, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *knowledge.beside(effects)),
+            free,
             known=knowledge.known,
             joint=knowledge.joint,
-            considered=CONSIDERED,
+            considered=considered_in(experiments, free),
             hint=hint,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
