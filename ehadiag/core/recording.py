@@ -260,6 +260,8 @@ class Recording:
     """What the computer has found itself; None where it did not say."""
     by_time: bool = False
     """No counter told the samples' ticks: one message's may be placed later than another's."""
+    out_of_order: float = 0.0
+    """Share of the ticks whose command is another tick's: the frames' order is not the bus's."""
 
     @property
     def duration(self) -> float:
