@@ -264,7 +264,7 @@ def _recording(
         test_id=episode.test_id,
         serial=episode.serial,
         outcome=episode.outcome,
-        environment=_environment(decoded, bus_map, begin, end),
+        environment=replace(_environment(decoded, begin, end), temperature_std=_rounding(bus_map)),
         quality=quality,
         channel=bus_map.channel,
         start_ns=_start_ns(samples),
@@ -314,7 +314,7 @@ def _saturated(samples: Samples | None) -> dict[str, int]:
     return {key: int(samples.saturated[index].sum()) for index, key in enumerate(CHANNEL_KEYS)}
 
 
-def _environment(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int) -> Environment:
+def _environment(decoded: DecodedTable, begin: int, end: int) -> Environment:
     def median(key: str) -> float | None:
         role = f"environment.{key}"
         for item in decoded.messages.values():
@@ -328,7 +328,6 @@ def _environment(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int) -
         supply_pressure=median("supply_pressure"),
         return_pressure=median("return_pressure"),
         oil_temperature=median("oil_temperature"),
-        temperature_std=_rounding(bus_map),
     )
 
 
