@@ -19,8 +19,8 @@ from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
-    CONSIDERED,
     FirstPart,
+    considered_in,
     first_spans,
     refine_first_part,
 )
@@ -247,7 +247,7 @@ class Session:
             experiments,
             (*nuisances_of(REGISTRY), parameter("load")),
             least=found.excess,
-            considered=CONSIDERED,
+            considered=considered_in(experiments),
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
         )
@@ -267,12 +267,13 @@ class Session:
         tell: Progress,
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
-            (*knowledge.severities, *OFFSETS, *knowledge.beside(effects)),
+            free,
             known=knowledge.known,
             joint=knowledge.joint,
-            considered=CONSIDERED,
+            considered=considered_in(experiments, free),
             hint=hint,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
