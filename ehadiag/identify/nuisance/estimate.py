@@ -24,7 +24,7 @@ from ehadiag.identify.nuisance.starts import Found, robust_cost, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
-from ehadiag.identify.refine.posterior import sharpen
+from ehadiag.identify.refine.posterior import nothing, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
@@ -104,7 +104,8 @@ def estimate(
     seed : int
         The same seed gives the same answer.
     tell : callable, optional
-        Called from time to time with the share of the budget that is spent.
+        Called again and again with the share of the budget that is spent; what it raises ends the
+        estimation.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
     explains : callable
@@ -121,7 +122,14 @@ def estimate(
     if any(item.constants.OIL > 0.0 for item in experiments):
         guide = _spool_guide(experiments, free, coarse.levels)
         guided = search(
-            guide, first, information, origins, _spool_is_noise, budget=budget // 2, seed=seed
+            guide,
+            first,
+            information,
+            origins,
+            _spool_is_noise,
+            budget=budget // 2,
+            seed=seed,
+            tell=tell,
         )
         there = guided.belief.x * guide.scale
         names = [item.name for item in guide.estimated]
@@ -142,7 +150,8 @@ def estimate(
     held = [item.parameter for item in considered]
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
     before = belief_of(fine, known, joint), information_of(fine, known, joint)
-    belief = _last_look(fine, model, found, before, seed)
+    between = nothing if tell is None else partial(tell, 1.0)
+    belief = _last_look(fine, model, found, before, seed, between)
     linear = linearised(fine, belief, np.random.default_rng(seed))
     refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
     return Estimated(
@@ -205,6 +214,7 @@ def _last_look(
     found: Found,
     before: tuple[Belief, NDArray[np.float64]],
     seed: int,
+    between: Callable[[], None],
 ) -> Belief:
     """Optimum by the noise as judged: of the search, or a better one beside it.
 
@@ -214,7 +224,8 @@ def _last_look(
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    again = sharpen(fine, before[0], wider, before[1], partial(linearised, rng=rng)).belief
+    linearise = partial(linearised, rng=rng)
+    again = sharpen(fine, before[0], wider, before[1], linearise, between=between).belief
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
 

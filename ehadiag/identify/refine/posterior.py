@@ -19,7 +19,7 @@ from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import Belief, Linearised
 
-__all__ = ["FEW", "MANY", "TAIL", "Pace", "Sharpened", "robust_weights", "sharpen"]
+__all__ = ["FEW", "MANY", "TAIL", "Pace", "Sharpened", "nothing", "robust_weights", "sharpen"]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
@@ -33,6 +33,10 @@ WIDTH = 2.0
 HELD_BACK = 0.1
 """Share of the belief's information that a round's step is held back by."""
 FREE = 1e-9
+
+
+def nothing() -> None:
+    """Let a search go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +89,7 @@ def sharpen(
     information: NDArray[np.float64],
     linearise: Callable[[Derivatives, Belief], Linearised],
     pace: Pace = MANY,
+    between: Callable[[], None] = nothing,
 ) -> Sharpened:
     """Sharpen a belief until the noise stops it.
 
@@ -101,9 +106,12 @@ def sharpen(
     linearise : callable
         How the model is made linear over a belief.
     pace : Pace
+    between : callable
+        Called before each round, some 16 to 32 runs of the model; what it raises ends the search.
     """
     belief, rounds, settled = begin, 0, False
     while not settled and rounds < pace.most_rounds:
+        between()
         linear = linearise(model, belief)
         belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
