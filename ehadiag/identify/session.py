@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
+from ehadiag.identify.nuisance.astray import may_be_astray, would_explain
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
-from ehadiag.identify.nuisance.explained import excess
+from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.nuisance.stepwise import stepwise
@@ -186,7 +187,8 @@ class Session:
             hint = best.refined.values if best else named(found.best)
             freed = self._freed(experiments, hint if near else None, tell)
         if best is not None and (freed is None or _is_poorer(freed, best)):
-            if near and outliers(best.refined) <= BEYOND_RESCUE:
+            elsewhere = freed is not None and is_of_the_pressure(freed.refined.residuals)
+            if near and outliers(best.refined) <= BEYOND_RESCUE and not elsewhere:
                 best = rescued(
                     experiments, best, self._first_part, self.solver, self.seed, tell,
                     time.perf_counter,
@@ -240,11 +242,14 @@ class Session:
         self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
     ) -> Estimated:
         """Estimate one effect after another where that explains what all at once do not."""
+        load = parameter("load")
         if found.excess > BEYOND_STEPS:
+            return found
+        if not may_be_astray(experiments, found) and not would_explain(load, found, self.seed):
             return found
         few = stepwise(
             experiments,
-            (*nuisances_of(REGISTRY), parameter("load")),
+            (*nuisances_of(REGISTRY), load),
             least=found.excess,
             considered=CONSIDERED,
             seed=self.seed,

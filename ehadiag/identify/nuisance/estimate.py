@@ -82,6 +82,7 @@ def estimate(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     give_up: bool = False,
+    look_again: bool = False,
     explains: Explains = is_noise,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
@@ -108,6 +109,8 @@ def estimate(
         estimation.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
+    look_again : bool
+        Whether to look about the optimum with the noise as judged even where it was given up.
     explains : callable
         Of residuals, shape (signals, N): whether there is nothing better to look for.
     """
@@ -151,7 +154,11 @@ def estimate(
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
     before = belief_of(fine, known, joint), information_of(fine, known, joint)
     between = nothing if tell is None else partial(tell, 1.0)
-    belief = _last_look(fine, model, found, before, seed, between)
+    given_up = give_up and not found.explained and is_hopeless(found.residuals, found.starts)
+    if given_up and not look_again:
+        belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
+    else:
+        belief = _last_look(fine, model, found, before, seed, between)
     linear = linearised(fine, belief, np.random.default_rng(seed))
     refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
     return Estimated(
