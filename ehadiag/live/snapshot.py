@@ -104,6 +104,8 @@ class Residuals:
 
     spool: float | None = None
     pressure: float | None = None
+    against: str = ""
+    """What the model goes by: a diagnosis, a calibration, a unit as new."""
     spool_above: float = 0.0
     spool_below: float = 0.0
     pressure_above: float = 0.0
