@@ -1,6 +1,6 @@
 """One look at a running session: bus, test, signals, residuals, severities, verdict.
 
-A session makes some ten of them a second (`ehadiag.live.publisher`); a screen, a log or a web page
+A session makes four of them a second (`ehadiag.live.publisher`); a screen, a log or a web page
 shows them. Names say the unit. Where a value is not known it is None: neither `to_dict` nor
 `to_json` ever holds NaN.
 """

@@ -63,7 +63,6 @@ class BitView:
         self._progress: Progress | None = None
         self._working = ""
         self._diagnosis: Diagnosis | None = None
-        self.serial: int | None = None
         self.notes: tuple[str, ...] = ()
 
     def connected(self, transport: Transport) -> None:
@@ -131,10 +130,11 @@ class BitView:
         return Ending(verdict=verdict, reasons=diagnosis.reasons)
 
     def _serial(self) -> int | None:
+        heard = None if self._beside is None else self._beside.serial
         if self._diagnosis is None:
-            return self.serial
+            return heard
         serials = (item.serial for item in self._diagnosis.recordings)
-        return next((item for item in serials if item is not None), self.serial)
+        return next((item for item in serials if item is not None), heard)
 
     def _bus(self) -> Bus:
         if self._transport is None:

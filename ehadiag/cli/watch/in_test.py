@@ -64,6 +64,11 @@ class InTest:
             self._end(error)
 
     @property
+    def serial(self) -> int | None:
+        """Serial number that the bus says; None before it did."""
+        return None if self._watcher is None else self._watcher.said_serial
+
+    @property
     def alarms(self) -> tuple[int, tuple[Alarm, ...]]:
         """How many there were, and all of them: a test is too short for many."""
         return self._alarms
