@@ -64,6 +64,11 @@ BEYOND_RESCUE = 0.05
 made: 0.04 at most on a textbook's actuator after the search before."""
 BEYOND_STEPS = 15.0
 """Excess after all nuisances at once from which on they are not tried one after another."""
+NEARLY = 1.3
+"""Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
+brings out what its model leaves, and loosened effects would stand in for that."""
+CHANGE = 0.5
+"""Share of what is left beyond noise that may remain where effects have changed since."""
 LASTING = 1.2
 """Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
 1.15 at most in 80 recordings of units without any."""
@@ -227,10 +232,10 @@ class Session:
             return found
         if not self.knowledge.doubts:
             return self._stepwise(experiments, found, tell)
-        if self.knowledge.joint is None:
+        if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
         loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
-        return min(found, loose, key=lambda item: item.excess)
+        return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
     def _stepwise(
         self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
@@ -264,7 +269,7 @@ class Session:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *knowledge.beside(effects)),
+            (*knowledge.severities, *OFFSETS, *knowledge.beside(effects)),
             known=knowledge.known,
             joint=knowledge.joint,
             considered=CONSIDERED,
