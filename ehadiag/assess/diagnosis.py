@@ -44,6 +44,7 @@ from ehadiag.assess.unobservable import (
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
+from ehadiag.core.shown_in import told
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
 from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, knowledge_of
@@ -373,8 +374,8 @@ def _freed(identification: Identification | None, actuator: Actuator) -> tuple[s
             "recordings: its data and effects are refined within what is known of them"
         )
         out += [
-            f"{parameter(name).short} has changed since: {value:.4g} then, "
-            f"{identification.nuisances[name].value:.4g} {parameter(name).unit} now"
+            f"{parameter(name).short} has changed since: {told(value, parameter(name).unit)} then, "
+            f"{told(identification.nuisances[name].value, parameter(name).unit)} now"
             for name, value in calibration.effects.items()
             if name in identification.nuisances
             and abs(identification.nuisances[name].value - value)

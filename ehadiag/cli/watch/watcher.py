@@ -204,6 +204,7 @@ class Watcher:
         return Residuals(
             spool=known(spool),
             pressure=known(pressure),
+            against=self.unit.source,
             spool_above=shares[0],
             spool_below=shares[1],
             pressure_above=shares[2],

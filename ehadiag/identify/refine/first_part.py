@@ -5,7 +5,7 @@ What is left for the whole test is one step (`ehadiag.identify.refine.update`), 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import SPREAD, Refinement, median_offsets, refine
+from ehadiag.identify.refine.posterior import nothing
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, parameter
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = [
+    "AGAIN",
+    "JUDGEMENTS",
+    "NOISE_SETTLED",
     "FirstPart",
     "anchored_derivatives",
     "anchored_model",
@@ -69,18 +73,21 @@ class FirstPart:
 
 
 def refine_first_part(
-    experiments: Sequence[Experiment], until: Sequence[int], start: Mapping[str, float]
+    experiments: Sequence[Experiment],
+    until: Sequence[int],
+    start: Mapping[str, float],
+    between: Callable[[], None] = nothing,
 ) -> FirstPart:
     """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
-    `start`: severities by name.
+    `start`: severities by name. `between`: called between rounds; what it raises ends the search.
     """
     spans = first_spans(experiments, until)
     free, residuals = residuals_at(experiments, spans, start)
     start = {**start, **median_offsets(free, residuals)}
     experiments = _judged(experiments, until, residuals)
     levels = anchored_model(experiments, spans).levels
-    best = _refine(experiments, spans, start, levels, SPREAD)
+    best = _refine(experiments, spans, start, levels, SPREAD, between)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [item.noise for item in experiments]
@@ -89,7 +96,7 @@ def refine_first_part(
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
-        best = _refine(experiments, spans, best.values, levels, AGAIN)
+        best = _refine(experiments, spans, best.values, levels, AGAIN, between)
         evaluations += best.evaluations
     noise = tuple(item.noise for item in experiments)
     return FirstPart(best, noise, levels, evaluations)
@@ -113,11 +120,12 @@ def _refine(
     start: Mapping[str, float],
     levels: NDArray[np.int64],
     spread: NDArray[np.float64] | float,
+    between: Callable[[], None],
 ) -> Refinement:
     batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
     # What is considered is worked out with the last part.
     model = SimdModel(batch, unknowns_of(experiments), levels=levels)
-    return refine(Derivatives(model, experiments[0].noise), start, spread)
+    return refine(Derivatives(model, experiments[0].noise), start, spread, between)
 
 
 def anchored_derivatives(
