@@ -26,6 +26,7 @@ __all__ = [
     "TAIL",
     "Pace",
     "Sharpened",
+    "nothing",
     "robust_cost",
     "robust_weights",
     "sharpen",
@@ -52,6 +53,10 @@ HELD_BACK_WHERE_LINEAR = 1e-3
 """The same where the model is linear over it: a belief that became too narrow on its way would
 creep."""
 FREE = 1e-9
+
+
+def nothing() -> None:
+    """Let a search go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +115,7 @@ def sharpen(
     information: NDArray[np.float64],
     linearise: Callable[[Derivatives, Belief], Linearised],
     pace: Pace = MANY,
+    between: Callable[[], None] = nothing,
 ) -> Sharpened:
     """Sharpen a belief until the noise stops it.
 
@@ -126,10 +132,13 @@ def sharpen(
     linearise : callable
         How the model is made linear over a belief.
     pace : Pace
+    between : callable
+        Called before each round, some 16 to 32 runs of the model; what it raises ends the search.
     """
     belief, rounds, settled = begin, 0, False
     course = _Course(known, information, pace.flat)
     while not settled and rounds < pace.most_rounds:
+        between()
         linear = linearise(model, belief)
         rounds += 1
         if pace.flat:

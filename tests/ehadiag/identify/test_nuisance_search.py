@@ -146,7 +146,7 @@ def test_what_nothing_explains_ends_with_the_budget():
     )
     assert not found.explained
     assert problem.evaluations < 600 + 600  # a start goes on to its end
-    assert len(told) == found.starts
+    assert len(told) > found.starts  # between the rounds of each start, too
     assert told[-1] == 1.0
 
 
