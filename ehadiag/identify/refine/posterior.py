@@ -84,8 +84,8 @@ class Pace:
 
 MANY = Pace(0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
 """For many unknowns."""
-LAST = replace(MANY, flat=2.0)
-"""The same, of a last look that nothing follows."""
+LAST = replace(MANY, most_rounds=12, flat=4.0)
+"""The same, of a last look, which begins beside the optimum."""
 FEW = Pace(0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12, flat=0.0)
 """For few ones, which are told apart at once."""
 
