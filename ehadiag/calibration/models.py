@@ -14,8 +14,8 @@ from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.knowledge import severities_below
 from ehadiag.identify.nuisance.prior import Known, nuisances_of
-from ehadiag.identify.nuisance.starts import robust_cost
 from ehadiag.identify.refine.first_part import CONSIDERED
+from ehadiag.identify.refine.posterior import robust_cost
 from ehadiag.identify.spans import lay_out
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 

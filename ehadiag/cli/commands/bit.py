@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.assess.verdict import Levels, Rule
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, bus_options, options
 from ehadiag.cli.acquire import STOPPED, Heard, acquire, recording_path
 from ehadiag.cli.batch.job import labelled
 from ehadiag.cli.beforehand import refuse_beforehand
@@ -94,13 +94,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     ):
         parser.add_argument(
             f"--max-{name}",
-            type=options.positive,
+            type=argument_types.positive,
             metavar=unit,
             help=f"abort the test when the {what} goes beyond ±{unit} (default: not watched)",
         )
     parser.add_argument(
         "--onboard-wait",
-        type=options.positive,
+        type=argument_types.positive,
         default=60.0,
         metavar="S",
         help="how long to wait after the test for what the flight-control computer finds itself,"
@@ -112,7 +112,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_keeping_options(parser)
     options.add_result_options(parser)
     add_report_option(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     options.add_fault_options(parser)
     parser.set_defaults(run=run)
 
@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--mapping: a test is requested of one actuator; name one mapping, or --listen"
         )
     described = [
-        (unit, options.the_actuator(unit.arguments), options.the_bus_map(unit.arguments))
+        (unit, asked_for.the_actuator(unit.arguments), asked_for.the_bus_map(unit.arguments))
         for unit in named
     ]
     for unit, actuator, bus_map in described:
@@ -225,7 +225,7 @@ class _Run:
             self._test,
             self._session,
             lambda: show(view),
-            options.the_bitrate(arguments, self._bus_map),
+            bus_options.the_bitrate(arguments, self._bus_map),
             self._beside,
         )
         heard = acquire(
@@ -269,7 +269,7 @@ class _Run:
         assert result is not None
         ended_at = heard.ended_at
         spent = Spent(self._read_s, None if ended_at is None else time.perf_counter() - ended_at)
-        asked = options.the_asked(self.unit.arguments, self._bus_map, [self._test])
+        asked = asked_for.the_asked(self.unit.arguments, self._bus_map, [self._test])
         line = json_line(result, spent, asked, [log_file(heard.recording.source)])
         draw = partial(drawn, result, self._levels) if can_be_drawn(result) else None
         name = f"{heard.name}-{self.unit.label}" if self.unit.label else heard.name

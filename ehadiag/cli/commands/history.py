@@ -8,13 +8,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ehadiag.cli.argument_types import unit_serial
 from ehadiag.cli.history_file import (
     add_history_file,
     add_usage_options,
     open_history,
     the_usage,
 )
-from ehadiag.cli.options import unit_serial
 from ehadiag.cli.output import emit, put, rendered, say
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.core.errors import ConfigurationError, InputOutputError
