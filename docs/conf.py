@@ -36,6 +36,7 @@ numpydoc_show_class_members = False
 CONTENTS = "index"
 LINK = re.compile(r"- \[.*?\]\(([\w/-]+)\.md\)")
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+examples/README\.md)\)")
+SCROLLED = re.compile(r'<pre(?=>)|<div(?= class="table-wrapper)')
 HEAD = re.compile(r"^(?=[A-Z][a-z]+$)", re.MULTILINE)
 
 
@@ -68,7 +69,7 @@ def make_accessible(
         'role="heading"', 'role="heading" aria-level="2"'
     )
     if "body" in context:
-        context["body"] = context["body"].replace("<pre>", '<pre tabindex="0">')
+        context["body"] = SCROLLED.sub(r'\g<0> tabindex="0"', context["body"])
 
 
 def setup(app: Sphinx) -> None:
