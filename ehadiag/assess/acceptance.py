@@ -19,6 +19,9 @@ from ehadiag.identify.result import Identification
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
 
 __all__ = [
+    "LONGEST_GAP_S",
+    "MOST_LOST",
+    "most_left",
     "nothing_is_under_way",
     "objections_to_estimate",
     "objections_to_experiment",
@@ -244,10 +247,7 @@ def objections_to_estimate(
     fit = identification.fit
     out = []
     rms = max(fit.spool_rms, fit.pressure_rms)
-    most_outliers, most_rms = MOST_OUTLIERS, MOST_RMS
-    if calibration is not None and calibration.fit.left > 0.0:
-        most_outliers += CHANGED * calibration.fit.outliers
-        most_rms *= CHANGED * max(calibration.fit.spool_rms, calibration.fit.pressure_rms)
+    most_outliers, most_rms = most_left(calibration)
     if fit.outliers > most_outliers or not rms <= most_rms:
         out.append(
             f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
@@ -258,6 +258,20 @@ def objections_to_estimate(
     if hidden:
         out.append(f"the test does not show {', '.join(hidden)}")
     return out
+
+
+def most_left(calibration: Calibration | None) -> tuple[float, float]:
+    """Outliers (share) and rms residual that an explained recording may have.
+
+    calibration: of the unit: what it could not explain is allowed.
+    """
+    if calibration is None or not calibration.fit.left > 0.0:
+        return MOST_OUTLIERS, MOST_RMS
+    fit = calibration.fit
+    return (
+        MOST_OUTLIERS + CHANGED * fit.outliers,
+        MOST_RMS * CHANGED * max(fit.spool_rms, fit.pressure_rms),
+    )
 
 
 def remarks_on_recording(

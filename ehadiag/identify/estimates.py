@@ -17,7 +17,7 @@ from ehadiag.identify.uncertainty import interval95
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, Kind, Parameter
 
-__all__ = ["estimates_of", "fit_of", "identification", "of_faults", "outliers"]
+__all__ = ["NOT_SHOWN_STD", "estimates_of", "fit_of", "identification", "of_faults", "outliers"]
 
 NOT_SHOWN_STD = 0.1
 BOUND = 1e-6

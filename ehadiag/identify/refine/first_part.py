@@ -21,6 +21,9 @@ from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, parameter
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = [
+    "AGAIN",
+    "JUDGEMENTS",
+    "NOISE_SETTLED",
     "FirstPart",
     "anchored_derivatives",
     "anchored_model",
