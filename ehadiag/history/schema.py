@@ -136,9 +136,10 @@ def version_of(connection: sqlite3.Connection) -> int:
     ConfigurationError
         The file is another program's.
     """
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    # In this order: another process that makes the tables between two of these has marked them.
     (tables,) = connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
     if tables and application != APPLICATION_ID:
         raise ConfigurationError("is an SQLite file of another program: name another file")
     return int(version)
