@@ -19,6 +19,9 @@ from ehadiag.identify.result import Identification
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
 
 __all__ = [
+    "LONGEST_GAP_S",
+    "MOST_LOST",
+    "most_left",
     "nothing_is_under_way",
     "objections_to_estimate",
     "objections_to_experiment",
@@ -205,18 +208,8 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
             f"the command differs from test {test.name!r} by up to "
             f"{trace.command_deviation * 1e3:.3g} {unit}: another test was played"
         )
-    # The current's own noise is not to be had in closed loop; the other converters' stands for it.
-    noise_lsb = min(
-        experiment.spool_noise / channels.spool.grain,
-        experiment.pressure_noise / channels.pressure.grain,
-    )
-    limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
-    if trace.residual_lsb > limit_lsb:
-        out.append(
-            f"servovalve current {trace.residual_lsb:.1f} LSB rms from what the "
-            f"{'control law' if test.closed_loop else 'command'} gives (limit "
-            f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
-        )
+    if current := objection_to_current(experiment):
+        out.append(current)
     if lost := lost_positions(experiment):
         out.append(lost)
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
@@ -224,6 +217,24 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
         if seen.size and float(np.ptp(seen)) == 0.0:
             out.append(f"the {name} signal is frozen")
     return out
+
+
+def objection_to_current(experiment: Experiment) -> str:
+    """Why the measured current is none that the test asks for; empty if it is."""
+    trace, channels = experiment.trace, experiment.channels
+    # The current's own noise is not to be had in closed loop; the other converters' stands for it.
+    noise_lsb = min(
+        experiment.spool_noise / channels.spool.grain,
+        experiment.pressure_noise / channels.pressure.grain,
+    )
+    limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
+    if not trace.residual_lsb > limit_lsb:
+        return ""
+    return (
+        f"servovalve current {trace.residual_lsb:.1f} LSB rms from what the "
+        f"{'control law' if experiment.test.closed_loop else 'command'} gives (limit "
+        f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
+    )
 
 
 def objections_to_estimate(
@@ -236,10 +247,7 @@ def objections_to_estimate(
     fit = identification.fit
     out = []
     rms = max(fit.spool_rms, fit.pressure_rms)
-    most_outliers, most_rms = MOST_OUTLIERS, MOST_RMS
-    if calibration is not None and calibration.fit.left > 0.0:
-        most_outliers += CHANGED * calibration.fit.outliers
-        most_rms *= CHANGED * max(calibration.fit.spool_rms, calibration.fit.pressure_rms)
+    most_outliers, most_rms = most_left(calibration)
     if fit.outliers > most_outliers or not rms <= most_rms:
         out.append(
             f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
@@ -250,6 +258,20 @@ def objections_to_estimate(
     if hidden:
         out.append(f"the test does not show {', '.join(hidden)}")
     return out
+
+
+def most_left(calibration: Calibration | None) -> tuple[float, float]:
+    """Outliers (share) and rms residual that an explained recording may have.
+
+    calibration: of the unit: what it could not explain is allowed.
+    """
+    if calibration is None or not calibration.fit.left > 0.0:
+        return MOST_OUTLIERS, MOST_RMS
+    fit = calibration.fit
+    return (
+        MOST_OUTLIERS + CHANGED * fit.outliers,
+        MOST_RMS * CHANGED * max(fit.spool_rms, fit.pressure_rms),
+    )
 
 
 def remarks_on_recording(

@@ -1,7 +1,8 @@
 """Object files for other computers from compiled kernels, by the compiler that is in numba.
 
 numba keeps with each compiled kernel its LLVM module. Of it the kernel itself is taken, with a
-C function in front that converts nothing but pointers, and code for the target is emitted. numba's
+C function in front that converts nothing but pointers, and code for the target is emitted: each
+product and each sum rounded by itself, so that every processor comes to the same digits. numba's
 run-time library stays behind: kernels that need it are refused. Of a C library only `RUNTIME` is
 called, which compilers too may call in any program.
 """
@@ -34,6 +35,9 @@ __all__ = [
 RUNTIME = frozenset({"memcpy", "memset", "memmove"})
 """What of a C library the code may call."""
 OPTIMISE = 2
+LEAVE = re.compile(r"\b(?:contract|nnan|nsz|ninf|arcp|afn|reassoc|fast) (?=[^\"]*$)", re.M)
+"""Leave to round otherwise, to fuse a product and a sum above all: what a compiler makes of it
+depends on the processor, and with it the last digit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,22 +105,23 @@ class Processor:
         What it has beyond or less than its name says.
     abi : str
         Calling convention, empty: the triple's.
-    fused : bool
-        Whether a product and a sum that the kernels let fuse are one instruction with one rounding.
     shared : bool
         Whether the code may be part of a shared library.
     rounds : bool
         Whether it rounds to whole numbers by an instruction. Where not, a function of the C library
         would be called, and no Arm code can hand it a number in both calling conventions.
+    doubles : bool
+        Whether it has instructions for doubles. Where not, the compiler's run-time library has
+        their arithmetic, but no square root.
     """
 
     triple: str
     cpu: str = ""
     features: str = ""
     abi: str = ""
-    fused: bool = True
     shared: bool = False
     rounds: bool = True
+    doubles: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +170,7 @@ def object_code(
     main = _parsed(_head(machine) + _front(functions, tables, replaced), machine)
     wanted = {item.name for item in functions}
     for kernel, kinds in _kernels(functions, replaced):
-        main.link_in(_module(kernel, kinds, machine, processor.fused, replaced))
+        main.link_in(_module(kernel, kinds, machine, replaced))
     text = _closed(str(main), wanted)
     whole = _parsed(text, machine)
     _optimise(whole, machine)
@@ -241,7 +246,6 @@ def _module(
     kernel: Any,
     kinds: tuple[Any, ...],
     machine: _Machine,
-    fused: bool,
     replaced: Mapping[str, Any],
 ) -> Any:
     """Take a kernel's module, without the parts that only Python calls."""
@@ -254,8 +258,7 @@ def _module(
             item.linkage = "external" if item.name == name else "internal"
     _tidy(module)
     text = str(module)
-    if not fused:
-        text = re.sub(r"\bcontract\b ", "", text)
+    text = LEAVE.sub("", text)
     # The intrinsic is one instruction where there is one.
     text = re.sub(r"^declare double @sqrt\(.*$", "", text, flags=re.M)
     if "@sqrt(" in text:

@@ -11,11 +11,14 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from ehadiag.assess.acceptance import LONGEST_GAP_S, MOST_LOST, most_left
+from ehadiag.assess.verdict import FALSE_HEALTHY, FAULT_CHANCE, Levels
 from ehadiag.compile.kernel_cache import source_hash
 from ehadiag.compile.object_code import (
     Function,
     Numbers,
     Pointer,
+    Processor,
     Table,
     object_code,
     tool_versions,
@@ -29,17 +32,25 @@ from ehadiag.export.arm_attributes import either_convention
 from ehadiag.export.firmware import SOURCES, firmware
 from ehadiag.export.linking import c_compiler, link_shared
 from ehadiag.export.targets import Target
+from ehadiag.identify.estimates import NOT_SHOWN_STD
 from ehadiag.model.exponential import exponential, exponential_less_one
-from ehadiag.model.plant import plant_constants
+from ehadiag.model.unit import unit_constants
 from ehadiag.monitor import layout
 from ehadiag.monitor.cusum import CusumDesign, design_cusum
 from ehadiag.monitor.kernel import push_tick
 from ehadiag.monitor.plan import monitor_plan
 from ehadiag.monitor.prepare import prepare, rest
 from ehadiag.onboard import layout as identification
-from ehadiag.onboard.elementary import cosine, logarithm, round_down, round_even
+from ehadiag.onboard.elementary import (
+    cosine,
+    logarithm,
+    round_down,
+    round_even,
+    square_root,
+)
 from ehadiag.onboard.environment import set_environment
 from ehadiag.onboard.kernels import begin_identification, identify_some
+from ehadiag.onboard.rules import Rules, with_rules
 
 __all__ = [
     "HEADER",
@@ -49,6 +60,7 @@ __all__ = [
     "SHARED",
     "export_library",
     "manifest",
+    "rules",
     "template",
     "write",
 ]
@@ -67,6 +79,7 @@ OWN_FUNCTIONS: Final[Mapping[str, Any]] = {
 """What stands for functions of the C library, whose last digit differs from one to the next."""
 ROUNDING: Final[Mapping[str, Any]] = {"rint": round_even, "floor": round_down}
 """The same for a processor without such instructions; exact, so that no digit depends on it."""
+ROOT: Final[Mapping[str, Any]] = {"sqrt": square_root}
 PLAN: Final = "eha_plan"
 NOT_MEASURED: Final = dict.fromkeys(
     ("bit_equality", "instructions_of_push", "instructions_of_identification"), "not measured"
@@ -118,9 +131,12 @@ def export_library(
         The folder cannot be written.
     """
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
-    plan = monitor_plan(actuator, plant_constants(actuator), design)
-    own = OWN_FUNCTIONS if target.processor.rounds else {**OWN_FUNCTIONS, **ROUNDING}
-    code = either_convention(object_code(FUNCTIONS, {PLAN: plan.tolist()}, own, target.processor))
+    plan = with_rules(monitor_plan(actuator, unit_constants(actuator), design), rules(actuator))
+    code = either_convention(
+        object_code(
+            FUNCTIONS, {PLAN: plan.tolist()}, _own_functions(target.processor), target.processor
+        )
+    )
     library = archive("eha.o", code, [item.name for item in FUNCTIONS])
     names = {"version": metadata.version("ehadiag"), "target": target.name}
     files = {
@@ -151,7 +167,7 @@ def export_library(
             "triple": target.processor.triple or "of this computer",
             "cpu": target.processor.cpu,
             "features": target.processor.features,
-            "fused": target.processor.fused,
+            "doubles": target.processor.doubles,
         },
         compiler_flags=list(target.flags),
         options={"actuator": actuator.name, "hours": hours, "shift": shift},
@@ -164,6 +180,39 @@ def export_library(
     )
     write(folder, files)
     return list(files)
+
+
+def rules(actuator: Actuator) -> Rules:
+    """What a verdict on board goes by: the rules of `ehadiag diagnose` at its default levels.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        What a calibration of the unit could not explain is no reason against a verdict.
+
+    Returns
+    -------
+    Rules
+        The limits.
+    """
+    levels, (outliers, rms) = Levels(), most_left(actuator.calibration)
+    return Rules(
+        advisory=levels.advisory,
+        limit=levels.limit,
+        false_healthy=FALSE_HEALTHY,
+        fault_chance=FAULT_CHANCE,
+        most_outliers=outliers,
+        most_rms=rms,
+        most_std=NOT_SHOWN_STD,
+        most_lost=MOST_LOST,
+        longest_gap=LONGEST_GAP_S * actuator.controller.rate,
+    )
+
+
+def _own_functions(processor: Processor) -> Mapping[str, Any]:
+    """What stands for functions of the C library on a processor."""
+    rounding = {} if processor.rounds else ROUNDING
+    return {**OWN_FUNCTIONS, **rounding, **({} if processor.doubles else ROOT)}
 
 
 def _header(
@@ -183,7 +232,7 @@ def _header(
         reference=f"{design.reference:g}",
         threshold=f"{design.threshold:.4g}",
         hours=f"{hours:g}",
-        supply=repr(float(plant_constants(actuator).PSR)),
+        supply=repr(float(unit_constants(actuator).PSR)),
         bytes=str(layout.SIZE * layout.NUMBER),
         before=str(layout.PREDICTED),
         behind=str(layout.SIZE - layout.PREDICTED - held),

@@ -35,20 +35,21 @@ class Target:
 TARGETS: tuple[Target, ...] = (
     Target("host", "this computer", Processor("", "host", shared=True)),
     Target(
-        "host-unfused",
-        "this computer, each product and sum rounded by itself as on a target that cannot fuse",
-        Processor("", "host", fused=False, shared=True),
-    ),
-    Target(
         "cortex-m7",
         "Arm Cortex-M7 with double precision, bare",
         Processor("thumbv7em-none-eabihf", "cortex-m7"),
         ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-d16"),
     ),
     Target(
+        "cortex-m4",
+        "Arm Cortex-M4F, bare; doubles in software",
+        Processor("thumbv7em-none-eabihf", "cortex-m4", rounds=False, doubles=False),
+        ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"),
+    ),
+    Target(
         "cortex-r5",
-        "Arm Cortex-R5F, bare; cannot fuse",
-        Processor("armv7r-none-eabihf", "cortex-r5", fused=False, rounds=False),
+        "Arm Cortex-R5F, bare",
+        Processor("armv7r-none-eabihf", "cortex-r5", rounds=False),
         ("-mcpu=cortex-r5", "-mfloat-abi=hard", "-mfpu=vfpv3-d16"),
     ),
     Target(
@@ -65,8 +66,8 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "powerpc-e500mc",
-        "Freescale e500mc, 32 bits, big-endian, Linux; fuses otherwise, so not at all",
-        Processor("powerpc-unknown-linux-gnu", "e500mc", fused=False, rounds=False),
+        "Freescale e500mc, 32 bits, big-endian, Linux",
+        Processor("powerpc-unknown-linux-gnu", "e500mc", rounds=False),
         ("-mcpu=e500mc",),
     ),
 )

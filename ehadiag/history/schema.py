@@ -78,6 +78,16 @@ CREATE TABLE event (
 );
 """
 
+WITHDRAWALS = """
+CREATE TABLE withdrawal (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    appended TEXT NOT NULL,
+    kind TEXT NOT NULL,          -- table of what is withdrawn
+    number INTEGER NOT NULL,     -- its id there
+    text TEXT NOT NULL           -- why
+);
+"""
+
 
 def _guards(tables: Mapping[str, Sequence[str]]) -> str:
     """Triggers that keep the rows of tables, named with their keys."""
@@ -101,7 +111,10 @@ _PARTS = ("diagnosis", "place")
 _KEYS = {"diagnosis": ("id",), "event": ("id",)} | dict.fromkeys(
     ("source", "severity", "effect"), _PARTS
 )
-STEPS: tuple[str, ...] = (FIRST + _guards(_KEYS),)
+STEPS: tuple[str, ...] = (
+    FIRST + _guards(_KEYS),
+    WITHDRAWALS + _guards({"withdrawal": ("id",)}),
+)
 """SQL of each step, in order."""
 
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from ehadiag.core.channels import Channel
 
 __all__ = [
+    "KEPT_MEAN",
+    "KEPT_SHARE",
     "QUIET_BLOCK",
     "TYPICAL_NOISE_LSB",
     "noise_of_signal",

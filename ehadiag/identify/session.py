@@ -21,8 +21,8 @@ from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
-    CONSIDERED,
     FirstPart,
+    considered_in,
     first_spans,
     refine_first_part,
 )
@@ -67,6 +67,11 @@ BEYOND_RESCUE = 0.05
 made: 0.04 at most on a textbook's actuator after the search before."""
 BEYOND_STEPS = 15.0
 """Excess after all nuisances at once from which on they are not tried one after another."""
+NEARLY = 1.3
+"""Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
+brings out what its model leaves, and loosened effects would stand in for that."""
+CHANGE = 0.5
+"""Share of what is left beyond noise that may remain where effects have changed since."""
 LASTING = 1.2
 """Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
 1.15 at most in 80 recordings of units without any."""
@@ -233,10 +238,10 @@ class Session:
             return found
         if not self.knowledge.doubts:
             return self._stepwise(experiments, found, tell)
-        if self.knowledge.joint is None:
+        if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
         loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
-        return min(found, loose, key=lambda item: item.excess)
+        return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
     def _stepwise(
         self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
@@ -251,7 +256,7 @@ class Session:
             experiments,
             (*nuisances_of(REGISTRY), load),
             least=found.excess,
-            considered=CONSIDERED,
+            considered=considered_in(experiments),
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
         )
@@ -271,12 +276,13 @@ class Session:
         tell: Progress,
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *knowledge.beside(effects)),
+            free,
             known=knowledge.known,
             joint=knowledge.joint,
-            considered=CONSIDERED,
+            considered=considered_in(experiments, free),
             hint=hint,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),

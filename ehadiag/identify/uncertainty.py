@@ -11,7 +11,7 @@ from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.refine.least_squares import Refinement
 from ehadiag.model.parameters import Kind
 
-__all__ = ["covariance", "interval95"]
+__all__ = ["DISCREPANCY_STD", "EXPECTED_CAPPED", "UNIFORM_STD", "covariance", "interval95"]
 
 NORMAL = NormalDist()
 CUT = float(np.sqrt(CAP))

@@ -72,9 +72,7 @@ def approximate(
         trial[0], trial[1] = (k // GRID) / (GRID - 1), (k % GRID) / (GRID - 1)
     else:
         trial[2] = k / (JACK_GRID - 1)
-    spool, pressure = run_model(
-        address, plan_address, plan, ticks_address, count, trial, False, CAP
-    )
+    spool, pressure = run_model(address, plan_address, plan, ticks_address, count, trial, CAP)
     cost = spool if a.phase == GRIDS else pressure
     best = a.best
     if cost < best:
@@ -92,4 +90,4 @@ def approximate(
             p[SPREAD + i] = WIDE
         p[GENERATOR] = math.inf
         p[GENERATOR + 1] = 0.0
-    keep_advance(p, Advance(phase, done, best, a.damping))
+    keep_advance(p, Advance(phase, done, best, 0.0, 0.0))

@@ -1,9 +1,9 @@
 """The identification itself, as two kernels: begin, and go on for some runs of the model.
 
 First approximation: a grid of filter and spool friction by the spool alone, then one of the jack's
-friction by the pressure. The compact genetic algorithm goes on from there, and a damped
-Gauss-Newton refines severities and both offsets together. One run of the model is a pass of the
-streaming monitor over the recording.
+friction by the pressure. The compact genetic algorithm goes on from there. Then noise and offsets
+are judged, and a belief about severities and both offsets is sharpened. One run of the model is a
+pass of the streaming monitor over the recording.
 """
 
 from __future__ import annotations
@@ -13,14 +13,17 @@ import math
 from ehadiag.compile.address import array_at
 from ehadiag.compile.kernels import brief_kernel
 from ehadiag.monitor.layout import NUMBER
-from ehadiag.monitor.prepare import PLAN_SIZE, UNIT_SIZE, prepare
+from ehadiag.monitor.prepare import UNIT_SIZE, prepare
 from ehadiag.onboard.approximate import approximate, take_offsets
+from ehadiag.onboard.examine import examine
 from ehadiag.onboard.layout import (
+    CONCLUSION,
     DONE,
     GENES,
     GRIDS,
     JACK,
     LANES,
+    LOOK,
     POINT,
     REFINEMENT,
     RUNS,
@@ -32,7 +35,9 @@ from ehadiag.onboard.layout import (
     advance_of,
     keep_advance,
 )
-from ehadiag.onboard.refine import LEAST_DAMPING, refine
+from ehadiag.onboard.noise import look
+from ehadiag.onboard.refine import refine
+from ehadiag.onboard.rules import PLAN_SIZE
 from ehadiag.onboard.search import search
 
 __all__ = ["begin_identification", "identify_some"]
@@ -47,7 +52,7 @@ def begin_identification(address: int, plan_address: int, unit_address: int) -> 
     address : int
         Of the SIZE numbers of `ehadiag.onboard.layout`.
     plan_address : int
-        Of a monitor's plan.
+        Of a plan with rules, see `ehadiag.onboard.rules`.
     unit_address : int
         Of the numbers of a `Unit`: viscosity, supply and kind of the commands hold.
 
@@ -63,7 +68,7 @@ def begin_identification(address: int, plan_address: int, unit_address: int) -> 
         p[i] = 0.0
     for i in range(UNIT_SIZE):
         p[UNIT + i] = unit[i]
-    keep_advance(p, Advance(GRIDS, 0.0, math.inf, LEAST_DAMPING))
+    keep_advance(p, Advance(GRIDS, 0.0, math.inf, 0.0, 0.0))
     p[POINT + 2] = 0.3
     for i in range(GENES):
         p[TRIAL + i] = p[POINT + i]
@@ -106,8 +111,12 @@ def identify_some(
             approximate(address, plan_address, plan, ticks_address, count)
         elif a.phase == SEARCH:
             search(address, plan_address, plan, ticks_address, count)
+        elif a.phase == LOOK:
+            look(address, plan_address, plan, ticks_address, count)
         elif a.phase == REFINEMENT:
             refine(address, plan_address, plan, ticks_address, count)
+        elif a.phase == CONCLUSION:
+            examine(address, plan_address, plan, ticks_address, count)
         else:
             break
     return 0 if advance_of(p).phase == DONE else 1

@@ -10,17 +10,22 @@ from ehadiag.monitor.prepare import UNIT_SIZE
 
 __all__ = [
     "ADVANCE",
-    "CONVERGED",
+    "BELIEF",
+    "BINS",
+    "CONCLUSION",
     "DONE",
     "ELITE",
     "GENERATOR",
     "GENES",
-    "GRADIENT",
     "GRIDS",
+    "HISTOGRAMS",
     "JACK",
+    "LAGS",
     "LANES",
+    "LOOK",
     "MEAN",
     "MONITORS",
+    "NOISE",
     "NORMAL",
     "OUTCOME",
     "PARAMETERS",
@@ -29,11 +34,11 @@ __all__ = [
     "REFINEMENT",
     "RUNS",
     "SAMPLES",
+    "SCORES",
     "SCRATCH",
     "SEARCH",
     "SIZE",
     "SPREAD",
-    "STEP",
     "TRIAL",
     "UNIT",
     "VERDICT",
@@ -51,8 +56,12 @@ PARAMETERS: Final = 5
 """Severities, then the offsets of spool and pressure in units of their noise."""
 SAMPLES: Final = 8
 """Of a generation of the compact genetic algorithm."""
-MONITORS: Final = 1 + 2 * PARAMETERS
-"""Models that run side by side for derivatives: at the point, and either side in each direction."""
+MONITORS: Final = 1 + 2 * GENES
+"""Models that run side by side: at the point, and two more on each severity's axis through it."""
+BINS: Final = 128
+"""Of each histogram that noise and offsets are read from."""
+LAGS: Final = 20
+"""Ticks over which residuals are held to be correlated, see `ehadiag.identify.uncertainty`."""
 
 
 class Outcome(NamedTuple):
@@ -84,10 +93,14 @@ class Outcome(NamedTuple):
         Residuals that it is of.
     outliers : float
         Share of them beyond three deviations.
+    spool_rms : float
+        Rms of the spool's residuals, squares capped, in units of the noise that they show.
+    pressure_rms : float
+        The same of the pressure's.
     runs : float
         Runs of the model so far.
     converged : float
-        Not 0: the refinement came to an end by itself.
+        Not 0: the refinement came to rest by itself.
     """
 
     Kintas: float
@@ -102,6 +115,8 @@ class Outcome(NamedTuple):
     cost: float
     samples: float
     outliers: float
+    spool_rms: float
+    pressure_rms: float
     runs: float
     converged: float
 
@@ -112,27 +127,28 @@ class Advance(NamedTuple):
     Attributes
     ----------
     phase : float
-        0 grid of the spool's severities, 1 grid of the jack's, 2 genetic search, 3 refinement,
-        4 done.
+        0 grid of the spool's severities, 1 grid of the jack's, 2 genetic search, 3 look at noise
+        and offsets, 4 refinement, 5 conclusion, 6 done.
     steps : float
         Runs or steps within the phase.
     best : float
         Least cost of the phase so far.
-    damping : float
-        Of the refinement's next step.
+    judged : float
+        How often the noise was judged.
+    settled : float
+        Not 0: the refinement came to rest.
     """
 
     phase: float
     steps: float
     best: float
-    damping: float
+    judged: float
+    settled: float
 
 
 GRIDS: Final = 0.0
 """Phases, see `Advance`."""
-JACK, SEARCH, REFINEMENT, DONE = 1.0, 2.0, 3.0, 4.0
-STEP: Final = 5e-5
-"""Half-width of the differences, and distance from the ends of a severity's range."""
+JACK, SEARCH, LOOK, REFINEMENT, CONCLUSION, DONE = 1.0, 2.0, 3.0, 4.0, 5.0, 6.0
 
 
 def _behind(start: int, length: int) -> int:
@@ -142,7 +158,6 @@ def _behind(start: int, length: int) -> int:
 OUTCOME: Final = 0
 VERDICT: Final = OUTCOME + Outcome._fields.index("verdict")
 RUNS: Final = OUTCOME + Outcome._fields.index("runs")
-CONVERGED: Final = OUTCOME + Outcome._fields.index("converged")
 ADVANCE: Final = _behind(OUTCOME, len(Outcome._fields))
 UNIT: Final = _behind(ADVANCE, len(Advance._fields))
 """What the monitor's kernels are told of the unit, severities and offsets of the run."""
@@ -157,12 +172,19 @@ GENERATOR: Final = _behind(ELITE, GENES)
 """Cost of the elite, then the state of the random numbers."""
 POPULATION: Final = _behind(GENERATOR, 2)
 """A generation, then its costs."""
-NORMAL: Final = _behind(POPULATION, SAMPLES * (GENES + 1))
-"""Normal matrix and gradient at the best point."""
-GRADIENT: Final = _behind(NORMAL, PARAMETERS * PARAMETERS)
-SCRATCH: Final = _behind(GRADIENT, PARAMETERS)
-"""The same at the trial, a matrix, two vectors, and the elite before a generation."""
-LANES: Final = _behind(SCRATCH, 2 * PARAMETERS * PARAMETERS + 4 * PARAMETERS + GENES)
+BELIEF: Final = _behind(POPULATION, SAMPLES * (GENES + 1))
+"""Root of the covariance of the severities as they are believed."""
+NOISE: Final = _behind(BELIEF, GENES * GENES)
+"""Noise of spool and pressure as the residuals show it, in units of the plan's."""
+NORMAL: Final = _behind(NOISE, 2)
+"""Normal matrix, then what pulls at the parameters."""
+SCORES: Final = _behind(NORMAL, PARAMETERS * (PARAMETERS + 1))
+"""Pull of each of the last ticks."""
+HISTOGRAMS: Final = _behind(SCORES, (LAGS + 1) * PARAMETERS)
+"""Of spool and pressure: residuals, then their second differences."""
+SCRATCH: Final = _behind(HISTOGRAMS, 4 * BINS)
+"""Matrices and vectors of a step."""
+LANES: Final = _behind(SCRATCH, 4 * PARAMETERS * PARAMETERS + 8 * PARAMETERS)
 SIZE: Final = _behind(LANES, MONITORS * MONITOR_SIZE)
 
 outcome_of, keep_outcome = unpacker(Outcome, OUTCOME), packer(Outcome, OUTCOME)

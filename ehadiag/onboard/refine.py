@@ -1,4 +1,9 @@
-"""Damped Gauss-Newton on severities and offsets, its derivatives by monitors side by side."""
+"""Refinement: a belief about severities and offsets, sharpened round by round.
+
+What `ehadiag.identify.refine.posterior` does for few unknowns, in fixed memory: the model is made
+linear over the spread of what is believed, on seven models side by side, so that it looks past the
+steps that break-aways make in the cost; the linear problem gives a sharper belief.
+"""
 
 from __future__ import annotations
 
@@ -9,137 +14,154 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.address import array_at
 from ehadiag.compile.kernels import brief_kernel
-from ehadiag.monitor.kernel import push_tick
-from ehadiag.monitor.layout import NUMBER, RESIDUAL
-from ehadiag.monitor.layout import SIZE as MONITOR_SIZE
-from ehadiag.onboard.bounded import bounded_step
-from ehadiag.onboard.conclude import conclude
+from ehadiag.monitor.layout import NUMBER
+from ehadiag.onboard.bounded import (
+    bounded_step,
+    eigenvectors,
+    invert,
+    invert_small,
+    similar,
+)
 from ehadiag.onboard.layout import (
-    DONE,
+    BELIEF,
+    CONCLUSION,
     GENES,
-    GRADIENT,
-    LANES,
     MONITORS,
     NORMAL,
     PARAMETERS,
     POINT,
-    REFINEMENT,
     RUNS,
     SCRATCH,
     SIZE,
-    STEP,
     TRIAL,
     Advance,
-    Outcome,
     advance_of,
     keep_advance,
-    keep_outcome,
-    outcome_of,
 )
-from ehadiag.onboard.run import PRESSURE_WEIGHT, SPOOL_WEIGHT, start_lane, vector_at
+from ehadiag.onboard.run import lines, push_lanes, start_cross, vector_at
 
-__all__ = ["LEAST_DAMPING", "refine"]
+__all__ = ["refine"]
 
 Array = NDArray[np.float64]
-CAP = 9.0
-"""Largest square of one residual that counts."""
-KINK = 0.3
-"""Two-sided differences that disagree by more (in units of noise) mark a break-away."""
-ITERATIONS = 16
-LEAST_GAIN = 1e-2
-LEAST_DAMPING, MOST_DAMPING = 1e-6, 10.0
+TAIL = 9.0
+"""Variances from which a residual counts little."""
+ROUNDS = 16
+SETTLED_RATIO, SETTLED_STEP = 0.7, 0.05
+"""Of a round after which nothing changes: ratio of the widths, step in units of them."""
+WIDTH = 4.0
+"""Of the belief, in variances of what the linear problem leaves."""
+HELD_BACK, FREE = 0.1, 1e-9
+"""Share of the belief's information that a step is held back by."""
+LEAST_RATIO, LEAST_RATIO_OF_LINEAR = 0.3, 0.05
+"""By which a belief may become narrower in a round; where the model is linear over it."""
+LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
+"""Scatter, and share of samples with more of it, up to which it is."""
+SQUARE = PARAMETERS * PARAMETERS
+MOVED = SCRATCH + 2 * SQUARE + PARAMETERS
+SMALL = MOVED + PARAMETERS
+"""Places of what a step works on."""
 
 
 @brief_kernel
-def _derive(
+def _linearise(
     address: int, plan_address: int, plan: Array, ticks_address: int, count: int
-) -> tuple[float, float, float]:
-    """Normal matrix and gradient at the trial: cost, residuals, and those beyond the cap."""
+) -> tuple[float, float]:
+    """Normal matrix and gradient over the belief: what is left unexplained, and jumps' share."""
     p, ticks = array_at(address, (SIZE,)), array_at(ticks_address, (count, 5))
-    trial = vector_at(address, TRIAL)
-    normal = array_at(address + NUMBER * SCRATCH, (PARAMETERS, PARAMETERS))
-    gradient = vector_at(address, SCRATCH + PARAMETERS * PARAMETERS)
-    slope = vector_at(address, SCRATCH + PARAMETERS * (PARAMETERS + 1))
-    for i in range(PARAMETERS):
-        gradient[i] = 0.0
-        for j in range(PARAMETERS):
-            normal[i, j] = 0.0
-    for lane in range(MONITORS):
-        which, side = (lane - 1) // 2, STEP if lane % 2 == 1 else -STEP
-        if lane > 0:
-            kept = trial[which]
-            trial[which] = kept + side
-            start_lane(address, plan_address, plan, lane, trial)
-            trial[which] = kept
-        else:
-            start_lane(address, plan_address, plan, lane, trial)
-    cost, samples, beyond = 0.0, 0.0, 0.0
+    normal = array_at(address + NUMBER * NORMAL, (PARAMETERS, PARAMETERS))
+    gradient = vector_at(address, NORMAL + PARAMETERS * PARAMETERS)
+    slope = vector_at(address, SCRATCH)
+    along = array_at(address + NUMBER * (SCRATCH + PARAMETERS), (GENES, 3))
+    for i in range(PARAMETERS * (PARAMETERS + 1)):
+        p[NORMAL + i] = 0.0
+    start_cross(
+        address, plan_address, plan, vector_at(address, POINT), vector_at(address, TRIAL), along
+    )
+    left, weighed, jumped, samples = 0.0, 0.0, 0.0, 0.0
     for k in range(count):
-        sample = (ticks[k, 0], ticks[k, 1], ticks[k, 2], ticks[k, 3], ticks[k, 4])
-        for lane in range(MONITORS):
-            push_tick(address + NUMBER * (LANES + lane * MONITOR_SIZE), sample)
+        push_lanes(address, (ticks[k, 0], ticks[k, 1], ticks[k, 2], ticks[k, 3], ticks[k, 4]))
         for channel in range(2):
-            at = LANES + RESIDUAL + channel
-            r = p[at]
-            if not math.isfinite(r):
+            if not math.isfinite(ticks[k, 2 + channel]):
                 continue
+            residual, scatter = lines(p, channel, along, slope)
+            weight = 1.0 / (1.0 + scatter + residual * residual / TAIL)
+            left += residual * residual * weight
+            weighed += (1.0 + scatter) * weight
             samples += 1.0
-            cost += min(r * r, CAP)
-            smooth = r * r < CAP
-            if not smooth:
-                beyond += 1.0
+            if scatter > LINEAR_SCATTER:
+                jumped += 1.0
             for i in range(PARAMETERS):
-                up = p[at + (1 + 2 * i) * MONITOR_SIZE]
-                down = p[at + (2 + 2 * i) * MONITOR_SIZE]
-                if not abs(up - r - (r - down)) <= KINK:
-                    smooth = False
-                slope[i] = (up - down) / (2.0 * STEP)
-            if smooth:
-                for i in range(PARAMETERS):
-                    gradient[i] += slope[i] * r
-                    for j in range(PARAMETERS):
-                        normal[i, j] += slope[i] * slope[j]
+                gradient[i] += weight * slope[i] * residual
+                for j in range(PARAMETERS):
+                    normal[i, j] += weight * slope[i] * slope[j]
     p[RUNS] += float(MONITORS)
-    return cost, samples, beyond
+    return left / max(weighed, 1.0), jumped / max(samples, 1.0)
+
+
+@brief_kernel
+def _narrow(address: int, excess: float, linear: bool) -> tuple[float, float]:
+    """Step and narrow the belief: the ratio by which it would narrow most, the step's length.
+
+    The ratio is negative where there is no step to make.
+    """
+    normal = array_at(address + NUMBER * NORMAL, (PARAMETERS, PARAMETERS))
+    gradient = vector_at(address, NORMAL + PARAMETERS * PARAMETERS)
+    point, trial = vector_at(address, POINT), vector_at(address, TRIAL)
+    held = array_at(address + NUMBER * SCRATCH, (PARAMETERS, PARAMETERS))
+    matrix = array_at(address + NUMBER * (SCRATCH + SQUARE), (PARAMETERS, PARAMETERS))
+    column, out = vector_at(address, SCRATCH + 2 * SQUARE), vector_at(address, MOVED)
+    root = array_at(address + NUMBER * BELIEF, (GENES, GENES))
+    inverse = array_at(address + NUMBER * SMALL, (GENES, GENES))
+    spread = array_at(address + NUMBER * (SMALL + GENES * GENES), (GENES, GENES))
+    axes = array_at(address + NUMBER * (SMALL + 2 * GENES * GENES), (GENES, GENES))
+    invert_small(root, inverse)
+    for i in range(PARAMETERS):
+        for j in range(PARAMETERS):
+            held[i, j] = normal[i, j] + (FREE if i == j else 0.0)
+            for k in range(GENES if i < GENES and j < GENES else 0):
+                held[i, j] += HELD_BACK * inverse[k, i] * inverse[k, j]
+    if not bounded_step(trial, held, gradient, GENES, 0.0, 1.0, matrix, column, out):
+        return -1.0, 0.0
+    step = 0.0
+    for i in range(GENES):
+        along = 0.0
+        for j in range(GENES):
+            along += inverse[i, j] * (out[j] - point[j])
+        step = max(step, abs(along))
+    for i in range(PARAMETERS):
+        point[i] = out[i]
+    # The covariance that is left, in units of the belief's own root.
+    for i in range(PARAMETERS):
+        normal[i, i] += FREE * held[i, i]
+    for j in range(GENES):
+        if not math.isfinite(invert(normal, j, matrix, column)):
+            return -1.0, 0.0
+        for i in range(GENES):
+            spread[i, j] = WIDTH * max(excess, 1.0) * column[i]
+    similar(inverse, spread, axes)
+    eigenvectors(spread, axes)
+    least, narrowest = LEAST_RATIO_OF_LINEAR if linear else LEAST_RATIO, 1.0
+    for j in range(GENES):
+        ratio = math.sqrt(max(spread[j, j], 0.0))
+        narrowest = min(narrowest, ratio)
+        for i in range(GENES):
+            inverse[i, j] = 0.0
+            for k in range(GENES):
+                inverse[i, j] += root[i, k] * axes[k, j] * min(max(ratio, least), 1.0)
+    for i in range(GENES):
+        for j in range(GENES):
+            root[i, j] = inverse[i, j]
+    return narrowest, step
 
 
 @brief_kernel
 def refine(address: int, plan_address: int, plan: Array, ticks_address: int, count: int) -> None:
-    """One step of the refinement: derivatives at the trial, and the next trial."""
+    """One round of the refinement."""
     p = array_at(address, (SIZE,))
     a = advance_of(p)
-    point, trial = vector_at(address, POINT), vector_at(address, TRIAL)
-    cost, samples, beyond = _derive(address, plan_address, plan, ticks_address, count)
-    best, damping, done = a.best, a.damping, a.steps + 1.0
-    ended = False
-    if cost < best:
-        ended = best - cost < LEAST_GAIN
-        best, damping = cost, max(damping / 10.0, LEAST_DAMPING)
-        for i in range(PARAMETERS):
-            point[i] = trial[i]
-        for i in range(PARAMETERS * (PARAMETERS + 1)):
-            p[NORMAL + i] = p[SCRATCH + i]
-        o = outcome_of(p)
-        keep_outcome(
-            p,
-            Outcome(
-                point[0], point[1], point[2], 0.0, 0.0, 0.0,
-                point[3] / plan[SPOOL_WEIGHT], point[4] / plan[PRESSURE_WEIGHT],
-                0.0, cost, samples, beyond / max(samples, 1.0), o.runs, 0.0,
-            ),
-        )  # fmt: skip
-    else:
-        ended = damping >= MOST_DAMPING
-        damping = max(100.0 * damping, 0.1)
-    normal = array_at(address + NUMBER * NORMAL, (PARAMETERS, PARAMETERS))
-    gradient = vector_at(address, GRADIENT)
-    matrix = array_at(address + NUMBER * SCRATCH, (PARAMETERS, PARAMETERS))
-    step = vector_at(address, SCRATCH + PARAMETERS * PARAMETERS)
-    sound = bounded_step(
-        point, normal, gradient, damping, GENES, STEP, 1.0 - STEP, matrix, step, trial
-    )
-    phase = REFINEMENT
-    if ended or not sound or done >= ITERATIONS:
-        phase = DONE
-        conclude(address, ended)
-    keep_advance(p, Advance(phase, done, best, damping))
+    excess, jumped = _linearise(address, plan_address, plan, ticks_address, count)
+    ratio, step = _narrow(address, excess, jumped < LINEAR_SHARE)
+    done = a.steps + 1.0
+    settled = ratio > SETTLED_RATIO and step < SETTLED_STEP
+    phase = CONCLUSION if settled or ratio < 0.0 or done >= ROUNDS else a.phase
+    keep_advance(p, Advance(phase, done, a.best, a.judged, 1.0 if settled else 0.0))

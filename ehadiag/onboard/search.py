@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,14 +14,13 @@ from ehadiag.onboard.layout import (
     GENERATOR,
     GENES,
     LANES,
+    LOOK,
     MEAN,
     POINT,
     POPULATION,
-    REFINEMENT,
     SAMPLES,
     SIZE,
     SPREAD,
-    STEP,
     TRIAL,
     Advance,
     advance_of,
@@ -64,9 +61,7 @@ def search(address: int, plan_address: int, plan: Array, ticks_address: int, cou
                 population[0, i] = p[POINT + i]
     for i in range(GENES):
         trial[i] = population[k, i]
-    spool, pressure = run_model(
-        address, plan_address, plan, ticks_address, count, trial, False, CAP
-    )
+    spool, pressure = run_model(address, plan_address, plan, ticks_address, count, trial, CAP)
     costs[k] = spool + pressure
     done, phase = a.steps + 1.0, a.phase
     if k == SAMPLES - 1:
@@ -74,7 +69,7 @@ def search(address: int, plan_address: int, plan: Array, ticks_address: int, cou
         learn_from(state, population, costs, VIRTUAL_POPULATION, TOLERANCE, before)
         narrow = max(p[SPREAD], p[SPREAD + 1], p[SPREAD + 2]) <= TOLERANCE
         if narrow or done >= GENERATIONS * SAMPLES:
-            phase, done = REFINEMENT, 0.0
+            phase, done = LOOK, 0.0
             for i in range(GENES):
-                trial[i] = min(max(p[ELITE + i], STEP), 1.0 - STEP)
-    keep_advance(p, Advance(phase, done, math.inf if phase != a.phase else a.best, a.damping))
+                p[POINT + i] = p[ELITE + i]
+    keep_advance(p, Advance(phase, done, a.best, 0.0, 0.0))

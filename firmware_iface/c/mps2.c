@@ -1,5 +1,5 @@
-/* What a bare Cortex-M7 (QEMU's mps2-an500) needs before newlib starts: its vectors, and
- * floating-point switched on; and its instructions counted. */
+/* What a bare Cortex-M (QEMU's mps2-an500 and mps2-an386) needs before newlib starts: its vectors,
+ * and floating-point switched on; and its instructions counted. */
 #include <stdint.h>
 
 extern void _start(void);

@@ -9,6 +9,7 @@ among those that are estimated from the start.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,14 +20,14 @@ from ehadiag.identify.nuisance.explained import excess, excess_of_signals, outli
 from ehadiag.identify.nuisance.prior import belief_of, beside, information_of
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import linearised
-from ehadiag.identify.refine.posterior import Pace, sharpen
+from ehadiag.identify.refine.posterior import FEW, sharpen
 from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.model.parameters import Parameter
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = ["may_be_astray", "would_explain"]
 
-FEW_ROUNDS = Pace(least_ratio=0.3, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
+FEW_ROUNDS = replace(FEW, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
 MOST_PRESSURE = 4.5
 """Excess of the pressure where a search went astray."""
 ACCEPTED = 0.015

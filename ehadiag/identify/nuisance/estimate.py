@@ -20,11 +20,11 @@ from ehadiag.identify.nuisance.prior import (
     information_of,
     small_effects,
 )
-from ehadiag.identify.nuisance.starts import Found, robust_cost, search
+from ehadiag.identify.nuisance.starts import Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
-from ehadiag.identify.refine.posterior import nothing, sharpen
+from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
@@ -132,6 +132,7 @@ def estimate(
             _spool_is_noise,
             budget=budget // 2,
             seed=seed,
+            hopeless=_spool_is_hopeless if give_up else None,
             tell=tell,
         )
         there = guided.belief.x * guide.scale
@@ -208,6 +209,10 @@ def _spool_is_noise(residuals: NDArray[np.float64]) -> bool:
     return is_noise(residuals[SPOOL_ROW : SPOOL_ROW + 1])
 
 
+def _spool_is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
+    return is_hopeless(residuals[SPOOL_ROW : SPOOL_ROW + 1], starts)
+
+
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:
     """Weigh the experiments by the noise that residuals of all their ticks show."""
     ends = np.cumsum([item.ticks for item in experiments])[:-1]
@@ -231,8 +236,8 @@ def _last_look(
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    linearise = partial(linearised, rng=rng)
-    again = sharpen(fine, before[0], wider, before[1], linearise, between=between).belief
+    draw = partial(linearised, rng=rng)
+    again = sharpen(fine, before[0], wider, before[1], draw, LAST, between).belief
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
-from ehadiag.identify.refine.posterior import TAIL, sharpen
+from ehadiag.identify.refine.posterior import robust_cost, sharpen
 
-__all__ = ["Found", "Place", "robust_cost", "search"]
+__all__ = ["Found", "Place", "search"]
 
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
@@ -65,11 +65,6 @@ class Found:
     def starts(self) -> int:
         """How many it took."""
         return len(self.places)
-
-
-def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cauchy's cost of weighted residuals, shape (n, signals, N): shape (n,)."""
-    return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
 
 
 def search(

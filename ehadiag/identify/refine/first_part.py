@@ -17,13 +17,17 @@ from ehadiag.identify.refine.least_squares import SPREAD, Refinement, median_off
 from ehadiag.identify.refine.posterior import nothing
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
-from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
+from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, parameter
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = [
+    "AGAIN",
+    "JUDGEMENTS",
+    "NOISE_SETTLED",
     "FirstPart",
     "anchored_derivatives",
     "anchored_model",
+    "considered_in",
     "derivatives_of",
     "first_spans",
     "refine_first_part",
@@ -40,6 +44,7 @@ AGAIN = 3e-4
 CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6, (SPOOL_ROW,)),)
 """Half a step of a plant that is integrated at 0.25 µs is of this size; sized on the spool, which
 moves fastest."""
+VISCOSITY = parameter("oil_viscosity")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +139,7 @@ def anchored_derivatives(
 
 def derivatives_of(model: SimdModel, experiments: Sequence[Experiment]) -> Derivatives:
     """A model of `anchored_model`, in coordinates scaled by the noise."""
-    return Derivatives(model, experiments[0].noise, CONSIDERED)
+    return Derivatives(model, experiments[0].noise, considered_in(experiments))
 
 
 def anchored_model(
@@ -149,9 +154,32 @@ def anchored_model(
     `levels`: of a model of the same spans, if there was one.
     """
     batch = lay_out(experiments, spans, lead=lead, anchor_lsb=ANCHOR_LSB)
-    considered = [item.parameter for item in CONSIDERED]
+    considered = [item.parameter for item in considered_in(experiments)]
     unknowns = unknowns_of(experiments, (*FAULTS, *OFFSETS, *considered))
     return SimdModel(batch, unknowns, levels=levels)
+
+
+def considered_in(
+    experiments: Sequence[Experiment], free: Sequence[Parameter] = ()
+) -> tuple[Considered, ...]:
+    """What is held in an identification, with a tolerance that counts in the interval.
+
+    Parameters
+    ----------
+    experiments : Sequence[Experiment]
+        What it is from.
+    free : Sequence[Parameter]
+        What is estimated.
+
+    Returns
+    -------
+    tuple[Considered, ...]
+        `CONSIDERED`, and the oil's viscosity where the bus rounds its temperature anew.
+    """
+    std = max(item.viscosity_std for item in experiments)
+    if std == 0.0 or VISCOSITY.name in (item.name for item in free):
+        return CONSIDERED
+    return (*CONSIDERED, Considered(VISCOSITY, std))
 
 
 def first_spans(experiments: Sequence[Experiment], until: Sequence[int]) -> Spans:

@@ -22,7 +22,7 @@ from ehadiag.identify.refine.posterior import FEW, nothing, sharpen
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Parameter
 
-__all__ = ["SPREAD", "Refinement", "described", "median_offsets", "refine"]
+__all__ = ["CLEAR", "SPREAD", "Refinement", "described", "median_offsets", "refine"]
 
 SPREAD = np.array([2e-3, 1e-3, 4e-4])
 """Of the severities, in the order of `FAULTS`, about the optimum of a search, which is mostly

@@ -143,7 +143,7 @@ def test_stages_are_told():
 def test_random_cases_of_the_cube(test):
     """A short sweep with the independent simulator, corners and edges included."""
     from ehadiag_tools.accuracy.cases import random_faults
-    from ehadiag_tools.accuracy.figures import figures_of
+    from ehadiag_tools.accuracy.figures import figures_of, percent_errors
     from ehadiag_tools.accuracy.runs import Run, perform
 
     cases = random_faults(20, 11)
@@ -153,4 +153,7 @@ def test_random_cases_of_the_cube(test):
     assert figures.mean_all <= mean
     assert figures.p95_case <= p95
     assert max(figures.maximum) <= largest
-    assert 88.0 <= figures.coverage_all <= 99.5
+    assert figures.coverage_all >= 88.0
+    interval = np.array([record["interval95"] for record in records])
+    widths = np.abs(percent_errors(records)) / (50.0 * np.diff(interval).squeeze(-1))
+    assert np.median(widths) >= 0.1, "intervals several times wider than the errors need"

@@ -50,14 +50,25 @@ MPS2 = (
     "-semihosting-config", "enable=on,target=native", "-icount", "shift=0", "-kernel",
 )  # fmt: skip
 
+M4 = (
+    "qemu-system-arm", "-M", "mps2-an386", "-nographic", "-monitor", "none", "-serial", "null",
+    "-semihosting-config", "enable=on,target=native", "-icount", "shift=0", "-kernel",
+)  # fmt: skip
+
 EMULATED: tuple[Emulator, ...] = (
     Emulator("host", "cc"),
-    Emulator("host-unfused", "cc"),
     Emulator(
         "cortex-m7",
         "arm-none-eabi-gcc",
         (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
         MPS2,
+        (str(FIRMWARE / "mps2.c"),),
+    ),
+    Emulator(
+        "cortex-m4",
+        "arm-none-eabi-gcc",
+        (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
+        M4,
         (str(FIRMWARE / "mps2.c"),),
     ),
     Emulator("cortex-r5", "arm-none-eabi-gcc", BARE, ("qemu-arm", "-cpu", "max")),

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.recording import CommandMode, Recording
 from ehadiag.model.plant import plant_constants, relative_viscosity
-from ehadiag.monitor import Monitor
 from ehadiag.monitor.prepare import Unit
 from ehadiag.onboard.environment import set_environment
 from ehadiag.onboard.layout import Outcome
@@ -22,7 +21,6 @@ __all__ = [
     "Identified",
     "Replay",
     "identified",
-    "own_lines",
     "replayed",
     "surrounded",
     "ticks_of",
@@ -119,23 +117,6 @@ def surrounded(recording: Recording, actuator: Actuator | None = None) -> Unit:
     if oil is not None and supply is not None and back is not None:
         set_environment(numbers.ctypes.data, (oil, supply, back))
     return Unit(*numbers.tolist())
-
-
-def own_lines(
-    recording: Recording, faults: Sequence[float], ticks: NDArray[np.float64]
-) -> list[str]:
-    """What the package's own monitor makes of ticks, as `replay.c` prints it."""
-    assert recording.samples is not None
-    monitor = Monitor(
-        default_actuator(), faults, recording.environment, mode=recording.samples.mode
-    )
-    lines = []
-    for row in ticks.tolist():
-        reading = monitor.push(tuple(row))
-        alarms = int(reading.alarmed.ravel() @ np.array([1, 2, 4, 8]))
-        numbers = (*reading.predicted, *reading.residual, *reading.cusum.ravel())
-        lines.append(" ".join([str(alarms), *(f"{bits:016x}" for bits in _bits(numbers))]))
-    return lines
 
 
 def replayed(
