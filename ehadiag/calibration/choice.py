@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.calibration.judging import MOST_LEFT
+from ehadiag.calibration.judging import MOST_LEFT, is_explained
 from ehadiag.calibration.models import EFFECTS, SMOOTH, Learned, Model, simple_models
 from ehadiag.calibration.session import Session
 from ehadiag.core.actuator import Actuator
@@ -61,11 +61,14 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     if any(item.estimated.explained for item in out):
         return out
     smooth = [_smooth(session, out, simple) for simple in simple_models(start)]
-    best = min(smooth, key=lambda item: item.criterion)
     if not compare:
         out += smooth
-    if not best.estimated.explained:
-        out.append(_rich(session, best))
+    if any(item.estimated.explained for item in smooth):
+        return out
+    for item in smooth:  # what they leave does not tell the second stage
+        out.append(_rich(session, item))
+        if is_explained(out[-1]):
+            break
     return out
 
 
