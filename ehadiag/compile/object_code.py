@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from numba import types
 
+from ehadiag.compile.single import single_precision
 from ehadiag.core.errors import ConfigurationError
 
 __all__ = [
@@ -113,6 +114,8 @@ class Processor:
     doubles : bool
         Whether it has instructions for doubles. Where not, the compiler's run-time library has
         their arithmetic, but no square root.
+    single : bool
+        Whether results are rounded to single precision, see `ehadiag.compile.single`.
     """
 
     triple: str
@@ -122,6 +125,7 @@ class Processor:
     shared: bool = False
     rounds: bool = True
     doubles: bool = True
+    single: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +144,7 @@ def object_code(
     processor: Processor,
     *,
     allowed: frozenset[str] = frozenset(),
+    exact: frozenset[Any] = frozenset(),
 ) -> bytes:
     """Emit an object file with these C functions.
 
@@ -155,6 +160,8 @@ def object_code(
         The target.
     allowed : frozenset[str]
         What else of the C library the code may call.
+    exact : frozenset[Any]
+        Kernels of which no result is rounded to single precision.
 
     Returns
     -------
@@ -170,7 +177,9 @@ def object_code(
     main = _parsed(_head(machine) + _front(functions, tables, replaced), machine)
     wanted = {item.name for item in functions}
     for kernel, kinds in _kernels(functions, replaced):
-        main.link_in(_module(kernel, kinds, machine, replaced))
+        main.link_in(
+            _module(kernel, kinds, machine, replaced, processor.single and kernel not in exact)
+        )
     text = _closed(str(main), wanted)
     whole = _parsed(text, machine)
     _optimise(whole, machine)
@@ -247,6 +256,7 @@ def _module(
     kinds: tuple[Any, ...],
     machine: _Machine,
     replaced: Mapping[str, Any],
+    single: bool,
 ) -> Any:
     """Take a kernel's module, without the parts that only Python calls."""
     result = _compiled(kernel, kinds)
@@ -265,6 +275,8 @@ def _module(
         text = text.replace("@sqrt(", "@llvm.sqrt.f64(")
         if "declare double @llvm.sqrt.f64(" not in text:
             text += "\ndeclare double @llvm.sqrt.f64(double)\n"
+    if single:
+        text = single_precision(text)
     for function in replaced:
         for called in (f"llvm.{function}.f64", function):
             text = re.sub(rf"^declare double @{re.escape(called)}\(.*$", "", text, flags=re.M)

@@ -134,7 +134,12 @@ def export_library(
     plan = with_rules(monitor_plan(actuator, unit_constants(actuator), design), rules(actuator))
     code = either_convention(
         object_code(
-            FUNCTIONS, {PLAN: plan.tolist()}, _own_functions(target.processor), target.processor
+            FUNCTIONS,
+            {PLAN: plan.tolist()},
+            _own_functions(target.processor),
+            target.processor,
+            # They add so much to a number that nothing is left of its fraction but a rounding.
+            exact=frozenset(ROUNDING.values()),
         )
     )
     library = archive("eha.o", code, [item.name for item in FUNCTIONS])
@@ -168,6 +173,7 @@ def export_library(
             "cpu": target.processor.cpu,
             "features": target.processor.features,
             "doubles": target.processor.doubles,
+            "single": target.processor.single,
         },
         compiler_flags=list(target.flags),
         options={"actuator": actuator.name, "hours": hours, "shift": shift},

@@ -35,6 +35,11 @@ class Target:
 TARGETS: tuple[Target, ...] = (
     Target("host", "this computer", Processor("", "host", shared=True)),
     Target(
+        "host-single",
+        "this computer, results rounded to single precision as on cortex-m4-single",
+        Processor("", "host", shared=True, single=True),
+    ),
+    Target(
         "cortex-m7",
         "Arm Cortex-M7 with double precision, bare",
         Processor("thumbv7em-none-eabihf", "cortex-m7"),
@@ -44,6 +49,12 @@ TARGETS: tuple[Target, ...] = (
         "cortex-m4",
         "Arm Cortex-M4F, bare; doubles in software",
         Processor("thumbv7em-none-eabihf", "cortex-m4", rounds=False, doubles=False),
+        ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"),
+    ),
+    Target(
+        "cortex-m4-single",
+        "Arm Cortex-M4F, bare; arithmetic in single precision",
+        Processor("thumbv7em-none-eabihf", "cortex-m4", rounds=False, single=True),
         ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"),
     ),
     Target(

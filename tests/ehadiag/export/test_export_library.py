@@ -20,6 +20,7 @@ from ehadiag.monitor import Monitor
 from ehadiag.monitor.layout import CUSUM, PREDICTED, SIZE
 from ehadiag_tools.onboard.emulators import EMULATED, missing
 from ehadiag_tools.onboard.replay import identified, replayed, ticks_of, unit_of
+from ehadiag_tools.onboard.table import REFERENCE
 from firmware_iface.logs.reader import read_recording
 
 SEVERITIES = (0.3, 0.4, 0.2)
@@ -126,7 +127,9 @@ def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
         pytest.skip(f"not installed: {', '.join(absent)}")
     recording = read_recording(LOGS / "paper-closed-1.blf")
     ticks, unit = ticks_of(recording)[:600], unit_of(recording, SEVERITIES)
-    expected = replayed(EMULATED[0], exported("host", place), unit, ticks, tmp_path).lines
+    name = REFERENCE[target(emulator.target).processor.single]
+    host = next(item for item in EMULATED if item.target == name)
+    expected = replayed(host, exported(name, place), unit, ticks, tmp_path).lines
     replay = replayed(emulator, exported(emulator.target, place), unit, ticks, tmp_path)
     assert replay.lines == expected
     assert 0 < replay.push_stack <= 2560
@@ -211,7 +214,7 @@ def test_a_number_of_hours_that_no_threshold_gives(place):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("arm-none-eabi-nm"), reason="no binutils for Arm here")
-@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4", "cortex-r5"])
+@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4", "cortex-m4-single", "cortex-r5"])
 def test_arm_code_hands_numbers_to_nobody(name, place):
     """Either calling convention fits only functions of pointers, and those of the compiler."""
     told = subprocess.run(
@@ -223,6 +226,7 @@ def test_arm_code_hands_numbers_to_nobody(name, place):
     of_compiler = {"div", "mod", "udiv", "umod"}
     assert called <= {
         "memset", "memcpy", "__fixdfdi", "__floatdidf", "__floatundidf",
+        "__fixsfdi", "__floatdisf", "__floatundisf",
         *(f"__{name}di3" for name in of_compiler),
     }  # fmt: skip
 

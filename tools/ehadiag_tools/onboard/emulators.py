@@ -57,6 +57,7 @@ M4 = (
 
 EMULATED: tuple[Emulator, ...] = (
     Emulator("host", "cc"),
+    Emulator("host-single", "cc"),
     Emulator(
         "cortex-m7",
         "arm-none-eabi-gcc",
@@ -66,6 +67,13 @@ EMULATED: tuple[Emulator, ...] = (
     ),
     Emulator(
         "cortex-m4",
+        "arm-none-eabi-gcc",
+        (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
+        M4,
+        (str(FIRMWARE / "mps2.c"),),
+    ),
+    Emulator(
+        "cortex-m4-single",
         "arm-none-eabi-gcc",
         (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
         M4,

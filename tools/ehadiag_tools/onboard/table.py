@@ -22,11 +22,11 @@ from ehadiag_tools.onboard.emulators import EMULATED, Emulator, missing
 from ehadiag_tools.onboard.replay import identified, replayed, surrounded, ticks_of, unit_of
 from firmware_iface.logs.reader import read_recording
 
-__all__ = ["main"]
+__all__ = ["REFERENCE", "main"]
 
 SEVERITIES = (0.3, 0.4, 0.2)
-REFERENCE = "host"
-"""Whose digits every target must have."""
+REFERENCE = {False: "host", True: "host-single"}
+"""Whose digits a target must have, by whether it is of single precision."""
 CLOCK_MHZ = 400.0
 """For which a time is estimated, at one instruction a cycle."""
 
@@ -70,11 +70,11 @@ def main(argv: list[str] | None = None) -> int:
         "--into", type=Path, metavar="DIR", help="measure this export, and tell its manifest"
     )
     arguments = parser.parse_args(argv)
-    wanted = set(arguments.target or [item.target for item in EMULATED]) | {REFERENCE}
+    wanted = set(arguments.target or [item.target for item in EMULATED]) | set(REFERENCE.values())
     given = {}
     if arguments.into is not None:
         own = str(_manifest(arguments.into)["target"])
-        given, wanted = {own: arguments.into.resolve()}, {own, REFERENCE}
+        given, wanted = {own: arguments.into.resolve()}, {own, *REFERENCE.values()}
     work = _identify if arguments.identify else _replay
     measured: list[Measured] = []
     actuator = default_actuator()
@@ -144,6 +144,10 @@ def _exports(
     return exports
 
 
+def _reference(emulator: Emulator) -> str:
+    return REFERENCE[target(emulator.target).processor.single]
+
+
 def _replay(
     log: str,
     actuator: Actuator,
@@ -158,7 +162,7 @@ def _replay(
     for emulator, export in exports.items():
         replay = replayed(emulator, export, unit, ticks, work)
         lines[emulator.target] = replay.lines
-        pairs = zip(replay.lines, lines[REFERENCE], strict=True)
+        pairs = zip(replay.lines, lines[_reference(emulator)], strict=True)
         count = sum(a != b for a, b in pairs)
         worst = {"mean": replay.mean_push, "worst": replay.worst_push}
         counts = {"instructions_of_push": worst} if replay.worst_push else {}
@@ -185,7 +189,7 @@ def _identify(
     for emulator, export in exports.items():
         found = identified(emulator, export, unit, ticks, work)
         bits[emulator.target] = found.bits
-        same = found.bits == bits[REFERENCE]
+        same = found.bits == bits[_reference(emulator)]
         outcome = found.outcome
         millions = {"millions": found.millions, "runs": int(outcome.runs)}
         counts = {"instructions_of_identification": millions} if found.millions else {}
