@@ -107,7 +107,7 @@ def search(
 
     def between() -> None:
         if tell is not None:
-            tell(min(1.0 - (until - model.evaluations) / budget, 1.0))
+            tell(min(1.0 - (until - model.evaluations) / max(budget, 1), 1.0))
 
     best: Found | None = None
     places: list[Place] = []
