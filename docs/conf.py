@@ -9,6 +9,7 @@ import re
 import sys
 from importlib.metadata import version as installed
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
@@ -35,6 +36,7 @@ numpydoc_show_class_members = False
 CONTENTS = "index"
 LINK = re.compile(r"- \[.*?\]\(([\w/-]+)\.md\)")
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+examples/README\.md)\)")
+SCROLLED = re.compile(r'<pre(?=>)|<div(?= class="table-wrapper)')
 HEAD = re.compile(r"^(?=[A-Z][a-z]+$)", re.MULTILINE)
 
 
@@ -58,7 +60,20 @@ def name_types(
     lines[:] = [line.replace("np.bool_", "np.bool") for line in lines]
 
 
+def make_accessible(
+    _app: Sphinx, _page: str, _template: str, context: dict[str, Any], _tree: object
+) -> None:
+    """Give the navigation's captions their level, and let code that is scrolled take the focus."""
+    tree = str(context.get("furo_navigation_tree", ""))
+    context["furo_navigation_tree"] = tree.replace(
+        'role="heading"', 'role="heading" aria-level="2"'
+    )
+    if "body" in context:
+        context["body"] = SCROLLED.sub(r'\g<0> tabindex="0"', context["body"])
+
+
 def setup(app: Sphinx) -> None:
     """Connect what is above."""
+    app.connect("html-page-context", make_accessible, priority=900)  # after the theme
     app.connect("source-read", adapt)
     app.connect("autodoc-process-docstring", name_types, priority=400)  # before numpydoc

@@ -208,18 +208,8 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
             f"the command differs from test {test.name!r} by up to "
             f"{trace.command_deviation * 1e3:.3g} {unit}: another test was played"
         )
-    # The current's own noise is not to be had in closed loop; the other converters' stands for it.
-    noise_lsb = min(
-        experiment.spool_noise / channels.spool.grain,
-        experiment.pressure_noise / channels.pressure.grain,
-    )
-    limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
-    if trace.residual_lsb > limit_lsb:
-        out.append(
-            f"servovalve current {trace.residual_lsb:.1f} LSB rms from what the "
-            f"{'control law' if test.closed_loop else 'command'} gives (limit "
-            f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
-        )
+    if current := objection_to_current(experiment):
+        out.append(current)
     if lost := lost_positions(experiment):
         out.append(lost)
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
@@ -227,6 +217,24 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
         if seen.size and float(np.ptp(seen)) == 0.0:
             out.append(f"the {name} signal is frozen")
     return out
+
+
+def objection_to_current(experiment: Experiment) -> str:
+    """Why the measured current is none that the test asks for; empty if it is."""
+    trace, channels = experiment.trace, experiment.channels
+    # The current's own noise is not to be had in closed loop; the other converters' stands for it.
+    noise_lsb = min(
+        experiment.spool_noise / channels.spool.grain,
+        experiment.pressure_noise / channels.pressure.grain,
+    )
+    limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
+    if not trace.residual_lsb > limit_lsb:
+        return ""
+    return (
+        f"servovalve current {trace.residual_lsb:.1f} LSB rms from what the "
+        f"{'control law' if experiment.test.closed_loop else 'command'} gives (limit "
+        f"{limit_lsb:.3g}): controller data wrong, or the current driver failed"
+    )
 
 
 def objections_to_estimate(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ehadiag.assess.acceptance import (
+    objection_to_current,
     objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
@@ -34,10 +35,16 @@ from ehadiag.assess.position import (
 )
 from ehadiag.assess.supply import objections_to_supply
 from ehadiag.assess.travel import objections_to_travel
-from ehadiag.assess.unobservable import lost_positions, observable, what_is_left
+from ehadiag.assess.unobservable import (
+    lost_order,
+    lost_positions,
+    observable,
+    what_is_left,
+)
 from ehadiag.assess.verdict import Levels, Verdict, judge
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording
+from ehadiag.core.shown_in import told
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
 from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, knowledge_of
@@ -166,7 +173,10 @@ class DiagnosisSession:
         begin = time.perf_counter()
         matched = match_tests(recordings, self._tests, self._default)
         experiments, reasons = self._experiments(recordings, matched)
-        hidden = tuple(dict.fromkeys(filter(None, map(lost_positions, experiments))))
+        orders = tuple(dict.fromkeys(filter(None, map(lost_order, recordings))))
+        known = (*map(lost_positions, experiments), *orders)
+        hidden = tuple(dict.fromkeys(reason for reason in reasons if reason in known))
+        closed = any(item.test.closed_loop for item in experiments)
         lost = bool(hidden) and set(reasons) <= set(hidden) and observable(experiments)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
@@ -176,7 +186,7 @@ class DiagnosisSession:
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
         if lost:
             found = self._session.finish(experiments, progress)
-            identification, words = what_is_left(found)
+            identification, words = what_is_left(found, closed=closed)
             why = tuple(f"{reason}: {words}" for reason in hidden)
         if not reasons:
             identification = self._session.finish(experiments, progress)
@@ -188,7 +198,10 @@ class DiagnosisSession:
             positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
             why = tuple(objections_to_estimate(identification, self._actuator.calibration))
-            if why:
+            if why and orders:
+                identification, words = what_is_left(identification, closed=closed)
+                why = tuple(f"{reason}: {words}" for reason in orders)
+            elif why:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:
                 why = (
@@ -230,6 +243,8 @@ class DiagnosisSession:
                     recording.samples, recording.environment, test, self._actuator
                 )
                 objections = objections_to_experiment(experiment)
+                if objections == [objection_to_current(experiment)] and lost_order(recording):
+                    objections = [lost_order(recording)]
                 if test.closed_loop and not objections:
                     # The control law works on the position: a search would take long.
                     objections = objections_to_travel(recording.samples, self._actuator)
@@ -359,8 +374,8 @@ def _freed(identification: Identification | None, actuator: Actuator) -> tuple[s
             "recordings: its data and effects are refined within what is known of them"
         )
         out += [
-            f"{parameter(name).short} has changed since: {value:.4g} then, "
-            f"{identification.nuisances[name].value:.4g} {parameter(name).unit} now"
+            f"{parameter(name).short} has changed since: {told(value, parameter(name).unit)} then, "
+            f"{told(identification.nuisances[name].value, parameter(name).unit)} now"
             for name, value in calibration.effects.items()
             if name in identification.nuisances
             and abs(identification.nuisances[name].value - value)

@@ -60,13 +60,37 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
             return out
     if any(item.estimated.explained for item in out):
         return out
-    for simple in simple_models(start):
-        model = Model(simple.second_stage, SMOOTH, tuple(EFFECTS))
-        found = session.learn(model, nearly_new=True, budget=ONE_START, some=True)
-        out.append(found)
-        if is_explained(found):
+    smooth = [_smooth(session, out, simple) for simple in simple_models(start)]
+    if not compare:
+        out += smooth
+    if any(item.estimated.explained for item in smooth):
+        return out
+    for item in smooth:  # what they leave does not tell the second stage
+        out.append(_rich(session, item))
+        if is_explained(out[-1]):
             break
     return out
+
+
+def _smooth(session: Session, tried: Sequence[Learned], simple: Model) -> Learned:
+    """Learn a smooth hysteresis with one class of second stage, if that has not been tried."""
+    model = replace(simple, plays=SMOOTH)
+    for item in tried:
+        if item.model == model:
+            return item
+    one_play = next(item for item in tried if item.model == simple)
+    hint = one_play.estimated.refined.values
+    return session.learn(model, nearly_new=True, hint=hint, budget=ONE_START, some=True)
+
+
+def _rich(session: Session, smooth: Learned) -> Learned:
+    """Learn all effects, beginning where the hysteresis alone explains most.
+
+    From the usual sizes of all of them friction that falls with speed stands in for hysteresis.
+    """
+    model = replace(smooth.model, beside=tuple(EFFECTS))
+    hint = smooth.estimated.refined.values
+    return session.learn(model, nearly_new=True, hint=hint, budget=ONE_START, some=True)
 
 
 def learned_as_new(session: Session, best: Learned) -> Learned:

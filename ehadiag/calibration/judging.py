@@ -42,11 +42,11 @@ def is_explained(learned: Learned) -> bool:
 
 
 def severities_of(found: Estimated) -> tuple[Severity, ...]:
-    """Severities where they were estimated, with their deviations."""
+    """Severities where they were estimated, with their deviations: 0 of less friction than new."""
     values, names = found.refined.values, [item.name for item in found.refined.parameters]
     std = np.sqrt(np.diag(covariance(found.refined) + found.covariance)).tolist()
     return tuple(
-        Severity(item.name, values[item.name], std[names.index(item.name)])
+        Severity(item.name, max(values[item.name], 0.0), std[names.index(item.name)])
         for item in FAULTS
         if item.name in values
     )

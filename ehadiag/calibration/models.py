@@ -12,9 +12,10 @@ import numpy as np
 from ehadiag.core.actuator import Actuator, SecondStage
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.nuisance.knowledge import severities_below
 from ehadiag.identify.nuisance.prior import Known, nuisances_of
-from ehadiag.identify.nuisance.starts import robust_cost
 from ehadiag.identify.refine.first_part import CONSIDERED
+from ehadiag.identify.refine.posterior import robust_cost
 from ehadiag.identify.spans import lay_out
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
@@ -198,7 +199,8 @@ def learn(
             for item in build(model.of(start))
         ]
     )
-    others = tuple(parameter(f"datum_{name}") for name in FRICTIONS) if new else FAULTS
+    frictions = tuple(parameter(f"datum_{name}") for name in FRICTIONS)
+    others = frictions if new else severities_below(start, dict.fromkeys(FRICTIONS, REACH))
     free = (*others, *model.parameters)
     small = dict.fromkeys((item.name for item in FAULTS), NEARLY_NEW) if nearly_new else {}
     found = estimate(

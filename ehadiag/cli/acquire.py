@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import bus_options
 from ehadiag.cli.ahead import Ahead, working_ahead
 from ehadiag.cli.deadline import Deadline
 from ehadiag.cli.output import say
@@ -157,7 +157,7 @@ def _connect(
     from firmware_iface.logs.recorder import Recorder  # noqa: PLC0415 - loads python-can
 
     if not arguments.simulate:
-        ours = options.open_transport(arguments, transmit=not arguments.listen)
+        ours = bus_options.open_transport(arguments, transmit=not arguments.listen)
         return stack.enter_context(ours), Recorder(path, channel=bus_map.channel)
     from ehadiag.cli.simulator import emulator_beside, make_core  # noqa: PLC0415 - loads numba
     from ehadiag_sim.fcc.emulator import EmulatorTransport  # noqa: PLC0415
@@ -165,10 +165,10 @@ def _connect(
     core = make_core(arguments, actuator, [test], bus_map)
     if arguments.fast:
         return stack.enter_context(EmulatorTransport(core)), Recorder(path, channel=bus_map.channel)
-    if not options.has_bus(arguments):
+    if not bus_options.has_bus(arguments):
         arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
-    theirs = stack.enter_context(options.open_transport(arguments, transmit=True))
-    ours = stack.enter_context(options.open_transport(arguments, transmit=True))
+    theirs = stack.enter_context(bus_options.open_transport(arguments, transmit=True))
+    ours = stack.enter_context(bus_options.open_transport(arguments, transmit=True))
     recorder = Recorder(path, channel=bus_map.channel)
     stack.enter_context(emulator_beside(core, theirs))
     return ours, recorder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import bus_options
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
@@ -67,16 +67,16 @@ def _refuse_contradictions(arguments: argparse.Namespace) -> None:
         raise ConfigurationError("--simulate and --listen exclude each other")
     if arguments.fast and not arguments.simulate:
         raise ConfigurationError("--fast: only the simulated actuator can hurry, add --simulate")
-    if arguments.fast and options.has_bus(arguments):
+    if arguments.fast and bus_options.has_bus(arguments):
         raise ConfigurationError("--fast: a bus has its own time, leave --interface out")
     if arguments.simulate and arguments.serial:
         raise ConfigurationError(
             "--simulate: a serial link has two ends, run ehadiag sim on the other one"
         )
     if arguments.simulate:
-        options.refuse_two_buses(arguments)
+        bus_options.refuse_two_buses(arguments)
     else:
-        options.need_one_bus(arguments)
+        bus_options.need_one_bus(arguments)
 
 
 def _refuse_what_cannot_be_requested(test: StoredTest, bus_map: BusMap) -> None:

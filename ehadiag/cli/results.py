@@ -86,6 +86,11 @@ class Results:
         self.stopped = False
         """Whether a signal came while a result was brought out."""
 
+    @property
+    def history(self) -> Path | None:
+        """Health history that the results are kept in; None: in none."""
+        return self._keeper.place
+
     def load(self) -> None:
         """Load what printing needs: a verdict must not wait for it."""
         if self._arguments.json:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
@@ -66,6 +67,8 @@ def make_core(
         serial=arguments.serial_number,
         bus_map=bus_map,
         channel_faults=item.channel_faults,
+        # In simulated time too a recording has the date of its test.
+        start_ns=time.time_ns(),
     )
     core.step()
     return core

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import bus_options
 
 if TYPE_CHECKING:
     from ehadiag.cli.acquire import Heard
@@ -56,7 +56,7 @@ def listen_together(
     from firmware_iface.transport.shared import SharedBus  # noqa: PLC0415
 
     with (
-        options.open_transport(arguments, transmit=False) as bus,
+        bus_options.open_transport(arguments, transmit=False) as bus,
         SharedBus(bus, len(listeners), Recorder(path, channel=channel)) as shared,
         ThreadPoolExecutor(len(listeners), thread_name_prefix="ehadiag-listen") as pool,
     ):

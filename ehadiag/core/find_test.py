@@ -429,7 +429,14 @@ def _cut(
     start = recording.start_ns
     if start is not None:
         start += (found.first + begin) * period
-    return replace(recording, samples=mine, test_id=test.id, quality=quality, start_ns=start)
+    return replace(
+        recording,
+        samples=mine,
+        test_id=test.id,
+        quality=quality,
+        start_ns=start,
+        out_of_order=float(strange.mean()),
+    )
 
 
 def _taken_at(recording: Recording, samples: Samples, test: StoredTest, begin: int) -> Recording:

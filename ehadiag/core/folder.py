@@ -6,6 +6,7 @@ Every file that the package writes, and every file that it reads back and trusts
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ __all__ = [
     "OPEN_FOLDER",
     "RESULT_MODE",
     "Folder",
+    "append_to_file",
     "create_file",
     "refuse_foreign",
 ]
@@ -33,6 +35,14 @@ NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 OPEN_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | NO_LINK
 # A FIFO in the place of a file must not make anybody wait.
 READ = os.O_RDONLY | NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+APPEND = (
+    os.O_WRONLY
+    | os.O_APPEND
+    | os.O_CREAT
+    | NO_LINK
+    | getattr(os, "O_NONBLOCK", 0)
+    | getattr(os, "O_BINARY", 0)
+)
 CREATE = os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | getattr(os, "O_BINARY", 0)
 
 
@@ -97,6 +107,17 @@ class Folder:
         Returns a descriptor for reading and writing, to be closed by the caller.
         """
         return self._open(name, CREATE)
+
+    def append(self, name: str) -> int:
+        """Open a file to be appended to, or create it; PermissionError for what is no file.
+
+        Returns a descriptor for writing, to be closed by the caller.
+        """
+        descriptor = self._open(name, APPEND)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise PermissionError(errno.EACCES, "not a regular file", name)
+        return descriptor
 
     def write(self, name: str, content: bytes, *, synced: bool = True) -> None:
         """Write a file whole, or leave what was there.
@@ -215,6 +236,15 @@ def create_file(path: Path) -> int:
     """
     with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
         return folder.create(path.name)
+
+
+def append_to_file(path: Path) -> int:
+    """Open a result that grows from call to call; OSError for a link and for what is no file.
+
+    Returns a descriptor for writing, to be closed by the caller.
+    """
+    with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
+        return folder.append(path.name)
 
 
 def refuse_foreign(info: os.stat_result, right_kind: Callable[[int], bool]) -> None:

@@ -159,6 +159,8 @@ class Environment:
     """Pa."""
     oil_temperature: float | None = None
     """degC: the scale of the viscosity laws."""
+    temperature_std: float = 0.0
+    """Standard deviation of rounding it to another scale than the computer's own, K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,6 +260,8 @@ class Recording:
     """What the computer has found itself; None where it did not say."""
     by_time: bool = False
     """No counter told the samples' ticks: one message's may be placed later than another's."""
+    out_of_order: float = 0.0
+    """Share of the ticks whose command is another tick's: the frames' order is not the bus's."""
 
     @property
     def duration(self) -> float:

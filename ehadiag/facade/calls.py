@@ -328,9 +328,12 @@ def save_actuator(actuator: Actuator, path: PathLike) -> None:
         It cannot be written.
     """
     from ehadiag.core.actuator_file import actuator_toml  # noqa: PLC0415 - loads tomli_w
+    from ehadiag.core.folder import RESULT_MODE, Folder  # noqa: PLC0415
 
     try:
-        Path(path).write_bytes(actuator_toml(actuator))
+        target = Path(path)
+        with Folder.at(target.parent, RESULT_MODE, follow=True) as folder:
+            folder.write(target.name, actuator_toml(actuator))
     except OSError as error:
         raise InputOutputError(f"actuator file {path}: {error.strerror or error}") from None
 

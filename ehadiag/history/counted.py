@@ -3,11 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import datetime
 
-from ehadiag.history.records import Entry, Source, Usage
+from ehadiag.history.records import Entry, Usage
 
 __all__ = ["counted"]
+
+NEAR_S = 2.0
+"""Formats round dates."""
+ZONE_S = 900.0
+"""Time zones differ by multiples of it."""
+DAY_S = 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Recording:
+    """What tells a recording from others."""
+
+    samples: str
+    date: datetime | None
+
+    def same(self, other: _Recording) -> bool:
+        """Whether the samples are the same, and the dates may be."""
+        if self.samples != other.samples:
+            return False
+        if self.date is None or other.date is None:
+            return True
+        apart = abs((self.date - other.date).total_seconds())
+        off = apart % ZONE_S
+        return apart < DAY_S + NEAR_S and min(off, ZONE_S - off) < NEAR_S
 
 
 def counted(entries: Sequence[Entry]) -> list[Entry]:
@@ -26,21 +51,25 @@ def counted(entries: Sequence[Entry]) -> list[Entry]:
     list[Entry]
         A part of them, in the same order.
     """
-    seen: set[str] = set()
-    told: dict[str, Usage] = {}
-    for entry in entries:
-        for name in _recordings(entry):
-            before = told.get(name, Usage())
-            told[name] = _newer(entry.usage, before)
-    out = []
-    for entry in reversed(entries):
-        names = _recordings(entry)
-        if seen.intersection(names):
-            continue
-        seen.update(names)
+    recordings = [_recordings(entry) for entry in entries]
+    last: dict[str, list[tuple[_Recording, Usage]]] = {}
+    usages: list[Usage] = []
+    for entry, named in zip(entries, recordings, strict=True):
         usage = entry.usage
-        for name in names:
-            usage = _newer(usage, told[name])
+        for item in named:
+            for before, told in reversed(last.get(item.samples, [])):
+                if item.same(before):
+                    usage = _newer(usage, told)
+        usages.append(usage)
+        for item in named:
+            last.setdefault(item.samples, []).append((item, usage))
+    seen: dict[str, list[_Recording]] = {}
+    out = []
+    for entry, named, usage in list(zip(entries, recordings, usages, strict=True))[::-1]:
+        if any(item.same(other) for item in named for other in seen.get(item.samples, [])):
+            continue
+        for item in named:
+            seen.setdefault(item.samples, []).append(item)
         out.append(replace(entry, usage=usage))
     return out[::-1]
 
@@ -52,10 +81,11 @@ def _newer(first: Usage, second: Usage) -> Usage:
     )
 
 
-def _recordings(entry: Entry) -> list[str]:
-    """Names by which recordings are the same; those without samples are never."""
-    return [name for name in map(_same, entry.sources) if name]
-
-
-def _same(source: Source) -> str:
-    return source.samples or source.sha256 or ""
+def _recordings(entry: Entry) -> list[_Recording]:
+    """What tells them from others; those without samples are like none."""
+    names = [item.samples or item.sha256 or "" for item in entry.sources]
+    # The date of an entry is that of its first recording.
+    date = None if entry.tested is None else datetime.fromisoformat(entry.tested)
+    return [
+        _Recording(name, date if place == 0 else None) for place, name in enumerate(names) if name
+    ]

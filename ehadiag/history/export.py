@@ -12,7 +12,7 @@ __all__ = ["COLUMNS", "csv_of"]
 
 COLUMNS = (
     "number", "when", "actuator", "serial", "hours", "cycles", "test", "verdict", "severity",
-    "estimate", "std", "low95", "high95", "at_bound", "shown", "recording", "sha256",
+    "estimate", "std", "low95", "high95", "at_bound", "shown", "recording", "sha256", "withdrawn",
 )  # fmt: skip
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
@@ -40,7 +40,8 @@ def csv_of(entries: Sequence[Entry]) -> str:
             entry.usage.cycles, _text(entry.test or ""), entry.verdict,
         )  # fmt: skip
         source = entry.sources[0] if entry.sources else None
-        tail = (_text(source.path), source.sha256) if source else ("", "")
+        recording = (_text(source.path), source.sha256) if source else ("", "")
+        tail = (*recording, _text(entry.withdrawn or ""))
         for item in entry.severities:
             numbers = (item.estimate, item.std, item.low, item.high)
             flags = (int(item.at_bound), int(item.shown))

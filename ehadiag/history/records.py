@@ -1,4 +1,4 @@
-"""What a health history holds: diagnoses with their numbers, and maintenance events."""
+"""What a health history holds: diagnoses, maintenance events, and what was withdrawn of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 from ehadiag.core.errors import ConfigurationError
 
-__all__ = ["Effect", "Entry", "Event", "Severity", "Source", "Usage"]
+__all__ = ["DIAGNOSIS", "EVENT", "Effect", "Entry", "Event", "Severity", "Source", "Usage"]
+
+DIAGNOSIS, EVENT = "diagnosis", "event"
+"""Kinds of what can be withdrawn, and their tables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +109,8 @@ class Entry:
     """The JSON result, one line."""
     number: int = 0
     """In its history, from 1; 0: not appended yet."""
+    withdrawn: str | None = None
+    """Why it counts no more; None: it counts."""
 
     @property
     def when(self) -> str:
@@ -130,3 +135,5 @@ class Event:
     """Severities that begin anew; empty: those that fell."""
     number: int = 0
     """In its history, from 1; 0: not appended yet."""
+    withdrawn: str | None = None
+    """Why it counts no more; None: it counts."""

@@ -78,6 +78,16 @@ CREATE TABLE event (
 );
 """
 
+WITHDRAWALS = """
+CREATE TABLE withdrawal (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    appended TEXT NOT NULL,
+    kind TEXT NOT NULL,          -- table of what is withdrawn
+    number INTEGER NOT NULL,     -- its id there
+    text TEXT NOT NULL           -- why
+);
+"""
+
 
 def _guards(tables: Mapping[str, Sequence[str]]) -> str:
     """Triggers that keep the rows of tables, named with their keys."""
@@ -101,7 +111,10 @@ _PARTS = ("diagnosis", "place")
 _KEYS = {"diagnosis": ("id",), "event": ("id",)} | dict.fromkeys(
     ("source", "severity", "effect"), _PARTS
 )
-STEPS: tuple[str, ...] = (FIRST + _guards(_KEYS),)
+STEPS: tuple[str, ...] = (
+    FIRST + _guards(_KEYS),
+    WITHDRAWALS + _guards({"withdrawal": ("id",)}),
+)
 """SQL of each step, in order."""
 
 
@@ -123,9 +136,10 @@ def version_of(connection: sqlite3.Connection) -> int:
     ConfigurationError
         The file is another program's.
     """
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    # In this order: another process that makes the tables between two of these has marked them.
     (tables,) = connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
     if tables and application != APPLICATION_ID:
         raise ConfigurationError("is an SQLite file of another program: name another file")
     return int(version)

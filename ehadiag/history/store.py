@@ -12,7 +12,16 @@ from pathlib import Path
 from typing import Any, Self
 
 from ehadiag.core.errors import ConfigurationError, InputOutputError
-from ehadiag.history.records import Effect, Entry, Event, Severity, Source, Usage
+from ehadiag.history.records import (
+    DIAGNOSIS,
+    EVENT,
+    Effect,
+    Entry,
+    Event,
+    Severity,
+    Source,
+    Usage,
+)
 from ehadiag.history.schema import STEPS, migrate, version_of
 
 __all__ = ["History"]
@@ -32,11 +41,12 @@ WHY = {
     "SQLITE_CONSTRAINT": "only ever appended to",
 }
 """By the first two words of SQLite's own name of an error."""
-DIAGNOSIS = (
+DIAGNOSIS_ROW = (
     "appended", "tested", "actuator", "serial", "test", "verdict", "reasons", "hours", "cycles",
     "covariance", "version", "simulated", "result",
 )  # fmt: skip
-EVENT = ("appended", "done", "serial", "actuator", "hours", "cycles", "text", "resets")
+EVENT_ROW = ("appended", "done", "serial", "actuator", "hours", "cycles", "text", "resets")
+WITHDRAWAL = ("appended", "kind", "number", "text")
 
 
 class History:
@@ -107,7 +117,7 @@ class History:
             "effect": [(e.name, e.value, e.std, e.at_bound) for e in entry.effects],
         }
         with self._told(), self._transaction():
-            number = self._insert("diagnosis", DIAGNOSIS, row)
+            number = self._insert("diagnosis", DIAGNOSIS_ROW, row)
             for table, rows in parts.items():
                 for place, cells in enumerate(rows):
                     marks = ", ".join("?" * (len(cells) + 2))
@@ -139,15 +149,45 @@ class History:
             event.usage.cycles, event.text, _json(event.resets),
         )  # fmt: skip
         with self._told(), self._transaction():
-            return self._insert("event", EVENT, row)
+            return self._insert("event", EVENT_ROW, row)
 
-    def entries(self, serial: int | None = None) -> list[Entry]:
+    def withdraw(self, kind: str, number: int, when: str, text: str) -> None:
+        """Append that a diagnosis or an event counts no more; it stays where it is.
+
+        Parameters
+        ----------
+        kind : str
+            `DIAGNOSIS` or `EVENT` of `ehadiag.history.records`.
+        number : int
+            Of the diagnosis or event.
+        when : str
+            Time of day: UTC, ISO 8601.
+        text : str
+            Why.
+
+        Raises
+        ------
+        ConfigurationError
+            There is none of this number, or it is withdrawn already.
+        InputOutputError
+            It could not be written.
+        """
+        with self._told(), self._transaction():
+            if not self._rows(f"SELECT 1 FROM {kind} WHERE id = ?", (number,)):
+                raise ConfigurationError(f"has no {kind} {number}; see ehadiag history list")
+            if number in self._withdrawn(kind):
+                raise ConfigurationError(f"has {kind} {number} withdrawn already")
+            self._insert("withdrawal", WITHDRAWAL, (when, kind, number, text))
+
+    def entries(self, serial: int | None = None, *, withdrawn: bool = False) -> list[Entry]:
         """Return the diagnoses, in the order in which they were appended.
 
         Parameters
         ----------
         serial : int | None
             Of one unit only; None: all.
+        withdrawn : bool
+            Also those that were withdrawn.
 
         Returns
         -------
@@ -158,6 +198,7 @@ class History:
             where, values = _of(serial)
             rows = self._rows(f"SELECT * FROM diagnosis {where} ORDER BY id", values)
             parts = {name: self._parts(name) for name in ("source", "severity", "effect")}
+            why = self._withdrawn(DIAGNOSIS)
         return [
             Entry(
                 number=row["id"],
@@ -195,8 +236,10 @@ class History:
                 version=row["version"],
                 simulated=bool(row["simulated"]),
                 result=row["result"],
+                withdrawn=why.get(row["id"]),
             )
             for row in rows
+            if withdrawn or row["id"] not in why
         ]
 
     def results(self) -> Iterator[str]:
@@ -211,13 +254,15 @@ class History:
             for row in self._connection.execute("SELECT result FROM diagnosis ORDER BY id"):
                 yield row["result"]
 
-    def events(self, serial: int | None = None) -> list[Event]:
+    def events(self, serial: int | None = None, *, withdrawn: bool = False) -> list[Event]:
         """Return the maintenance events, in the order in which they were appended.
 
         Parameters
         ----------
         serial : int | None
             Of one unit only; None: all.
+        withdrawn : bool
+            Also those that were withdrawn.
 
         Returns
         -------
@@ -227,6 +272,7 @@ class History:
         with self._told():
             where, values = _of(serial)
             rows = self._rows(f"SELECT * FROM event {where} ORDER BY id", values)
+            why = self._withdrawn(EVENT)
         return [
             Event(
                 number=row["id"],
@@ -237,8 +283,10 @@ class History:
                 usage=Usage(row["hours"], row["cycles"]),
                 text=row["text"],
                 resets=tuple(json.loads(row["resets"])),
+                withdrawn=why.get(row["id"]),
             )
             for row in rows
+            if withdrawn or row["id"] not in why
         ]
 
     def close(self) -> None:
@@ -311,6 +359,11 @@ class History:
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[sqlite3.Row]:
         return self._connection.execute(query, values).fetchall()
+
+    def _withdrawn(self, kind: str) -> dict[int, str]:
+        """Why each of a kind counts no more, by number."""
+        rows = self._rows("SELECT number, text FROM withdrawal WHERE kind = ?", (kind,))
+        return {row["number"]: row["text"] for row in rows}
 
     def _parts(self, table: str) -> dict[int, list[sqlite3.Row]]:
         out: dict[int, list[sqlite3.Row]] = {}

@@ -15,7 +15,7 @@ from ehadiag.identify.search.first_approximation import FirstApproximation
 from ehadiag.identify.search.solvers import SearchResult
 from ehadiag.identify.uncertainty import interval95
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
-from ehadiag.model.parameters import FAULTS, Kind
+from ehadiag.model.parameters import FAULTS, Kind, Parameter
 
 __all__ = ["NOT_SHOWN_STD", "estimates_of", "fit_of", "identification", "of_faults", "outliers"]
 
@@ -70,7 +70,8 @@ def identification(
 
 def of_faults(refined: Refinement, spread: NDArray[np.float64]) -> NDArray[np.float64]:
     """Part of a covariance that is of the severities, in the order of `FAULTS`."""
-    places = [refined.parameters.index(item) for item in FAULTS]
+    names = [item.name for item in refined.parameters]
+    places = [names.index(item.name) for item in FAULTS]
     return spread[np.ix_(places, places)]
 
 
@@ -88,12 +89,12 @@ def estimates_of(
     deviations = np.sqrt(np.diag(of_faults(refined, spread)))
     out = []
     for item, searched, std in zip(FAULTS, found.best, deviations.tolist(), strict=True):
-        value = values[item.name]
+        value = _within(item, values[item.name])
         out.append(
             Estimate(
                 name=item.name,
                 first=float(first.values[item.name]),
-                search=float(searched),
+                search=_within(item, float(searched)),
                 value=value,
                 std=std,
                 interval95=interval95(value, std),
@@ -102,6 +103,11 @@ def estimates_of(
             )
         )
     return tuple(out)
+
+
+def _within(item: Parameter, value: float) -> float:
+    """Severity as it is told: it is looked for beyond where data that pass for it may be off."""
+    return min(max(value, item.lower), item.upper)
 
 
 def fit_of(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:

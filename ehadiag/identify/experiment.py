@@ -15,7 +15,7 @@ from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.commanded_current import CurrentTrace, commanded_current
 from ehadiag.identify.noise import QUIET_BLOCK, noise_of_signal
-from ehadiag.model.plant import PlantConstants
+from ehadiag.model.plant import PlantConstants, relative_viscosity
 from ehadiag.model.unit import unit_constants
 
 __all__ = ["Experiment", "build_experiment", "noise_is_judged_early", "share_offsets"]
@@ -64,6 +64,8 @@ class Experiment:
     """Spool position before the test, m, as the pressure at rest tells."""
     channels: Channels
     """Converters that the samples went through."""
+    viscosity_std: float = 0.0
+    """Relative standard deviation of the oil's viscosity that the bus's rounding leaves."""
 
     @property
     def ticks(self) -> int:
@@ -124,7 +126,15 @@ def build_experiment(
         rested=rest >= LEAST_REST,
         origin=origin,
         channels=channels,
+        viscosity_std=_viscosity_std(environment),
     )
+
+
+def _viscosity_std(environment: Environment) -> float:
+    degc, std = environment.oil_temperature, environment.temperature_std
+    if degc is None or std == 0.0:
+        return 0.0
+    return std * abs(relative_viscosity(degc + 1.0) / relative_viscosity(degc) - 1.0)
 
 
 def _first_part(test: StoredTest) -> int:

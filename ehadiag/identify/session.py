@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
+from ehadiag.identify.nuisance.astray import may_be_astray, would_explain
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
-from ehadiag.identify.nuisance.explained import excess
+from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
-    CONSIDERED,
     FirstPart,
+    considered_in,
     first_spans,
     refine_first_part,
 )
 from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.refine.posterior import nothing
 from ehadiag.identify.result import Identification, Timing
 from ehadiag.identify.search.first_approximation import FirstApproximation
 from ehadiag.identify.search.solvers import CompactGa, SearchResult, Solver
@@ -64,6 +67,11 @@ BEYOND_RESCUE = 0.05
 made: 0.04 at most on a textbook's actuator after the search before."""
 BEYOND_STEPS = 15.0
 """Excess after all nuisances at once from which on they are not tried one after another."""
+NEARLY = 1.3
+"""Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
+brings out what its model leaves, and loosened effects would stand in for that."""
+CHANGE = 0.5
+"""Share of what is left beyond noise that may remain where effects have changed since."""
 LASTING = 1.2
 """Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
 1.15 at most in 80 recordings of units without any."""
@@ -145,11 +153,13 @@ class Session:
         experiments = share_offsets(experiments)
         best = self._first(experiments)[1]
         self.so_far = SoFar("first approximation", named(best))
-        for stage, result in enumerate(itertools.islice(self._stages(experiments, best), ready)):
+        for stage, result in enumerate(
+            itertools.islice(self._stages(experiments, best, lambda _share: None), ready)
+        ):
             best = result.best
             self.so_far = SoFar(f"search, stage {stage + 1} of {len(STAGES)}", named(best))
         if ready == len(STAGES) and unlikeness(experiments, best) <= HOPELESS:
-            self.so_far = _refined(self._first_part(experiments, best).refined)
+            self.so_far = _refined(self._first_part(experiments, best, nothing).refined)
 
     def finish(
         self, experiments: Sequence[Experiment], progress: Progress | None = None
@@ -167,7 +177,7 @@ class Session:
         experiments = share_offsets(experiments)
         first, start = self._first(experiments)
         searched_at = time.perf_counter()
-        found = staged_search(self._stages(experiments, start), tell)
+        found = staged_search(self._stages(experiments, start, partial(tell, "search")), tell)
         search_s = time.perf_counter() - searched_at
         tell("refinement", 0.0)
         doubts = self.knowledge.doubts
@@ -175,14 +185,15 @@ class Session:
         found, near = _nearer(experiments, found, start)
         best: Attempt | None = None
         if alone or (near and self.nuisances is Nuisances.AUTO and not doubts):
-            best = attempt(experiments, found, self._first_part)
+            best = attempt(experiments, found, self._first_part, partial(tell, "refinement", 0.0))
             best = replace(best, evaluations=best.evaluations + found.evaluations)
         freed: Estimated | None = None
         if not alone and (best is None or not _leaves_nothing(best.refined)):
             hint = best.refined.values if best else named(found.best)
             freed = self._freed(experiments, hint if near else None, tell)
         if best is not None and (freed is None or _is_poorer(freed, best)):
-            if near and outliers(best.refined) <= BEYOND_RESCUE:
+            elsewhere = freed is not None and is_of_the_pressure(freed.refined.residuals)
+            if near and outliers(best.refined) <= BEYOND_RESCUE and not elsewhere:
                 best = rescued(
                     experiments, best, self._first_part, self.solver, self.seed, tell,
                     time.perf_counter,
@@ -227,22 +238,25 @@ class Session:
             return found
         if not self.knowledge.doubts:
             return self._stepwise(experiments, found, tell)
-        if self.knowledge.joint is None:
+        if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
         loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
-        return min(found, loose, key=lambda item: item.excess)
+        return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
     def _stepwise(
         self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
     ) -> Estimated:
         """Estimate one effect after another where that explains what all at once do not."""
+        load = parameter("load")
         if found.excess > BEYOND_STEPS:
+            return found
+        if not may_be_astray(experiments, found) and not would_explain(load, found, self.seed):
             return found
         few = stepwise(
             experiments,
-            (*nuisances_of(REGISTRY), parameter("load")),
+            (*nuisances_of(REGISTRY), load),
             least=found.excess,
-            considered=CONSIDERED,
+            considered=considered_in(experiments),
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
         )
@@ -262,12 +276,13 @@ class Session:
         tell: Progress,
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
-            (*FAULTS, *OFFSETS, *knowledge.beside(effects)),
+            free,
             known=knowledge.known,
             joint=knowledge.joint,
-            considered=CONSIDERED,
+            considered=considered_in(experiments, free),
             hint=hint,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
@@ -309,12 +324,18 @@ class Session:
         return first, np.array([first.values[item.name] for item in FAULTS])
 
     def _stages(
-        self, experiments: Sequence[Experiment], start: NDArray[np.float64]
+        self,
+        experiments: Sequence[Experiment],
+        start: NDArray[np.float64],
+        tell: Callable[[float], None],
     ) -> Iterator[SearchResult]:
-        return search_stages(experiments, start, self.solver, self.seed, self._memory)
+        return search_stages(experiments, start, self.solver, self.seed, self._memory, tell)
 
     def _first_part(
-        self, experiments: Sequence[Experiment], start: NDArray[np.float64]
+        self,
+        experiments: Sequence[Experiment],
+        start: NDArray[np.float64],
+        between: Callable[[], None],
     ) -> FirstPart:
         """Refinement on the first parts of the tests, from memory if the inputs are the same."""
         until = [first_ticks(item) for item in experiments]
@@ -323,7 +344,7 @@ class Session:
         return self._memory.recall(
             digest("first part", [*free, *base, start]),
             FirstPart,
-            lambda: refine_first_part(experiments, until, named(start)),
+            lambda: refine_first_part(experiments, until, named(start), between),
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.refine.first_part import FirstPart, refine_first_part, residuals_at
 from ehadiag.identify.refine.least_squares import Refinement, median_offsets
+from ehadiag.identify.refine.posterior import nothing
 from ehadiag.identify.refine.update import add_last_part
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import SearchResult, Solver
@@ -113,21 +115,25 @@ class Attempt:
     count: int = 1
 
 
-FirstParts = Callable[[Sequence[Experiment], NDArray[np.float64]], FirstPart]
-"""Refinement on the first parts of the tests, from a start among the severities."""
+FirstParts = Callable[[Sequence[Experiment], NDArray[np.float64], Callable[[], None]], FirstPart]
+"""Refinement on the first parts of the tests, from a start among the severities; the last argument
+is called between rounds."""
 
 
 def attempt(
-    experiments: Sequence[Experiment], found: SearchResult, first_parts: FirstParts
+    experiments: Sequence[Experiment],
+    found: SearchResult,
+    first_parts: FirstParts,
+    between: Callable[[], None] = nothing,
 ) -> Attempt:
-    """Refine the optimum of a search."""
+    """Refine the optimum of a search; what `between` raises between rounds ends it."""
     until = [first_ticks(item) for item in experiments]
-    first = first_parts(experiments, found.best)
+    first = first_parts(experiments, found.best, between)
     judged = first.judged(experiments)
     best = add_last_part(judged, until, first)
     if best is None:
         ends = [item.ticks for item in experiments]
-        whole = refine_first_part(experiments, ends, first.refined.values)
+        whole = refine_first_part(experiments, ends, first.refined.values, between)
         judged = whole.judged(experiments)
         best = add_last_part(judged, ends, whole)
         assert best is not None
@@ -157,7 +163,7 @@ def rescued(
         found = _searched(experiments, best.refined.values, solver, of_search, plan, tell)
         search_s += clock() - before
         tell("refinement", 0.0)
-        other = attempt(experiments, found, first_parts)
+        other = attempt(experiments, found, first_parts, partial(tell, "refinement", 0.0))
         evaluations += found.evaluations + other.evaluations
         count += 1
         if other.score < best.score:

@@ -9,12 +9,12 @@ from ehadiag.live.snapshot import Snapshot
 
 __all__ = ["PERIOD_S", "Publisher"]
 
-PERIOD_S = 0.1
-"""Between two snapshots."""
+PERIOD_S = 0.25
+"""Between two snapshots: each costs the thread that reads the bus its caches for a tick or two."""
 
 
 class Publisher:
-    """Asks a session for a snapshot ten times a second, in a thread of its own.
+    """Asks a session for a snapshot four times a second, in a thread of its own.
 
     The session only answers `look`, from what its own threads keep anyway: the thread that reads
     the bus neither waits for a reader nor knows of one. Readers ask for `latest` as often as they

@@ -1,6 +1,6 @@
 """One look at a running session: bus, test, signals, residuals, severities, verdict.
 
-A session makes some ten of them a second (`ehadiag.live.publisher`); a screen, a log or a web page
+A session makes four of them a second (`ehadiag.live.publisher`); a screen, a log or a web page
 shows them. Names say the unit. Where a value is not known it is None: neither `to_dict` nor
 `to_json` ever holds NaN.
 """
@@ -104,6 +104,8 @@ class Residuals:
 
     spool: float | None = None
     pressure: float | None = None
+    against: str = ""
+    """What the model goes by: a diagnosis, a calibration, a unit as new."""
     spool_above: float = 0.0
     spool_below: float = 0.0
     pressure_above: float = 0.0

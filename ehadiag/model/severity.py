@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ehadiag.model.plant import Value
 
-__all__ = ["clogged", "worn"]
+__all__ = ["CLOGGED", "clogged", "worn"]
 
 CLOGGED = 0.8
 """Share of the first stage's flow gain that is lost at the limit of damage (PHY-13)."""

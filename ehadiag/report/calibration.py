@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ehadiag.core.printable import printable, valid_text
+from ehadiag.core.shown_in import SHOWN_IN
 
 if TYPE_CHECKING:
     from ehadiag.calibration.result import Calibrated, Value
@@ -16,19 +17,6 @@ if TYPE_CHECKING:
 __all__ = ["SCHEMA", "calibration_json", "print_calibration"]
 
 SCHEMA = "ehadiag.calibration/1"
-SHOWN_IN = {
-    "A": (1e3, "mA"),
-    "m": (1e6, "µm"),
-    "s": (1e3, "ms"),
-    "1": (1e2, "%"),
-    "m/s": (1e3, "mm/s"),
-    "N/m": (1e-3, "N/mm"),
-    "N m/A": (1.0, "N mm/mA"),
-    "Pa": (1e-6, "MPa"),
-    "Pa/m": (1e-9, "MPa/mm"),
-    "m²/s": (60.0, "L/min/mm"),
-}
-"""Factor and unit in which a table shows what is in an SI unit; others are shown as they are."""
 
 
 def calibration_json(found: Calibrated) -> str:

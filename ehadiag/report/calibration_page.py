@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.printable import printable
+from ehadiag.core.shown_in import SHOWN_IN
 from ehadiag.model.parameters import parameter
-from ehadiag.report.calibration import SHOWN_IN
 from ehadiag.report.html import fill
 from ehadiag.report.responses import draw_responses, modelled
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.core.printable import printable
+from ehadiag.core.shown_in import SHOWN_IN
 from ehadiag.history.fingerprint import hash_of_file
 from ehadiag.model.parameters import parameter
-from ehadiag.report.calibration import SHOWN_IN
 from ehadiag.report.html import fill
 from ehadiag.report.plots import plot_severities, plot_trend
 from ehadiag.report.prognosis_table import levels_named, remaining_text

@@ -36,17 +36,15 @@ def thinned(first: Array, second: Array, most: int) -> NDArray[np.intp]:
     ticks = len(first)
     if ticks <= most:
         return np.arange(ticks)
-    parts = np.array_split(np.arange(ticks), max(1, most // EXTREMES))
-    kept = [
-        part[0] + choice
-        for part in parts
-        for values in (first[part], second[part])
-        for choice in _extremes(values)
-    ]
-    return np.unique(np.array(kept, dtype=np.intp))
-
-
-def _extremes(values: Array) -> tuple[int, int]:
-    """Where the least and the greatest are; the first where all is missing."""
-    least, greatest = np.where(np.isnan(values), np.inf, values), np.nan_to_num(values, nan=-np.inf)
-    return int(least.argmin()), int(greatest.argmax())
+    width = -(-ticks // max(1, most // EXTREMES))
+    parts = -(-ticks // width)
+    begin = width * np.arange(parts)
+    kept = []
+    for values in (first, second):
+        table = np.full(parts * width, np.nan)
+        table[:ticks] = values
+        for extreme, beyond in ((np.argmin, np.inf), (np.argmax, -np.inf)):
+            # The first of a part where all is missing.
+            seen = np.where(np.isnan(table), beyond, table).reshape(parts, width)
+            kept.append(begin + extreme(seen, axis=1))
+    return np.unique(np.concatenate(kept).astype(np.intp))

@@ -39,6 +39,10 @@ from firmware_iface.transport.frames import FrameTable
 __all__ = ["assemble"]
 
 STUCK_FRAMES = 20
+OWN_STEP_K = 0.1
+"""Resolution in which the computer says the oil temperature in degC (`Environment` of the DBC)."""
+SAME = 1e-6
+"""Distance, in such steps, within which two scales are the same."""
 SEVERAL = 2
 LOOKED_BESIDE = 100
 """Ticks around a test, as the status tells it, in which its command is looked for."""
@@ -260,7 +264,7 @@ def _recording(
         test_id=episode.test_id,
         serial=episode.serial,
         outcome=episode.outcome,
-        environment=_environment(decoded, begin, end),
+        environment=replace(_environment(decoded, begin, end), temperature_std=_rounding(bus_map)),
         quality=quality,
         channel=bus_map.channel,
         start_ns=_start_ns(samples),
@@ -325,3 +329,16 @@ def _environment(decoded: DecodedTable, begin: int, end: int) -> Environment:
         return_pressure=median("return_pressure"),
         oil_temperature=median("oil_temperature"),
     )
+
+
+def _rounding(bus_map: BusMap) -> float:
+    """What rounding the oil temperature to the bus's scale does, K; 0 of the computer's own."""
+    found = bus_map.find("environment.oil_temperature")
+    if found is None or found[1].signal.is_float:
+        return 0.0
+    role = found[1]
+    step = abs(role.signal.scale * role.gain)
+    zero = (role.gain * role.signal.offset + role.bias) / OWN_STEP_K
+    own = abs(step / OWN_STEP_K - 1.0) < SAME and abs(zero - round(zero)) < SAME
+    # A rig that holds 40 °C is off by the same half step, 0.05 K of 313.1 or 313.2 K, every day.
+    return 0.0 if own else 0.5 * step

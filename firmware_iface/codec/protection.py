@@ -20,6 +20,8 @@ LONGEST_RUN = 8
 """Frames in a row that may be out of line; more of them are a counter that started again."""
 MOST_ROUNDS = 50
 """How often frames out of line are looked for: noise could go on until nothing is left."""
+MOST_NOTES = 3
+"""On the clock, of one message."""
 SLACK_TICKS = 8.0
 """Host-time jitter that a real gap may show, in ticks."""
 SLACK_RATE = 2e-4
@@ -197,7 +199,11 @@ def _clock_steps(
     residue: NDArray[np.float64],
     period_ns: int,
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Steps of the host clock itself (in ticks, at the differences where they happen)."""
+    """Steps of the host's time against the counters (in ticks, at the differences they are at).
+
+    Only a stamp before the one before shows that the host's clock was set. Where stamps run ahead
+    the computer may have paused: an emulated one on a busy machine does.
+    """
     rebase = np.zeros_like(residue)
     notes: list[str] = []
     after = 20
@@ -209,6 +215,14 @@ def _clock_steps(
         if abs(size) < 2 * SLACK_TICKS or (size > 0 and burst):
             continue
         rebase[place] = size
-        if len(notes) < 3:
-            notes.append(f"host clock stepped by {size * period_ns * 1e-9:+.3f} s")
+        seconds = abs(size) * period_ns * 1e-9
+        if len(notes) == MOST_NOTES or 0.0 > size > -jump[place]:
+            continue  # a stall, and frames lost in it: they are counted
+        if size > 0.0:
+            notes.append(
+                f"time stamps run {seconds:.3f} s ahead of the counters: the computer paused, or "
+                "the host clock was set"
+            )
+        else:
+            notes.append(f"host clock was set back by {seconds:.3f} s")
     return rebase, tuple(notes)

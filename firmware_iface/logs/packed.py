@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from ehadiag.core.errors import InputOutputError
 
-__all__ = ["Unpacked", "kind_of", "unpacked"]
+__all__ = ["Unpacked", "beginning_of", "kind_of", "unpacked"]
 
 PACKED = ".gz"
 PIECE = 1 << 20
@@ -33,6 +33,42 @@ def kind_of(path: Path) -> str:
     """Suffix that says how a log is written, in lower case: that below `.gz`, if it is packed."""
     suffix = path.suffix.lower()
     return Path(path.stem).suffix.lower() if suffix == PACKED else suffix
+
+
+def beginning_of(path: Path, count: int) -> bytes:
+    """Return the first bytes of a log, or of what a packed one holds; no more is unpacked.
+
+    Parameters
+    ----------
+    path : Path
+        Log, packed or not.
+    count : int
+        Bytes at most.
+
+    Returns
+    -------
+    bytes
+        Fewer where the log is shorter, or damaged there.
+
+    Raises
+    ------
+    OSError
+        It cannot be read.
+    """
+    if path.suffix.lower() != PACKED:
+        with path.open("rb") as plain:
+            return plain.read(count)
+    out = b""
+    with gzip.open(path, "rb") as source:
+        while len(out) < count:
+            try:
+                piece = source.read1(count - len(out))
+            except (gzip.BadGzipFile, EOFError, zlib.error):
+                break
+            if not piece:
+                break
+            out += piece
+    return out
 
 
 @contextmanager

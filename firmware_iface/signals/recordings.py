@@ -89,7 +89,8 @@ def recordings_of_signals(
         f"time stamps jitter by {1e3 * jitter:.2g} ms: the rows' own even clock takes their place"
     )
     evened = (even,) if jitter > 0.0 else ()
-    notes = ("decoded signals: no check sum, no counter", *evened, *said, *rules)
+    cut = _cut_off(signals, clock)
+    notes = ("decoded signals: no check sum, no counter", *evened, *cut, *said, *rules)
     whole = Recording(
         source=source,
         samples=samples,
@@ -137,6 +138,15 @@ def _clock(
     word = f"{phase % 1.0:.2f} of a tick, {1e6 * rate:+.0f} ppm"
     said = f"ticks by the {found.by} against test {found.test.name!r} ({word})"
     return Clock(begin), {}, (said,)
+
+
+def _cut_off(signals: Mapping[str, Signal], clock: Clock) -> tuple[str, ...]:
+    """Say where more was recorded than is looked at."""
+    left = min(signals[role].time[-1] for role in NEEDED) - float(clock.begin[-1])
+    if clock.ticks < MOST_TICKS or left <= 0.0:
+        return ()
+    seen = float(clock.begin[-1] - clock.begin[0])
+    return (f"the first {seen:.0f} s are looked at, the {left:.0f} s behind them are not",)
 
 
 def _led(signals: Mapping[str, Signal], found: Found) -> Signal | None:

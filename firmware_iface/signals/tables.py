@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import warnings
 from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.printable import printable
 from firmware_iface.logs.budget import Budget
-from firmware_iface.logs.packed import kind_of, unpacked
+from firmware_iface.logs.packed import beginning_of, kind_of, unpacked
 from firmware_iface.signals.columns import TIME, ColumnMap, missing, unit_of
 from firmware_iface.signals.row_clock import even_times
 
@@ -28,6 +29,10 @@ FRAMES_HEADER = "timestamp,arbitration_id"
 HEADER_BYTES = 1 << 16
 DELIMITERS = ";\t,"
 LEAST_ROWS = 10
+MOST_ROWS = 800_000
+"""Of a table, which is held at once in some 300 MB: 13 minutes at 1 kHz, 40 s at 20 kHz."""
+MOST_CELLS = 10_000_000
+"""Of a Parquet file, of which all columns are unpacked."""
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Resolutions in which pandas holds dates."""
 EXTRA = "pip install 'ehadiag[daq]'"
@@ -84,8 +89,7 @@ def holds_signals(path: Path | str, *, mapped: bool) -> bool:
 
 def _head(path: Path) -> str:
     try:
-        with unpacked(path, 1 << 40) as plain, plain.path.open("rb") as file:
-            text = file.read(HEADER_BYTES)
+        text = beginning_of(path, HEADER_BYTES)
     except OSError as error:
         raise InputOutputError(f"log {path}: {error.strerror or error}") from None
     return text.decode("utf-8-sig", "replace").lstrip()
@@ -131,23 +135,34 @@ def read_signals(
     with unpacked(path, budget.size) as plain:
         if kind_of(path) == ".mf4":
             return _read_mf4(plain.path, path, columns, complete=complete)
-        table, units = _read_table(plain.path, path, budget)
-    return _signals(table, units, columns, path, complete=complete)
+        table, units, present = _read_table(plain.path, path, columns, budget)
+    return _signals(table, units, present, columns, path, complete=complete)
 
 
-def _read_table(plain: Path, path: Path, budget: Budget) -> tuple[Any, dict[str, str]]:
-    """Read a data frame, and the units that the file says by column."""
+def _read_table(
+    plain: Path, path: Path, columns: ColumnMap, budget: Budget
+) -> tuple[Any, dict[str, str], list[str]]:
+    """Read a data frame, the units that the file says by column, and the names of all columns."""
     try:
         import pandas  # noqa: PLC0415 - optional, and slow
     except ImportError:
         raise InputOutputError(f"log {path}: decoded signals need pandas: {EXTRA}") from None
     if kind_of(path) == ".parquet":
         try:
-            return pandas.read_parquet(plain), {}
+            import pyarrow.parquet  # noqa: PLC0415 - optional, and slow
+
+            _check_size(pyarrow.parquet.read_metadata(plain), path)
+            table = pandas.read_parquet(plain)
         except ImportError:
             raise InputOutputError(f"log {path}: Parquet needs pyarrow: {EXTRA}") from None
+        except InputOutputError:
+            raise
         except Exception:  # pyarrow raises what it likes, and quotes the file
             raise InputOutputError(f"log {path}: not a readable Parquet file") from None
+        if table.index.name is not None:
+            table = table.reset_index()
+        table.columns = [str(name) for name in table.columns]
+        return table, {}, list(table.columns)
     lines = [line for line in _head(plain).splitlines()[:4] if line.strip()]
     delimiter = max(DELIMITERS, key=lines[0].count)
     rows = list(csv.reader(lines, delimiter=delimiter))
@@ -157,25 +172,46 @@ def _read_table(plain: Path, path: Path, budget: Budget) -> tuple[Any, dict[str,
     if len(rows) > 1 and not any(_is_number(cell) for cell in rows[1]):
         skipped = 2
         units = {name: cell.strip(" []()") for name, cell in zip(names, rows[1], strict=False)}
+    wanted = {item.column for item in columns.resolve(names, f"log {path}").values()}
     decimal = "," if delimiter != "," and "," in lines[-1] else "."
     try:
-        table = pandas.read_csv(
-            plain,
-            sep=delimiter,
-            decimal=decimal,
-            skiprows=skipped,
-            header=None,
-            names=names,
-            index_col=False,
-            nrows=budget.frames,
-            skip_blank_lines=True,
-            encoding="utf-8",
-            encoding_errors="replace",
-            on_bad_lines="skip",
-        )
+        # pandas warns of rows longer than the header, and of columns of mixed kinds: both are told
+        # by what is missing afterwards.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            table = pandas.read_csv(
+                plain,
+                sep=delimiter,
+                decimal=decimal,
+                skiprows=skipped,
+                header=None,
+                names=names,
+                usecols=wanted,
+                index_col=False,
+                nrows=min(budget.frames, MOST_ROWS) + 1,
+                skip_blank_lines=True,
+                encoding="utf-8",
+                encoding_errors="replace",
+                on_bad_lines="skip",
+            )
     except (ValueError, OSError):
         raise InputOutputError(f"log {path}: not a readable table of signals") from None
-    return table, units
+    if len(table) > MOST_ROWS:
+        raise _too_long(path)
+    return table, units, names
+
+
+def _check_size(about: Any, path: Path) -> None:
+    """Refuse a Parquet file by what it says of itself, before any of it is unpacked."""
+    if about.num_rows > MOST_ROWS or about.num_rows * about.num_columns > MOST_CELLS:
+        raise _too_long(path)
+
+
+def _too_long(path: Path) -> InputOutputError:
+    return InputOutputError(
+        f"log {path}: more than {MOST_ROWS} rows, or {MOST_CELLS} values, are too many to hold at"
+        " once; cut it about the test"
+    )
 
 
 def _is_number(text: str) -> bool:
@@ -187,14 +223,16 @@ def _is_number(text: str) -> bool:
 
 
 def _signals(
-    table: Any, units: dict[str, str], columns: ColumnMap, path: Path, *, complete: bool
+    table: Any,
+    units: dict[str, str],
+    present: list[str],
+    columns: ColumnMap,
+    path: Path,
+    *,
+    complete: bool,
 ) -> dict[str, Signal]:
     import pandas  # noqa: PLC0415 - read by now
 
-    if table.index.name is not None:
-        table = table.reset_index()
-    present = [str(name) for name in table.columns]
-    table.columns = present
     found = columns.resolve(present, f"log {path}")
     if complete and (lacking := missing(found, present)):
         raise ConfigurationError(f"log {path}: {lacking}")
@@ -219,7 +257,7 @@ def _signals(
             " numbers, in s or the unit that --column time=NAME:UNIT says, or ISO 8601 such as"
             " 2026-03-01T12:00:00.001"
         )
-    return _checked({role: (time, numbers(role)) for role in found if role != TIME}, path)
+    return _checked(((role, (time, numbers(role))) for role in found if role != TIME), path)
 
 
 def _instants(series: Any) -> NDArray[np.float64] | None:
@@ -246,11 +284,11 @@ def _instants(series: Any) -> NDArray[np.float64] | None:
 
 
 def _checked(
-    found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], path: Path
+    found: Iterable[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]], path: Path
 ) -> dict[str, Signal]:
     """In order of time, once for each instant, numbers alone."""
     out: dict[str, Signal] = {}
-    for role, (stamps, value) in found.items():
+    for role, (stamps, value) in found:
         time, jitter = even_times(stamps)
         known = np.isfinite(time) & np.isfinite(value)
         at, values = time[known], value[known]
@@ -287,7 +325,7 @@ def _read_mf4(plain: Path, path: Path, columns: ColumnMap, *, complete: bool) ->
         raise
     except Exception:  # asammdf raises what it likes, and quotes the file
         raise InputOutputError(f"log {path}: not a readable MF4 file of signals") from None
-    return _checked(out, path)
+    return _checked(out.items(), path)
 
 
 def joined(parts: Iterable[dict[str, Signal]]) -> dict[str, Signal]:

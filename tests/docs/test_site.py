@@ -38,3 +38,7 @@ def test_the_site_is_built_without_a_warning_and_has_every_public_name(tmp_path:
     first = (tmp_path / "site" / "index.html").read_text()
     assert "explanation/method.html" in first
     assert 'src="http' not in first
+    # What axe-core objects to in the theme.
+    assert 'role="heading" aria-level="2"' in first
+    assert 'role="heading">' not in first
+    assert "<pre>" not in first

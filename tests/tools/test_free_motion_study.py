@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 
 from ehadiag.core.actuator import default_actuator
+from ehadiag.core.channels import CHANNELS
 from ehadiag.core.recording import CommandMode
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.free_motion.motion import REACH, free_motion, random_command
+from ehadiag_sim.plant.simulator import Plant
+from ehadiag_tools.free_motion.motion import REACH, STEP, free_motion, random_command
 from ehadiag_tools.free_motion.study import Case, garwood, main, watch
 
 
@@ -24,6 +26,20 @@ def test_motion_is_that_of_its_seed_and_stays_within_reach(mode: CommandMode) ->
     commands = random_command(np.random.default_rng(0), 60_000, 1e3, REACH[mode])
     assert np.abs(commands).max() <= REACH[mode]
     assert np.ptp(commands) > REACH[mode]
+
+
+@pytest.mark.parametrize("mode", list(CommandMode))
+def test_motion_is_that_of_the_plant_tick_by_tick(mode: CommandMode) -> None:
+    actuator, faults = default_actuator(), Faults(0.2, 0.4, 0.3)
+    rows = free_motion(actuator, faults, mode, 0.4, 7)
+    rng = np.random.default_rng((7, int(mode)))
+    random_command(rng, len(rows), 1e3, REACH[mode])
+    plant = Plant(actuator, faults, seed=int(rng.integers(1 << 31)), step=STEP)
+    lsb = np.array([channel.lsb for channel in CHANNELS])
+    half = np.array([channel.half for channel in CHANNELS])
+    codes = np.array([plant.tick(command, mode) for command in rows[:, 0].tolist()])
+    np.testing.assert_allclose(rows[:, 1:], (codes - half) * lsb, rtol=1e-12)
+    assert np.ptp(rows[:, 4]) > 0.0
 
 
 def test_a_minute_tells_its_alarms_and_what_it_cost() -> None:

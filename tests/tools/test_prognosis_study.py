@@ -43,3 +43,4 @@ def test_the_study_prints_its_tables(capsys: pytest.CaptureFixture[str]) -> None
     out = capsys.readouterr().out
     assert "| all | ehadiag | 100.0% |" in out
     assert "| straight line |" in out
+    assert "| steady | straight line | " in out.partition("coverage off 80 %")[2]

@@ -10,13 +10,14 @@ import operator
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import atheris
 import numpy as np
 from atheris.version_dependent import CMP_OP_SHIFT_AMOUNT
 
-NAMES = ("frames", "windows", "serial", "logs", "mappings")
+NAMES = ("frames", "windows", "serial", "logs", "mappings", "signals", "configurations")
 SEEN = ("firmware_iface", "ehadiag", "cantools", "textparser", "tomllib", "can")
 """Packages whose branches guide the search."""
 AGAIN = "EHADIAG_FUZZ_TARGET"
@@ -41,8 +42,9 @@ def main() -> None:
     name = os.environ.get(AGAIN)
     if name not in NAMES:
         raise SystemExit(f"usage: run.py {'|'.join(NAMES)} [FOLDER...] [-option...]")
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     with atheris.instrument_imports(include=list(SEEN)):
-        import targets  # noqa: PLC0415 - the fuzzer must see its imports
+        from fuzz import targets  # noqa: PLC0415 - the fuzzer must see its imports
     options = [f"-timeout={HANG_S}", f"-rss_limit_mb={MEMORY_MB}", *sys.argv[1:]]
     atheris.Setup([sys.argv[0], *options], _without_leak(targets.target(name, targets.SHARE)))
     atheris.Fuzz()

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import sys
 import tempfile
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
-from targets import KINDS, RECORD, SEALED
+import pandas
 
 from firmware_iface.codec.encode import Encoder
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.transport.frames import Frame
 from firmware_iface.transport.serial_link import packet_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from fuzz.files import SIGNALS
+from fuzz.targets import KINDS, RECORD, SEALED
 
 TELEMETRY = 0x110
 
@@ -60,6 +66,61 @@ def _log(suffix: str, frames: list[Frame]) -> bytes:
         return path.read_bytes()
 
 
+def _decoded(rows: int) -> pandas.DataFrame:
+    """Decoded signals by their usual names."""
+    at = [row / 1000 for row in range(rows)]
+    columns = ("current", "spool", "pressure", "position")
+    return pandas.DataFrame(
+        {
+            "time": at,
+            **{f"channels.{name}": [1e-5 * row for row in range(rows)] for name in columns},
+        }
+    )
+
+
+def _signals(frames: list[Frame]) -> dict[str, bytes]:
+    """Recordings of the target `signals`, by name."""
+    lines = "".join(
+        f"({frame.time_ns * 1e-9:.6f}) can0 {frame.can_id:03X}#{frame.data.hex().upper()}\n"
+        for frame in frames
+    ).encode()
+    table = _decoded(40)
+    parquet = io.BytesIO()
+    table.to_parquet(parquet, index=False)
+    plain = table.to_csv(index=False).encode()
+    german = table.to_csv(index=False, sep=";", decimal=",").encode()
+    contents = {
+        "candump": (".log", lines),
+        "table": (".csv", plain),
+        "german": (".csv", german),
+        "parquet": (".parquet", parquet.getvalue()),
+        "packed-log": (".log.gz", gzip.compress(lines, mtime=0)),
+        "torn-gzip": (".csv.gz", gzip.compress(plain, mtime=0)[:-20]),
+        "packed-table": ("packed.csv.gz", plain),
+        "packed-candump": ("packed.log.gz", lines),
+    }
+    return {
+        f"signals/{name}": bytes((SIGNALS.index(kind),)) + content
+        for name, (kind, content) in contents.items()
+    }
+
+
+def _configurations() -> dict[str, bytes]:
+    """Files of the target `configurations`, by name."""
+    data = resources.files("ehadiag").joinpath("data")
+    bus = resources.files("firmware_iface").joinpath("data")
+    columns = '[time]\ncolumn = "t"\nunit = "s"\n[channels.spool]\ncolumn = "x"\nunit = "mm"\n'
+    mapping = bus.joinpath("eha_fcc.toml").read_bytes()
+    return {
+        "configurations/actuator": b"\0" + data.joinpath("actuator.toml").read_bytes(),
+        "configurations/test": b"\1" + data.joinpath("tests/open.toml").read_bytes(),
+        "configurations/columns": b"\2" + columns.encode(),
+        "configurations/mapping": b"\3" + mapping,
+        "configurations/dbc-elsewhere": b"\3" + mapping.replace(b"eha_fcc.dbc", b"/dev/zero"),
+        "configurations/deep": b"\0" + b"a" + b".a" * 200 + b" = 1",
+    }
+
+
 def main() -> None:
     """Write the files."""
     root = Path(sys.argv[1])
@@ -88,6 +149,7 @@ def main() -> None:
         "mappings/mapping": b"\0" + data.joinpath("eha_fcc.toml").read_bytes(),
         "mappings/dbc": b"\1" + data.joinpath("eha_fcc.dbc").read_bytes(),
     }
+    inputs |= {**_signals(frames), **_configurations()}
     for number, suffix in enumerate(KINDS):
         if suffix.startswith("."):
             inputs[f"logs/{suffix[1:]}"] = bytes((number,)) + _log(suffix, frames)

@@ -39,6 +39,7 @@ from firmware_iface.mapping.dbc import parse_dbc
 from firmware_iface.mapping.file import MappingFile
 from firmware_iface.transport.frames import MAX_PAYLOAD, Frame, FrameTable
 from firmware_iface.transport.serial_link import LONGEST_CODED, Framer, packet_of
+from fuzz import files
 
 __all__ = ["SHARE", "TARGETS", "target"]
 
@@ -271,4 +272,6 @@ TARGETS: Mapping[str, Callable[[int], Callable[[bytes], None]]] = {
     "serial": _serial,
     "logs": _logs,
     "mappings": _mappings,
+    "signals": files.signals,
+    "configurations": files.configurations,
 }

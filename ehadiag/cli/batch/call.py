@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.cli.argument_types import count
 from ehadiag.cli.batch.inputs import Input
 from ehadiag.cli.batch.job import Finding, Job, failure, work
 from ehadiag.cli.batch.resume import Journal
@@ -24,7 +25,6 @@ from ehadiag.cli.batch.summary import FAILED, Summary, summary_lines, worst_code
 from ehadiag.cli.batch.workers import Workers, processors_for
 from ehadiag.cli.drawing import can_be_drawn, drawn
 from ehadiag.cli.interrupt import interrupt_on_signals
-from ehadiag.cli.options import count
 from ehadiag.cli.output import counting_bar, progress_bar, say
 from ehadiag.cli.results import Results
 from ehadiag.core.errors import EhadiagError, InputOutputError, NotTestedError

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.assess.verdict import Levels, Rule
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, bus_options, options
 from ehadiag.cli.acquire import STOPPED, Heard, acquire, recording_path
 from ehadiag.cli.batch.job import labelled
 from ehadiag.cli.beforehand import refuse_beforehand
@@ -26,7 +26,7 @@ from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.cli.screen.bit_view import BitView
-from ehadiag.cli.screen.show import add_screen_options, shown
+from ehadiag.cli.screen.show import add_screen_options, shown, wants_screen
 from ehadiag.cli.together import Listener, listen_together
 from ehadiag.cli.units import Unit, add_unit_options, units_of
 from ehadiag.core.actuator import Actuator
@@ -37,6 +37,7 @@ from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis
+    from ehadiag.cli.watch.in_test import InTest
     from firmware_iface.mapping.bus_map import BusMap
     from firmware_iface.transport.interface import Transport
 
@@ -93,13 +94,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     ):
         parser.add_argument(
             f"--max-{name}",
-            type=options.positive,
+            type=argument_types.positive,
             metavar=unit,
             help=f"abort the test when the {what} goes beyond ±{unit} (default: not watched)",
         )
     parser.add_argument(
         "--onboard-wait",
-        type=options.positive,
+        type=argument_types.positive,
         default=60.0,
         metavar="S",
         help="how long to wait after the test for what the flight-control computer finds itself,"
@@ -111,7 +112,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_keeping_options(parser)
     options.add_result_options(parser)
     add_report_option(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     options.add_fault_options(parser)
     parser.set_defaults(run=run)
 
@@ -125,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--mapping: a test is requested of one actuator; name one mapping, or --listen"
         )
     described = [
-        (unit, options.the_actuator(unit.arguments), options.the_bus_map(unit.arguments))
+        (unit, asked_for.the_actuator(unit.arguments), asked_for.the_bus_map(unit.arguments))
         for unit in named
     ]
     for unit, actuator, bus_map in described:
@@ -135,7 +136,10 @@ def run(arguments: argparse.Namespace) -> int:
     folder = make_folder(arguments.out)
     say_if_compiling(simulation=arguments.simulate)
     results = Results(arguments, folder)
-    runs = [_Run(unit, test, actuator, bus_map) for unit, actuator, bus_map in described]
+    runs = [
+        _Run(unit, test, actuator, bus_map, results.history)
+        for unit, actuator, bus_map in described
+    ]
     results.load()
     with ExitStack() as stack:
         with stop_on_signals() as stop:
@@ -171,7 +175,14 @@ def _hear_all(
 class _Run:
     """The test of one actuator: listened to or requested, then judged."""
 
-    def __init__(self, unit: Unit, test: StoredTest, actuator: Actuator, bus_map: BusMap) -> None:
+    def __init__(
+        self,
+        unit: Unit,
+        test: StoredTest,
+        actuator: Actuator,
+        bus_map: BusMap,
+        history: Path | None,
+    ) -> None:
         from ehadiag.assess.diagnosis import DiagnosisSession  # noqa: PLC0415 - loads numba
         from ehadiag.identify.search.solvers import make_solver  # noqa: PLC0415
         from ehadiag.identify.session import Nuisances  # noqa: PLC0415
@@ -192,6 +203,7 @@ class _Run:
             seed=arguments.seed,
             nuisances=Nuisances(arguments.nuisances),
         )
+        self._beside = _monitor_beside(unit, actuator, bus_map, test, history)
         # What comes of it, one after the other.
         self._heard: Heard | None = None
         self._view: BitView | None = None
@@ -213,7 +225,8 @@ class _Run:
             self._test,
             self._session,
             lambda: show(view),
-            options.the_bitrate(arguments, self._bus_map),
+            bus_options.the_bitrate(arguments, self._bus_map),
+            self._beside,
         )
         heard = acquire(
             arguments, self._actuator, self._test, self._bus_map, folder, self._session, stop,
@@ -256,11 +269,36 @@ class _Run:
         assert result is not None
         ended_at = heard.ended_at
         spent = Spent(self._read_s, None if ended_at is None else time.perf_counter() - ended_at)
-        asked = options.the_asked(self.unit.arguments, self._bus_map, [self._test])
+        asked = asked_for.the_asked(self.unit.arguments, self._bus_map, [self._test])
         line = json_line(result, spent, asked, [log_file(heard.recording.source)])
         draw = partial(drawn, result, self._levels) if can_be_drawn(result) else None
         name = f"{heard.name}-{self.unit.label}" if self.unit.label else heard.name
         return results.deliver(result, line, spent, name, draw)
+
+
+def _monitor_beside(
+    unit: Unit,
+    actuator: Actuator,
+    bus_map: BusMap,
+    test: StoredTest,
+    history: Path | None,
+) -> InTest | None:
+    """Return the monitor whose residuals are shown; None where nobody would see them."""
+    if unit.label:
+        return None
+    arguments = unit.arguments
+    seen = arguments.snapshots or wants_screen(plain=arguments.plain)
+    # Plain lines tell alarms only, and those only of a unit of which something is known.
+    if not (seen or history is not None or actuator.calibration is not None):
+        return None
+    from ehadiag.cli.watch.in_test import InTest  # noqa: PLC0415 - loads numba
+    from ehadiag.cli.watch.known import from_history  # noqa: PLC0415
+
+    find = None
+    if history is not None and history.exists():
+        find = partial(from_history, history, actuator=actuator)
+    beside = InTest(actuator, bus_map, [test], find)
+    return beside if seen or not beside.why else None
 
 
 def _begin(stack: ExitStack, arguments: argparse.Namespace, view: BitView) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import asked_for, options
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
 from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import emit, progress_bar, rendered, say, say_if_compiling
@@ -73,7 +73,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; return the exit code."""
-    start = options.the_actuator(arguments)
+    start = asked_for.the_actuator(arguments)
     out = _place(arguments)
     if arguments.report:
         need_report_library()
@@ -150,7 +150,7 @@ def _read(arguments: argparse.Namespace) -> tuple[list[Recording], list[str]]:
         read_recordings,
     )
 
-    bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
+    bus_map, budget = asked_for.the_bus_map(arguments), asked_for.the_budget(arguments)
     interrupt_on_signals()
     recordings, digests = [], []
     for log in arguments.logs:
@@ -180,7 +180,7 @@ def _learn(
     from ehadiag.assess.diagnosis import match_tests  # noqa: PLC0415 - loads numba
     from ehadiag.calibration.unit import calibrate, update  # noqa: PLC0415
 
-    tests = options.known_tests(arguments.test)
+    tests = asked_for.known_tests(arguments.test)
     default = resolve_test(arguments.test[0]) if len(arguments.test) == 1 else None
     matched = match_tests(recordings, tests, default)
     sources = [

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, bus_options, options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import progress_bar, put, say
@@ -45,7 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--log", metavar="LOG", help="check a recording instead of a bus")
     parser.add_argument(
         "--duration",
-        type=options.positive,
+        type=argument_types.positive,
         default=3.0,
         metavar="S",
         help="how long to listen (default 3)",
@@ -57,26 +57,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_log_options(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Listen and report."""
     if arguments.log is None:
-        options.need_one_bus(arguments)
-    bus_map, actuator = options.the_bus_map(arguments), options.the_actuator(arguments)
+        bus_options.need_one_bus(arguments)
+    bus_map, actuator = asked_for.the_bus_map(arguments), asked_for.the_actuator(arguments)
     from firmware_iface.logs.reader import read_frames  # noqa: PLC0415
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
     from firmware_iface.session.bus_report import render, report_bus  # noqa: PLC0415
     from firmware_iface.transport.receiver import Receiver  # noqa: PLC0415
 
     if arguments.log is not None:
-        table = read_frames(arguments.log, options.the_budget(arguments))
+        table = read_frames(arguments.log, asked_for.the_budget(arguments))
         heard = f"log {arguments.log}"
     else:
         with (
-            options.open_transport(arguments, transmit=False) as transport,
+            bus_options.open_transport(arguments, transmit=False) as transport,
             Receiver(transport) as receiver,
             stop_on_signals(after_s=arguments.duration) as stop,
             progress_bar() as display,
@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         table = collected.table()
         heard = f"listened to {transport.name} for {listened:.1f} s, sent nothing"
     report = report_bus(table, bus_map)
-    seen = outlook(table, bus_map, actuator, options.known_tests([]))
+    seen = outlook(table, bus_map, actuator, asked_for.known_tests([]))
     report = _as_diagnosed(report, seen)
     if arguments.json:
         content = {"schema": SCHEMA, "source": valid_text(heard), **dataclasses.asdict(report)}

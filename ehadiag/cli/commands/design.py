@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, options
 from ehadiag.cli.output import emit, progress_bar, put, rendered, say, say_if_compiling
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
@@ -60,15 +60,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ("pressure", "MPA", "differential pressure"),
         ("duration", "S", "length of the test"),
     ):
-        limits.add_argument(f"--max-{name}", type=options.positive, metavar=unit, help=what)
+        limits.add_argument(f"--max-{name}", type=argument_types.positive, metavar=unit, help=what)
     parser.add_argument(
-        "--budget", type=options.count, default=200, metavar="N", help="tests to look at (200)"
+        "--budget",
+        type=argument_types.count,
+        default=200,
+        metavar="N",
+        help="tests to look at (200)",
     )
     options.add_seed_option(parser, "seed of the search")
     parser.add_argument("--name", metavar="NAME", help="of the better test (NAME-designed)")
     parser.add_argument(
         "--id",
-        type=options.count,
+        type=argument_types.count,
         metavar="N",
         help="number of the better test on the bus, 1 … 255 (the test's and 100)",
     )
@@ -78,7 +82,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Score a test, propose another; exit code 0, also where none was better."""
-    test, actuator = resolve_test(arguments.test), options.the_actuator(arguments)
+    test, actuator = resolve_test(arguments.test), asked_for.the_actuator(arguments)
     if abs(actuator.controller.rate / test.rate - 1.0) > SAME_RATE:
         raise ConfigurationError(
             f"test {test.name!r} has {test.rate:g} Hz, the actuator's controller "

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import asked_for, options
 from ehadiag.cli.batch.call import add_batch_options, diagnose_all, finish
 from ehadiag.cli.batch.inputs import Input, expand
 from ehadiag.cli.batch.job import Job
@@ -145,17 +145,17 @@ def _job(unit: Unit) -> Job:
     arguments = unit.arguments
     only = arguments.test[0] if len(arguments.test) == 1 else None
     default = resolve_test(only) if only else None
-    bus_map, actuator = options.the_bus_map(arguments), options.the_actuator(arguments)
-    tests = options.known_tests(arguments.test)
+    bus_map, actuator = asked_for.the_bus_map(arguments), asked_for.the_actuator(arguments)
+    tests = asked_for.known_tests(arguments.test)
     return Job(
-        asked=options.the_asked(arguments, bus_map, (default,) if default else tests),
+        asked=asked_for.the_asked(arguments, bus_map, (default,) if default else tests),
         actuator=actuator,
         tests=tests,
         default=default,
         bus_map=bus_map,
-        columns=options.the_columns(arguments),
-        sought=options.the_sought(arguments, (default,) if default else tests, actuator),
-        budget=options.the_budget(arguments),
+        columns=asked_for.the_columns(arguments),
+        sought=asked_for.the_sought(arguments, (default,) if default else tests, actuator),
+        budget=asked_for.the_budget(arguments),
         every=arguments.all,
         draw=arguments.out is not None and not arguments.no_picture,
         folder=str(Path.cwd()),
@@ -210,10 +210,10 @@ def _list(unit: Unit, inputs: Sequence[Input]) -> int:
     if unused := [name for name in NOT_LISTED if getattr(arguments, name) not in UNUSED]:
         told = ", ".join(f"--{name}" for name in unused)
         say(f"--list diagnoses none, and has no use for {told}")
-    bus_map, budget = options.the_bus_map(arguments), options.the_budget(arguments)
-    tests = options.known_tests(arguments.test)
-    sought = options.the_sought(arguments, tests, options.the_actuator(arguments))
-    meaning = Meaning(bus_map, options.the_columns(arguments), sought)
+    bus_map, budget = asked_for.the_bus_map(arguments), asked_for.the_budget(arguments)
+    tests = asked_for.known_tests(arguments.test)
+    sought = asked_for.the_sought(arguments, tests, asked_for.the_actuator(arguments))
+    meaning = Meaning(bus_map, asked_for.the_columns(arguments), sought)
     codes = []
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:

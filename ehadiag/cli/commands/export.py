@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, options
 from ehadiag.cli.output import put, say
 from ehadiag.cli.results import make_folder
 from ehadiag.core.actuator import Actuator
@@ -35,7 +35,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", metavar="DIR", help="folder to write into")
     parser.add_argument(
         "--hours",
-        type=options.positive,
+        type=argument_types.positive,
         default=100.0,
         metavar="H",
         help="mean time between false alarms of the monitor (default 100)",
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.out is None:
         raise ConfigurationError("export: need --out DIR")
-    actuator = options.the_actuator(arguments)
+    actuator = asked_for.the_actuator(arguments)
     say("compiling; this may take half a minute")
     names = _units(arguments, actuator) if arguments.fmu else _library(arguments, actuator)
     for name in names:

@@ -8,24 +8,26 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ehadiag.cli.argument_types import unit_serial
 from ehadiag.cli.history_file import (
     add_history_file,
     add_usage_options,
     open_history,
     the_usage,
 )
-from ehadiag.cli.options import unit_serial
 from ehadiag.cli.output import emit, put, rendered, say
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import printable, valid_text
+from ehadiag.history.records import DIAGNOSIS, EVENT
 
 if TYPE_CHECKING:
     from ehadiag.history.records import Entry, Event
 
 __all__ = ["add_parser", "run"]
 
+KINDS = (DIAGNOSIS, EVENT)
 COLUMNS = ("no.", "when", "serial", "hours", "cycles", "test", "verdict", "severities, ± 95 %")
 
 
@@ -33,7 +35,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command."""
     parser = subparsers.add_parser(
         "history",
-        help="health history: list, show, export, plot, init, event",
+        help="health history: list, show, export, plot, init, event, withdraw",
         description="The health history: every diagnosis of every unit, appended to one SQLite"
         " file by `bit` and `diagnose`, and never changed.",
         allow_abbrev=False,
@@ -56,8 +58,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for parser_ in (listed, exported):
         _add_serial(parser_, required=False)
         parser_.add_argument(
-            "--all", action="store_true", help="also what a later diagnosis of the same recording"
-            " has replaced"
+            "--all", action="store_true", help="also what was withdrawn, and what a later diagnosis"
+            " of the same recording has replaced"
         )  # fmt: skip
     listed.add_argument("--json", action="store_true", help="one JSON object a line")
     exported.add_argument("--out", metavar="FILE", help="CSV file (default: standard output)")
@@ -74,6 +76,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     event.add_argument("--when", metavar="TIME", help="ISO 8601; without a zone UTC (default: now)")
     add_usage_options(event)
+    withdrawn = verb("withdraw", "append that a diagnosis or an event counts no more")
+    withdrawn.add_argument("kind", choices=KINDS, metavar="KIND", help=" or ".join(KINDS))
+    withdrawn.add_argument("number", type=int, metavar="NUMBER", help="its number, as in list")
+    withdrawn.add_argument("text", metavar="TEXT", help='why, such as "of another unit"')
     parser.set_defaults(run=run)
 
 
@@ -88,6 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         "export": _export,
         "plot": _plot,
         "event": _event,
+        "withdraw": _withdraw,
     }[arguments.verb](arguments)
     return 0
 
@@ -139,7 +146,8 @@ def _list(arguments: argparse.Namespace) -> None:
 
 def _show(arguments: argparse.Namespace) -> None:
     with open_history(arguments) as history:
-        found = [item for item in history.entries() if item.number == arguments.number]
+        kept = history.entries(withdrawn=True)
+        found = [item for item in kept if item.number == arguments.number]
         if not found:
             raise ConfigurationError(
                 f"history {history.path}: has no diagnosis {arguments.number};"
@@ -193,6 +201,15 @@ def _event(arguments: argparse.Namespace) -> None:
     put(f"event {number} of serial {arguments.serial}: {event.text}")
 
 
+def _withdraw(arguments: argparse.Namespace) -> None:
+    from ehadiag.history.keep import now  # noqa: PLC0415
+
+    kind, number, text = arguments.kind, arguments.number, valid_text(arguments.text)
+    with open_history(arguments) as history:
+        history.withdraw(kind, number, now(), text)
+    put(f"{kind} {number} counts no more: {text}")
+
+
 def _when(text: str) -> str:
     from ehadiag.core.dates import utc_text  # noqa: PLC0415
 
@@ -209,10 +226,11 @@ def _read(arguments: argparse.Namespace) -> tuple[list[Entry], list[Event]]:
     """Read the unit that was named, or all; what counts, or all."""
     from ehadiag.history.counted import counted  # noqa: PLC0415
 
+    whole = arguments.all
     with open_history(arguments) as history:
-        entries = history.entries(arguments.serial)
-        events = history.events(arguments.serial)
-    return (entries if arguments.all else counted(entries)), events
+        entries = history.entries(arguments.serial, withdrawn=whole)
+        events = history.events(arguments.serial, withdrawn=whole)
+    return (entries if whole else counted(entries)), events
 
 
 def _row(entry: Entry) -> tuple[str, ...]:
@@ -228,7 +246,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
         _cell(entry.usage.hours),
         _cell(entry.usage.cycles),
         _cell(entry.test),
-        entry.verdict.replace("_", " "),
+        entry.verdict.replace("_", " ") + _withdrawn(entry),
         severities or "; ".join(entry.reasons),
     )
 
@@ -236,7 +254,12 @@ def _row(entry: Entry) -> tuple[str, ...]:
 def _event_row(event: Event) -> tuple[str, ...]:
     resets = f" (begins anew: {', '.join(event.resets)})" if event.resets else ""
     usage = (_cell(event.usage.hours), _cell(event.usage.cycles))
-    return ("", event.when, str(event.serial), *usage, "", "event", event.text + resets)
+    kind = f"event {event.number}{_withdrawn(event)}"
+    return ("", event.when, str(event.serial), *usage, "", kind, event.text + resets)
+
+
+def _withdrawn(item: Entry | Event) -> str:
+    return "" if item.withdrawn is None else f" (withdrawn: {item.withdrawn})"
 
 
 def _cell(value: float | str | None) -> str:
@@ -254,6 +277,7 @@ def _object(entry: Entry, *, brief: bool) -> dict[str, object]:
         "serial": entry.serial,
         "test": entry.test,
         "verdict": entry.verdict,
+        "withdrawn": entry.withdrawn,
         "hours": entry.usage.hours,
         "cycles": entry.usage.cycles,
         "severities": {
@@ -297,6 +321,7 @@ def _event_object(event: Event) -> dict[str, object]:
         "hours": event.usage.hours,
         "cycles": event.usage.cycles,
         "text": event.text,
+        "withdrawn": event.withdrawn,
         "resets": list(event.resets),
     }
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, bus_options, options
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import say, say_if_compiling
@@ -58,14 +58,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     group.add_argument(
         "--serial-number",
-        type=options.unit_serial,
+        type=argument_types.unit_serial,
         metavar="N",
         help="of the unit, to find it in the health history (default: as the bus says)",
     )
     group = parser.add_argument_group("alarms")
     group.add_argument(
         "--hours",
-        type=options.positive,
+        type=argument_types.positive,
         default=100.0,
         metavar="H",
         help="mean time between false alarms of the sums (default 100); between tests only what"
@@ -81,7 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     group.add_argument(
         "--around",
-        type=options.positive,
+        type=argument_types.positive,
         default=5.0,
         metavar="S",
         help="seconds to record before and after an alarm (default 5)",
@@ -94,7 +94,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--duration",
-        type=options.positive,
+        type=argument_types.positive,
         metavar="S",
         help="end after this time (default: at Ctrl-C)",
     )
@@ -112,16 +112,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
     options.add_log_options(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Watch until the end, and say how it was."""
     if arguments.log is None:
-        options.need_one_bus(arguments)
-    actuator, bus_map = options.the_actuator(arguments), options.the_bus_map(arguments)
-    tests = options.known_tests(arguments.test)
+        bus_options.need_one_bus(arguments)
+    actuator, bus_map = asked_for.the_actuator(arguments), asked_for.the_bus_map(arguments)
+    tests = asked_for.known_tests(arguments.test)
     reads = [("the log", arguments.log), ("--from", arguments.from_result)]
     outputs = [Output("--log-file", arguments.log_file)] if arguments.log_file else []
     refuse_overwriting(arguments, outputs, [(kind, name) for kind, name in reads if name])
@@ -136,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
     from firmware_iface.transport.receiver import open_source  # noqa: PLC0415
 
     with contextlib.ExitStack() as stack:
-        traffic = Traffic(options.the_bitrate(arguments, bus_map))
+        traffic = Traffic(bus_options.the_bitrate(arguments, bus_map))
         outlets = Outlets(
             AlarmLog(Path(arguments.log_file) if arguments.log_file else None),
             Surroundings(
@@ -216,10 +216,10 @@ def _found(place: Path, serial: int, actuator: Actuator) -> KnownUnit | None:
 
 def _transport(arguments: argparse.Namespace) -> Transport:
     if arguments.log is None:
-        return options.open_transport(arguments, transmit=False)
+        return bus_options.open_transport(arguments, transmit=False)
     from firmware_iface.logs.reader import read_frames  # noqa: PLC0415
     from firmware_iface.logs.replay import ReplayTransport  # noqa: PLC0415
 
     return ReplayTransport(
-        read_frames(arguments.log, options.the_budget(arguments)), str(arguments.log)
+        read_frames(arguments.log, asked_for.the_budget(arguments)), str(arguments.log)
     )

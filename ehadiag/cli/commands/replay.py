@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, bus_options, options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import damage, progress_bar, say
 
@@ -28,19 +28,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="times its own rhythm (default 1); 0: as fast as the bus takes it",
     )
     options.add_log_options(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the log."""
-    options.need_one_bus(arguments)
+    bus_options.need_one_bus(arguments)
     from firmware_iface.logs.replay import StoredLog, play  # noqa: PLC0415 - loads python-can
 
     # Read once beforehand: what is wrong with it must be said before anything is sent.
-    log = StoredLog(arguments.log, arguments.log_channel, options.the_budget(arguments))
+    log = StoredLog(arguments.log, arguments.log_channel, asked_for.the_budget(arguments))
     with (
-        options.open_transport(arguments, transmit=True) as transport,
+        bus_options.open_transport(arguments, transmit=True) as transport,
         stop_on_signals() as stop,
         progress_bar() as display,
     ):
@@ -56,4 +56,4 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _speed(text: str) -> float:
-    return 0.0 if text.strip() in ("0", "0.0") else options.positive(text)
+    return 0.0 if text.strip() in ("0", "0.0") else argument_types.positive(text)

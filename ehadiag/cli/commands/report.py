@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.cli import options
+from ehadiag.cli import asked_for, options
 from ehadiag.cli.exit_codes import code_of_inputs
 from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.output import say, say_if_compiling
@@ -60,13 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the reports; return the worst exit code."""
     need_report_library()
     asked = Levels(arguments.advisory, arguments.limit)
-    options.the_actuator(arguments)
-    bus_map = options.the_bus_map(arguments)
+    asked_for.the_actuator(arguments)
+    bus_map = asked_for.the_bus_map(arguments)
     results = list(dict.fromkeys(arguments.results))
     pages = [Output("report", str(_page_of(Path(name)))) for name in results]
     reads = [("the result", name) for name in results]
     refuse_overwriting(arguments, pages, [*reads, ("the DBC", bus_map.name)])
-    options.known_tests(arguments.test)
+    asked_for.known_tests(arguments.test)
     codes = []
     for name in results:
         try:
@@ -150,7 +150,7 @@ def _again(arguments: argparse.Namespace, path: Path, result: dict[str, Any]) ->
     if log is None:
         say(f"result {path}: its recording {source} is not at hand; no responses are drawn")
         return None
-    actuator = options.the_actuator(arguments)
+    actuator = asked_for.the_actuator(arguments)
     if result.get("actuator_sha256") not in (None, fingerprint(actuator)):
         say(
             f"result {path}: it goes by other actuator data than {actuator.name!r} has: name its"
@@ -164,8 +164,10 @@ def _again(arguments: argparse.Namespace, path: Path, result: dict[str, Any]) ->
     say_if_compiling()
     solver = result.get("solver") or {}
     name, seed = solver.get("name"), solver.get("seed")
-    found = read_recordings(str(log), options.the_bus_map(arguments), options.the_budget(arguments))
-    tests = options.known_tests(arguments.test)
+    found = read_recordings(
+        str(log), asked_for.the_bus_map(arguments), asked_for.the_budget(arguments)
+    )
+    tests = asked_for.known_tests(arguments.test)
     default = tests[-1] if len(arguments.test) == 1 else None
     for recording in found:
         again = diagnose(

@@ -6,7 +6,7 @@ import argparse
 import json
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, options
 from ehadiag.cli.history_file import add_history_file, open_history
 from ehadiag.cli.output import emit, put, rendered
 
@@ -25,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--serial",
-        type=options.unit_serial,
+        type=argument_types.unit_serial,
         required=True,
         metavar="N",
         help="serial number of the unit",

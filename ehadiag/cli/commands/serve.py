@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.cli import options
+from ehadiag.cli import asked_for, bus_options, options
 from ehadiag.cli.history_file import add_keeping_options, history_place
 from ehadiag.cli.output import say
 from ehadiag.cli.report_page import need_report_library
@@ -69,7 +69,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     add_keeping_options(parser)
     options.add_level_options(parser)
     parser.set_defaults(run=partial(run, parser=parser))
@@ -81,15 +81,15 @@ def run(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     parser: that the arguments are from.
     """
     need_report_library()
-    watched = options.has_bus(arguments)
+    watched = bus_options.has_bus(arguments)
     if arguments.simulate and not arguments.allow_tests:
         raise ConfigurationError("--simulate: nothing is simulated without --allow-tests")
     if not watched and not arguments.simulate:
-        options.need_one_bus(arguments)
+        bus_options.need_one_bus(arguments)
     names = arguments.tests or ["open", "closed"]
     tests = {resolve_test(name).name: name for name in names}
-    options.the_actuator(arguments)
-    options.the_bus_map(arguments)
+    asked_for.the_actuator(arguments)
+    asked_for.the_bus_map(arguments)
     folder = make_folder(arguments.out)
     from ehadiag.serve.pages import Pages  # noqa: PLC0415 - bokeh is slow
     from ehadiag.serve.server import HOST, Site, serve  # noqa: PLC0415

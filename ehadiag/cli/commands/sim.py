@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ehadiag.cli import options
+from ehadiag.cli import argument_types, asked_for, bus_options, options
 from ehadiag.cli.interrupt import stop_on_signals
 from ehadiag.cli.output import damage, say, say_if_compiling
 
@@ -28,28 +28,28 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="further test that the computer stores; repeatable",
     )
     parser.add_argument(
-        "--duration", type=options.positive, metavar="S", help="stop after so many seconds"
+        "--duration", type=argument_types.positive, metavar="S", help="stop after so many seconds"
     )
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)
-    options.add_bus_options(parser)
+    bus_options.add_bus_options(parser)
     options.add_fault_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run until stopped."""
-    options.need_one_bus(arguments)
-    actuator = options.the_actuator(arguments)
-    tests = options.known_tests(arguments.test)
-    bus_map = options.the_bus_map(arguments)
+    bus_options.need_one_bus(arguments)
+    actuator = asked_for.the_actuator(arguments)
+    tests = asked_for.known_tests(arguments.test)
+    bus_map = asked_for.the_bus_map(arguments)
     say_if_compiling(simulation=True, identification=False)
     from ehadiag.cli.simulator import make_core  # noqa: PLC0415 - loads numba
     from ehadiag_sim.fcc.emulator import run_emulator  # noqa: PLC0415
 
     core = make_core(arguments, actuator, tests, bus_map)
     with (
-        options.open_transport(arguments, transmit=True) as transport,
+        bus_options.open_transport(arguments, transmit=True) as transport,
         stop_on_signals(after_s=arguments.duration) as stop,
     ):
         names = ", ".join(

@@ -17,6 +17,7 @@ from ehadiag.live.traffic import Traffic
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis, DiagnosisSession
+    from ehadiag.cli.watch.in_test import InTest
     from firmware_iface.session.tester import Progress
     from firmware_iface.transport.frames import Frame
     from firmware_iface.transport.interface import Transport
@@ -39,6 +40,8 @@ class BitView:
         Called once the bus is open: from then on somebody may look.
     bitrate : float | None
         Of the bus, bit/s; None where it is not known.
+    beside : InTest | None
+        Monitors the unit while the test runs; None: nobody looks at residuals.
     """
 
     def __init__(
@@ -48,8 +51,10 @@ class BitView:
         session: DiagnosisSession,
         begin: Callable[[], None],
         bitrate: float | None,
+        beside: InTest | None = None,
     ) -> None:
         self._actuator, self._test, self._session, self._begin = actuator, test, session, begin
+        self._beside = beside
         self._traffic = Traffic(bitrate)
         self._trace = Trace()
         self._command = test.command()
@@ -58,7 +63,6 @@ class BitView:
         self._progress: Progress | None = None
         self._working = ""
         self._diagnosis: Diagnosis | None = None
-        self.serial: int | None = None
         self.notes: tuple[str, ...] = ()
 
     def connected(self, transport: Transport) -> None:
@@ -67,8 +71,10 @@ class BitView:
         self._begin()
 
     def take(self, frame: Frame) -> None:
-        """Count a frame."""
+        """Count a frame, and monitor it."""
         self._traffic.take(len(frame.data), extended=frame.extended)
+        if self._beside is not None:
+            self._beside.take(frame)
 
     def progress(self, progress: Progress) -> None:
         """Take how far the test is."""
@@ -95,6 +101,8 @@ class BitView:
 
     def look(self, number: int) -> Snapshot:
         """Return a snapshot."""
+        beside = self._beside
+        count, alarms = (0, ()) if beside is None else beside.alarms
         return Snapshot(
             number=number,
             time=utc_text(datetime.now(UTC)),
@@ -105,10 +113,13 @@ class BitView:
             test=self._running(),
             mode=self._mode.name.lower(),
             signals=self._trace.signals(),
+            residuals=None if beside is None else beside.residuals,
+            alarms=alarms,
+            alarm_count=count,
             severities=self._severities(),
             working=self._working,
             ending=self._ending(),
-            notes=self.notes,
+            notes=(*self.notes, beside.why) if beside is not None and beside.why else self.notes,
         )
 
     def _ending(self) -> Ending | None:
@@ -119,10 +130,11 @@ class BitView:
         return Ending(verdict=verdict, reasons=diagnosis.reasons)
 
     def _serial(self) -> int | None:
+        heard = None if self._beside is None else self._beside.serial
         if self._diagnosis is None:
-            return self.serial
+            return heard
         serials = (item.serial for item in self._diagnosis.recordings)
-        return next((item for item in serials if item is not None), self.serial)
+        return next((item for item in serials if item is not None), heard)
 
     def _bus(self) -> Bus:
         if self._transport is None:

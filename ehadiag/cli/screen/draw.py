@@ -50,14 +50,15 @@ def drawn(snapshot: Snapshot, width: int, *, unicode: bool = True) -> Renderable
     RenderableType
         Texts of others stand in it as text, never as markup.
     """
+    monitored = snapshot.residuals is not None or snapshot.command == "monitor"
     inner = width // 2 - 4 if width >= WIDE else width - 4
     parts = [_signals(snapshot.signals, inner, unicode=unicode)]
-    if snapshot.residuals is not None or snapshot.command == "monitor":
+    if monitored:
         parts.append(_residuals(snapshot.residuals, unicode=unicode))
     none = "severities: none" if snapshot.ending else "severities: none yet"
     severities = _severities(snapshot.severities, unicode=unicode)
     beside: list[RenderableType] = [severities if snapshot.severities else _line(none, "dim")]
-    if snapshot.command == "monitor":
+    if monitored:
         beside.append(_alarms(snapshot))
     body: RenderableType
     if width >= WIDE:
@@ -211,7 +212,7 @@ def _residuals(found: Residuals | None, *, unicode: bool) -> RenderableType:
             Text(_bar(high, unicode=unicode), style=style),
             Text(f"{high:4.0%} of the alarm, {side}", style=style),
         )
-    return table
+    return Group(table, _line(f"against: {found.against}", "dim")) if found.against else table
 
 
 def _severities(severities: Sequence[Severity], *, unicode: bool) -> RenderableType:

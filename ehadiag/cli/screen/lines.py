@@ -33,8 +33,11 @@ class Lines:
             yield from self._new("severities", _severities(snapshot.severities))
         fresh = snapshot.alarm_count - self._alarms
         self._alarms = snapshot.alarm_count
+        against = ""
+        if snapshot.command == "bit" and snapshot.residuals is not None:
+            against = f", compared with {snapshot.residuals.against}"
         for alarm in snapshot.alarms[len(snapshot.alarms) - min(fresh, len(snapshot.alarms)) :]:
-            yield _alarm(alarm)
+            yield _alarm(alarm) + against
         for note in snapshot.notes:
             yield from self._new(note, note)
         if snapshot.ending is not None and snapshot.command == "monitor":

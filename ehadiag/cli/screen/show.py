@@ -36,7 +36,7 @@ def add_screen_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--snapshots",
         action="store_true",
-        help="write what the live view shows to standard output, ten JSON lines a second; all else"
+        help="write what the live view shows to standard output, four JSON lines a second; all else"
         " goes to standard error. The session ends as by Ctrl-C when nobody reads any more",
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from datetime import UTC, datetime
@@ -10,6 +11,7 @@ from typing import Any
 
 from ehadiag.core.dates import utc_text
 from ehadiag.core.errors import InputOutputError
+from ehadiag.core.folder import append_to_file
 from ehadiag.core.printable import valid_text
 
 __all__ = ["SCHEMA", "AlarmLog", "now_text"]
@@ -28,13 +30,15 @@ class AlarmLog:
     Raises
     ------
     InputOutputError
-        It cannot be opened.
+        It cannot be opened, is a link or no file.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
         try:
-            self._file = None if path is None else path.open("a", encoding="utf-8")
+            self._file = (
+                None if path is None else os.fdopen(append_to_file(path), "a", encoding="utf-8")
+            )
         except OSError as error:
             raise InputOutputError(f"log {path}: {error.strerror or error}") from None
 
@@ -73,9 +77,10 @@ class AlarmLog:
         return tree
 
     def close(self) -> None:
-        """Close the file; may be called twice."""
+        """Close the file; may be called twice. What could not be written was said then."""
         if self._file is not None:
-            self._file.close()
+            with contextlib.suppress(OSError):
+                self._file.close()
 
 
 def now_text() -> str:

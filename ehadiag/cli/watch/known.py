@@ -72,9 +72,9 @@ def as_new(actuator: Actuator) -> KnownUnit:
     """
     calibration = actuator.calibration
     if calibration is None:
-        source, serial = "no result named: taken as new", None
+        source, serial = "a unit as new", None
     else:
-        source, serial = f"as calibrated on {calibration.date}", calibration.serial
+        source, serial = f"the calibration of {calibration.date}", calibration.serial
     severities = tuple(Severity(name=name, estimate=0.0, source=source) for name in NAMES)
     return KnownUnit(source, severities, serial=serial)
 

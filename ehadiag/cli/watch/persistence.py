@@ -12,12 +12,15 @@ from collections import deque
 __all__ = ["NEEDED", "OF", "SPAN_S", "Persistence"]
 
 SPAN_S = 5.0
-NEEDED, OF = 3, 6
-"""Alarms in so many of so many spans in a row are of something that lasts."""
+NEEDED, OF = 4, 6
+"""Spans that alarmed, of so many in a row, are of something that lasts."""
+INSTANT_S = 0.1
+INSTANTS = 2
+"""Instants with an alarm that a span needs to count: a break-away by itself mostly makes one."""
 
 
 class Persistence:
-    """Counts the spans of time in which the sums alarmed.
+    """Counts the spans of time in which the sums alarmed more than once.
 
     Parameters
     ----------
@@ -26,8 +29,11 @@ class Persistence:
     """
 
     def __init__(self, rate: float) -> None:
-        self._length = round(SPAN_S * rate)
-        self._spans: deque[int] = deque(maxlen=NEEDED)
+        self._span_ticks = round(SPAN_S * rate)
+        self._instant_ticks = round(INSTANT_S * rate)
+        self._span = self._instant = -1
+        self._instants = 0
+        self._counted: deque[int] = deque(maxlen=NEEDED)
 
     def take(self, tick: int) -> bool:
         """Take an alarm at a tick, in order; return whether the alarms last.
@@ -42,7 +48,19 @@ class Persistence:
         bool
             Whether there were enough of them.
         """
-        span = tick // self._length
-        if not self._spans or self._spans[-1] != span:
-            self._spans.append(span)
-        return len(self._spans) == NEEDED and span - self._spans[0] < OF
+        span, instant = tick // self._span_ticks, tick // self._instant_ticks
+        if span != self._span:
+            self._span, self._instants = span, 0
+        elif instant == self._instant:
+            return self._lasts()
+        self._instant = instant
+        self._instants += 1
+        if self._instants == INSTANTS:
+            self._counted.append(span)
+        return self._lasts()
+
+    def _lasts(self) -> bool:
+        counted = self._counted
+        if len(counted) < NEEDED or counted[-1] != self._span:
+            return False
+        return self._span - counted[0] < OF

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ehadiag.cli.watch.known import KnownUnit
@@ -204,6 +204,7 @@ class Watcher:
         return Residuals(
             spool=known(spool),
             pressure=known(pressure),
+            against=self.unit.source,
             spool_above=shares[0],
             spool_below=shares[1],
             pressure_above=shares[2],
@@ -300,8 +301,8 @@ class Watcher:
         self._fresh = True
 
     def _environment_told(self) -> Environment:
-        values = {key: self._told.get(f"environment.{key}") for key in KEYS}
-        return replace(Environment(), **values)
+        supply, drain, oil = (self._told.get(f"environment.{key}") for key in KEYS)
+        return Environment(supply, drain, oil)
 
     def _other_environment(self) -> bool:
         told, made = self._environment_told(), self._made_for

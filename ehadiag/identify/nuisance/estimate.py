@@ -20,11 +20,11 @@ from ehadiag.identify.nuisance.prior import (
     information_of,
     small_effects,
 )
-from ehadiag.identify.nuisance.starts import Found, robust_cost, search
+from ehadiag.identify.nuisance.starts import Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
-from ehadiag.identify.refine.posterior import sharpen
+from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
@@ -82,6 +82,7 @@ def estimate(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     give_up: bool = False,
+    look_again: bool = False,
     explains: Explains = is_noise,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
@@ -104,9 +105,12 @@ def estimate(
     seed : int
         The same seed gives the same answer.
     tell : callable, optional
-        Called from time to time with the share of the budget that is spent.
+        Called again and again with the share of the budget that is spent; what it raises ends the
+        estimation.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
+    look_again : bool
+        Whether to look about the optimum with the noise as judged even where it was given up.
     explains : callable
         Of residuals, shape (signals, N): whether there is nothing better to look for.
     """
@@ -121,7 +125,15 @@ def estimate(
     if any(item.constants.OIL > 0.0 for item in experiments):
         guide = _spool_guide(experiments, free, coarse.levels)
         guided = search(
-            guide, first, information, origins, _spool_is_noise, budget=budget // 2, seed=seed
+            guide,
+            first,
+            information,
+            origins,
+            _spool_is_noise,
+            budget=budget // 2,
+            seed=seed,
+            hopeless=_spool_is_hopeless if give_up else None,
+            tell=tell,
         )
         there = guided.belief.x * guide.scale
         names = [item.name for item in guide.estimated]
@@ -142,7 +154,12 @@ def estimate(
     held = [item.parameter for item in considered]
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
     before = belief_of(fine, known, joint), information_of(fine, known, joint)
-    belief = _last_look(fine, model, found, before, seed)
+    between = nothing if tell is None else partial(tell, 1.0)
+    given_up = give_up and not found.explained and is_hopeless(found.residuals, found.starts)
+    if given_up and not look_again:
+        belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
+    else:
+        belief = _last_look(fine, model, found, before, seed, between)
     linear = linearised(fine, belief, np.random.default_rng(seed))
     refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
     return Estimated(
@@ -192,6 +209,10 @@ def _spool_is_noise(residuals: NDArray[np.float64]) -> bool:
     return is_noise(residuals[SPOOL_ROW : SPOOL_ROW + 1])
 
 
+def _spool_is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
+    return is_hopeless(residuals[SPOOL_ROW : SPOOL_ROW + 1], starts)
+
+
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:
     """Weigh the experiments by the noise that residuals of all their ticks show."""
     ends = np.cumsum([item.ticks for item in experiments])[:-1]
@@ -205,6 +226,7 @@ def _last_look(
     found: Found,
     before: tuple[Belief, NDArray[np.float64]],
     seed: int,
+    between: Callable[[], None],
 ) -> Belief:
     """Optimum by the noise as judged: of the search, or a better one beside it.
 
@@ -214,7 +236,8 @@ def _last_look(
     there = Belief(found.belief.x * ratio, found.belief.root)
     wider = Belief(there.x, LOOK * there.root)
     rng = np.random.default_rng([seed, -1 % 2**32])
-    again = sharpen(fine, before[0], wider, before[1], partial(linearised, rng=rng)).belief
+    draw = partial(linearised, rng=rng)
+    again = sharpen(fine, before[0], wider, before[1], draw, LAST, between).belief
     costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
     return again if costs[1] < costs[0] else there
 

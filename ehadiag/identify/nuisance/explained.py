@@ -11,7 +11,16 @@ from ehadiag.core.calibration import CHANGED, NOISE_ALONE, Goodness
 from ehadiag.identify.noise import relative_noise
 from ehadiag.identify.refine.posterior import TAIL
 
-__all__ = ["Explains", "excess", "is_hopeless", "is_noise", "leaves_no_more"]
+__all__ = [
+    "Explains",
+    "excess",
+    "excess_of_signals",
+    "is_hopeless",
+    "is_noise",
+    "is_of_the_pressure",
+    "leaves_no_more",
+    "outliers_of",
+]
 
 Explains = Callable[[NDArray[np.float64]], bool]
 """Of weighted residuals, shape (signals, N): whether there is nothing better to look for."""
@@ -26,7 +35,12 @@ MOST_OUTLIERS = 0.01
 
 HOPELESS = (0.3, 0.05)
 """Share of residuals beyond three deviations after one start, and after two, from which on no more
-is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones."""
+is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones; 0.21
+where a search went astray in closed loop."""
+HOPELESS_EXCESS = 3.0
+"""The same of the excess, after two starts: 1.6 at most on sound units that a further start
+explained, 2.0 with a load that is not estimated."""
+SPOOL_EXPLAINED = 1.25
 
 
 def excess(residuals: NDArray[np.float64]) -> float:
@@ -39,18 +53,22 @@ def excess(residuals: NDArray[np.float64]) -> float:
     residuals : shape (signals, N)
         Weighted; 0 where no sample counts.
     """
-    out = 0.0
+    return max(excess_of_signals(residuals), default=0.0)
+
+
+def excess_of_signals(residuals: NDArray[np.float64]) -> list[float]:
+    """Return the same of each signal; 0 of one without samples."""
+    out = []
     for row in residuals:
         known = row != 0.0
-        if known.any():
-            share = row[known] / (TAIL * relative_noise(row))
-            out = max(out, float(TAIL**2 * np.log1p(share**2).mean() / EXPECTED))
+        share = row[known] / (TAIL * relative_noise(row)) if known.any() else np.zeros(1)
+        out.append(float(TAIL**2 * np.log1p(share**2).mean() / EXPECTED))
     return out
 
 
 def is_noise(residuals: NDArray[np.float64]) -> bool:
     """Whether nothing is left to explain."""
-    return _outliers(residuals) <= MOST_OUTLIERS and excess(residuals) <= MOST_EXCESS
+    return outliers_of(residuals) <= MOST_OUTLIERS and excess(residuals) <= MOST_EXCESS
 
 
 def leaves_no_more(fit: Goodness) -> Explains:
@@ -59,16 +77,24 @@ def leaves_no_more(fit: Goodness) -> Explains:
         return is_noise
     most_outliers = MOST_OUTLIERS + CHANGED * fit.outliers
     return lambda residuals: (
-        _outliers(residuals) <= most_outliers and excess(residuals) <= fit.most_excess
+        outliers_of(residuals) <= most_outliers and excess(residuals) <= fit.most_excess
     )
 
 
 def is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
     """Whether so much is left after so many starts that further ones will not explain it."""
-    return _outliers(residuals) > HOPELESS[min(starts, len(HOPELESS)) - 1]
+    if outliers_of(residuals) > HOPELESS[min(starts, len(HOPELESS)) - 1]:
+        return True
+    return starts > 1 and excess(residuals) > HOPELESS_EXCESS
 
 
-def _outliers(residuals: NDArray[np.float64]) -> float:
+def is_of_the_pressure(residuals: NDArray[np.float64]) -> bool:
+    """Whether the spool, where break-aways happen, is explained and the pressure is far from it."""
+    spool, pressure = excess_of_signals(residuals)[:2]
+    return spool <= SPOOL_EXPLAINED and pressure > HOPELESS_EXCESS
+
+
+def outliers_of(residuals: NDArray[np.float64]) -> float:
     """Share of residuals beyond three deviations."""
     known = residuals != 0.0
     return float(np.mean(residuals[known] ** 2 >= TAIL**2)) if known.any() else 1.0

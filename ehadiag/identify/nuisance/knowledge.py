@@ -17,8 +17,9 @@ from ehadiag.core.errors import ConfigurationError
 from ehadiag.identify.nuisance.explained import Explains, is_noise, leaves_no_more
 from ehadiag.identify.nuisance.prior import Joint, Known, nuisances_of, usual
 from ehadiag.model.parameter import sized
-from ehadiag.model.parameters import REGISTRY, Kind, Parameter, Unknowns, parameter
+from ehadiag.model.parameters import FAULTS, REGISTRY, Kind, Parameter, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
+from ehadiag.model.severity import CLOGGED
 
 __all__ = [
     "MOTOR_GAIN",
@@ -30,6 +31,7 @@ __all__ = [
     "covariance_of",
     "datum_name",
     "knowledge_of",
+    "severities_below",
 ]
 
 MOTOR_GAIN = "torque_motor_gain"
@@ -106,6 +108,8 @@ class Knowledge:
         Of severities by name, beside all else.
     explains : callable
         Of residuals, shape (signals, N): whether no more is left than of the unit as new.
+    severities : tuple of Parameter
+        The faults, with the bounds within which they are looked for.
     """
 
     free: tuple[Parameter, ...] = ()
@@ -115,6 +119,7 @@ class Knowledge:
     about: Mapping[str, float] = field(default_factory=dict)
     std: Mapping[str, float] = field(default_factory=dict)
     explains: Explains = is_noise
+    severities: tuple[Parameter, ...] = FAULTS
 
     def loosened(self) -> Knowledge:
         """Return what is left of it where the unit's effects have changed since."""
@@ -181,7 +186,28 @@ def knowledge_of(actuator: Actuator) -> Knowledge:
         else:
             free.append(replace(item, lower=-half_width, upper=half_width))
             known[item.name] = Known(0.0, std)
-    return Knowledge(tuple(free), known, None, tuple(aliases))
+    tolerances = {symbol: actuator.tolerance.of(symbol) for symbol in PASS_FOR_FAULTS}
+    severities = severities_below(actuator, tolerances)
+    return Knowledge(tuple(free), known, None, tuple(aliases), severities=severities)
+
+
+def severities_below(actuator: Actuator, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
+    """Return the faults, looked for below 0 by what data that pass for them may be off.
+
+    A unit with less friction than its data sheet's is not explained by any severity from 0 up, and
+    other effects would stand in for it.
+
+    errors : mapping
+        Largest relative errors by symbol.
+    """
+    valve, jack = actuator.servovalve, actuator.jack
+    shares = {
+        "GQF": 1.0 / CLOGGED,
+        "FSS0": valve.FSS0 / (valve.FSS1 - valve.FSS0),
+        "FDJ0": jack.FDJ0 / (jack.FDJ1 - jack.FDJ0),
+    }
+    reach = {PASS_FOR_FAULTS[name]: shares[name] * error for name, error in errors.items()}
+    return tuple(replace(item, lower=item.lower - reach.get(item.name, 0.0)) for item in FAULTS)
 
 
 def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:

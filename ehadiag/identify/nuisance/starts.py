@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
-from ehadiag.identify.refine.posterior import TAIL, sharpen
+from ehadiag.identify.refine.posterior import robust_cost, sharpen
 
-__all__ = ["Found", "Place", "robust_cost", "search"]
+__all__ = ["Found", "Place", "search"]
 
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
@@ -67,11 +67,6 @@ class Found:
         return len(self.places)
 
 
-def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cauchy's cost of weighted residuals, shape (n, signals, N): shape (n,)."""
-    return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
-
-
 def search(
     model: Derivatives,
     known: Belief,
@@ -103,11 +98,17 @@ def search(
     budget : int
         Runs of the model after which no further start is made.
     tell : callable, optional
-        Called after each start with the share of the budget that is spent.
+        Called before each round and after each start with the share of the budget that is spent;
+        what it raises ends the search.
     hopeless : callable, optional
         Of the best residuals and the number of starts: whether further ones will not help.
     """
     until = model.evaluations + budget
+
+    def between() -> None:
+        if tell is not None:
+            tell(min(1.0 - (until - model.evaluations) / max(budget, 1), 1.0))
+
     best: Found | None = None
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
@@ -117,7 +118,8 @@ def search(
         else:
             begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
         rng = np.random.default_rng([seed, len(places)])
-        sharpened = sharpen(model, known, begin, information, partial(linearised, rng=rng))
+        linearise = partial(linearised, rng=rng)
+        sharpened = sharpen(model, known, begin, information, linearise, between=between)
         belief, settled = sharpened.belief, sharpened.settled
         residuals = model.many(belief.x[None, :])[0]
         cost = float(robust_cost(residuals))
@@ -126,8 +128,7 @@ def search(
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
         if hopeless is not None and hopeless(best.residuals, len(places)):
             break
-        if tell is not None:
-            tell(min(1.0 - (until - model.evaluations) / budget, 1.0))
+        between()
     return replace(best, places=tuple(places))
 
 

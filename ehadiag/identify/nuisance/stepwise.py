@@ -80,6 +80,7 @@ def stepwise(
             budget=budget,
             seed=seed,
             give_up=True,
+            look_again=True,
         )
         evaluations += found.evaluations
         starts += found.starts

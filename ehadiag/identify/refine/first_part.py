@@ -5,7 +5,7 @@ What is left for the whole test is one step (`ehadiag.identify.refine.update`), 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import SPREAD, Refinement, median_offsets, refine
+from ehadiag.identify.refine.posterior import nothing
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
 from ehadiag.model.batch import SPOOL_ROW
-from ehadiag.model.parameters import FAULTS, OFFSETS, parameter
+from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, parameter
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "FirstPart",
     "anchored_derivatives",
     "anchored_model",
+    "considered_in",
     "derivatives_of",
     "first_spans",
     "refine_first_part",
@@ -42,6 +44,7 @@ AGAIN = 3e-4
 CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6, (SPOOL_ROW,)),)
 """Half a step of a plant that is integrated at 0.25 µs is of this size; sized on the spool, which
 moves fastest."""
+VISCOSITY = parameter("oil_viscosity")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,18 +73,21 @@ class FirstPart:
 
 
 def refine_first_part(
-    experiments: Sequence[Experiment], until: Sequence[int], start: Mapping[str, float]
+    experiments: Sequence[Experiment],
+    until: Sequence[int],
+    start: Mapping[str, float],
+    between: Callable[[], None] = nothing,
 ) -> FirstPart:
     """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
-    `start`: severities by name.
+    `start`: severities by name. `between`: called between rounds; what it raises ends the search.
     """
     spans = first_spans(experiments, until)
     free, residuals = residuals_at(experiments, spans, start)
     start = {**start, **median_offsets(free, residuals)}
     experiments = _judged(experiments, until, residuals)
     levels = anchored_model(experiments, spans).levels
-    best = _refine(experiments, spans, start, levels, SPREAD)
+    best = _refine(experiments, spans, start, levels, SPREAD, between)
     evaluations = 1 + best.evaluations
     for _ in range(JUDGEMENTS):
         before = [item.noise for item in experiments]
@@ -90,7 +96,7 @@ def refine_first_part(
         if np.allclose(before, after, rtol=NOISE_SETTLED, atol=0.0):
             break
         experiments = judged
-        best = _refine(experiments, spans, best.values, levels, AGAIN)
+        best = _refine(experiments, spans, best.values, levels, AGAIN, between)
         evaluations += best.evaluations
     noise = tuple(item.noise for item in experiments)
     return FirstPart(best, noise, levels, evaluations)
@@ -114,11 +120,12 @@ def _refine(
     start: Mapping[str, float],
     levels: NDArray[np.int64],
     spread: NDArray[np.float64] | float,
+    between: Callable[[], None],
 ) -> Refinement:
     batch = lay_out(experiments, spans, anchor_lsb=ANCHOR_LSB)
     # What is considered is worked out with the last part.
     model = SimdModel(batch, unknowns_of(experiments), levels=levels)
-    return refine(Derivatives(model, experiments[0].noise), start, spread)
+    return refine(Derivatives(model, experiments[0].noise), start, spread, between)
 
 
 def anchored_derivatives(
@@ -132,7 +139,7 @@ def anchored_derivatives(
 
 def derivatives_of(model: SimdModel, experiments: Sequence[Experiment]) -> Derivatives:
     """A model of `anchored_model`, in coordinates scaled by the noise."""
-    return Derivatives(model, experiments[0].noise, CONSIDERED)
+    return Derivatives(model, experiments[0].noise, considered_in(experiments))
 
 
 def anchored_model(
@@ -147,9 +154,32 @@ def anchored_model(
     `levels`: of a model of the same spans, if there was one.
     """
     batch = lay_out(experiments, spans, lead=lead, anchor_lsb=ANCHOR_LSB)
-    considered = [item.parameter for item in CONSIDERED]
+    considered = [item.parameter for item in considered_in(experiments)]
     unknowns = unknowns_of(experiments, (*FAULTS, *OFFSETS, *considered))
     return SimdModel(batch, unknowns, levels=levels)
+
+
+def considered_in(
+    experiments: Sequence[Experiment], free: Sequence[Parameter] = ()
+) -> tuple[Considered, ...]:
+    """What is held in an identification, with a tolerance that counts in the interval.
+
+    Parameters
+    ----------
+    experiments : Sequence[Experiment]
+        What it is from.
+    free : Sequence[Parameter]
+        What is estimated.
+
+    Returns
+    -------
+    tuple[Considered, ...]
+        `CONSIDERED`, and the oil's viscosity where the bus rounds its temperature anew.
+    """
+    std = max(item.viscosity_std for item in experiments)
+    if std == 0.0 or VISCOSITY.name in (item.name for item in free):
+        return CONSIDERED
+    return (*CONSIDERED, Considered(VISCOSITY, std))
 
 
 def first_spans(experiments: Sequence[Experiment], until: Sequence[int]) -> Spans:

@@ -10,7 +10,7 @@ directions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import CAP, Derivatives, capped
 from ehadiag.identify.refine.linearisation import Belief, Linearised, crossed
-from ehadiag.identify.refine.posterior import FEW, sharpen
+from ehadiag.identify.refine.posterior import FEW, nothing, sharpen
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Parameter
 
@@ -92,11 +92,15 @@ class Refinement:
 
 
 def refine(
-    model: Derivatives, start: Mapping[str, float], spread: NDArray[np.float64] | float = SPREAD
+    model: Derivatives,
+    start: Mapping[str, float],
+    spread: NDArray[np.float64] | float = SPREAD,
+    between: Callable[[], None] = nothing,
 ) -> Refinement:
     """Sharpen a belief about a start, values by name (0 where not named).
 
     spread: of the severities about it, shape (c,), or of each of them.
+    between: see `sharpen`.
     """
     x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
     curved = model.curved
@@ -104,7 +108,7 @@ def refine(
         np.clip(x, model.lower, model.upper),
         np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
     )
-    found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, FEW)
+    found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, FEW, between)
     return described(model, found.belief.x, found.linear, settled=found.settled)
 
 

@@ -54,25 +54,29 @@ class Linearised:
     jacobian : shape (k, signals, N)
     scatter : shape (signals, N)
         Variance about the linear function.
+    middle : shape (signals, N)
+        Residuals at the mean of the belief itself.
     """
 
     x: NDArray[np.float64]
     residuals: NDArray[np.float64]
     jacobian: NDArray[np.float64]
     scatter: NDArray[np.float64]
+    middle: NDArray[np.float64]
 
 
 def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> Linearised:
     """Regress the residuals on points drawn about a belief.
 
-    The points are as many as fill whole blocks of runs, in pairs that mirror each other, along
-    random orthogonal directions: their mean and covariance are nearly the belief's own.
+    The points are the mean and as many as nearly fill whole blocks of runs, in pairs that mirror
+    each other, along random orthogonal directions: their mean and covariance are nearly the
+    belief's own.
     """
     curved, count = model.curved, len(model.curved)
-    pairs = BLOCK // 2 * -(-(count + 1) // (BLOCK // 2))
+    pairs = BLOCK // 2 * -(-(count + 1) // (BLOCK // 2)) - 1
     shares = _directions(rng, count, pairs)
-    points = np.repeat(belief.x[None, :], 2 * pairs, axis=0)
-    points[:, curved] += np.vstack([shares, -shares]) @ belief.root.T
+    points = np.repeat(belief.x[None, :], 1 + 2 * pairs, axis=0)
+    points[1:, curved] += np.vstack([shares, -shares]) @ belief.root.T
     points[:, curved] = _mirrored(points[:, curved], model.lower[curved], model.upper[curved])
     x = points.mean(axis=0)
     runs = model.many(points)
@@ -88,7 +92,7 @@ def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> 
     jacobian = model.additive_slopes()
     jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
     mean = (along[0] * basis[0, 0]).reshape(shape)
-    return Linearised(x, mean, jacobian, scatter.reshape(shape))
+    return Linearised(x, mean, jacobian, scatter.reshape(shape), runs[0])
 
 
 def crossed(model: Derivatives, belief: Belief) -> Linearised:
@@ -120,7 +124,7 @@ def crossed(model: Derivatives, belief: Belief) -> Linearised:
         jacobian[j] = np.tensordot(along / (along @ along), line, 1)
         left = line - line.mean(axis=0) - along[:, None, None] * jacobian[j]
         scatter += np.einsum("ijk,ijk->jk", left, left)
-    return Linearised(points.mean(axis=0), runs.mean(axis=0), jacobian, scatter / count)
+    return Linearised(points.mean(axis=0), runs.mean(axis=0), jacobian, scatter / count, runs[0])
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

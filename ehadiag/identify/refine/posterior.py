@@ -10,7 +10,7 @@ the smooth outline first and the fine structure last, each sample in its own tim
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,18 @@ from ehadiag.identify.refine.bounded_step import bounded_step
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import Belief, Linearised
 
-__all__ = ["FEW", "MANY", "TAIL", "Pace", "Sharpened", "robust_weights", "sharpen"]
+__all__ = [
+    "FEW",
+    "LAST",
+    "MANY",
+    "TAIL",
+    "Pace",
+    "Sharpened",
+    "nothing",
+    "robust_cost",
+    "robust_weights",
+    "sharpen",
+]
 
 TAIL = 3.0
 """Deviations beyond which a residual counts little (Cauchy's weight)."""
@@ -30,9 +41,22 @@ LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
 """Scatter, in variances of the noise; share of samples with more of it, up to which it is so."""
 WIDTH = 2.0
 """Of the belief, in deviations of what the linear problem leaves."""
+FLAT_ROUNDS, FLAT_PLACES = 6, 3
+"""Rounds of which so many end with the same objective: no more is to be gained. Between them a
+break-away may come at another tick."""
+STUCK_ROUNDS, STUCK_SHARE, STUCK_ABOVE = 5, 0.01, 1.5
+"""Rounds in which the objective must fall by that share, where it is above so much a sample (noise
+alone leaves 0.86, a break-away that comes at another tick 0.3 more)."""
 HELD_BACK = 0.1
 """Share of the belief's information that a round's step is held back by."""
+HELD_BACK_WHERE_LINEAR = 1e-3
+"""The same where the model is linear over it: a belief that became too narrow on its way would
+creep."""
 FREE = 1e-9
+
+
+def nothing() -> None:
+    """Let a search go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +70,23 @@ class Pace:
     settled_ratio, settled_step : float
         Of a round after which nothing changes: ratio of the widths, step in units of them.
     most_rounds : int
+    flat : float
+        By how much the objective differs where it is the same (a parameter one deviation off costs
+        1), so that the search ends, and at the best place seen; 0: it does not go by the objective.
     """
 
     least_ratio: float
     settled_ratio: float
     settled_step: float
     most_rounds: int
+    flat: float
 
 
-MANY = Pace(least_ratio=0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=18)
+MANY = Pace(0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
 """For many unknowns."""
-FEW = Pace(least_ratio=0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12)
+LAST = replace(MANY, most_rounds=12, flat=4.0)
+"""The same, of a last look, which begins beside the optimum."""
+FEW = Pace(0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12, flat=0.0)
 """For few ones, which are told apart at once."""
 
 
@@ -85,6 +115,7 @@ def sharpen(
     information: NDArray[np.float64],
     linearise: Callable[[Derivatives, Belief], Linearised],
     pace: Pace = MANY,
+    between: Callable[[], None] = nothing,
 ) -> Sharpened:
     """Sharpen a belief until the noise stops it.
 
@@ -101,14 +132,74 @@ def sharpen(
     linearise : callable
         How the model is made linear over a belief.
     pace : Pace
+    between : callable
+        Called before each round, some 16 to 32 runs of the model; what it raises ends the search.
     """
     belief, rounds, settled = begin, 0, False
+    course = _Course(known, information, pace.flat)
     while not settled and rounds < pace.most_rounds:
+        between()
         linear = linearise(model, belief)
+        rounds += 1
+        if pace.flat:
+            course.passed(belief.x, linear.middle)
+            if course.is_flat or course.is_stuck:
+                return Sharpened(replace(belief, x=course.x), linear, course.is_flat)
         belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
-        rounds += 1
+    if pace.flat:
+        course.passed(belief.x, model.many(belief.x[None, :])[0])
+        belief = replace(belief, x=course.x)
     return Sharpened(belief, linear, settled)
+
+
+class _Course:
+    """Places that a search came through, and the objective there: cost and what was known.
+
+    Parameters
+    ----------
+    known, information
+        See `sharpen`.
+    flat : float
+        See `Pace`.
+    """
+
+    def __init__(self, known: Belief, information: NDArray[np.float64], flat: float) -> None:
+        self._known, self._information, self._flat = known, information, flat
+        self._course: list[float] = []
+        self._unit = 1.0
+        self.x = known.x
+        """The best place."""
+
+    def passed(self, x: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
+        """Take down a place and the residuals there, shape (signals, N)."""
+        off = x - self._known.x
+        objective = float(robust_cost(residuals) + off @ self._information @ off)
+        if not self._course or objective < min(self._course):
+            self.x = x
+            self._unit = objective / max(int(np.count_nonzero(residuals)), 1)
+        self._course.append(objective)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the search came to the same objective again and again of late."""
+        late = sorted(self._course[-FLAT_ROUNDS:])[:FLAT_PLACES]
+        return len(late) == FLAT_PLACES and late[-1] - late[0] < self._flat * max(self._unit, 1.0)
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether next to nothing was gained of late, far from what noise alone would leave."""
+        before, late = self._course[:-STUCK_ROUNDS], self._course[-STUCK_ROUNDS:]
+        return (
+            self._unit > STUCK_ABOVE
+            and bool(before)
+            and min(late) > (1.0 - STUCK_SHARE) * min(before)
+        )
+
+
+def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cauchy's cost of weighted residuals, shape (…, signals, N): shape (…)."""
+    return np.asarray(TAIL**2 * np.log1p((residuals / TAIL) ** 2).sum(axis=(-2, -1)))
 
 
 def robust_weights(linear: Linearised) -> NDArray[np.float64]:
@@ -117,9 +208,9 @@ def robust_weights(linear: Linearised) -> NDArray[np.float64]:
     return np.asarray(1.0 / (variance + linear.residuals**2 / TAIL**2))
 
 
-def _is_linear(linear: Linearised) -> bool:
-    """Whether next to no sample leaves the line by more than its noise."""
-    return float(np.mean(linear.scatter > LINEAR_SCATTER)) < LINEAR_SHARE
+def _bent(linear: Linearised) -> float:
+    """Share of samples that leave the line by more than their noise."""
+    return float(np.mean(linear.scatter > LINEAR_SCATTER))
 
 
 def _narrowed(
@@ -139,7 +230,9 @@ def _narrowed(
     curved = model.curved
     inverse_root = np.linalg.inv(belief.root)
     held = FREE * np.eye(len(belief.x))
-    held[np.ix_(curved, curved)] += HELD_BACK * inverse_root.T @ inverse_root
+    is_linear = _bent(linear) < LINEAR_SHARE
+    back = HELD_BACK_WHERE_LINEAR if is_linear and pace.flat else HELD_BACK
+    held[np.ix_(curved, curved)] += back * inverse_root.T @ inverse_root
     x = bounded_step(linear.x, normal + held, gradient, model.lower, model.upper)
     # What is left unexplained widens the belief.
     variance = (1.0 + linear.scatter).ravel()
@@ -148,7 +241,7 @@ def _narrowed(
     spread *= WIDTH**2 * max(excess, 1.0)
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
-    least = LEAST_RATIO_OF_LINEAR if _is_linear(linear) else pace.least_ratio
+    least = LEAST_RATIO_OF_LINEAR if is_linear else pace.least_ratio
     kept = np.clip(ratios, least, 1.0)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
     return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step

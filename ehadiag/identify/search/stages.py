@@ -67,6 +67,10 @@ LEAD_S = 0.1
 """Run-in before a window, s."""
 
 
+def _untold(_share: float) -> None:
+    """Tell nobody."""
+
+
 class Memory:
     """Results of stages by a digest of their inputs; a handful, a few kilobytes in all.
 
@@ -139,11 +143,16 @@ def search_stages(
     solver: Solver,
     seed: int,
     memory: Memory,
+    tell: Callable[[float], None] = _untold,
 ) -> Iterator[SearchResult]:
-    """Results of all stages, each from the best of the one before; run as they are asked for."""
+    """Results of all stages, each from the best of the one before; run as they are asked for.
+
+    tell: called after every generation with the share of the search that is done; what it raises
+    ends it.
+    """
     best = start
     for stage in range(len(STAGES)):
-        result = _search_stage(experiments, best, solver, seed, stage, memory)
+        result = _search_stage(experiments, best, solver, seed, stage, memory, tell)
         best = result.best
         yield result
 
@@ -155,6 +164,7 @@ def _search_stage(
     seed: int,
     stage: int,
     memory: Memory,
+    tell: Callable[[float], None],
 ) -> SearchResult:
     """One stage of the genetic search, from memory if the inputs are the same."""
     windows = [_grown(item.test.windows.refinement, STAGES[stage]) for item in experiments]
@@ -165,7 +175,13 @@ def _search_stage(
     return memory.recall(
         digest(f"search {seed} {part!r}", [*batch, np.array(unknowns.base), start, spread]),
         SearchResult,
-        lambda: part.minimise(Objective(SimdModel(batch, unknowns)), start, spread, seed + stage),
+        lambda: part.minimise(
+            Objective(SimdModel(batch, unknowns)),
+            start,
+            spread,
+            seed + stage,
+            lambda used, budget: tell((stage + used / budget) / len(STAGES)),
+        ),
     )
 
 

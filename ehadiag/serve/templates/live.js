@@ -47,6 +47,7 @@ function show(snapshot) {
     [item.name, number(item.estimate, 4), number(item.std, 4), item.source]));
   fill(at("residuals"), residuals ? ["spool", "pressure"].map((name) =>
     [name, number(residuals[name], 2), number(residuals[name + "_above"], 2), number(residuals[name + "_below"], 2)]) : []);
+  at("against").textContent = residuals && residuals.against ? "Compared with " + residuals.against : "";
   at("alarm-count").textContent = snapshot.alarm_count;
   fill(at("alarms"), snapshot.alarms.map((item) => [item.time, item.signal, item.side, item.during]).reverse());
   list(at("notes"), snapshot.notes);

@@ -124,6 +124,44 @@ def test_events_are_listed_with_the_diagnoses(run: Run) -> None:
     assert "filter\\x1b[31m changed (begins anew: Kintas)" in table
 
 
+def test_what_is_withdrawn_counts_no_more_and_stays(run: Run) -> None:
+    history = ("--history", "h.sqlite")
+    run("diagnose", *history, HEALTHY, WORN)
+    run("history", "event", "--serial", 1, "filter changed", *history)
+    for kind in ("event", "diagnosis"):
+        said = run("history", "withdraw", kind, 1, "=of unit\x1b[31m 8", *history)
+        assert (said.code, "\x1b" in said.out) == (0, False)
+    assert [(item["kind"], item["number"]) for item in listed(run)] == [("diagnosis", 2)]
+    gone = {item["kind"] for item in listed(run, "--all") if item["withdrawn"]}
+    assert gone == {"event", "diagnosis"}
+    assert (
+        "event 1 (withdrawn: =of unit\\x1b[31m 8)" in run("history", "list", "--all", *history).out
+    )
+    assert "withdrawn" in json.loads(run("history", "show", 1, *history).out)
+    text = run("history", "export", "--all", *history).out
+    assert {row["withdrawn"] for row in csv.DictReader(io.StringIO(text))} == {
+        "", "'=of unit\x1b[31m 8",
+    }  # fmt: skip
+    for number, words in ((1, "has event 1 withdrawn already"), (9, "has no event 9")):
+        again = run("history", "withdraw", "event", number, "x", *history)
+        assert again.code == 2
+        assert words in again.err
+
+
+def test_two_tests_of_a_simulated_unit_count_both(run: Run) -> None:
+    """Their noise has the same seed, so their samples are the same."""
+    for hours in (10, 20):
+        run("bit", "--simulate", "--fast", "--test", "open", "--history", "h.sqlite",
+            "--hours", hours, "--no-picture")  # fmt: skip
+    found = listed(run)
+    assert [item["hours"] for item in found] == [10, 20]
+    first, second = (
+        json.loads(run("history", "show", item["number"], "--history", "h.sqlite").out)
+        for item in found
+    )
+    assert first["recordings"][0]["samples"] == second["recordings"][0]["samples"]
+
+
 def test_export_is_csv(run: Run) -> None:
     run("diagnose", "--history", "h.sqlite", "--hours", 5, WORN)
     text = run("history", "export", "--history", "h.sqlite").out

@@ -98,6 +98,18 @@ def test_all_that_is_known_is_there() -> None:
         assert item in whole
 
 
+def test_a_test_shows_residuals_and_alarms_too_and_against_what() -> None:
+    found = Residuals(spool=-3.25, against=HOSTILE, spool_below=1.0)
+    item = snapshot(command="bit", residuals=found, alarms=(alarm(1),), alarm_count=1)
+    for width in (80, 200):
+        whole = "\n".join(printed(item, width))
+        for part in ("-3.2 σ", "100% of the alarm, below", "against: [bold red]x", "1 alarms",
+                     "spool above model during open"):  # fmt: skip
+            assert part in whole
+    assert "residual" not in "\n".join(printed(snapshot(command="bit", residuals=None), 80))
+    assert list(Lines().of(item))[3].endswith(f"during test 'open', compared with {HOSTILE}")
+
+
 def test_a_terminal_without_block_characters_gets_ascii() -> None:
     whole = "\n".join(printed(snapshot(), 80, unicode=False)[1:-1])
     assert not set(whole) & set("▁▂▃▄▅▆▇█·")

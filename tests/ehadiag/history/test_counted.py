@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from history_cases import an_entry
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,6 +33,27 @@ def test_hours_that_only_the_first_diagnosis_was_told_are_kept() -> None:
 def test_a_joint_diagnosis_replaces_those_of_its_recordings() -> None:
     entries = [of("a", number=1), of("b", number=2), of("a", "b", number=3)]
     assert [item.number for item in counted(entries)] == [3]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "count"),
+    [
+        ("2026-03-01T12:00:00.000Z", "2026-03-01T12:00:00.001Z", 1),
+        ("2026-03-01T12:00:00.000Z", "2026-03-01T14:00:00.001Z", 1),  # another zone
+        ("2026-03-01T12:00:00.000Z", "2026-03-01T11:14:59.500Z", 1),
+        ("2026-03-01T12:00:00.000Z", None, 1),
+        (None, None, 1),
+        ("2026-03-01T12:00:00.000Z", "2026-03-01T12:00:07.000Z", 2),
+        ("2026-03-01T12:00:00.000Z", "2026-03-03T12:00:00.000Z", 2),
+    ],
+)
+def test_two_tests_of_a_simulated_unit_are_two_whatever_their_samples(
+    first: str | None, second: str | None, count: int
+) -> None:
+    entries = [replace(of("a", hours=5.0), tested=first), replace(of("a"), tested=second)]
+    found = counted(entries)
+    assert len(found) == count
+    assert found[-1].usage == Usage(5.0 if count == 1 else None)
 
 
 def test_without_samples_each_counts() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -18,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ehadiag.core.errors import ConfigurationError, InputOutputError
-from ehadiag.history.records import Usage
+from ehadiag.history.records import EVENT, Usage
 from ehadiag.history.schema import STEPS, migrate
 from ehadiag.history.store import History
 
@@ -58,7 +59,9 @@ def test_any_text_comes_back(text: str, serial: int) -> None:
     assert (found.actuator, found.reasons, found.serial) == (text, (text,), serial)
 
 
-@pytest.mark.parametrize("table", ["diagnosis", "source", "severity", "effect", "event"])
+@pytest.mark.parametrize(
+    "table", ["diagnosis", "source", "severity", "effect", "event", "withdrawal"]
+)
 @pytest.mark.parametrize(
     "statement",
     [
@@ -71,6 +74,7 @@ def test_nothing_is_changed_in_place(tmp_path: Path, table: str, statement: str)
     with History(tmp_path / "h", create=True) as history:
         history.append(an_entry(samples="ab"))
         history.append_event(an_event())
+        history.withdraw(EVENT, 1, "2026-03-03T12:00:00.000Z", "why")
     connection = sqlite3.connect(tmp_path / "h")
     with pytest.raises(sqlite3.IntegrityError, match="only ever appended to"):
         connection.execute(statement.format(table))
@@ -163,6 +167,23 @@ def test_a_step_of_the_tables_keeps_the_rows(
     connection.close()
     with pytest.raises(ConfigurationError, match="use a later ehadiag"):
         History(tmp_path / "h")
+
+
+def test_a_history_of_the_first_version_takes_withdrawals(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as old:
+        migrate(old, STEPS[:1])
+        old.execute(
+            "INSERT INTO event (appended, done, serial, text, resets)"
+            " VALUES ('x', 'y', 7, 'z', '[]')"
+        )
+    with History(path) as history:
+        assert len(history.events()) == 1
+        history.withdraw(EVENT, 1, "2026-03-01T12:00:00.000Z", "why")
+        assert history.events() == []
+        assert [item.withdrawn for item in history.events(withdrawn=True)] == ["why"]
+        with pytest.raises(ConfigurationError, match="already"):
+            history.withdraw(EVENT, 1, "2026-03-01T12:00:00.000Z", "why")
 
 
 def test_a_step_that_fails_changes_nothing(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The search for many parameters: on problems whose answer is known."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,7 +13,7 @@ from ehadiag.identify.nuisance.explained import MOST_EXCESS, excess, is_noise
 from ehadiag.identify.nuisance.prior import Joint, Known, belief_of, information_of, nuisances_of
 from ehadiag.identify.nuisance.starts import Found, Place, search
 from ehadiag.identify.refine.linearisation import Belief, linearised
-from ehadiag.identify.refine.posterior import sharpen
+from ehadiag.identify.refine.posterior import MANY, robust_cost, sharpen
 from ehadiag.model.parameters import FAULTS, REGISTRY, parameter
 
 SAMPLES = 400
@@ -106,7 +107,7 @@ def curved(truth, seed=3):
 
 def searched(problem, begin, width=0.4):
     first = Belief(np.array([*begin, 0.0]), width * np.eye(3))
-    information = np.array([1.0, 1.0, 1.0, 0.0])
+    information = np.diag([1.0, 1.0, 1.0, 0.0])
     return search(problem, first, information, [first], is_noise, seed=1)
 
 
@@ -137,7 +138,7 @@ def test_what_nothing_explains_ends_with_the_budget():
     found = search(
         problem,
         first,
-        np.zeros(4),
+        np.zeros((4, 4)),
         [first],
         is_noise,
         budget=600,
@@ -145,7 +146,7 @@ def test_what_nothing_explains_ends_with_the_budget():
     )
     assert not found.explained
     assert problem.evaluations < 600 + 600  # a start goes on to its end
-    assert len(told) == found.starts
+    assert len(told) > found.starts  # between the rounds of each start, too
     assert told[-1] == 1.0
 
 
@@ -164,6 +165,53 @@ def test_a_settled_belief_is_as_wide_as_the_noise_allows():
     stated = 0.5 * np.sqrt(np.diag(belief.root @ belief.root.T))
     assert np.all(stated > 0.3 * spread)
     assert np.all(stated < 4.0 * spread)
+
+
+def sharpened(function, width=0.4, pace=MANY, seen=None):
+    """A search on such residuals; also how many points it ran, and the places it came through."""
+    problem = Problem(function)
+    begin = Belief(np.array([0.5, 0.5, 0.5, 0.0]), width * np.eye(3))
+    rng = np.random.default_rng(5)
+
+    def linearise(model, belief):
+        if seen is not None:
+            seen.append(belief.x)
+        return linearised(model, belief, rng)
+
+    found = sharpen(problem, begin, begin, np.zeros((4, 4)), linearise, pace)
+    return found, problem.evaluations
+
+
+def cost_of(function, x):
+    return robust_cost(Problem(function).many(x[None, :])[0])
+
+
+def test_a_search_that_nothing_helps_ends_early():
+    wave = 30.0 * np.sin(np.arange(SAMPLES) / 5.0)
+    _, runs = sharpened(lambda p: curved((0.8, 0.5, 0.7))(p) + wave)
+    assert runs < MANY.most_rounds * 15 // 2
+
+
+def test_a_step_of_the_cost_beside_the_optimum_keeps_no_search_from_its_end():
+    smooth = curved((0.8, 0.5, 0.7))
+
+    def stepped(p):
+        out = smooth(p)
+        out[1, :12] += 9.0 * (p[0] > 0.8005)
+        return out
+
+    found, runs = sharpened(stepped)
+    assert found.settled
+    assert runs < MANY.most_rounds * 15
+    assert np.allclose(found.belief.x[:3], (0.8, 0.5, 0.7), atol=0.01)
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 3, 5])
+def test_a_search_ends_at_the_best_place_that_it_came_through(rounds):
+    function, seen = curved((0.8, 0.5, 0.7)), []
+    found, _ = sharpened(function, pace=replace(MANY, most_rounds=rounds), seen=seen)
+    best = min(cost_of(function, x) for x in seen)
+    assert cost_of(function, found.belief.x) <= best
 
 
 def test_noise_is_told_from_what_lasts():

@@ -311,3 +311,24 @@ def test_a_frozen_channel_is_noted_with_its_time() -> None:
         "no frame brings the position",
     ]
     assert samples.host_ns.tolist() == list(range(50, 379))
+
+
+@pytest.mark.parametrize(
+    ("scale", "gain", "bias", "std"),
+    [
+        (0.1, 1.0, 0.0, 0.0),  # the computer's own
+        (0.1, 1.0, -273.15, 0.05),  # kelvin: 40 °C lies midway between two steps
+        (0.1, 1.0, -273.2, 0.0),
+        (1.0, 1.0, 0.0, 0.5),
+        (0.1, 5.0 / 9.0, -160.0 / 9.0, 0.25 / 9.0),  # °F
+    ],
+)
+def test_a_temperature_on_another_scale_is_rounded_anew(
+    scale: float, gain: float, bias: float, std: float
+) -> None:
+    signal = SimpleNamespace(is_float=False, scale=scale, offset=0.0)
+    role = SimpleNamespace(signal=signal, gain=gain, bias=bias)
+    bus_map: Any = SimpleNamespace(find=lambda _: (None, role))
+    assert align._rounding(bus_map) == pytest.approx(std)
+    nothing: Any = SimpleNamespace(find=lambda _: None)
+    assert align._rounding(nothing) == 0.0

@@ -45,7 +45,11 @@ def test_notes_of_every_step_are_handed_on(frames, bus_map):
     ]
     known = ("a fact", "ServoTelemetry: no check sum; a corrupt frame cannot be told")
     (recording,) = assemble(FrameTable.from_frames(stepped), bare, "a log", ("a fact",))
-    assert recording.quality.notes == (*known, "host clock stepped by +2.000 s")
+    assert recording.quality.notes == (
+        *known,
+        "time stamps run 2.000 s ahead of the counters: the computer paused, or the host clock"
+        " was set",
+    )
     assert recording.source == "a log"
     silent = [frame for frame in frames if frame.can_id != TELEMETRY]
     (recording,) = assemble(FrameTable.from_frames(silent), bare, "a log", ("a fact",))

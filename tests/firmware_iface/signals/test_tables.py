@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 from ehadiag.core.errors import InputOutputError
 from firmware_iface.logs.budget import Budget
+from firmware_iface.signals import tables
 from firmware_iface.signals.columns import ColumnMap
 from firmware_iface.signals.tables import Signal, joined, read_signals
 
@@ -93,3 +96,51 @@ def test_columns_without_a_number(tmp_path: Path) -> None:
     table(STEPS_NS * 1e-9, spool=np.nan).to_csv(path, index=False)
     with pytest.raises(InputOutputError, match=r"channels.spool has 0 numbers"):
         read(path)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_table_too_long_to_hold_is_refused(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    path = tmp_path / f"daq{suffix}"
+    whole = table(STEPS_NS * 1e-9, remark=["x"] * ROWS)
+    whole.to_csv(path, index=False) if suffix == ".csv" else whole.to_parquet(path)
+    monkeypatch.setattr(tables, "MOST_ROWS", ROWS)
+    assert len(read(path)["channels.spool"].time) == ROWS
+    monkeypatch.setattr(tables, "MOST_ROWS", ROWS - 1)
+    with pytest.raises(InputOutputError, match=r"more than 39 rows, .* cut it about"):
+        read(path)
+
+
+def test_a_parquet_file_of_many_columns_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    path = tmp_path / "daq.parquet"
+    table(STEPS_NS * 1e-9).to_parquet(path)
+    monkeypatch.setattr(tables, "MOST_CELLS", ROWS)
+    monkeypatch.setattr(pandas, "read_parquet", None)
+    with pytest.raises(InputOutputError, match="40 values"):
+        read(path)
+
+
+def test_no_more_of_a_packed_table_is_unpacked_than_tells_its_kind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "daq.csv.gz"
+    path.write_bytes(gzip.compress(b"time,spool\n" + b"0,0\n" * 1_000_000))
+    monkeypatch.setattr(tables, "unpacked", None)
+    assert tables.holds_signals(path, mapped=False)
+    torn = tmp_path / "torn.csv.gz"
+    torn.write_bytes(path.read_bytes()[:200])
+    assert tables.holds_signals(torn, mapped=False)
+
+
+def test_rows_longer_than_the_header_are_no_warning(tmp_path: Path) -> None:
+    path = tmp_path / "daq.csv"
+    rows = "".join(f"{k / 1000},1,2,3,4,spare\n" for k in range(ROWS))
+    path.write_text("time,current,spool,pressure,position\n" + rows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read(path)["channels.current"].value.tolist() == [1.0] * ROWS

@@ -31,7 +31,7 @@ from ehadiag.identify.session import Nuisances, identify
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_tools.accuracy.nuisances import HEADINGS, row_of
 from ehadiag_tools.accuracy.resume import perform_all
-from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
+from ehadiag_tools.simulator.units import COARSE_STEP, GROUPS, Unit, record, unit_with
 
 __all__ = ["LINES", "SheetRun", "main", "perform_sheet"]
 
@@ -93,15 +93,7 @@ def perform_sheet(run: SheetRun) -> dict[str, Any]:
 
 def _drawn(seed: int, case: int, groups: tuple[str, ...]) -> tuple[Unit, list[float]]:
     rng = np.random.default_rng([seed, case])
-    unit = random_unit(
-        rng,
-        data=True,
-        sensing="sensing" in groups,
-        friction="friction" in groups,
-        orifice="orifice" in groups,
-        strangers="strangers" in groups,
-        serial=case,
-    )
+    unit = unit_with(rng, groups, case)
     return unit, rng.uniform(0.0, 1.0, 3).tolist()
 
 
@@ -163,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
         "--group",
         action="append",
         default=[],
-        choices=["sensing", "friction", "orifice", "strangers"],
+        choices=GROUPS,
         help="further effects of the units; may be repeated (none)",
     )
     add("--cases", type=int, default=200, help="units of each line (%(default)d)")

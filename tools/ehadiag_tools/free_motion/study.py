@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from ehadiag.core.actuator import default_actuator
 from ehadiag.core.recording import CommandMode
 from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.free_motion.motion import free_motion
+from ehadiag_tools.free_motion.motion import STEP, free_motion
 
 __all__ = ["Case", "Outcome", "garwood", "main", "watch"]
 
@@ -53,6 +54,8 @@ class Case:
     hours: float
     """Between false alarms, as asked of the monitor."""
     seconds: float = MINUTE_S
+    step: float = STEP
+    """Of the simulator, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,8 @@ def watch(case: Case) -> Outcome:
     """
     began = time.process_time()
     actuator = default_actuator()
-    rows = free_motion(actuator, Faults(*case.true), case.mode, case.seconds, case.seed)
+    faults = Faults(*case.true)
+    rows = free_motion(actuator, faults, case.mode, case.seconds, case.seed, case.step)
     inner = Monitor(actuator, case.known, mode=case.mode, hours=case.hours)
     monitor = FreeMotionMonitor(inner, undecided_spool(actuator, case.known[2]))
     alarms, resting, persistence = [], 0, Persistence(actuator.controller.rate)
@@ -125,6 +129,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--piece", type=float, default=MINUTE_S, metavar="S", help="length of one (default 60)"
     )
     parser.add_argument("--seed", type=int, default=1, metavar="N")
+    parser.add_argument(
+        "--step",
+        type=float,
+        default=STEP * 1e6,
+        metavar="US",
+        help="of the simulator, µs (%(default)g)",
+    )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
     arguments = parser.parse_args(argv)
     if arguments.delays:
@@ -143,7 +154,17 @@ def _false_alarms(arguments: argparse.Namespace) -> None:
         mode = CommandMode.POSITION if number % 2 else CommandMode.CURRENT
         severities = (known[0], known[1], known[2])
         seed = arguments.seed + number
-        cases.append(Case(mode, severities, severities, seed, arguments.hours, arguments.piece))
+        cases.append(
+            Case(
+                mode,
+                severities,
+                severities,
+                seed,
+                arguments.hours,
+                arguments.piece,
+                arguments.step / 1e6,
+            )
+        )
     found = _run(cases, arguments.jobs)
     for mode in (*CommandMode, None):
         chosen = [b for a, b in zip(cases, found, strict=True) if mode in (None, a.mode)]
@@ -188,6 +209,7 @@ def _delays(arguments: argparse.Namespace) -> None:
                     arguments.seed + number,
                     arguments.hours,
                     arguments.piece,
+                    arguments.step / 1e6,
                 )
             )
     found = _run(cases, arguments.jobs)
@@ -210,6 +232,11 @@ def _first(tick: int | None) -> str:
 
 
 def _run(cases: Sequence[Case], jobs: int) -> list[Outcome]:
-    work = joblib.Parallel(n_jobs=jobs)
-    found: list[Outcome] = work(joblib.delayed(watch)(case) for case in cases)
+    work = joblib.Parallel(n_jobs=jobs, return_as="generator")
+    found: list[Outcome] = []
+    for outcome in work(joblib.delayed(watch)(case) for case in cases):
+        found.append(outcome)
+        raised = sum(len(item.lasting) for item in found)
+        print(f"\r{len(found)} of {len(cases)} pieces, {raised} alarms", end="", file=sys.stderr)
+    print(file=sys.stderr)
     return found

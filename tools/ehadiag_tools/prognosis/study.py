@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,8 @@ TRAINING = 20
 """Units of a fleet whose whole lives are known; none of those that are judged."""
 FIRST_TRAINING = 10_000
 BOOTSTRAPS = 2000
+NOMINAL = 0.8
+KEYS = ("near", "horizon", "error")
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +156,13 @@ def _print(found: dict[str, dict[str, list[Score]]], given: argparse.Namespace) 
         for name in methods:
             print(f"| {law} | {name} | {' | '.join(_cells(scores[name]))} |")
     print("\nDifference of the units' mean, ours less the other's, with its 95 % interval:\n")
-    print("| other | α-λ | horizon | error |")
-    print("| --- | --- | --- | --- |")
-    for name in methods[1:]:
-        cells = (_difference(whole, name, key) for key in ("near", "horizon", "error"))
-        print(f"| {name} | {' | '.join(cells)} |")
+    print("| law | other | coverage off 80 % | α-λ | horizon | error |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for law, scores in (*found.items(), ("all", whole)):
+        for name in methods[1:]:
+            cells = [_difference(scores, name, COVERAGE)]
+            cells += [_difference(scores, name, _mean_of(key)) for key in KEYS]
+            print(f"| {law} | {name} | {' | '.join(cells)} |")
 
 
 def _cells(scores: Sequence[Score]) -> tuple[str, ...]:
@@ -175,15 +179,52 @@ def _cells(scores: Sequence[Score]) -> tuple[str, ...]:
     )
 
 
-def _difference(whole: dict[str, list[Score]], other: str, key: str) -> str:
-    ours, theirs = (
-        np.array([float(getattr(score, key)) for score in whole[name]]) for name in (OURS, other)
-    )
-    gap = ours - theirs
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure of many units: numerator and denominator of each, and what their ratio tells."""
+
+    parts: Callable[[Sequence[Score]], Array]
+    told: Callable[[Array], Array]
+
+
+def _mean_of(key: str) -> Figure:
+    def mean(scores: Sequence[Score]) -> Array:
+        values = np.array([float(getattr(score, key)) for score in scores])
+        return np.column_stack([values, np.ones_like(values)])
+
+    return Figure(mean, lambda shares: shares)
+
+
+def _counts(scores: Sequence[Score]) -> Array:
+    return np.array(
+        [(sum(map(bool, item.covered)), len(item.covered) - item.covered.count(None))
+         for item in scores],
+        dtype=np.float64,
+    )  # fmt: skip
+
+
+COVERAGE = Figure(_counts, lambda shares: np.abs(shares - NOMINAL))
+"""How far the share of intervals that hold the truth is from what they claim."""
+
+
+def _difference(scores: Mapping[str, Sequence[Score]], other: str, figure: Figure) -> str:
+    """Ours less the other's, with its 95 % interval by bootstrap over units."""
+    ours, theirs = (figure.parts(scores[name]) for name in (OURS, other))
     rng = np.random.default_rng(0)
-    means = gap[rng.integers(len(gap), size=(BOOTSTRAPS, len(gap)))].mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return f"{gap.mean():+.3f} ({low:+.3f} … {high:+.3f})"
+    drawn = rng.integers(len(ours), size=(BOOTSTRAPS, len(ours)))
+
+    def gap(chosen: NDArray[np.intp]) -> Array:
+        a, b = (figure.told(_ratio(part[chosen])) for part in (ours, theirs))
+        return a - b
+
+    found = float(gap(np.arange(len(ours))[None, :])[0])
+    low, high = np.quantile(gap(drawn), (0.025, 0.975))
+    return f"{found:+.3f} ({low:+.3f} … {high:+.3f})"
+
+
+def _ratio(parts: Array) -> Array:
+    sums: Array = parts.sum(axis=1)
+    return sums[:, 0] / np.maximum(sums[:, 1], 1.0)
 
 
 if __name__ == "__main__":

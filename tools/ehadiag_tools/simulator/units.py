@@ -9,6 +9,7 @@ those of a recording:
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 
 import msgspec
@@ -22,10 +23,12 @@ from ehadiag_sim.plant.conditions import DataErrors, Effects, Faults, Sensors, S
 from ehadiag_sim.plant.dynamics import DEFAULT_STEP
 from ehadiag_sim.plant.simulator import simulate
 
-__all__ = ["COARSE_STEP", "Unit", "random_unit", "record"]
+__all__ = ["COARSE_STEP", "GROUPS", "Unit", "random_unit", "record", "unit_with"]
 
 COARSE_STEP = 1e-6
 """Four times as fast as the default; its error beside the noise: docs, detailed-model.md."""
+GROUPS = ("sensing", "friction", "orifice", "strangers")
+"""Of effects beside the data's errors, see `random_unit`."""
 HALF_RANGE_CODES = 2048
 RATED_BIAS = 0.02
 """Of rated current."""
@@ -116,6 +119,19 @@ def random_unit(
     if strangers:
         effects = replace(effects, plays=8, strangers=_random_strangers(sixth))
     return Unit(actuator, effects, sensors, serial)
+
+
+def unit_with(rng: np.random.Generator, groups: Collection[str], serial: int) -> Unit:
+    """Draw a unit with errors of its data and groups of effects by name, see `random_unit`."""
+    return random_unit(
+        rng,
+        data=True,
+        sensing="sensing" in groups,
+        friction="friction" in groups,
+        orifice="orifice" in groups,
+        strangers="strangers" in groups,
+        serial=serial,
+    )
 
 
 def record(

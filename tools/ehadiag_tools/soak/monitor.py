@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import multiprocessing
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,7 +48,8 @@ from firmware_iface.transport.receiver import Receiver
 __all__ = ["BESIDE", "MonitorSoak", "monitor_soak", "monitor_text"]
 
 BESIDE = ("thread", "process", "none", "view")
-"""Where diagnoses run; `view`: the live view instead of them."""
+"""Where diagnoses run; `view`: the live view instead of them, in every other `SPAN_S`."""
+SPAN_S = 3.0
 LOGS = Path(__file__).parents[3] / "tests" / "data" / "logs"
 FAULTS = (0.3, 0.3, 0.3)
 SHARES = (50.0, 99.0, 99.9)
@@ -71,6 +73,9 @@ class MonitorSoak:
     cpu: the same by the thread's processor time, the reading of both clocks included.
     take: of the receive thread's whole work on a frame that completes a tick, by the clock.
     residual: rms of the residuals of spool and pressure, in units of noise.
+    unseen_wall: as `wall`, while the live view rests; `wall` is then that while it is shown. None
+        without a live view.
+    unseen_take: as `take`, the same.
     """
 
     interface: str
@@ -89,6 +94,8 @@ class MonitorSoak:
     alarms: int
     residual: tuple[float, float]
     switch_ms: float
+    unseen_wall: tuple[float, ...] | None = None
+    unseen_take: tuple[float, ...] | None = None
 
 
 def monitor_soak(
@@ -131,16 +138,18 @@ def monitor_soak(
         try:
             _wait_for_frames(watch, source)
             begin = time.monotonic()
-            while time.monotonic() - begin < seconds:
+            while (elapsed := time.monotonic() - begin) < seconds:
+                if beside == "view":
+                    watch.show(int(elapsed / SPAN_S) % 2 == 0)
                 if item is None:
                     time.sleep(IDLE_S)
                 else:
                     identify([item])
                     done.value += 1
                 _drain(source)
-            elapsed = time.monotonic() - begin
         finally:
             stop.set()
+            watch.show(True)
             for process in processes:
                 process.join()
         _drain(source, QUIET_S)
@@ -155,6 +164,9 @@ class _Watch:
         self._monitor = Monitor(default_actuator(), FAULTS, mode=CommandMode.POSITION)
         room = round(seconds * 1e9 / PERIOD_NS) + 600_000
         self._wall, self._cpu, self._take = np.zeros((3, room), dtype=np.int64)
+        self._seen_at = np.ones(room, dtype=np.bool_)
+        self._showing = threading.Event()
+        self._showing.set()
         self._squares, self._seen = np.zeros(2), np.zeros(2)
         self._breaks = self._alarms = self._pushes = 0
         self._trace, self._traffic = Trace(), Traffic(1e6)
@@ -183,9 +195,18 @@ class _Watch:
             self._squares += np.where(known, reading.residual, 0.0) ** 2
             self._trace.take(self._pushes / 1e3, CommandMode.POSITION, tick[0], tick[1:])
             self._take[k] = clock() - begin
+            self._seen_at[k] = self._showing.is_set()
+
+    def show(self, shown: bool) -> None:
+        """Let the live view go on, or rest."""
+        if shown:
+            self._showing.set()
+        else:
+            self._showing.clear()
 
     def look(self, number: int) -> Snapshot:
-        """Return what the live view shows."""
+        """Return what the live view shows; waits while it rests."""
+        self._showing.wait()
         rate, load, _ = self._traffic.measure()
         spool, pressure = self._monitor.reading.residual.tolist()
         return Snapshot(
@@ -219,6 +240,8 @@ class _Watch:
             raise BusLostError(f"{name}: no tick arrived whole")
         rms = np.sqrt(self._squares / np.maximum(self._seen, 1.0))
         some = slice(min(self._pushes, len(self._wall)))
+        seen = self._seen_at[some]
+        rested = not seen.all()
         return MonitorSoak(
             interface=name,
             seconds=seconds,
@@ -230,12 +253,14 @@ class _Watch:
             ticks_lost=self._ticks.lost,
             unread=unread,
             pushes=self._pushes,
-            wall=_figures(self._wall[some]),
-            cpu=_figures(self._cpu[some]),
-            take=_figures(self._take[some]),
+            wall=_figures(self._wall[some][seen]),
+            cpu=_figures(self._cpu[some][seen]),
+            take=_figures(self._take[some][seen]),
             alarms=self._alarms,
             residual=(float(rms[0]), float(rms[1])),
             switch_ms=sys.getswitchinterval() * 1e3,
+            unseen_wall=_figures(self._wall[some][~seen]) if rested else None,
+            unseen_take=_figures(self._take[some][~seen]) if rested else None,
         )
 
 
@@ -307,6 +332,12 @@ def monitor_text(result: MonitorSoak) -> str:
             f"p99.9 {values[p999]:.1f} µs, most {values[most]:.0f} µs"
         )
 
+    rested = []
+    if result.unseen_wall is not None and result.unseen_take is not None:
+        rested = [
+            told("push while the view rests", result.unseen_wall),
+            told("whole work while the view rests", result.unseen_take),
+        ]
     return "\n".join(
         (
             f"{result.interface}: {result.seconds:.0f} s, {result.diagnoses} diagnoses beside "
@@ -316,6 +347,7 @@ def monitor_text(result: MonitorSoak) -> str:
             told(f"push, {result.pushes} calls, by the clock", result.wall),
             told("push, processor time, both clocks included", result.cpu),
             told("a frame that completes a tick, whole work, by the clock", result.take),
+            *rested,
             f"alarms {result.alarms}, residuals rms {result.residual[0]:.2f} (spool) and "
             f"{result.residual[1]:.2f} (pressure) of the noise",
         )

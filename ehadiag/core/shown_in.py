@@ -1,0 +1,38 @@
+"""Units in which people read what is in SI: mA for A, % for a share."""
+
+from __future__ import annotations
+
+__all__ = ["SHOWN_IN", "told"]
+
+SHOWN_IN = {
+    "A": (1e3, "mA"),
+    "m": (1e6, "µm"),
+    "s": (1e3, "ms"),
+    "1": (1e2, "%"),
+    "m/s": (1e3, "mm/s"),
+    "N/m": (1e-3, "N/mm"),
+    "N m/A": (1.0, "N mm/mA"),
+    "Pa": (1e-6, "MPa"),
+    "Pa/m": (1e-9, "MPa/mm"),
+    "m²/s": (60.0, "L/min/mm"),
+}
+"""Factor and unit by the SI unit; others are shown as they are."""
+
+
+def told(value: float, unit: str) -> str:
+    """Write a number with the unit that people read.
+
+    Parameters
+    ----------
+    value : float
+        In the SI unit.
+    unit : str
+        SI unit; `1` for a share.
+
+    Returns
+    -------
+    str
+        Such as `0.4 mA`.
+    """
+    factor, name = SHOWN_IN.get(unit, (1.0, unit))
+    return f"{factor * value:.4g} {name}"

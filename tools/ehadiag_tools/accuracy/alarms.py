@@ -1,0 +1,174 @@
+"""`tools/alarms`: false and missed alarms of units that were calibrated once and tested often.
+
+The units are those of `tools/data_sheet`. Each is calibrated on one open- and one closed-loop
+recording of it as new; every other recording after that is of a sound unit (all severities at most
+0.20), the rest of a worn one (at least one of 0.30 or more), both tests in turn, oil and supply
+of the day. Recordings of one unit share its calibration, so the interval is that of units: of the
+share of them with any such verdict (Clopper and Pearson, Biometrika 26, 1934).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
+from ehadiag.calibration.unit import calibrate
+from ehadiag.core.actuator import default_actuator
+from ehadiag.core.errors import EhadiagError
+from ehadiag.core.stored_test import bundled_tests, resolve_test
+from ehadiag_sim.plant.conditions import Faults
+from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.simulator.units import COARSE_STEP, GROUPS, record, unit_with
+
+__all__ = ["AlarmRun", "main", "perform_unit"]
+
+TESTS = ("open", "closed")
+SOUND, WORN = 0.20, 0.30
+"""Largest severity of a sound unit; least of the largest one of a worn unit."""
+HEADINGS = ("units", "what", "recordings", "of them", "rate", "units with any, 95 % interval")
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmRun:
+    """One unit: its number, the seed, recordings after the calibration, groups of effects."""
+
+    unit: int
+    seed: int
+    recordings: int
+    groups: tuple[str, ...]
+
+
+def perform_unit(run: AlarmRun) -> dict[str, Any]:
+    """Calibrate a random unit, then diagnose it as often as asked: truth and verdict of each."""
+    rng = np.random.default_rng([run.seed, run.unit])
+    unit = unit_with(rng, run.groups, run.unit)
+    new = [
+        record(unit, resolve_test(name), seed=int(rng.integers(2**31)), step=COARSE_STEP)
+        for name in TESTS
+    ]
+    begin = time.process_time()
+    found = calibrate(new, default_actuator(), bundled_tests().values())
+    calibrated = time.process_time()
+    tested = []
+    if found.actuator is not None:
+        for k in range(run.recordings):
+            faults = _severities(rng, sound=k % 2 == 0)
+            recording = record(
+                unit,
+                resolve_test(TESTS[k // 2 % 2]),
+                Faults(*faults),
+                seed=int(rng.integers(2**31)),
+                step=COARSE_STEP,
+            )
+            done = diagnose([recording], found.actuator, bundled_tests().values())
+            tested.append(
+                {"faults": faults, "verdict": done.verdict.name, "reasons": list(done.reasons)}
+            )
+    return {
+        **asdict(run),
+        "refused": list(found.reasons),
+        "tested": tested,
+        "calibration_s": calibrated - begin,
+        "diagnoses_s": time.process_time() - calibrated,
+    }
+
+
+def _severities(rng: np.random.Generator, *, sound: bool) -> list[float]:
+    if sound:
+        return [float(value) for value in rng.uniform(0.0, SOUND, 3)]
+    while True:
+        drawn = rng.uniform(0.0, 1.0, 3)
+        if drawn.max() >= WORN:
+            return [float(value) for value in drawn]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table; exit code 0, or that of the error."""
+    options = _parser().parse_args(argv)
+    groups = tuple(sorted(set(options.group)))
+    runs = [
+        AlarmRun(unit, options.seed, options.recordings, groups) for unit in range(options.units)
+    ]
+    try:
+        records = perform_all(perform_unit, runs, options.results, options.jobs, "units")
+    except EhadiagError as error:
+        print(f"alarms: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print(f"alarms: stopped; goes on from {options.results}", file=sys.stderr)
+        return 130
+    print_table(records)
+    return 0
+
+
+def print_table(records: Sequence[dict[str, Any]]) -> None:
+    """Rates of both kinds of wrong verdict, and what they were."""
+    calibrated = [record for record in records if record["tested"]]
+    print(f"{len(records) - len(calibrated)} of {len(records)} units were not calibrated\n")
+    print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
+    for what, sound in (("sound, not HEALTHY", True), ("worn, HEALTHY", False)):
+        each = [
+            [_is_wrong(item) for item in record["tested"] if _is_sound(item) is sound]
+            for record in calibrated
+        ]
+        count, wrong = sum(map(len, each)), sum(map(sum, each))
+        units = sum(any(item) for item in each)
+        interval = _interval(units, len(each))
+        print(
+            f"| {len(each)} | {what} | {count} | {wrong} | {wrong / max(count, 1):.2%} "
+            f"| {units}: {interval[0]:.2%} … {interval[1]:.2%} |"
+        )
+    said = Counter(
+        (item["verdict"], "sound" if _is_sound(item) else "worn")
+        for record in calibrated
+        for item in record["tested"]
+    )
+    words = [f"{kind} {name} {count}" for (name, kind), count in sorted(said.items())]
+    print("\n" + ", ".join(words))
+
+
+def _is_sound(item: dict[str, Any]) -> bool:
+    return bool(max(item["faults"]) <= SOUND)
+
+
+def _is_wrong(item: dict[str, Any]) -> bool:
+    return bool((item["verdict"] == Verdict.HEALTHY.name) is not _is_sound(item))
+
+
+def _interval(events: int, count: int) -> tuple[float, float]:
+    if not count:
+        return 0.0, 1.0
+    interval = binomtest(events, count).proportion_ci(0.95, method="exact")
+    return float(interval.low), float(interval.high)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="alarms", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--units", type=int, default=200, help="%(default)d")
+    add("--recordings", type=int, default=25, help="of each unit (%(default)d)")
+    add(
+        "--group",
+        action="append",
+        default=[],
+        choices=GROUPS,
+        help="further effects of the units; may be repeated (none)",
+    )
+    add("--seed", type=int, default=1, help="of the random units (%(default)d)")
+    add("--results", type=Path, default=Path("build/alarms.jsonl"), help="done (%(default)s)")
+    add("--jobs", type=int, default=os.cpu_count() or 1, help="processes (%(default)d)")
+    return parser
