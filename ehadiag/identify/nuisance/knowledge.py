@@ -55,10 +55,12 @@ UNEXPLAINED_STD = 3e-3
 effects that no model has do to an estimate. It grows with the root of what is left, as a deviation
 does with a share of the residual (a model discrepancy: Kennedy and O'Hagan, J. R. Stat. Soc. B
 63(3), 2001; Brynjarsdóttir and O'Hagan, Inverse Problems 30, 2014)."""
-FURTHER_STD = {"Kintas": 5e-3, "FSS": 2e-2, "FDJ": 4e-3}
-"""Of each severity, where effects were learned beyond the usual ones: their laws were seen on the
-unit as new, with a thirtieth of the friction at the limit of damage, and are held to when it is
-worn. Errors of two recorded units were up to 0.8, 3.7 and 0.4 % (identification-results.md)."""
+FURTHER_STD = {"Kintas": 2.4e-2, "FSS": 4e-2, "FDJ": 1e-2}
+"""Of each severity, where effects were learned beyond the usual ones, times the root of what the
+calibration's residuals leave beside noise: the effects' laws were seen on the unit as new, with a
+thirtieth of the friction at the limit of damage, and are held to when it is worn. With 0.25 left
+errors of a recorded unit were up to 2.3, 1.4 and 0.9 %, with 0.09 up to 0.1, 0.2 and 0.04 %
+(identification-results.md)."""
 _NAMES = frozenset(item.name for item in REGISTRY if item.kind is not Kind.FAULT)
 _USUAL = frozenset(item.name for item in nuisances_of(REGISTRY))
 _FURTHER = frozenset(item.name for item in REGISTRY if item.kind is Kind.NUISANCE) - _USUAL
@@ -225,8 +227,9 @@ def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:
     free += [parameter(name) for name in OF_THE_DAY]
     left = UNEXPLAINED_STD * math.sqrt(calibration.fit.left)
     further = any(name in _FURTHER for name in calibration.parameters)
+    beside_noise = math.sqrt(max(calibration.fit.excess - 1.0, 0.0)) if further else 0.0
     std = {
-        name: math.hypot(CALIBRATED_STD, left, size if further else 0.0)
+        name: math.hypot(CALIBRATED_STD, left, size * beside_noise)
         for name, size in FURTHER_STD.items()
     }
     explains = leaves_no_more(calibration.fit)
