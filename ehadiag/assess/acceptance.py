@@ -15,6 +15,7 @@ from ehadiag.core.recording import BitState, CommandMode, Environment, Recording
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
 from ehadiag.identify.commanded_current import CONTROL_LAW_LSB, FRAME_TOLERANCE
 from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.nuisance.knowledge import has_further_effects
 from ehadiag.identify.result import Identification
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
 
@@ -263,13 +264,17 @@ def objections_to_estimate(
 def most_left(calibration: Calibration | None) -> tuple[float, float]:
     """Outliers (share) and rms residual that an explained recording may have.
 
-    calibration: of the unit: what it could not explain is allowed.
+    calibration: of the unit: what it could not explain is allowed, and what wear brings out of
+    effects that stand in for others.
     """
-    if calibration is None or not calibration.fit.left > 0.0:
+    if calibration is None:
+        return MOST_OUTLIERS, MOST_RMS
+    further = has_further_effects(calibration)
+    if not (further or calibration.fit.left > 0.0):
         return MOST_OUTLIERS, MOST_RMS
     fit = calibration.fit
     return (
-        MOST_OUTLIERS + CHANGED * fit.outliers,
+        (CHANGED if further else 1.0) * MOST_OUTLIERS + CHANGED * fit.outliers,
         MOST_RMS * CHANGED * max(fit.spool_rms, fit.pressure_rms),
     )
 

@@ -30,6 +30,7 @@ __all__ = [
     "Knowledge",
     "covariance_of",
     "datum_name",
+    "has_further_effects",
     "knowledge_of",
     "severities_below",
 ]
@@ -226,14 +227,20 @@ def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:
     joint = Joint(calibration.parameters, np.zeros(len(free)), covariance_of(calibration))
     free += [parameter(name) for name in OF_THE_DAY]
     left = UNEXPLAINED_STD * math.sqrt(calibration.fit.left)
-    further = any(name in _FURTHER for name in calibration.parameters)
-    beside_noise = math.sqrt(max(calibration.fit.excess - 1.0, 0.0)) if further else 0.0
+    beside_noise = 0.0
+    if has_further_effects(calibration):
+        beside_noise = math.sqrt(max(calibration.fit.excess - 1.0, 0.0))
     std = {
         name: math.hypot(CALIBRATED_STD, left, size * beside_noise)
         for name, size in FURTHER_STD.items()
     }
     explains = leaves_no_more(calibration.fit)
     return Knowledge(tuple(free), OF_THE_DAY, joint, (), calibration.effects, std, explains)
+
+
+def has_further_effects(calibration: Calibration) -> bool:
+    """Whether effects were learned that an identification does not free by itself."""
+    return any(name in _FURTHER for name in calibration.parameters)
 
 
 def covariance_of(calibration: Calibration) -> NDArray[np.float64]:
