@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from ehadiag.assess.acceptance import most_left
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.calibration import Calibration, Goodness, Source
 from ehadiag.identify.nuisance.explained import is_noise, leaves_no_more
@@ -18,9 +19,9 @@ def fit(excess, outliers=0.002):
     return Goodness(excess=excess, outliers=outliers, spool_rms=1.0, pressure_rms=1.1)
 
 
-def severity_std(excess, name="hysteresis"):
-    """Of a calibrated unit of which one effect was learned, beside all else."""
-    calibration = Calibration(
+def calibration_of(excess, name="hysteresis"):
+    """Of a unit of which one effect was learned."""
+    return Calibration(
         date="2026-01-02T03:04:05Z",
         start="reference-31",
         effects={name: 0.02},
@@ -30,6 +31,11 @@ def severity_std(excess, name="hysteresis"):
         fit=fit(excess),
         recordings=(Source(name="a.blf", test="open"),),
     )
+
+
+def severity_std(excess, name="hysteresis"):
+    """Of such a unit, beside all else."""
+    calibration = calibration_of(excess, name)
     unit = msgspec.structs.replace(default_actuator(), calibration=calibration)
     free = (*FAULTS, parameter(name))
     added = knowledge_of(unit).spread(
@@ -51,8 +57,17 @@ def test_what_is_left_widens_every_severity():
 
 def test_effects_beyond_the_usual_ones_widen_what_they_bend():
     kintas, spool, jack = severity_std(1.05, "spool_stribeck")
-    assert spool == pytest.approx(0.02, rel=1e-3)
+    assert spool == pytest.approx(0.04 * np.sqrt(0.05), rel=1e-3)
     assert spool > kintas > jack > 1e-3
+    assert (severity_std(1.15, "spool_stribeck") > severity_std(1.05, "spool_stribeck")).all()
+
+
+def test_what_wear_brings_out_of_effects_beyond_the_usual_ones_is_allowed():
+    usual, further = calibration_of(1.1), calibration_of(1.1, "spool_bow")
+    assert most_left(usual) == most_left(None)
+    assert most_left(further)[0] == pytest.approx(2.0 * most_left(None)[0] + 2.0 * 0.002)
+    assert most_left(further)[1] > most_left(None)[1]
+    assert most_left(calibration_of(1.5))[0] == pytest.approx(most_left(None)[0] + 2.0 * 0.002)
 
 
 def residuals(size):
