@@ -173,6 +173,8 @@ def _read_table(
         skipped = 2
         units = {name: cell.strip(" []()") for name, cell in zip(names, rows[1], strict=False)}
     wanted = {item.column for item in columns.resolve(names, f"log {path}").values()}
+    if not wanted:
+        return pandas.DataFrame(columns=names), units, names
     decimal = "," if delimiter != "," and "," in lines[-1] else "."
     try:
         # pandas warns of rows longer than the header, and of columns of mixed kinds: both are told

@@ -44,9 +44,6 @@ WIDTH = 2.0
 FLAT_ROUNDS, FLAT_PLACES = 6, 3
 """Rounds of which so many end with the same objective: no more is to be gained. Between them a
 break-away may come at another tick."""
-STUCK_ROUNDS, STUCK_SHARE, STUCK_ABOVE = 5, 0.01, 1.5
-"""Rounds in which the objective must fall by that share, where it is above so much a sample (noise
-alone leaves 0.86, a break-away that comes at another tick 0.3 more)."""
 HELD_BACK = 0.1
 """Share of the belief's information that a round's step is held back by."""
 HELD_BACK_WHERE_LINEAR = 1e-3
@@ -143,8 +140,8 @@ def sharpen(
         rounds += 1
         if pace.flat:
             course.passed(belief.x, linear.middle)
-            if course.is_flat or course.is_stuck:
-                return Sharpened(replace(belief, x=course.x), linear, course.is_flat)
+            if course.is_flat:
+                return Sharpened(replace(belief, x=course.x), linear, True)
         belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
     if pace.flat:
@@ -185,16 +182,6 @@ class _Course:
         """Whether the search came to the same objective again and again of late."""
         late = sorted(self._course[-FLAT_ROUNDS:])[:FLAT_PLACES]
         return len(late) == FLAT_PLACES and late[-1] - late[0] < self._flat * max(self._unit, 1.0)
-
-    @property
-    def is_stuck(self) -> bool:
-        """Whether next to nothing was gained of late, far from what noise alone would leave."""
-        before, late = self._course[:-STUCK_ROUNDS], self._course[-STUCK_ROUNDS:]
-        return (
-            self._unit > STUCK_ABOVE
-            and bool(before)
-            and min(late) > (1.0 - STUCK_SHARE) * min(before)
-        )
 
 
 def robust_cost(residuals: NDArray[np.float64]) -> NDArray[np.float64]:

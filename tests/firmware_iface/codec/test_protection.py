@@ -122,7 +122,8 @@ def test_clock_step_is_noted_once_and_moves_nothing(step):
     got, notes = follow(position, time)
     assert got == position.tolist()
     assert len(notes) == 1
-    assert f"{step * 1e-3:+.3f} s" in notes[0]
+    assert f"{abs(step) * 1e-3:.3f} s" in notes[0]
+    assert ("set back" in notes[0]) is (step < 0)
 
 
 def test_gap_after_a_clock_step_is_measured_from_there():
