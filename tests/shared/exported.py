@@ -1,7 +1,7 @@
 """An exported object file loaded into this process, without a linker."""
 
 import ctypes
-from functools import lru_cache
+from functools import cache
 
 import llvmlite.binding as llvm
 
@@ -14,7 +14,7 @@ HEAD = 68
 """Bytes of an archive before its index."""
 
 
-@lru_cache(maxsize=8)
+@cache
 def exported(name, place):
     """Folder of an export for a target."""
     out = place / name

@@ -224,6 +224,8 @@ def test_arm_code_hands_numbers_to_nobody(name, place):
     called = {line.split()[-1] for line in told.splitlines() if line.split()[:1] == ["U"]}
     called = {item for item in called if not item.startswith("__aeabi_")}
     of_compiler = {"div", "mod", "udiv", "umod"}
+    if name.startswith("cortex-m4"):  # doubles in software: by the compiler's own functions
+        called = {item for item in called if not re.fullmatch(r"__\w+[sd]f\d?", item)}
     assert called <= {
         "memset", "memcpy", "__fixdfdi", "__floatdidf", "__floatundidf",
         "__fixsfdi", "__floatdisf", "__floatundisf",

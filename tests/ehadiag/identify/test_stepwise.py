@@ -46,7 +46,7 @@ def test_a_little_gain_in_closed_loop():
 )
 def test_one_effect_alone(test, truth, effects, name, value):
     found = check(test, truth, effects)
-    assert found.nuisances[name].value == pytest.approx(value, rel=0.05)
+    assert found.nuisances[name].value == pytest.approx(value, rel=0.1)
 
 
 @pytest.mark.slow
