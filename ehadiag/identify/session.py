@@ -56,7 +56,7 @@ from ehadiag.identify.textbook import (
     rescued,
     unlikeness,
 )
-from ehadiag.identify.uncertainty import covariance
+from ehadiag.identify.uncertainty import covariance, independent
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, parameter
 
 __all__ = ["Nuisances", "Session", "SoFar", "identify"]
@@ -363,9 +363,8 @@ def identify(
 
 def _guessed(refinement: Refinement) -> NDArray[np.float64]:
     """Covariance that a guessed current adds to the severities'."""
-    names = [item.name for item in FAULTS]
     std = GUESSED_STD if is_guessed(refinement) else 0.0
-    return np.diag([std**2 if item.name in names else 0.0 for item in refinement.parameters])
+    return independent(refinement.parameters, dict.fromkeys((item.name for item in FAULTS), std))
 
 
 def _nearer(

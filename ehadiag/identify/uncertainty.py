@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -9,9 +10,16 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.refine.least_squares import Refinement
-from ehadiag.model.parameters import Kind
+from ehadiag.model.parameters import Kind, Parameter
 
-__all__ = ["DISCREPANCY_STD", "EXPECTED_CAPPED", "UNIFORM_STD", "covariance", "interval95"]
+__all__ = [
+    "DISCREPANCY_STD",
+    "EXPECTED_CAPPED",
+    "UNIFORM_STD",
+    "covariance",
+    "independent",
+    "interval95",
+]
 
 NORMAL = NormalDist()
 CUT = float(np.sqrt(CAP))
@@ -74,6 +82,14 @@ def _meat(refinement: Refinement) -> NDArray[np.float64]:
         cross = score[:, lag:] @ score[:, :-lag].T
         total = total + weight * (cross + cross.T)
     return np.asarray(total)
+
+
+def independent(parameters: Sequence[Parameter], std: Mapping[str, float]) -> NDArray[np.float64]:
+    """Covariance of deviations by name that have nothing to do with each other, shape (k, k).
+
+    std: in the parameters' units; 0 of those that are not named.
+    """
+    return np.diag([std.get(item.name, 0.0) ** 2 for item in parameters])
 
 
 def interval95(value: float, std: float) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, linearised
 from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
+from ehadiag.identify.uncertainty import independent
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
 from ehadiag.model.simd.model import SimdModel
@@ -182,14 +183,13 @@ def estimate(
 
 def _spread_of_twins(refined: Refinement, experiments: Sequence[Experiment]) -> NDArray[np.float64]:
     """Covariance of places that are alike where hysteresis is small, SI, shape (k, k)."""
-    out = np.zeros((len(refined.parameters), len(refined.parameters)))
     values = refined.values
-    if HYSTERESIS not in values or not all(item.test.closed_loop for item in experiments):
-        return out
-    if values[HYSTERESIS] + experiments[0].constants.HYS >= LITTLE_HYSTERESIS:
-        return out
-    np.fill_diagonal(out, [TWINS.get(item.name, 0.0) ** 2 for item in refined.parameters])
-    return out
+    alike = (
+        HYSTERESIS in values
+        and all(item.test.closed_loop for item in experiments)
+        and values[HYSTERESIS] + experiments[0].constants.HYS < LITTLE_HYSTERESIS
+    )
+    return independent(refined.parameters, TWINS if alike else {})
 
 
 def _free_running(

@@ -16,6 +16,7 @@ from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.identify.nuisance.explained import Explains, is_noise, leaves_no_more
 from ehadiag.identify.nuisance.prior import Joint, Known, nuisances_of, usual
+from ehadiag.identify.uncertainty import independent
 from ehadiag.model.parameter import sized
 from ehadiag.model.parameters import FAULTS, REGISTRY, Kind, Parameter, Unknowns, parameter
 from ehadiag.model.plant import PlantConstants
@@ -150,8 +151,7 @@ class Knowledge:
         self, parameters: Sequence[Parameter], values: Mapping[str, float], base: PlantConstants
     ) -> NDArray[np.float64]:
         """Covariance that aliases and a calibration add to that of estimates, SI, shape (k, k)."""
-        out = np.zeros((len(parameters), len(parameters)))
-        out += np.diag([self.std.get(item.name, 0.0) ** 2 for item in parameters])
+        out = independent(parameters, self.std)
         names = [item.name for item in parameters]
         for item in self.aliases:
             place = names.index(item.fault.name)

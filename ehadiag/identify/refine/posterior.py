@@ -195,9 +195,9 @@ def robust_weights(linear: Linearised) -> NDArray[np.float64]:
     return np.asarray(1.0 / (variance + linear.residuals**2 / TAIL**2))
 
 
-def _bent(linear: Linearised) -> float:
-    """Share of samples that leave the line by more than their noise."""
-    return float(np.mean(linear.scatter > LINEAR_SCATTER))
+def _is_linear(linear: Linearised) -> bool:
+    """Whether next to no sample leaves the line by more than its noise."""
+    return float(np.mean(linear.scatter > LINEAR_SCATTER)) < LINEAR_SHARE
 
 
 def _narrowed(
@@ -217,7 +217,7 @@ def _narrowed(
     curved = model.curved
     inverse_root = np.linalg.inv(belief.root)
     held = FREE * np.eye(len(belief.x))
-    is_linear = _bent(linear) < LINEAR_SHARE
+    is_linear = _is_linear(linear)
     back = HELD_BACK_WHERE_LINEAR if is_linear and pace.flat else HELD_BACK
     held[np.ix_(curved, curved)] += back * inverse_root.T @ inverse_root
     x = bounded_step(linear.x, normal + held, gradient, model.lower, model.upper)

@@ -30,7 +30,7 @@ from ehadiag.core.errors import EhadiagError
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_tools.accuracy.resume import perform_all
-from ehadiag_tools.simulator.units import COARSE_STEP, GROUPS, record, unit_with
+from ehadiag_tools.simulator.units import COARSE_STEP, add_group, record, unit_with
 
 __all__ = ["AlarmRun", "main", "perform_unit"]
 
@@ -161,13 +161,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--units", type=int, default=200, help="%(default)d")
     add("--recordings", type=int, default=25, help="of each unit (%(default)d)")
-    add(
-        "--group",
-        action="append",
-        default=[],
-        choices=GROUPS,
-        help="further effects of the units; may be repeated (none)",
-    )
+    add_group(parser)
     add("--seed", type=int, default=1, help="of the random units (%(default)d)")
     add("--results", type=Path, default=Path("build/alarms.jsonl"), help="done (%(default)s)")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes (%(default)d)")

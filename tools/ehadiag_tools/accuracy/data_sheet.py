@@ -31,7 +31,7 @@ from ehadiag.identify.session import Nuisances, identify
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_tools.accuracy.nuisances import HEADINGS, row_of
 from ehadiag_tools.accuracy.resume import perform_all
-from ehadiag_tools.simulator.units import COARSE_STEP, GROUPS, Unit, record, unit_with
+from ehadiag_tools.simulator.units import COARSE_STEP, Unit, add_group, record, unit_with
 
 __all__ = ["LINES", "SheetRun", "main", "perform_sheet"]
 
@@ -151,13 +151,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=[Nuisances.AUTO.value, Nuisances.NONE.value],
         help="may be repeated (both)",
     )
-    add(
-        "--group",
-        action="append",
-        default=[],
-        choices=GROUPS,
-        help="further effects of the units; may be repeated (none)",
-    )
+    add_group(parser)
     add("--cases", type=int, default=200, help="units of each line (%(default)d)")
     add("--seed", type=int, default=1, help="of the random units (%(default)d)")
     add(

@@ -9,6 +9,7 @@ those of a recording:
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 
@@ -23,7 +24,7 @@ from ehadiag_sim.plant.conditions import DataErrors, Effects, Faults, Sensors, S
 from ehadiag_sim.plant.dynamics import DEFAULT_STEP
 from ehadiag_sim.plant.simulator import simulate
 
-__all__ = ["COARSE_STEP", "GROUPS", "Unit", "random_unit", "record", "unit_with"]
+__all__ = ["COARSE_STEP", "GROUPS", "Unit", "add_group", "random_unit", "record", "unit_with"]
 
 COARSE_STEP = 1e-6
 """Four times as fast as the default; its error beside the noise: docs, detailed-model.md."""
@@ -131,6 +132,17 @@ def unit_with(rng: np.random.Generator, groups: Collection[str], serial: int) ->
         orifice="orifice" in groups,
         strangers="strangers" in groups,
         serial=serial,
+    )
+
+
+def add_group(parser: argparse.ArgumentParser) -> None:
+    """Let a tool's command line ask for groups of effects, see `random_unit`."""
+    parser.add_argument(
+        "--group",
+        action="append",
+        default=[],
+        choices=GROUPS,
+        help="further effects of the units; may be repeated (none)",
     )
 
 
