@@ -61,6 +61,10 @@ class Estimated:
     covariance : shape (k, k)
         SI, of what several optima of like cost leave open, beside that of the refinement.
     explained : bool
+    confirmed : bool
+        See `ehadiag.identify.nuisance.starts.Found`.
+    cost : float
+        Robust, of the search, before the noise was judged.
     excess : float
         See `ehadiag.identify.nuisance.explained.excess`.
     starts : int
@@ -73,6 +77,8 @@ class Estimated:
     experiments: list[Experiment]
     covariance: NDArray[np.float64]
     explained: bool
+    confirmed: bool
+    cost: float
     excess: float
     starts: int
     evaluations: int
@@ -90,7 +96,8 @@ def estimate(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     give_up: bool = False,
-    look_again: bool = False,
+    look_below: float = 0.0,
+    left_before: float = np.inf,
     explains: Explains = is_noise,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
@@ -117,8 +124,11 @@ def estimate(
         estimation.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
-    look_again : bool
-        Whether to look about the optimum with the noise as judged even where it was given up.
+    look_below : float
+        Cost of the search up to which to look about its optimum with the noise as judged even where
+        it was given up.
+    left_before : float
+        Excess that is left with none of the effects.
     explains : callable
         Of residuals, shape (signals, N): whether there is nothing better to look for.
     """
@@ -157,6 +167,8 @@ def estimate(
         seed=seed,
         tell=tell,
         hopeless=is_hopeless if give_up else None,
+        confirms=give_up,
+        before=left_before,
     )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
@@ -164,7 +176,7 @@ def estimate(
     before = belief_of(fine, known, joint), information_of(fine, known, joint)
     between = nothing if tell is None else partial(tell, 1.0)
     given_up = give_up and not found.explained and is_hopeless(found.residuals, found.starts)
-    if given_up and not look_again:
+    if given_up and found.cost > look_below:
         belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
     else:
         belief = _last_look(fine, model, found, before, seed, between)
@@ -175,6 +187,8 @@ def estimate(
         experiments=judged,
         covariance=spread_of_optima(found, model.scale) + _spread_of_twins(refined, judged),
         explained=explains(refined.residuals),
+        confirmed=found.confirmed,
+        cost=found.cost,
         excess=excess(refined.residuals),
         starts=found.starts,
         evaluations=sum(item.evaluations for item in (guide, model, fine) if item),

@@ -13,12 +13,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.identify.nuisance.explained import excess, misses_only_pressure
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
 from ehadiag.identify.refine.posterior import robust_cost, sharpen
 
 __all__ = ["Found", "Place", "search"]
 
+SAME, TWICE = 4.0, 2
+"""Objective up to which two ends are of the same place (a parameter one deviation off costs 1), and
+ends there after which it is the optimum, if break-aways come at the right ticks there."""
+NO_LESS = 0.98
+"""Share of the excess with fewer unknowns that is as much."""
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
 ALIAS_SPAN = 1.25
@@ -53,6 +59,8 @@ class Found:
     explained : bool
     places : tuple of Place
         Where all starts ended.
+    confirmed : bool
+        Whether only the pressure is not explained there, and another search ended there, too.
     """
 
     belief: Belief
@@ -60,6 +68,7 @@ class Found:
     cost: float
     explained: bool
     places: tuple[Place, ...]
+    confirmed: bool = False
 
     @property
     def starts(self) -> int:
@@ -79,6 +88,8 @@ def search(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     hopeless: Callable[[NDArray[np.float64], int], bool] | None = None,
+    confirms: bool = False,
+    before: float = np.inf,
 ) -> Found:
     """Search until the residuals are explained, or the budget is spent.
 
@@ -102,6 +113,11 @@ def search(
         what it raises ends the search.
     hopeless : callable, optional
         Of the best residuals and the number of starts: whether further ones will not help.
+    confirms : bool
+        Whether a place that only misses the pressure ends the search, too, if it is found again or
+        leaves as much as `before`.
+    before : float
+        Excess that another search left with fewer unknowns.
     """
     until = model.evaluations + budget
 
@@ -110,6 +126,7 @@ def search(
             tell(min(1.0 - (until - model.evaluations) / max(budget, 1), 1.0))
 
     best: Found | None = None
+    confirmed = False
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
         turn, beside = divmod(len(places), 2)
@@ -126,10 +143,21 @@ def search(
         places.append(Place(belief.x, cost))
         if best is None or cost < best.cost:
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
-        if hopeless is not None and hopeless(best.residuals, len(places)):
+        confirmed = confirms and _is_confirmed(best, places, before)
+        if confirmed or (hopeless is not None and hopeless(best.residuals, len(places))):
             break
         between()
-    return replace(best, places=tuple(places))
+    return replace(best, places=tuple(places), confirmed=confirmed)
+
+
+def _is_confirmed(best: Found, places: Sequence[Place], before: float) -> bool:
+    """Whether others would end there, too: so many starts did, or the search with fewer unknowns,
+    which the others have nothing to add to."""
+    if best.explained or not misses_only_pressure(best.residuals):
+        return False
+    unit = max(best.cost / max(int(np.count_nonzero(best.residuals)), 1), 1.0)
+    ends = sum(place.cost - best.cost <= SAME * unit for place in places)
+    return ends >= TWICE or excess(best.residuals) >= NO_LESS * before
 
 
 def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:

@@ -10,8 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.nuisance.explained import is_of_the_pressure
 from ehadiag.identify.nuisance.prior import usual
 from ehadiag.identify.refine.derivatives import Considered
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter
@@ -25,6 +28,8 @@ WORTH = 0.8
 ONE_START = 1
 MOST_DEVIATIONS = 4.0
 """Of an effect's usual size; a larger one is a fault, to be named."""
+AS_MUCH = 0.02
+"""Relative difference up to which one effect leaves as much as all at once."""
 HELD = 0.05
 """What is not known of an effect that is held at none, in deviations of its usual size."""
 
@@ -33,7 +38,7 @@ def stepwise(
     experiments: Sequence[Experiment],
     effects: Sequence[Parameter],
     *,
-    least: float,
+    all_at_once: Estimated,
     considered: Sequence[Considered],
     seed: int,
     tell: Callable[[float], None],
@@ -45,9 +50,9 @@ def stepwise(
     experiments : sequence of Experiment
     effects : sequence of Parameter
         To choose from.
-    least : float
-        Excess with all effects at once. Where the first effect alone leaves more, all at once have
-        not gone astray, and no more is tried.
+    all_at_once : Estimated
+        With all effects. Where the best one alone leaves more, or any alone as much, or one leaves
+        next to nothing but pressure, all at once have not gone astray, and no more is tried.
     considered : sequence of Considered
         What is held, with a tolerance that counts in the interval.
     seed : int
@@ -70,6 +75,7 @@ def stepwise(
         budget: int,
         hint: Mapping[str, float] | None,
         held: Sequence[Considered] = (),
+        most: float = np.inf,
     ) -> Estimated:
         nonlocal evaluations, starts
         found = estimate(
@@ -80,7 +86,7 @@ def stepwise(
             budget=budget,
             seed=seed,
             give_up=True,
-            look_again=True,
+            look_below=most,
         )
         evaluations += found.evaluations
         starts += found.starts
@@ -88,17 +94,20 @@ def stepwise(
 
     while len(chosen) < len(effects) and (best is None or not best.explained):
         rest = [item for item in effects if item not in chosen]
+        before = best or all_at_once
         hint = None if best is None else best.refined.values
         now: Estimated | None = None
         for item in rest:
-            found = tried((*chosen, item), BUDGET, hint)
+            found = tried((*chosen, item), BUDGET, hint, most=before.cost)
             if now is None or found.excess < now.excess:
                 now, added = found, item
             if found.explained:
                 break
+            if _is_no_way(found, all_at_once):
+                return None
         tell(len(chosen) / len(effects))
         assert now is not None
-        most = least if best is None else WORTH * best.excess
+        most = all_at_once.excess if best is None else WORTH * best.excess
         if now.excess > most and not now.explained:
             return None
         best = now
@@ -113,6 +122,13 @@ def stepwise(
         again = tried(chosen, ONE_START, best.refined.values, held)
         best = again if again.explained else best
     return replace(best, evaluations=evaluations, starts=starts)
+
+
+def _is_no_way(found: Estimated, all_at_once: Estimated) -> bool:
+    """Whether a few effects leave what all at once do, or what none of them is the cause of."""
+    if is_of_the_pressure(found.refined.residuals):
+        return True
+    return abs(found.excess - all_at_once.excess) <= AS_MUCH * all_at_once.excess
 
 
 def _is_usual(found: Estimated, effects: Sequence[Parameter]) -> bool:
