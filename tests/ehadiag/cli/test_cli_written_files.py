@@ -1,5 +1,5 @@
 """Every file that a command writes in the same predicaments: a link in its place, a full disk, an
-odd name. Results and pictures of `--out` and recordings have further tests of their own.
+odd name; and its permissions. Results and pictures of `--out` have tests of their own.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ WRITTEN = {
         ".jsonl", "monitor", "--log", "v.blf", "--log-file", "{}",
     ),
     "recording": (
-        ".blf", "bit", "--simulate", "--fast", "--test", "open", "--out", "o", "--record", "{}"
+        ".blf", "bit", "--simulate", "--fast", "--test", "open", "--no-picture", "--out", "o",
+        "--record", "{}",
     ),
     "template": ("", "init", "test", "{}"),
 }  # fmt: skip
@@ -69,6 +70,7 @@ def written(kind: str, folder: Path, stem: str = "x") -> tuple[Path, list[str]]:
     path = folder / f"{stem}{suffix}"
     if kind == "page":
         result = shutil.copy("v.json", folder / f"{stem}.json")
+        os.chmod(result, 0o640)
         return path, ["report", str(result)]
     if kind == "template":
         return folder / "test.toml", ["init", "test", str(folder)]
@@ -114,8 +116,13 @@ def test_an_odd_name_is_written_as_it_is_and_shown_as_text(
     kind: str, place: Path, run: Run
 ) -> None:
     path, command = written(kind, place, ODD)
-    result = run(*command)
+    before = os.umask(0o027)
+    try:
+        result = run(*command)
+    finally:
+        os.umask(before)
     assert result.code == 0
-    assert path.exists()
+    assert {item.stat().st_mode & 0o777 for item in path.parent.iterdir()} == {0o640}
+    assert path.stat().st_mode & 0o777 == 0o640
     assert "\x1b" not in result.out + result.err
     assert "Traceback" not in result.err
