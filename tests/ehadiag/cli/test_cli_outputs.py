@@ -13,6 +13,7 @@ import pytest
 from cli_result import COMMAND, Run
 from places import LOGS
 
+from ehadiag.history.store import History
 from firmware_iface.logs.reader import read_frames
 
 HEALTHY, WORN = LOGS / "healthy-open.blf", LOGS / "paper-open-1.blf"
@@ -89,6 +90,26 @@ def test_commands_without_a_verdict(
     assert done.returncode == 3
     (said,) = lines(done.stderr)
     assert said.startswith("standard output: ")
+
+
+@full
+@posix
+@pytest.mark.parametrize(
+    "command",
+    [
+        'diagnose --list "$1"', "export --list", "completion bash", "init test new",
+        "history --history h init", "history --history h list",
+    ],
+)  # fmt: skip
+def test_other_commands_with_a_full_output(
+    command: str, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    History(tmp_path / "h", create=True).close()
+    done = shell(f"$EHADIAG {command} > /dev/full", tmp_path, environment, HEALTHY)
+    assert done.returncode == 3
+    (said,) = lines(done.stderr)
+    assert said == "standard output: No space left on device"
+    assert command != "init test new" or (tmp_path / "new" / "test.toml").stat().st_size > 0
 
 
 @full
