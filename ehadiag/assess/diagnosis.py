@@ -19,6 +19,7 @@ from ehadiag.assess.acceptance import (
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
 from ehadiag.assess.delays import in_time
+from ehadiag.assess.lost_ticks import can_be_told, told_by_response
 from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
@@ -184,20 +185,29 @@ class DiagnosisSession:
         culprit: Culprit | None = None
         late: tuple[str, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
-        if lost:
+        if lost and not orders:
+            told = self._told(recordings, experiments, progress)
+            if told is not None:
+                (experiments, late), reasons = told, []
+        if lost and reasons:
             found = self._session.finish(experiments, progress)
             identification, words = what_is_left(found, closed=closed)
             why = tuple(f"{reason}: {words}" for reason in hidden)
         if not reasons:
             identification = self._session.finish(experiments, progress)
-            if any(item.by_time for item in recordings):
+            if any(item.by_time for item in recordings) and not late:
                 experiments, identification, late = in_time(
                     experiments, identification, lambda item: self._session.finish(item, progress)
                 )
+            why = tuple(objections_to_estimate(identification, self._actuator.calibration))
+            if why and not orders and not late:
+                told = self._told(recordings, experiments, progress)
+                if told is not None:
+                    experiments, late = told
+                    identification, why = self._session.finish(experiments, progress), ()
             modelled = [response_of(item, identification) for item in experiments]
             positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
-            why = tuple(objections_to_estimate(identification, self._actuator.calibration))
             if why and orders:
                 identification, words = what_is_left(identification, closed=closed)
                 why = tuple(f"{reason}: {words}" for reason in orders)
@@ -230,6 +240,25 @@ class DiagnosisSession:
             ),
             elapsed=time.perf_counter() - begin,
         )
+
+    def _told(
+        self,
+        recordings: Sequence[Recording],
+        experiments: Sequence[Experiment],
+        progress: Progress | None,
+    ) -> tuple[list[Experiment], tuple[str, ...]] | None:
+        """Experiments whose lost positions the response told, and a note; None where it did not."""
+        if not can_be_told(recordings, experiments):
+            return None
+        now, found, note = told_by_response(
+            recordings,
+            experiments,
+            self._actuator,
+            lambda item: self._session.finish(item, progress),
+        )
+        if objections_to_estimate(found, self._actuator.calibration):
+            return None
+        return now, (note,)
 
     def _experiments(
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]

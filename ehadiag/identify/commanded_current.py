@@ -21,7 +21,7 @@ from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.command_step import step_by_current
 from ehadiag.model.control import ControlLaw, commanded_currents
 
-__all__ = ["CurrentTrace", "commanded_current"]
+__all__ = ["CurrentTrace", "commanded_current", "guessed_positions"]
 
 FRAME_TOLERANCE = {
     CommandMode.CURRENT: 20e-6 / CURRENT.full_scale,
@@ -77,13 +77,10 @@ def commanded_current(
     known = np.isfinite(samples.command)
     deviation = np.abs(samples.command - stored)[known]
     command_deviation = float(deviation.max()) if deviation.size else 0.0
-    step = _resolution(samples.command[known])
     law = ControlLaw(
         controller.IM, controller.GAP, controller.GAI, controller.GAD, samples.period_ns * 1e-9
     )
-    if test.closed_loop and not known.any():
-        step = _step_followed(stored, samples, law, channels)
-    command = np.where(known, samples.command, _as_sent(stored, step))
+    command, step = _command(stored, samples, law, channels, closed=test.closed_loop)
     guessed = 0.0
     if not test.closed_loop:
         current = np.clip(command, -controller.IM, controller.IM)
@@ -105,6 +102,34 @@ def commanded_current(
     residual_lsb = float(np.sqrt(np.mean(spread**2))) / channels.current.grain
     rebuilt = residual_lsb < CONTROL_LAW_LSB
     return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed, step)
+
+
+def guessed_positions(
+    samples: Samples, test: StoredTest, controller: Controller, channels: Channels
+) -> NDArray[np.int64]:
+    """Ticks of a closed loop whose current follows from a position that nothing tells."""
+    stored = _fit_length(test.command(), samples.ticks)
+    law = ControlLaw(
+        controller.IM, controller.GAP, controller.GAI, controller.GAD, samples.period_ns * 1e-9
+    )
+    command, _ = _command(stored, samples, law, channels, closed=True)
+    return np.flatnonzero(_positions_seen(command, samples, controller, channels)[1])
+
+
+def _command(
+    stored: NDArray[np.float64],
+    samples: Samples,
+    law: ControlLaw,
+    channels: Channels,
+    *,
+    closed: bool,
+) -> tuple[NDArray[np.float64], float]:
+    """Command that was acted on, and its resolution, A or m."""
+    known = np.isfinite(samples.command)
+    step = _resolution(samples.command[known])
+    if closed and not known.any():
+        step = _step_followed(stored, samples, law, channels)
+    return np.where(known, samples.command, _as_sent(stored, step)), step
 
 
 def _step_followed(
