@@ -22,10 +22,15 @@ from ehadiag.identify.commanded_current import guessed_positions
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.result import Identification
 from ehadiag.identify.spans import ANCHOR_LSB, lay_out
+from ehadiag.identify.uncertainty import interval95
 from ehadiag.model.parameters import Unknowns
 from ehadiag.model.scalar.residuals import ScalarModel
 
-__all__ = ["can_be_told", "told_by_response"]
+__all__ = ["can_be_told", "told_by_response", "widened"]
+
+TOLD_STD = 1e-3
+"""Deviation of each severity that this leaves: 0.0014 off was seen, changes and severities bearing
+each other out."""
 
 MOST_GUESSED = 0.1
 """Share of guessed currents up to which this was tried: 0.005 to 0.04."""
@@ -40,8 +45,10 @@ CODES = (0, -1, 1, -2, 2)
 off; its noise and rounding are 0.6 steps."""
 UNLIKELY = 1.3
 """Steps squared, of the same: a variance and what the straight line adds."""
-LONGEST_ROW = 3
-"""Rows that are moved together."""
+FEW_ROWS = 3
+"""Rows that are moved together beside a gap, besides all up to the next gap, and"""
+MOST_ROWS = 40
+"""at most so many of these."""
 MOVED = 8.0
 """What moving rows must explain, in variances: they were placed by their time and their current."""
 CLEAR = 4.0
@@ -152,6 +159,28 @@ def told_by_response(
     )  # fmt: skip
 
 
+def widened(found: Identification) -> Identification:
+    """Add what the telling leaves open to the severities' intervals.
+
+    Parameters
+    ----------
+    found : Identification
+        As if all positions had been seen.
+
+    Returns
+    -------
+    Identification
+        With wider intervals.
+    """
+    std = [float(np.hypot(item.std, TOLD_STD)) for item in found.estimates]
+    estimates = tuple(
+        replace(item, std=wide, interval95=interval95(item.value, wide))
+        for item, wide in zip(found.estimates, std, strict=True)
+    )
+    covariance = found.covariance + TOLD_STD**2 * np.eye(len(std))
+    return replace(found, estimates=estimates, covariance=covariance)
+
+
 class _Rows:
     """Samples of one recording, changed step by step."""
 
@@ -162,6 +191,7 @@ class _Rows:
         self._movable = recording.by_time
         self._begin = experiment
         self._actuator = actuator
+        self._anchor: tuple[float, float] | None = ANCHOR_LSB
 
     def experiment(self) -> Experiment:
         """Return what is identified from."""
@@ -173,6 +203,10 @@ class _Rows:
         controller = self._actuator.controller
         if not self._begin.trace.guessed or controller.GAI or controller.GAD:
             return made
+        ways: dict[float, tuple[float, float] | None] = {
+            float(self._misfit(self._samples, found, way).sum()): way for way in (ANCHOR_LSB, None)
+        }
+        self._anchor = ways[min(ways)]
         for _ in range(SWEEPS):
             chosen = self._sweep(found)
             self._samples = _changed(self._samples, chosen)
@@ -182,12 +216,12 @@ class _Rows:
         return made
 
     def _sweep(self, found: Identification) -> list[Change]:
-        before = self._misfit(self._samples, found)
+        before = self._misfit(self._samples, found, self._anchor)
         gains: list[tuple[float, Change]] = []
         for together in _apart(self._changes()):
-            after = self._misfit(_changed(self._samples, together), found)
+            after = self._misfit(_changed(self._samples, together), found, self._anchor)
             for change in together:
-                seen = slice(max(change.first - 1, 0), change.first + REACH)
+                seen = slice(max(change.first - 1, 0), change.end + REACH)
                 gain = float(np.sum(before[seen] - after[seen])) - change.unlikely
                 gains.append((gain, change))
         return _best(gains)
@@ -209,14 +243,7 @@ class _Rows:
                     Change(tick, tick + 1, 0, (code + off) * step, off * off / UNLIKELY)
                     for off in CODES
                 ]
-        rows = range(1, LONGEST_ROW + 1) if self._movable else ()
-        for gap in np.flatnonzero(lost).tolist():
-            for count in rows:
-                for begin, by in ((gap + 1, -1), (gap - count, 1)):
-                    end = begin + count
-                    if begin >= 0 and end <= len(lost) and not lost[begin:end].any():
-                        out.append(Change(begin, end, by, np.nan, MOVED))
-        return out
+        return out + (_moves(lost) if self._movable else [])
 
     def _build(self, samples: Samples) -> Experiment:
         """Experiment of some samples, noise and offsets as they were judged at first."""
@@ -233,17 +260,37 @@ class _Rows:
             origin=begin.origin,
         ).with_noise(begin.noise)
 
-    def _misfit(self, samples: Samples, found: Identification) -> Floats:
-        """What each tick's samples say against some severities, in variances, shape (n,)."""
+    def _misfit(
+        self, samples: Samples, found: Identification, anchor: tuple[float, float] | None
+    ) -> Floats:
+        """What each tick's samples say against some severities, in variances, shape (n,).
+
+        anchor: see `ehadiag.identify.spans.lay_out`.
+        """
         item = self._build(samples)
         constants = found.constants(item.constants)
-        model = ScalarModel(lay_out([item], anchor_lsb=ANCHOR_LSB), Unknowns((), (constants,), {}))
+        model = ScalarModel(lay_out([item], anchor_lsb=anchor), Unknowns((), (constants,), {}))
         left = model.residuals(np.zeros((1, 0)))[0][0]
         trace, noise = item.trace, CURRENT_NOISE * item.channels.current.lsb
         current = np.nan_to_num((samples.current - trace.offset - trace.current) / noise)
         return np.asarray(
             np.minimum(left**2, CAP).sum(axis=0) + np.minimum(current**2, CAP_CURRENT)
         )
+
+
+def _moves(lost: NDArray[np.bool_]) -> list[Change]:
+    """Rows beside a gap that may be moved into it: some, or all up to the next gap."""
+    out: list[Change] = []
+    gaps = np.flatnonzero(np.concatenate([[True], lost, [True]])) - 1
+    for before, after in zip(gaps[:-1].tolist(), gaps[1:].tolist(), strict=True):
+        row = after - before - 1
+        counts = {*range(1, min(row, FEW_ROWS) + 1), *([row] if 0 < row <= MOST_ROWS else [])}
+        for count in sorted(counts):
+            if before >= 0:
+                out.append(Change(before + 1, before + 1 + count, -1, np.nan, MOVED))
+            if after < len(lost):
+                out.append(Change(after - count, after, 1, np.nan, MOVED))
+    return out
 
 
 def _changed(samples: Samples, changes: Sequence[Change]) -> Samples:
@@ -275,7 +322,7 @@ def _apart(changes: Sequence[Change]) -> Iterator[list[Change]]:
         together: list[Change] = []
         others: list[Change] = []
         for item in left:
-            free = not together or item.first >= together[-1].first + APART
+            free = not together or item.first >= together[-1].end + APART
             (together if free else others).append(item)
         yield together
         left = others
@@ -295,6 +342,8 @@ def _best(gains: Sequence[tuple[float, Change]]) -> list[Change]:
             wanted.append((margin, each[0][1]))
     chosen: list[Change] = []
     for _, item in sorted(wanted, key=lambda pair: -pair[0]):
-        if all(abs(item.first - other.first) >= CLOSE for other in chosen):
+        if all(
+            item.first >= other.end + CLOSE or other.first >= item.end + CLOSE for other in chosen
+        ):
             chosen.append(item)
     return chosen
