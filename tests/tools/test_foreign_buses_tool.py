@@ -27,6 +27,8 @@ def test_a_run_that_was_broken_off_goes_on(tmp_path, capsys):
     assert table.main(words) == 0
     assert capsys.readouterr().out == told
     assert results.read_text().strip() == first.strip()
+    assert table.main([*words, "--at-most", "1"]) == 0
+    assert "psi29" not in capsys.readouterr().out
     assert table.main([str(tmp_path / "nowhere")]) == 3
 
 

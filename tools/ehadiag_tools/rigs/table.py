@@ -43,15 +43,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         cases = [case for folder in given.folder for case in _cases(folder, given)]
         runs = [run for case in cases for run in _runs(case, given)]
-        # In any order, so that a run that was broken off is a sample of the whole.
-        order = np.random.default_rng(given.seed).permutation(len(runs))
+        # Those of the default bus, then the others in any order: a part of them is a sample.
+        usual = [place for place, run in enumerate(runs) if run.bus == DEFAULT]
+        drawn = np.random.default_rng(given.seed).permutation(len(runs)).tolist()
+        others = [place for place in drawn if runs[place].bus != DEFAULT]
+        order = (usual + others)[: given.at_most]
         mixed = [runs[place] for place in order]
         records = perform_all(perform_replay, mixed, given.results, given.jobs, "recordings")
     except EhadiagError as error:
         print(f"foreign_buses: {error}", file=sys.stderr)
         return error.exit_code
-    found = dict(zip(order.tolist(), records, strict=True))
-    _show([(run, found[place]) for place, run in enumerate(runs)], verbose=given.verbose)
+    found = dict(zip(order, records, strict=True))
+    _show([(runs[place], found[place]) for place in sorted(found)], verbose=given.verbose)
     return 0
 
 
@@ -80,6 +83,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--results", type=Path, default=Path("foreign-buses.jsonl"))
     parser.add_argument("--jobs", type=int, default=1, help="processes (%(default)d)")
+    parser.add_argument(
+        "--at-most",
+        type=int,
+        metavar="N",
+        help="diagnoses: those on the default bus, then a sample",
+    )
     parser.add_argument("--seed", type=int, default=1, help="(%(default)d)")
     parser.add_argument("-v", "--verbose", action="store_true", help="what is wrong, and why")
     return parser
