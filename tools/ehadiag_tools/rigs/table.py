@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         "--at-most",
         type=int,
         metavar="N",
-        help="diagnoses: those on the default bus, then a sample",
+        help="those on the default bus, then a sample",
     )
     parser.add_argument("--seed", type=int, default=1, help="(%(default)d)")
     parser.add_argument("-v", "--verbose", action="store_true", help="what is wrong, and why")
