@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
-from ehadiag.identify.nuisance.astray import may_be_astray, would_explain
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
+from ehadiag.identify.nuisance.further import would_explain
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
-from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
     FirstPart,
     considered_in,
@@ -58,7 +57,7 @@ from ehadiag.identify.textbook import (
     unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance, independent
-from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, parameter
+from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
 __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 
@@ -66,8 +65,8 @@ __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 BEYOND_RESCUE = 0.05
 """Share of residuals beyond three deviations after a refinement from which on no further search is
 made: 0.04 at most on a textbook's actuator after the search before."""
-BEYOND_STEPS = 15.0
-"""Excess after all nuisances at once from which on they are not tried one after another."""
+BEYOND_LOAD = 15.0
+"""Excess after all nuisances from which on a load is not tried besides."""
 NEARLY = 1.3
 """Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
 brings out what its model leaves, and loosened effects would stand in for that."""
@@ -255,36 +254,20 @@ class Session:
         if found.explained:
             return found
         if not self.knowledge.doubts:
-            return self._stepwise(experiments, found, tell)
+            return self._with_load(experiments, found, tell)
         if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
         loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
         return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
-    def _stepwise(
+    def _with_load(
         self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
     ) -> Estimated:
-        """Estimate one effect after another where that explains what all at once do not."""
+        """Estimate a constant load, too, where that explains what the others do not."""
         load = parameter("load")
-        if found.excess > BEYOND_STEPS:
+        if found.excess > BEYOND_LOAD or not would_explain(load, found, self.seed):
             return found
-        if not may_be_astray(experiments, found) and not would_explain(load, found, self.seed):
-            return found
-        few = stepwise(
-            experiments,
-            (*nuisances_of(REGISTRY), load),
-            least=found.excess,
-            considered=considered_in(experiments),
-            seed=self.seed,
-            tell=lambda share: tell("nuisances", share),
-        )
-        if few is None:
-            return found
-        return replace(
-            few,
-            evaluations=found.evaluations + few.evaluations,
-            starts=found.starts + few.starts,
-        )
+        return self._estimated(experiments, self.knowledge, found.refined.values, tell, (load,))
 
     def _estimated(
         self,
@@ -292,8 +275,11 @@ class Session:
         knowledge: Knowledge,
         hint: Mapping[str, float] | None,
         tell: Progress,
+        further: tuple[Parameter, ...] = (),
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        effects = (*effects, *further)
+        patient = any(item.test.closed_loop for item in experiments)
         free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
@@ -307,6 +293,7 @@ class Session:
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
             give_up=not knowledge.doubts,
             explains=knowledge.explains,
+            patient=patient,
         )
 
     def _said(
