@@ -19,6 +19,7 @@ from ehadiag.assess.acceptance import (
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
 from ehadiag.assess.delays import in_time
+from ehadiag.assess.lost_ticks import can_be_told, told_by_response, widened
 from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
@@ -88,6 +89,10 @@ class Diagnosis:
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
     """s from samples to verdict."""
+
+
+Estimated = tuple[list[Experiment], Identification, tuple[str, ...], tuple[str, ...]]
+"""Experiments, what they say, notes on what was put right, and why it cannot carry a verdict."""
 
 
 class DiagnosisSession:
@@ -184,20 +189,18 @@ class DiagnosisSession:
         culprit: Culprit | None = None
         late: tuple[str, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
-        if lost:
+        told = self._told(recordings, experiments, progress) if lost and not orders else None
+        if lost and told is None:
             found = self._session.finish(experiments, progress)
             identification, words = what_is_left(found, closed=closed)
             why = tuple(f"{reason}: {words}" for reason in hidden)
-        if not reasons:
-            identification = self._session.finish(experiments, progress)
-            if any(item.by_time for item in recordings):
-                experiments, identification, late = in_time(
-                    experiments, identification, lambda item: self._session.finish(item, progress)
-                )
+        if told is not None or not reasons:
+            experiments, identification, late, why = told or self._estimated(
+                recordings, experiments, progress, ordered=not orders
+            )
             modelled = [response_of(item, identification) for item in experiments]
             positions = tuple(map(position_fit, experiments, modelled))
             others = other_faults(identification, self._actuator)
-            why = tuple(objections_to_estimate(identification, self._actuator.calibration))
             if why and orders:
                 identification, words = what_is_left(identification, closed=closed)
                 why = tuple(f"{reason}: {words}" for reason in orders)
@@ -230,6 +233,48 @@ class DiagnosisSession:
             ),
             elapsed=time.perf_counter() - begin,
         )
+
+    def _estimated(
+        self,
+        recordings: Sequence[Recording],
+        experiments: list[Experiment],
+        progress: Progress | None,
+        *,
+        ordered: bool,
+    ) -> Estimated:
+        """Identify; where that does not explain the recordings, by what the response tells."""
+        found = self._session.finish(experiments, progress)
+        late: tuple[str, ...] = ()
+        if any(item.by_time for item in recordings):
+            experiments, found, late = in_time(
+                experiments, found, lambda item: self._session.finish(item, progress)
+            )
+        why = tuple(objections_to_estimate(found, self._actuator.calibration))
+        if why and ordered and not late:
+            told = self._told(recordings, experiments, progress)
+            if told is not None:
+                return told
+        return experiments, found, late, why
+
+    def _told(
+        self,
+        recordings: Sequence[Recording],
+        experiments: Sequence[Experiment],
+        progress: Progress | None,
+    ) -> Estimated | None:
+        """Identify with lost positions as the response tells them; None where that explains
+        nothing."""
+        if not can_be_told(recordings, experiments):
+            return None
+        now, found, note = told_by_response(
+            recordings,
+            experiments,
+            self._actuator,
+            lambda item: self._session.finish(item, progress),
+        )
+        if objections_to_estimate(found, self._actuator.calibration):
+            return None
+        return now, widened(found), (note,), ()
 
     def _experiments(
         self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]

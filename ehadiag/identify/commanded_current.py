@@ -18,9 +18,10 @@ from ehadiag.core.actuator import Controller
 from ehadiag.core.channels import CHANNELS, CURRENT, POSITION, Channels
 from ehadiag.core.recording import CommandMode, Samples
 from ehadiag.core.stored_test import StoredTest
+from ehadiag.identify.command_step import step_by_current
 from ehadiag.model.control import ControlLaw, commanded_currents
 
-__all__ = ["CurrentTrace", "commanded_current"]
+__all__ = ["CurrentTrace", "commanded_current", "guessed_positions"]
 
 FRAME_TOLERANCE = {
     CommandMode.CURRENT: 20e-6 / CURRENT.full_scale,
@@ -52,7 +53,8 @@ class CurrentTrace:
     offset: constant error of the measured current, A.
     rebuilt: whether the measured current bears it out.
     command_deviation: largest distance of a command frame from the stored test, A or m.
-    command_step: resolution of the command frames, A or m; 0 where too few tell.
+    command_step: resolution of the commands, A or m, as frames tell it, or where there are none
+        the measured current of a closed loop; 0 where nothing does.
     guessed: share of ticks whose current follows from a position that was lost, and that the
         measured current does not tell either; of a hole at most `LONG_HOLE` ticks count.
     """
@@ -75,23 +77,16 @@ def commanded_current(
     known = np.isfinite(samples.command)
     deviation = np.abs(samples.command - stored)[known]
     command_deviation = float(deviation.max()) if deviation.size else 0.0
-    step = _resolution(samples.command[known])
-    command = np.where(known, samples.command, _as_sent(stored, step))
+    law = ControlLaw(
+        controller.IM, controller.GAP, controller.GAI, controller.GAD, samples.period_ns * 1e-9
+    )
+    command, step = _command(stored, samples, law, channels, closed=test.closed_loop)
     guessed = 0.0
     if not test.closed_loop:
         current = np.clip(command, -controller.IM, controller.IM)
     else:
         seen, unknown = _positions_seen(command, samples, controller, channels)
-        current = commanded_currents(
-            ControlLaw(
-                controller.IM,
-                controller.GAP,
-                controller.GAI,
-                controller.GAD,
-                samples.period_ns * 1e-9,
-            ),
-            command - seen,
-        )
+        current = commanded_currents(law, command - seen)
         # What the control law did after the last sample explains none.
         last = np.flatnonzero(np.isfinite(samples.spool) | np.isfinite(samples.pressure))
         until = int(last[-1]) + 1 if last.size else n
@@ -107,6 +102,54 @@ def commanded_current(
     residual_lsb = float(np.sqrt(np.mean(spread**2))) / channels.current.grain
     rebuilt = residual_lsb < CONTROL_LAW_LSB
     return CurrentTrace(current, residual_lsb, offset, rebuilt, command_deviation, guessed, step)
+
+
+def guessed_positions(
+    samples: Samples, test: StoredTest, controller: Controller, channels: Channels
+) -> NDArray[np.int64]:
+    """Ticks of a closed loop whose current follows from a position that nothing tells."""
+    stored = _fit_length(test.command(), samples.ticks)
+    law = ControlLaw(
+        controller.IM, controller.GAP, controller.GAI, controller.GAD, samples.period_ns * 1e-9
+    )
+    command, _ = _command(stored, samples, law, channels, closed=True)
+    return np.flatnonzero(_positions_seen(command, samples, controller, channels)[1])
+
+
+def _command(
+    stored: NDArray[np.float64],
+    samples: Samples,
+    law: ControlLaw,
+    channels: Channels,
+    *,
+    closed: bool,
+) -> tuple[NDArray[np.float64], float]:
+    """Command that was acted on, and its resolution, A or m."""
+    known = np.isfinite(samples.command)
+    step = _resolution(samples.command[known])
+    if closed and not known.any():
+        step = _step_followed(stored, samples, law, channels)
+    return np.where(known, samples.command, _as_sent(stored, step)), step
+
+
+def _step_followed(
+    stored: NDArray[np.float64], samples: Samples, law: ControlLaw, channels: Channels
+) -> float:
+    """Resolution, m, of commands that no frame told: that which the measured current follows."""
+    seen = np.concatenate([[np.nan], _as_digitised(samples.position[:-1], channels.position.lsb)])
+    present = np.isfinite(seen)
+    if not present.any():
+        return 0.0
+    ticks = np.arange(len(seen))
+    bridged = np.interp(ticks, ticks[present], seen[present])
+    at_end = samples.saturated[0] | (np.abs(samples.current) > law.IM - channels.current.grain)
+    measured = np.where(present & ~at_end, samples.current, np.nan)
+    return step_by_current(
+        stored,
+        lambda command: commanded_currents(law, command - bridged),
+        measured,
+        channels.position.lsb,
+    )
 
 
 def _as_digitised(position: NDArray[np.float64], lsb: float) -> NDArray[np.float64]:

@@ -53,6 +53,7 @@ from ehadiag.identify.textbook import (
     is_guessed,
     named,
     rescued,
+    searched_whole,
     unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance, independent
@@ -181,7 +182,7 @@ class Session:
         tell("refinement", 0.0)
         doubts = self.knowledge.doubts
         alone = self.nuisances is Nuisances.NONE and not doubts
-        found, near = _nearer(experiments, found, start)
+        found, near = self._nearer(experiments, found, start)
         best: Attempt | None = None
         if alone or (near and self.nuisances is Nuisances.AUTO and not doubts):
             best = attempt(experiments, found, self._first_part, partial(tell, "refinement", 0.0))
@@ -223,6 +224,23 @@ class Session:
             freed.starts + (1 if best else 0),
             _timing(begin, searched_at, search_s),
         )
+
+    def _nearer(
+        self, experiments: Sequence[Experiment], found: SearchResult, start: NDArray[np.float64]
+    ) -> tuple[SearchResult, bool]:
+        """Return what a refinement begins from, and whether it may explain the recordings: the
+        optimum of the search, unless only what the search began from resembles them, or a search
+        over the whole window where currents were guessed."""
+        if unlikeness(experiments, found.best) <= HOPELESS:
+            return found, True
+        if unlikeness(experiments, start) <= HOPELESS:
+            return replace(found, best=start), True
+        if not any(item.trace.guessed for item in experiments):
+            return found, False
+        other = searched_whole(experiments, found, self.solver, self.seed + len(STAGES))
+        other = replace(other, evaluations=found.evaluations + other.evaluations)
+        near = unlikeness(experiments, other.best) <= HOPELESS
+        return (other if near else found), near
 
     def _freed(
         self,
@@ -358,17 +376,6 @@ def _guessed(refinement: Refinement) -> NDArray[np.float64]:
     """Covariance that a guessed current adds to the severities'."""
     std = GUESSED_STD if is_guessed(refinement) else 0.0
     return independent(refinement.parameters, dict.fromkeys((item.name for item in FAULTS), std))
-
-
-def _nearer(
-    experiments: Sequence[Experiment], found: SearchResult, start: NDArray[np.float64]
-) -> tuple[SearchResult, bool]:
-    """Return what a refinement begins from, and whether it may explain the recordings: the optimum
-    of the search, unless only what the search began from resembles them."""
-    if unlikeness(experiments, found.best) <= HOPELESS:
-        return found, True
-    near = unlikeness(experiments, start) <= HOPELESS
-    return (replace(found, best=start) if near else found), near
 
 
 def _timing(begin: float, searched_at: float, search_s: float) -> Timing:

@@ -44,6 +44,7 @@ __all__ = [
     "is_guessed",
     "named",
     "rescued",
+    "searched_whole",
     "unlikeness",
 ]
 
@@ -70,6 +71,9 @@ RESCUES = (
     Plan(0.4, budget=3.0),
 )
 """One after the other where the staged search does not explain the recording."""
+WHOLE = Plan(0.02)
+"""Where currents were guessed: break-aways at other ticks lead the stages astray that see a part of
+the window."""
 POOR_FIT = 0.01
 """Share of residuals beyond three deviations that asks for another attempt."""
 HOPELESS = 0.15
@@ -169,6 +173,14 @@ def rescued(
         if other.score < best.score:
             best = other
     return replace(best, evaluations=evaluations, search_s=search_s, count=count)
+
+
+def searched_whole(
+    experiments: Sequence[Experiment], found: SearchResult, solver: Solver, seed: int
+) -> SearchResult:
+    """Search the whole window from the optimum of the staged search."""
+    start = named(found.best)
+    return _searched(experiments, start, solver, seed, WHOLE, lambda _stage, _share: None)
 
 
 def explains(refinement: Refinement) -> bool:

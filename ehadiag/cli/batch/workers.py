@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Workers", "processors_for"]
 
-EACH = 32
+EACH = 128
 """Inputs a worker that are under way, or wait for those before them, at the most."""
 LEAST_EACH = 8
 """Inputs that make a worker of one's own worth its start."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import tomllib
 from collections.abc import Iterator
@@ -92,11 +91,3 @@ def test_links_and_named_files_exist(page: Path) -> None:
         assert (page.parent / target).exists(), target
     for name in re.findall(r"`((?:tests|tools|docs|firmware_iface|ehadiag)/[\w./-]+)`", text):
         assert (REPOSITORY / name).exists(), name
-
-
-def test_examples_in_the_docs_are_sound(run: Run, tmp_path: Path) -> None:
-    page = (DOCS / "how-to" / "own-test.md").read_text()
-    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "short.toml").write_text(example)
-    result = run("bit", "--simulate", "--fast", "--json", "--test", "short.toml", "--Kintas", 0.3)
-    assert json.loads(result.out)["faults"]["Kintas"]["estimate"] == pytest.approx(0.3, abs=2e-3)

@@ -217,12 +217,14 @@ def test_it_follows_tests_and_modes_on_a_bus_and_sends_nothing(run: Run, tmp_pat
         PythonCanTransport(BusOptions("virtual", channel=channel), transmit=True) as fcc,
         can.Bus(interface="virtual", channel=channel) as witness,
     ):
-        playing = threading.Thread(target=_play, args=(core, fcc), daemon=True)
+        listening, ended = tmp_path / "a.jsonl", threading.Event()
+        playing = threading.Thread(target=_play, args=(core, fcc, listening, ended), daemon=True)
         playing.start()
         found = run(
-            "monitor", "-i", "virtual", "-c", channel, "--duration", "3", "--from", "worn.json",
-            "--log-file", "a.jsonl",
+            "monitor", "-i", "virtual", "-c", channel, "--duration", "60", "--from", "worn.json",
+            "--log-file", listening,
         )  # fmt: skip
+        ended.set()
         playing.join(30.0)
         while (message := witness.recv(0.0)) is not None:
             heard.append(message.arbitration_id)
@@ -234,13 +236,19 @@ def test_it_follows_tests_and_modes_on_a_bus_and_sends_nothing(run: Run, tmp_pat
     assert 0x200 not in heard  # nobody requested anything
 
 
-def _play(core: FccCore, fcc: PythonCanTransport) -> None:
-    """Half a second of rest, the first two seconds of a test: as fast as it goes, in order."""
+def _play(core: FccCore, fcc: PythonCanTransport, listening: Path, ended: threading.Event) -> None:
+    """As soon as somebody listens half a second of rest, the first two seconds of a test: as fast
+    as it goes, in order; then Ctrl-C."""
+    patience = time.monotonic() + 50.0
+    while not (listening.exists() and listening.read_text()) and time.monotonic() < patience:
+        time.sleep(0.02)
     for tick in range(2500):
         if tick == 500:
             core.take(Encoder().request("start", 1, 0)[0])
         for frame in core.step():
             fcc.send(frame)
+    if not ended.wait(1.0):
+        signal.raise_signal(signal.SIGINT)
 
 
 def _result(severities: dict[str, float]) -> dict[str, Any]:

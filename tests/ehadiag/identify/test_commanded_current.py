@@ -1,5 +1,7 @@
 """The commanded current, rebuilt exactly, also where samples are lost."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -154,3 +156,13 @@ def test_without_command_frames_the_stored_command_serves():
     # The stored command is exact, the played one rounded to 2 µm.
     assert np.abs(trace.current - truth)[1:].max() < controller().GAP * 1.01e-6
     assert trace.command_deviation == 0.0
+
+
+@pytest.mark.parametrize("lost", [(), range(500, 900, 7)])
+def test_a_bus_without_commands_shows_by_the_current_how_they_were_rounded(lost):
+    samples, current = closed_loop(controller())
+    samples = without(samples, list(lost))
+    samples = replace(samples, command=np.full(samples.ticks, np.nan))
+    trace = commanded_current(samples, TEST, controller())
+    assert trace.command_step == pytest.approx(2e-6)
+    assert np.abs(trace.current - current).max() < EXACT

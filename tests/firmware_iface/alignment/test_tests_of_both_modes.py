@@ -11,8 +11,8 @@ from ehadiag.core.actuator import default_actuator
 from ehadiag.core.find_test import Sought
 from ehadiag.core.stored_test import bundled_tests
 from ehadiag_tools.rigs.buses import BUSES
+from ehadiag_tools.rigs.replay import as_sent
 from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, played
-from ehadiag_tools.rigs.table import as_sent
 from firmware_iface.alignment.windows import recordings_of
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.transport.frames import concatenate
