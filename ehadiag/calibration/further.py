@@ -19,15 +19,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.calibration.judging import MOST_LEFT
-from ehadiag.calibration.models import EFFECTS, ONE_START, SLOW, Learned
+from ehadiag.calibration.models import EFFECTS, ONE_START, SLOW, Learned, Model
 from ehadiag.calibration.session import Session
+from ehadiag.identify.refine.posterior import TAIL
+from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.identify.uncertainty import covariance
+from ehadiag.model.parameters import parameter
+from ehadiag.model.simd.model import SimdModel
 
 __all__ = ["asked_for", "asked_for_by", "with_further_effects"]
 
 QUICK = tuple(name for name in EFFECTS if name not in SLOW)
 LITTLE = 1.5
 """Residuals over noise up to which no slow search is made for a little more."""
+SIZES = (0.1, 0.3, 1.0, 2.0)
+"""Of an effect, over its usual one, that are tried."""
+MUCH = 0.03
+"""Share of what is left that an effect must take away."""
 TINY = 1e-300
 
 
@@ -49,30 +57,70 @@ def with_further_effects(session: Session, smooth: Learned) -> Learned:
     best = _round(session, smooth, QUICK, 0)
     if best.estimated.excess <= MOST_LEFT:
         best = _round(session, best, QUICK, 1)
-    best = _round(session, best, SLOW, 2)
+    if _promising(best, SLOW):
+        best = _round(session, best, SLOW, 2)
     if best.estimated.excess > LITTLE:
         best = _round(session, best, QUICK, 3)
+    if best.estimated.excess > MOST_LEFT:
+        best = _round(session, best, QUICK, 4, afresh=True)
     return best
 
 
-def _round(session: Session, best: Learned, more: Sequence[str], turn: int) -> Learned:
+def _promising(best: Learned, names: Sequence[str]) -> bool:
+    """Whether one of some effects alone could take away much of what is left.
+
+    Their usual sizes are tried beside the optimum, and what changes the residuals as none of the
+    estimated parameters does is held against what is left (a score test with finite steps).
+    """
+    names = [name for name in names if name not in best.model.beside]
+    if best.estimated.explained or not names:
+        return False
+    refined, experiments = best.estimated.refined, best.estimated.experiments
+    free = (*refined.parameters, *(parameter(name) for name in names))
+    model = SimdModel(lay_out(experiments), unknowns_of(experiments, free))
+    points = np.zeros((1 + len(SIZES) * len(names), len(free)))
+    points[:, : len(refined.x)] = refined.x * refined.scale
+    for k, name in enumerate(names):
+        rows = slice(1 + k * len(SIZES), 1 + (k + 1) * len(SIZES))
+        points[rows, len(refined.x) + k] = np.array(SIZES) * EFFECTS[name].mean
+    runs = model.residuals(points)[0]
+    runs = runs.reshape(len(runs), -1)
+    weights = 1.0 / np.sqrt(1.0 + (runs[0] / TAIL) ** 2)
+    known = np.linalg.qr((refined.jacobian.reshape(len(refined.x), -1) * weights).T)[0]
+    left = runs[0] * weights
+    changes = (runs[1:] - runs[0]) * weights
+    left -= known @ (known.T @ left)
+    changes -= (changes @ known) @ known.T
+    sizes = np.maximum(np.einsum("ij,ij->i", changes, changes), TINY)
+    gains = np.minimum(changes @ left, 0.0) ** 2 / sizes
+    return bool(gains.max() > MUCH * (left @ left))
+
+
+def _round(
+    session: Session, best: Learned, more: Sequence[str], turn: int, *, afresh: bool = False
+) -> Learned:
     """Learn more effects beside those that are asked for, and then those that are, if need be."""
     if best.estimated.explained:
         return best
     names = {*more, *asked_for_by(best)}
-    found = _beginning_at(session, best, tuple(name for name in EFFECTS if name in names), turn)
+    begin = None if afresh else best
+    wanted = tuple(name for name in EFFECTS if name in names)
+    found = _search(session, best.model, wanted, begin, turn)
     if found.estimated.excess > LITTLE or not names.intersection(SLOW):
-        fewer = _beginning_at(session, found, asked_for_by(found), turn)
+        fewer = _search(session, best.model, asked_for_by(found), found, turn)
         found = min(found, fewer, key=_worse)
     return min(best, found, key=_worse)
 
 
-def _beginning_at(session: Session, found: Learned, names: tuple[str, ...], turn: int) -> Learned:
+def _search(
+    session: Session, model: Model, names: tuple[str, ...], begin: Learned | None, turn: int
+) -> Learned:
     """Learn with these further effects, beginning where another search ended."""
+    usual = {name: EFFECTS[name].mean for name in SLOW}
     return session.learn(
-        replace(found.model, beside=names),
+        replace(model, beside=names),
         nearly_new=True,
-        hint=found.estimated.refined.values,
+        hint={**usual, **begin.estimated.refined.values} if begin else None,
         budget=ONE_START,
         some=True,
         turn=turn,

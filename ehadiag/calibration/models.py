@@ -67,8 +67,8 @@ EFFECTS = {
     "land_even": Known(0.0, 0.02),
     "land_odd": Known(0.0, 0.02),
     "land_lap": Known(0.0, 1e-6),
-    "pressure_bend": Known(0.0, 0.005),
-    "pressure_bow": Known(0.0, 0.01),
+    "pressure_bend": Known(0.0, 0.001),
+    "pressure_bow": Known(0.0, 0.001),
 }
 """What is added where the rest does not explain the recordings: usual sizes (PHY-31 to 36)."""
 SLOW = ("jack_stribeck", "spool_stribeck")
