@@ -22,7 +22,9 @@ from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, param
 __all__ = [
     "BUDGET",
     "EFFECTS",
+    "ONE_START",
     "SECOND_STAGES",
+    "SLOW",
     "SMOOTH",
     "Learned",
     "Model",
@@ -35,6 +37,8 @@ SECOND_STAGES = ("linear", "orifice")
 SMOOTH = 8
 """Plays of a smooth hysteresis: more of them do the same within the noise."""
 BUDGET = 1600
+ONE_START = 1
+"""Budget of a search that ends after its first start."""
 DATUM = Known(0.0, 0.05 / math.sqrt(3.0))
 """A data sheet's usual ±5 %."""
 REACH = 0.1
@@ -58,8 +62,17 @@ EFFECTS = {
     "hysteresis_skew": Known(0.0, 2.0),
     "spool_bend": Known(0.0, 0.005),
     "spool_bow": Known(0.0, 0.01),
+    "driver_lag": Known(1e-4, 2e-4),
+    "land_shift": Known(0.0, 1e-6),
+    "land_even": Known(0.0, 0.02),
+    "land_odd": Known(0.0, 0.02),
+    "land_lap": Known(0.0, 1e-6),
+    "pressure_bend": Known(0.0, 0.001),
+    "pressure_bow": Known(0.0, 0.001),
 }
 """What is added where the rest does not explain the recordings: usual sizes (PHY-31 to 36)."""
+SLOW = ("jack_stribeck", "spool_stribeck")
+"""Those with which a run of the model takes several times as long."""
 OIL = {"bulk_modulus": Known(0.0, 0.15)}
 """Of an orifice stage: entrained air lowers the bulk modulus (PHY-39)."""
 NEARLY_NEW = Known(0.02, 0.05)

@@ -97,8 +97,8 @@ def build_experiment(
     constants = unit_constants(actuator, environment)
     spool_offset, pressure_offset = _mean(spool[:rest]), _mean(pressure[:rest])
     origin = 0.0
-    if constants.FR != 0.0:
-        # What the jack's load asks for is no offset.
+    if constants.FR != 0.0 or constants.XLD != 0.0:
+        # What the jack's load or displaced lands ask for is no offset.
         pressure_offset = 0.0
     elif abs(pressure_offset) > DISPLACED * channels.pressure.full_scale:
         # So much pressure is that of a spool that friction holds beside the middle.

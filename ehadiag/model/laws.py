@@ -25,6 +25,7 @@ __all__ = [
     "faded",
     "flapper_held",
     "jack_law",
+    "lagged",
     "opening",
     "play",
     "pressure",
@@ -58,6 +59,8 @@ class DriveLaw(NamedTuple):
     share: of the narrowest play in the current that acts.
     fade: share of each play over that of the next narrower one.
     even, odd: relative gain of the torque per current (1/A) and per its square (1/A²).
+    left: share of a change of the current that its driver's lag leaves after a tick.
+    late: the same in the mean over the tick.
     """
 
     gain: Any
@@ -67,18 +70,31 @@ class DriveLaw(NamedTuple):
     fade: Any
     even: Any
     odd: Any
+    left: Any
+    late: Any
 
 
 @inlined
-def drive_law(c: PlantConstants) -> DriveLaw:
-    """Precombine what the torque motor's law needs (PHY-4, PHY-29, PHY-30)."""
+def drive_law(c: PlantConstants, tick: float) -> DriveLaw:
+    """Precombine what the torque motor's law needs (PHY-4, PHY-29, PHY-30); tick: s."""
     fade = exponential(-c.SKW / c.NPL)
     total, weight = 0.0, 1.0
     for _ in range(int(c.NPL)):
         total += weight
         weight *= fade
     even, odd = c.TQ2 / c.IM, c.TQ3 / (c.IM * c.IM)
-    return DriveLaw(c.GM / c.KF, c.IB, c.HYS * c.IM / c.NPL, 1.0 / total, fade, even, odd)
+    left, late = 0.0, 0.0
+    if c.LAG > 0.0:
+        left = exponential(-tick / c.LAG)
+        late = c.LAG / tick * (1.0 - left)
+    spacing = c.HYS * c.IM / c.NPL
+    return DriveLaw(c.GM / c.KF, c.IB, spacing, 1.0 / total, fade, even, odd, left, late)
+
+
+@packed
+def lagged(share: Any, before: Any, current: Any) -> Any:
+    """Current (A) of which a driver's lag leaves a share of its change from that of before."""
+    return current + share * (before - current)
 
 
 @packed
@@ -211,6 +227,10 @@ class JackLaw(NamedTuple):
     static: of the resting one, N.
     extra: friction that a creeping jack has and a fast one has not, N; 0 without Stribeck's effect.
     by_stribeck: reciprocal of the velocity over which that fades, s/m.
+    shaped: whether the lands open otherwise than by the spool's travel, 1 or 0.
+    closed: spool position at which they are closed, m.
+    even, odd: what they open more by the travel from there, to both sides, and by its cube, 1/m².
+    lap: travel that their overlap takes, m.
     """
 
     flow: Any
@@ -230,6 +250,11 @@ class JackLaw(NamedTuple):
     static: Any
     extra: Any
     by_stribeck: Any
+    shaped: Any
+    closed: Any
+    even: Any
+    odd: Any
+    lap: Any
 
 
 @inlined
@@ -253,6 +278,11 @@ def jack_law(c: PlantConstants) -> JackLaw:
         STATIC_RATIO_JACK * c.FDJ,
         (STATIC_RATIO_JACK - 1.0) * c.FDJ if c.VSJ > 0.0 else 0.0,
         1.0 / max(c.VSJ, SLOWEST_STRIBECK) if c.VSJ > 0.0 else 0.0,
+        1.0 if c.XLD != 0.0 or c.LD2 != 0.0 or c.LD3 != 0.0 or c.LAP != 0.0 else 0.0,
+        c.XLD,
+        c.LD2,
+        c.LD3 / (c.XSM * c.XSM),
+        c.LAP,
     )
 
 

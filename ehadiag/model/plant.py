@@ -58,6 +58,8 @@ class PlantConstants(NamedTuple):
     """Even part of the torque's curve: at rated current the torque is GM IM (1 + TQ2 + TQ3)."""
     TQ3: Value
     """Odd part of it, by the square of the current."""
+    LAG: Value
+    """Time constant of the current's driver and the coil, s."""
     GM: Value
     """Torque-motor gain, N m/A."""
     JF: Value
@@ -96,6 +98,14 @@ class PlantConstants(NamedTuple):
     """Pressure gain, Pa/m."""
     GQ: Value
     """Flow gain, m²/s."""
+    XLD: Value
+    """Spool position at which the metering lands are closed, m."""
+    LD2: Value
+    """Opening of the lands to the plus side over the mean of both, less 1."""
+    LD3: Value
+    """Odd part of their opening: at the spool's stop it is 1 + LD3 of the travel."""
+    LAP: Value
+    """Travel about the middle that the lands' overlap takes, m; below 0: an underlap."""
     CLK: Value
     """Leakage, m³/(s Pa)."""
     OIL: Value
@@ -135,6 +145,10 @@ class PlantConstants(NamedTuple):
     """Odd part of it, by the square of the position."""
     GPD: Value
     """The same of the sensor of differential pressure."""
+    BP2: Value
+    """Even part of that sensor's curve: at the supply pressure it reads 1 + BP2 + BP3."""
+    BP3: Value
+    """Odd part of it, by the square of the pressure."""
     GXJ: Value
     """The same of the jack's sensor."""
     TAU: Value
@@ -190,6 +204,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         SKW=0.0,
         TQ2=0.0,
         TQ3=0.0,
+        LAG=0.0,
         GM=valve.GM,
         JF=valve.JF,
         CF=valve.CF,
@@ -209,6 +224,10 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         PSR=supply,
         GP=valve.GP,
         GQ=valve.GQ,
+        XLD=0.0,
+        LD2=0.0,
+        LD3=0.0,
+        LAP=0.0,
         CLK=valve.CLK / viscosity,
         OIL=2.0 * stage.beta / stage.volume if stage.kind == "orifice" else 0.0,
         AJ=jack.AJ,
@@ -228,6 +247,8 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         BX2=0.0,
         BX3=0.0,
         GPD=0.0,
+        BP2=0.0,
+        BP3=0.0,
         GXJ=0.0,
         TAU=0.0,
         DLY=0.0,

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.kernels import bare_kernel, inlined
 from ehadiag.model.jack import limited, linear_piece, sensed_linear_piece, still_pressure
 from ehadiag.model.jack_state import JackState, Piece, Probe
+from ehadiag.model.lands import open_piece, opens
 from ehadiag.model.laws import JackLaw, pressure
 from ehadiag.model.orifice import orifice_piece, sensed_orifice_piece
 from ehadiag.model.sensors import SensorLaw, sensing
@@ -43,7 +44,7 @@ def jack_piece(
 @inlined
 def jack_rest(j: JackLaw, place: float, spool: float) -> JackState:
     """Jack at rest, jack and spool at these positions, m."""
-    p12 = still_pressure(j, spool)
+    p12 = still_pressure(j, opens(j, spool))
     return JackState(place, 0.0, 0.0, 0.0, p12, p12, p12)
 
 
@@ -75,6 +76,7 @@ def jack_tick(
     for node in range(first, end):
         span, x1 = nodes[node, 0], nodes[node, 1]
         piece = Piece(span, spool, x1, span * nodes[node, 2], span * nodes[node, 3])
+        piece = open_piece(j, piece)
         state = jack_piece(j, Probe(sensor.lag, due), senses, piece, 0.0, 1.0, state)
         due -= span
         spool = x1
@@ -82,4 +84,5 @@ def jack_tick(
         return state.seen, state, spool
     if j.oil > 0.0:
         return state.pressure, state, spool
-    return limited(j, pressure(j, spool, state.velocity)), state, spool
+    opening = opens(j, spool) if j.shaped != 0.0 else spool
+    return limited(j, pressure(j, opening, state.velocity)), state, spool

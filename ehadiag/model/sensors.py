@@ -23,6 +23,7 @@ __all__ = [
     "SensorLaw",
     "followed",
     "following",
+    "read_pressure",
     "read_spool",
     "sensing",
     "sensor_law",
@@ -45,6 +46,7 @@ class SensorLaw(NamedTuple):
     spool_gain, pressure_gain, position_gain: what is shown over what is there; of the spool about
         the middle, and
     spool_even, spool_odd: what its gain grows by with the position (1/m) and its square (1/m²).
+    pressure_even, pressure_odd: the same of the pressure, 1/Pa and 1/Pa².
     lead: all are sampled so long before the end of the tick, s.
     lag: time constant of the filter before the converters of spool and pressure, s; 0: none.
     """
@@ -59,6 +61,8 @@ class SensorLaw(NamedTuple):
     lag: Any
     spool_even: Any
     spool_odd: Any
+    pressure_even: Any
+    pressure_odd: Any
 
 
 @inlined
@@ -75,6 +79,8 @@ def sensor_law(c: PlantConstants) -> SensorLaw:
         c.TAU,
         c.BX2 / c.XSM,
         c.BX3 / (c.XSM * c.XSM),
+        c.BP2 / c.PSR,
+        c.BP3 / (c.PSR * c.PSR),
     )
 
 
@@ -83,6 +89,13 @@ def read_spool(law: SensorLaw, place: Any) -> Any:
     """What the spool's sensor reads of a position (m), but for noise and rounding."""
     bent = place * (law.spool_even + law.spool_odd * place)
     return law.spool_offset + place * (law.spool_gain + bent)
+
+
+@packed
+def read_pressure(law: SensorLaw, p12: Any) -> Any:
+    """What the sensor of differential pressure reads of one (Pa), but for noise and rounding."""
+    bent = p12 * (law.pressure_even + law.pressure_odd * p12)
+    return law.pressure_offset + p12 * (law.pressure_gain + bent)
 
 
 @inlined

@@ -19,7 +19,7 @@ from ehadiag.model.scalar.drive import drive
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK, sensed_path, spool_tick
 from ehadiag.model.scalar.transition import FINEST, SpoolTables
 from ehadiag.model.second_stage import jack_tick
-from ehadiag.model.sensors import read_spool
+from ehadiag.model.sensors import read_pressure, read_spool
 from ehadiag.model.spool_events import SpoolState
 from ehadiag.monitor.layout import (
     CUSUM,
@@ -167,7 +167,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
         _part(address, DECAY, (FINEST + 1,)),
         law,
     )
-    held = _part(address, PLAYS, (int(s.plays),))
+    held = _part(address, PLAYS, (int(s.plays) + 1,))
     deflection = drive(drive_law_of(p), held, _commanded(p, s, command, current, position))
     before = SpoolState(m.xf, m.wf, m.xs, m.vs, m.wire, int(m.direction), m.clamped != 0.0)
     after, count = spool_tick(tables, deflection, control_law_of(p).tick, before, nodes, 0)
@@ -181,7 +181,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
     p[PREDICTED], p[PREDICTED + 1] = seen, p12
     p[PREDICTED + 2] = jack.place - sensor.lead * jack.velocity
     p[RESIDUAL] = innovation * s.spool_weight
-    missed = pressure - sensor.pressure_offset - sensor.pressure_gain * p12
+    missed = pressure - read_pressure(sensor, p12)
     p[RESIDUAL + 1] = missed * s.pressure_weight
     xs, filtered, _ = re_anchored(
         innovation, s.anchor_gain, s.anchor_small, s.anchor_large, after.xs, m.filtered, law.stroke

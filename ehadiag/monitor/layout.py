@@ -150,9 +150,10 @@ RESIDUAL: Final = PREDICTED + 3
 CUSUM: Final = RESIDUAL + 2
 """Upper and lower sum of the spool, then of the pressure."""
 PLAYS: Final = CUSUM + 4
-"""What the plays of the hysteresis hold, A; how many is in the settings."""
+"""What the plays of the hysteresis hold, A, as many as the settings say, and last what flows behind
+the lag of the current's driver."""
 MOST_PLAYS: Final = 16
-TABLES: Final = PLAYS + MOST_PLAYS
+TABLES: Final = PLAYS + MOST_PLAYS + 1
 SLIDE: Final = TABLES
 """See `ehadiag.model.scalar.transition.SpoolTables`: spool moving with
 and without the feedback wire, at rest, flapper on its stop."""

@@ -159,7 +159,7 @@ def prepare(address: int, plan_address: int, unit_address: int) -> int:
     _make_constants(row, unit)
     constants, control = plant_of(row), _plan_control_of(plan)
     law = spool_law(constants)
-    _keep_drive_law(p, drive_law(constants))
+    _keep_drive_law(p, drive_law(constants, control.tick))
     _keep_spool_law(p, law)
     _keep_jack_law(p, jack_law(constants))
     _keep_sensor_law(p, sensor_law(constants))

@@ -19,7 +19,7 @@ from ehadiag.model.scalar.jack import jack_response
 from ehadiag.model.scalar.spool import spool_response
 from ehadiag.model.scalar.spool_tick import NODE_COLUMNS, NODES_PER_TICK
 from ehadiag.model.scalar.transition import spool_tables
-from ehadiag.model.sensors import read_spool, sensor_law
+from ehadiag.model.sensors import read_pressure, read_spool, sensor_law
 
 __all__ = ["ScalarModel"]
 
@@ -92,8 +92,7 @@ def _residuals(
         for k in range(n):
             spool = batch.spool[a + k] - read_spool(law, work.spool[k])
             out[SPOOL_ROW, a + k] = _weighted(spool, batch.weight[SPOOL_ROW, a + k])
-            pressure = batch.pressure[a + k] - law.pressure_offset
-            pressure -= law.pressure_gain * work.pressure[k]
+            pressure = batch.pressure[a + k] - read_pressure(law, work.pressure[k])
             out[PRESSURE_ROW, a + k] = _weighted(pressure, batch.weight[PRESSURE_ROW, a + k])
             if signals > POSITION_ROW:
                 position = batch.position[a + k] - law.position_offset

@@ -52,8 +52,8 @@ def spool_response(
     -------
     How many times the model was re-anchored.
     """
-    motor, law, sensor = drive_law(constants), tables.law, sensor_law(constants)
-    held = np.zeros(int(constants.NPL))
+    motor, law, sensor = drive_law(constants, tick), tables.law, sensor_law(constants)
+    held = np.zeros(int(constants.NPL) + 1)
     for k in range(history.shape[0]):
         drive(motor, held, history[k])
     s = spool_rest(law, deflection_held(motor, held), origin)

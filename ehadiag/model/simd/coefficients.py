@@ -23,6 +23,7 @@ from ehadiag.model.simd.layout import (
     ROOM,
     SENSING,
     SENSING_ROWS,
+    jack_law_of_lane,
     keep_drive_law,
     keep_jack_law,
     keep_sampled_step,
@@ -129,10 +130,10 @@ def _powers(
 
 
 @inlined
-def _laws(c: PlantConstants, i: int, out: NDArray[np.float64]) -> SpoolLaw:
-    """Write the laws of lane `i`; returns that of the spool."""
+def _laws(c: PlantConstants, tick: float, i: int, out: NDArray[np.float64]) -> SpoolLaw:
+    """Write the laws of lane `i`, tick: s; returns that of the spool."""
     t = spool_law(c)
-    keep_drive_law(out, i, drive_law(c))
+    keep_drive_law(out, i, drive_law(c, tick))
     keep_spool_law(out, i, t)
     keep_jack_law(out, i, jack_law(c))
     keep_sensor_law(out, i, sensor_law(c))
@@ -163,9 +164,9 @@ def tabulate(
     moving: NDArray[np.float64],
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
-) -> tuple[bool, bool, bool]:
+) -> tuple[bool, bool, bool, bool]:
     """Coefficients of all lanes; returns whether any has backlash, Stribeck's friction of the
-    spool, and a filter, a lead or Stribeck's friction of the jack.
+    spool, lands of a shape of their own, and a filter, a lead or Stribeck's friction of the jack.
 
     Parameters
     ----------
@@ -178,12 +179,13 @@ def tabulate(
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
-    any_backlash = any_creep = any_other = False
+    any_backlash = any_creep = any_shape = any_other = False
     for i in range(LANES):
         c = plant_of(candidates[i])
-        t = _laws(c, i, coefficients)
+        t = _laws(c, tick, i, coefficients)
         any_backlash = any_backlash or t.backlash > 0.0
         any_creep = any_creep or t.extra > 0.0
+        any_shape = any_shape or jack_law_of_lane(coefficients, i).shaped != 0.0
         any_other = any_other or sensing(sensor_law(c)) or c.VSJ > 0.0
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
@@ -216,4 +218,4 @@ def tabulate(
             for level in range(len(SHIFTS)):
                 place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH
                 loose[place : place + WIDTH] = moving[place : place + WIDTH]
-    return any_backlash, any_creep, any_other
+    return any_backlash, any_creep, any_shape, any_other

@@ -26,6 +26,7 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.collocation import C1, C2, creeping_pressures, radau_pressures, radau_velocity
 from ehadiag.model.jack import CREEPING, FINE_FADE
+from ehadiag.model.lands import opens, opens_by
 from ehadiag.model.laws import JackLaw, opening, pressure, resistance
 from ehadiag.model.sensors import followed, through_stages
 from ehadiag.model.simd.layout import (
@@ -60,6 +61,7 @@ __all__ = [
     "follow_lanes",
     "follow_pressure",
     "jack_lanes",
+    "open_lanes",
     "place_at",
     "positions",
     "pressures",
@@ -112,6 +114,18 @@ def place_at(path: NDArray[np.float64], o: int, k: int, tick: float) -> Vector:
     slopes = load(path, SLOPE * LANES + a) * STAGES[k + 3]
     slopes = slopes + load(path, SLOPE * LANES + b) * STAGES[k + 4]
     return STAGES[k + 1] * load(path, a) + STAGES[k + 2] * load(path, b) + tick * slopes
+
+
+@packed
+def open_lanes(end: int, path: NDArray[np.float64], coefficients: NDArray[np.float64]) -> None:
+    """Make the spool's path of a tick that of the lands' opening, all lanes, in place."""
+    for o in range(0, end, WIDTH):
+        j = jack_laws(coefficients, o)
+        for n in range(NODES + 1):
+            place, slope = (PLACE + n) * LANES + o, (SLOPE + n) * LANES + o
+            x = load(path, place)
+            store(path, slope, opens_by(j, x) * load(path, slope))
+            store(path, place, opens(j, x))
 
 
 @packed
@@ -299,6 +313,6 @@ def rest_jacks(
     for o in range(0, end, WIDTH):
         j = jack_laws(coefficients, o)
         store(state, JACK * LANES + o, place)
-        p12 = _limited(j, pressure(j, j.load * 0.0 + origin, 0.0))
+        p12 = _limited(j, pressure(j, opens(j, j.load * 0.0 + origin), 0.0))
         store(state, LAGGED * LANES + o, p12)
         store(state, PRESSURE * LANES + o, p12)

@@ -37,14 +37,15 @@ NODES = 4
     PRESSURE_SEEN,
     POSITION,
     ANCHORED,
+    FLOWING,
     PLAYS,
-) = range(23)
+) = range(24)
 """Rows of the state. DEFLECTION: of the flapper by the current alone; SEEN: spool as it is sampled;
 SPOOL_LAGGED, LAGGED: spool and pressure behind the filter at the end of the tick; PRESSURE: stored
 in the oil of an orifice stage; PRESSURE_SEEN, POSITION: pressure and jack as they are sampled;
 WIRE: end of the feedback wire; FRESH: the jack has just started or stopped; DONE: it has taken this
 tick beside the spool; ANCHORED: how often the lane was re-anchored, which goes on from span to
-span."""
+span; FLOWING: current behind its driver's lag."""
 
 MOST_PLAYS = 16
 STATE_ROWS = PLAYS + MOST_PLAYS

@@ -22,11 +22,12 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch
 from ehadiag.model.plant import FIELDS, plant_of
-from ehadiag.model.sensors import read_spool
+from ehadiag.model.sensors import read_pressure, read_spool
 from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
 from ehadiag.model.simd.jack import (
     follow_lanes,
     jack_lanes,
+    open_lanes,
     positions,
     pressures,
     rest_jacks,
@@ -36,9 +37,9 @@ from ehadiag.model.simd.jack_events import jack_events
 from ehadiag.model.simd.layout import (
     ANCHORED,
     COEFFICIENT_ROWS,
+    FLOWING,
     LANES,
     PATH_ROWS,
-    PLAYS,
     POSITION,
     PRESSURE_SEEN,
     SEEN,
@@ -207,7 +208,7 @@ def _hold_against(
         if signal == SPOOL_ROW:
             shown = read_spool(law, value)
         elif signal == PRESSURE_ROW:
-            shown = law.pressure_offset + law.pressure_gain * value
+            shown = read_pressure(law, value)
         else:
             shown = law.position_offset + law.position_gain * value
         residual = (measured - shown) * weight
@@ -284,12 +285,12 @@ def _block(
         for i in range(LANES):
             for field in range(FIELDS):
                 rows[i, field] = candidates[min(i, count - 1), test, field]
-        backlash, creeps, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        backlash, creeps, shaped, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
         orifice = plant_of(rows[0]).OIL > 0.0
-        state[PLAYS * LANES :] = 0.0
+        state[FLOWING * LANES :] = 0.0
         for k in range(since - batch.history[index], since):
             drive_lanes(end, current[k], plays, state, coefficients)
         deflect_lanes(end, plays, state, coefficients)
@@ -315,6 +316,8 @@ def _block(
                 )  # fmt: skip
                 for i in range(wanted):
                     out[i, SPOOL_ROW, k] = sample[i]
+            if shaped:
+                open_lanes(end, path, coefficients)
             if levels[k] < 0:
                 levels[k] = orifice_level(tick, coefficients) if orifice else _level(path)
             if k <= last:  # nothing depends on the jack but pressure and position

@@ -23,7 +23,7 @@ from ehadiag.compile.vector import (
     store,
     where,
 )
-from ehadiag.model.laws import driven, play, slide_base, still_flapper
+from ehadiag.model.laws import driven, lagged, play, slide_base, still_flapper
 from ehadiag.model.sensors import followed, read_spool, through_ends
 from ehadiag.model.simd.layout import (
     ANCHORED,
@@ -35,6 +35,7 @@ from ehadiag.model.simd.layout import (
     FILTERED,
     FLAPPER,
     FLAPPER_RATE,
+    FLOWING,
     LANES,
     LOOSE,
     MOVE,
@@ -83,7 +84,9 @@ def drive_lanes(
     """Flapper deflection that the current (A) of a tick alone makes, all lanes, into the state."""
     for o in range(0, end, WIDTH):
         law = drive_laws(coefficients, o)
-        value = law.bias + current
+        flowing = load(state, FLOWING * LANES + o)
+        store(state, FLOWING * LANES + o, lagged(law.left, flowing, current))
+        value = law.bias + lagged(law.late, flowing, current)
         total, weight = value * 0.0, value * 0.0 + 1.0
         for i in range(plays):
             row = (PLAYS + i) * LANES + o

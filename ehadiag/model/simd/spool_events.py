@@ -24,6 +24,7 @@ from ehadiag.compile.vector import (
     store,
 )
 from ehadiag.model.jack_state import Piece, Probe
+from ehadiag.model.lands import open_piece
 from ehadiag.model.laws import SpoolLaw, play, slide_base, steady_rate, still_flapper
 from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.second_stage import jack_piece
@@ -362,6 +363,7 @@ def _jack_beside(
         o = PIECES + 4 * n
         span = path[o]
         piece = Piece(span, from_xs, path[o + 1], path[o + 2] * span, path[o + 3] * span)
+        piece = open_piece(j, piece)
         jack = jack_piece(j, Probe(sensor.lag, due), senses, piece, 0.0, 1.0, jack)
         due -= span
         from_xs = path[o + 1]
