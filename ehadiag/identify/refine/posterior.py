@@ -62,8 +62,8 @@ class Pace:
 
     Attributes
     ----------
-    least_ratio : float
-        By which it may become narrower in a round, in any direction.
+    least_ratio, most_ratio : float
+        By which it may become narrower, and wider, in a round, in any direction.
     settled_ratio, settled_step : float
         Of a round after which nothing changes: ratio of the widths, step in units of them.
     most_rounds : int
@@ -73,18 +73,19 @@ class Pace:
     """
 
     least_ratio: float
+    most_ratio: float
     settled_ratio: float
     settled_step: float
     most_rounds: int
     flat: float
 
 
-MANY = Pace(0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
+MANY = Pace(0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
 """For many unknowns."""
 LAST = replace(MANY, most_rounds=12, flat=4.0)
 """The same, of a last look, which begins beside the optimum."""
-FEW = Pace(0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12, flat=0.0)
-"""For few ones, which are told apart at once."""
+FEW = Pace(0.3, 1.5, settled_ratio=0.7, settled_step=0.1, most_rounds=12, flat=0.0)
+"""For few ones, which are told apart at once: until the estimate is that of any search before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,6 +230,6 @@ def _narrowed(
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
     least = LEAST_RATIO_OF_LINEAR if is_linear else pace.least_ratio
-    kept = np.clip(ratios, least, 1.0)
+    kept = np.clip(ratios, least, pace.most_ratio)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
     return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step
