@@ -67,6 +67,10 @@ class Pace:
     settled_ratio, settled_step : float
         Of a round after which nothing changes: ratio of the widths, step in units of them.
     most_rounds : int
+    whole_rounds : int
+        Rounds that are taken whole. Of the first after them half is taken, of the next a third, and
+        so on (Robbins, Monro, Annals of Mathematical Statistics 22(3), 1951): where the cost has
+        steps as wide as the belief, round follows round about its mean for ever.
     flat : float
         By how much the objective differs where it is the same (a parameter one deviation off costs
         1), so that the search ends, and at the best place seen; 0: it does not go by the objective.
@@ -77,14 +81,17 @@ class Pace:
     settled_ratio: float
     settled_step: float
     most_rounds: int
+    whole_rounds: int
     flat: float
 
 
-MANY = Pace(0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
+MANY = Pace(
+    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=24, flat=10.0
+)
 """For many unknowns."""
 LAST = replace(MANY, most_rounds=12, flat=4.0)
 """The same, of a last look, which begins beside the optimum."""
-FEW = Pace(0.3, 1.5, settled_ratio=0.7, settled_step=0.1, most_rounds=12, flat=0.0)
+FEW = Pace(0.3, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0)
 """For few ones, which are told apart at once: until the estimate is that of any search before."""
 
 
@@ -143,7 +150,8 @@ def sharpen(
             course.passed(belief.x, linear.middle)
             if course.is_flat:
                 return Sharpened(replace(belief, x=course.x), linear, True)
-        belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
+        share = 1.0 / (1 + max(rounds - pace.whole_rounds, 0))
+        belief, ratio, step = _narrowed(model, linear, known, belief, information, pace, share)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
     if pace.flat:
         course.passed(belief.x, model.many(belief.x[None, :])[0])
@@ -208,8 +216,10 @@ def _narrowed(
     belief: Belief,
     information: NDArray[np.float64],
     pace: Pace,
+    share: float,
 ) -> tuple[Belief, float, float]:
-    """Belief after a round; also the ratio by which it would narrow most, and the step."""
+    """Belief after a share of a round; also the ratio by which it would narrow most, and the step,
+    of the whole of it."""
     weights = robust_weights(linear).ravel()
     rows = linear.jacobian.reshape(len(belief.x), -1)
     weighed = rows * weights
@@ -232,4 +242,5 @@ def _narrowed(
     least = LEAST_RATIO_OF_LINEAR if is_linear else pace.least_ratio
     kept = np.clip(ratios, least, pace.most_ratio)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
-    return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step
+    taken = x + (1.0 - share) * (belief.x - x)
+    return Belief(taken, belief.root @ (axes * kept**share)), float(ratios.min()), step
