@@ -11,7 +11,13 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from ehadiag.assess.acceptance import LONGEST_GAP_S, MOST_LOST, most_left
+from ehadiag.assess.acceptance import (
+    LEAST_SUPPLY,
+    LONGEST_GAP_S,
+    MOST_LOST,
+    MOST_SATURATED,
+    most_left,
+)
 from ehadiag.assess.verdict import FALSE_HEALTHY, FAULT_CHANCE, Levels
 from ehadiag.compile.kernel_cache import source_hash
 from ehadiag.compile.object_code import (
@@ -24,6 +30,8 @@ from ehadiag.compile.object_code import (
     tool_versions,
 )
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import Channel
+from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import InputOutputError
 from ehadiag.core.folder import Folder
 from ehadiag.core.printable import plain_name
@@ -202,6 +210,7 @@ def rules(actuator: Actuator) -> Rules:
         The limits.
     """
     levels, (outliers, rms) = Levels(), most_left(actuator.calibration)
+    _, spool, pressure, position = map(_ends, actuator_channels(actuator))
     return Rules(
         advisory=levels.advisory,
         limit=levels.limit,
@@ -212,7 +221,21 @@ def rules(actuator: Actuator) -> Rules:
         most_std=NOT_SHOWN_STD,
         most_lost=MOST_LOST,
         longest_gap=LONGEST_GAP_S * actuator.controller.rate,
+        most_saturated=MOST_SATURATED,
+        least_supply=LEAST_SUPPLY * actuator.servovalve.PSR,
+        spool_low=spool[0],
+        spool_high=spool[1],
+        pressure_low=pressure[0],
+        pressure_high=pressure[1],
+        position_low=position[0],
+        position_high=position[1],
     )
+
+
+def _ends(channel: Channel) -> tuple[float, float]:
+    """Values from which on a converter stands at its ends, SI."""
+    half = 0.5 * channel.lsb
+    return half - channel.full_scale, channel.full_scale - 3.0 * half
 
 
 def _own_functions(processor: Processor) -> Mapping[str, Any]:

@@ -42,6 +42,7 @@ from ehadiag.onboard.layout import (
     keep_outcome,
 )
 from ehadiag.onboard.noise import clear_histograms, count_residual, shown_noise
+from ehadiag.onboard.plausible import carries_verdict
 from ehadiag.onboard.rules import rules_of
 from ehadiag.onboard.run import (
     PRESSURE_WEIGHT,
@@ -160,5 +161,6 @@ def examine(address: int, plan_address: int, plan: Array, ticks_address: int, co
     )  # fmt: skip
     deviate(address, normal, meat, shift, squares / max(used - PARAMETERS, 1.0))
     complete = min(last[3, 0], last[3, 1]) >= most
-    judge(address, plan, complete and max(last[5, 0], last[5, 1]) <= rules.longest_gap)
+    complete = complete and max(last[5, 0], last[5, 1]) <= rules.longest_gap
+    judge(address, plan, complete and carries_verdict(address, plan, ticks, count))
     keep_advance(p, Advance(DONE, a.steps, a.best, judged, a.settled))

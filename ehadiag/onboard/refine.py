@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.address import array_at
 from ehadiag.compile.kernels import brief_kernel
+from ehadiag.model.exponential import exponential
 from ehadiag.monitor.layout import NUMBER
 from ehadiag.onboard.bounded import (
     bounded_step,
@@ -22,6 +23,7 @@ from ehadiag.onboard.bounded import (
     invert_small,
     similar,
 )
+from ehadiag.onboard.elementary import logarithm
 from ehadiag.onboard.layout import (
     BELIEF,
     CONCLUSION,
@@ -52,8 +54,10 @@ WIDTH = 4.0
 """Of the belief, in variances of what the linear problem leaves."""
 HELD_BACK, FREE = 0.1, 1e-9
 """Share of the belief's information that a step is held back by."""
-LEAST_RATIO, LEAST_RATIO_OF_LINEAR = 0.3, 0.05
-"""By which a belief may become narrower in a round; where the model is linear over it."""
+LEAST_RATIO, LEAST_RATIO_OF_LINEAR, MOST_RATIO = 0.3, 0.05, 1.5
+"""By which a belief may become narrower in a round; where the model is linear over it; wider."""
+WHOLE_ROUNDS = 10.0
+"""Rounds that are taken whole, see `ehadiag.identify.refine.posterior.Pace`."""
 LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
 """Scatter, and share of samples with more of it, up to which it is."""
 SQUARE = PARAMETERS * PARAMETERS
@@ -99,11 +103,12 @@ def _linearise(
 
 
 @brief_kernel
-def _narrow(address: int, excess: float, linear: bool) -> tuple[float, float]:
+def _narrow(address: int, excess: float, linear: bool, rounds: float) -> tuple[float, float]:
     """Step and narrow the belief: the ratio by which it would narrow most, the step's length.
 
-    The ratio is negative where there is no step to make.
+    The ratio is negative where there is no step to make. Of late rounds a share is taken.
     """
+    part = 1.0 + max(rounds - WHOLE_ROUNDS, 0.0)
     normal = array_at(address + NUMBER * NORMAL, (PARAMETERS, PARAMETERS))
     gradient = vector_at(address, NORMAL + PARAMETERS * PARAMETERS)
     point, trial = vector_at(address, POINT), vector_at(address, TRIAL)
@@ -129,7 +134,7 @@ def _narrow(address: int, excess: float, linear: bool) -> tuple[float, float]:
             along += inverse[i, j] * (out[j] - point[j])
         step = max(step, abs(along))
     for i in range(PARAMETERS):
-        point[i] = out[i]
+        point[i] = out[i] if part == 1.0 else point[i] + (out[i] - point[i]) / part
     # The covariance that is left, in units of the belief's own root.
     for i in range(PARAMETERS):
         normal[i, i] += FREE * held[i, i]
@@ -144,10 +149,13 @@ def _narrow(address: int, excess: float, linear: bool) -> tuple[float, float]:
     for j in range(GENES):
         ratio = math.sqrt(max(spread[j, j], 0.0))
         narrowest = min(narrowest, ratio)
+        kept = min(max(ratio, least), MOST_RATIO)
+        if part > 1.0:
+            kept = exponential(logarithm(kept) / part)
         for i in range(GENES):
             inverse[i, j] = 0.0
             for k in range(GENES):
-                inverse[i, j] += root[i, k] * axes[k, j] * min(max(ratio, least), 1.0)
+                inverse[i, j] += root[i, k] * axes[k, j] * kept
     for i in range(GENES):
         for j in range(GENES):
             root[i, j] = inverse[i, j]
@@ -160,8 +168,8 @@ def refine(address: int, plan_address: int, plan: Array, ticks_address: int, cou
     p = array_at(address, (SIZE,))
     a = advance_of(p)
     excess, jumped = _linearise(address, plan_address, plan, ticks_address, count)
-    ratio, step = _narrow(address, excess, jumped < LINEAR_SHARE)
     done = a.steps + 1.0
+    ratio, step = _narrow(address, excess, jumped < LINEAR_SHARE, done)
     settled = ratio > SETTLED_RATIO and step < SETTLED_STEP
     phase = CONCLUSION if settled or ratio < 0.0 or done >= ROUNDS else a.phase
     keep_advance(p, Advance(phase, done, a.best, a.judged, 1.0 if settled else 0.0))

@@ -36,6 +36,22 @@ class Rules(NamedTuple):
         Share of a channel's samples that may be missing.
     longest_gap : float
         Ticks without a sample that there may be.
+    most_saturated : float
+        Share of a channel's samples that may stand at its converter's ends.
+    least_supply : float
+        Supply above return, Pa, below which nothing is judged.
+    spool_low : float
+        Ends of the converters: m of the spool, Pa of the pressure, m of the jack.
+    spool_high : float
+        See `spool_low`.
+    pressure_low : float
+        See `spool_low`.
+    pressure_high : float
+        See `spool_low`.
+    position_low : float
+        See `spool_low`.
+    position_high : float
+        See `spool_low`.
     """
 
     advisory: float
@@ -47,6 +63,14 @@ class Rules(NamedTuple):
     most_std: float
     most_lost: float
     longest_gap: float
+    most_saturated: float
+    least_supply: float
+    spool_low: float
+    spool_high: float
+    pressure_low: float
+    pressure_high: float
+    position_low: float
+    position_high: float
 
 
 PLAN_SIZE: Final = MONITOR_PLAN_SIZE + len(Rules._fields)

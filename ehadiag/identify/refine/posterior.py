@@ -61,11 +61,15 @@ class Pace:
 
     Attributes
     ----------
-    least_ratio : float
-        By which it may become narrower in a round, in any direction.
+    least_ratio, most_ratio : float
+        By which it may become narrower, and wider, in a round, in any direction.
     settled_ratio, settled_step : float
         Of a round after which nothing changes: ratio of the widths, step in units of them.
     most_rounds : int
+    whole_rounds : int
+        Rounds that are taken whole. Of the first after them half is taken, of the next a third, and
+        so on (Robbins, Monro, Annals of Mathematical Statistics 22(3), 1951): where the cost has
+        steps as wide as the belief, round follows round about its mean for ever.
     flat : float
         By how much the objective differs where it is the same (a parameter one deviation off costs
         1), so that the search ends, and at the best place seen; 0: it does not go by the objective.
@@ -74,23 +78,27 @@ class Pace:
     """
 
     least_ratio: float
+    most_ratio: float
     settled_ratio: float
     settled_step: float
     most_rounds: int
+    whole_rounds: int
     flat: float
     width: float = 2.0
 
 
-MANY = Pace(0.5, settled_ratio=0.85, settled_step=0.5, most_rounds=24, flat=10.0)
+MANY = Pace(
+    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=24, flat=10.0
+)
 """For many unknowns."""
-PATIENT = replace(MANY, least_ratio=0.85, most_rounds=70, width=3.0)
+PATIENT = replace(MANY, least_ratio=0.85, most_rounds=70, whole_rounds=70, width=3.0)
 """The same, where break-aways lead a faster search astray. Of 54 starts on nine recordings that are
 hard (closed loop, little hysteresis) 38 came to the optimum, with 700 runs each; with a ratio of
 0.75 19, with 480 runs; of 0.65 9, with 360; of 0.9 42, with 970."""
 LAST = replace(MANY, most_rounds=12, flat=4.0)
 """The same, of a last look, which begins beside the optimum."""
-FEW = Pace(0.3, settled_ratio=0.7, settled_step=0.7, most_rounds=12, flat=0.0)
-"""For few ones, which are told apart at once."""
+FEW = Pace(0.3, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0)
+"""For few ones, which are told apart at once: until the estimate is that of any search before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +156,8 @@ def sharpen(
             course.passed(belief.x, linear.middle)
             if course.is_flat:
                 return Sharpened(replace(belief, x=course.x), linear, True)
-        belief, ratio, step = _narrowed(model, linear, known, belief, information, pace)
+        share = 1.0 / (1 + max(rounds - pace.whole_rounds, 0))
+        belief, ratio, step = _narrowed(model, linear, known, belief, information, pace, share)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
     if pace.flat:
         course.passed(belief.x, model.many(belief.x[None, :])[0])
@@ -213,8 +222,10 @@ def _narrowed(
     belief: Belief,
     information: NDArray[np.float64],
     pace: Pace,
+    share: float,
 ) -> tuple[Belief, float, float]:
-    """Belief after a round; also the ratio by which it would narrow most, and the step."""
+    """Belief after a share of a round; also the ratio by which it would narrow most, and the step,
+    of the whole of it."""
     weights = robust_weights(linear).ravel()
     rows = linear.jacobian.reshape(len(belief.x), -1)
     weighed = rows * weights
@@ -235,6 +246,7 @@ def _narrowed(
     squares, axes = np.linalg.eigh(inverse_root @ spread @ inverse_root.T)
     ratios = np.sqrt(np.maximum(squares, 0.0))
     least = LEAST_RATIO_OF_LINEAR if is_linear else pace.least_ratio
-    kept = np.clip(ratios, least, 1.0)
+    kept = np.clip(ratios, least, pace.most_ratio)
     step = float(np.abs(inverse_root @ (x - belief.x)[curved]).max())
-    return Belief(x, belief.root @ (axes * kept)), float(ratios.min()), step
+    taken = x + (1.0 - share) * (belief.x - x)
+    return Belief(taken, belief.root @ (axes * kept**share)), float(ratios.min()), step

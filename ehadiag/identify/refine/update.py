@@ -3,8 +3,8 @@
 The optimum of the first part stands with its information, the normal matrix of its residuals; one
 Gauss-Newton step on the residuals of the last part, weighed by the information of both, leads to
 the optimum of the whole (a measurement update of the information filter). Where the last part is
-small the step is a fraction of a deviation, over which derivatives hold; a longer one, or one that
-does not lead down, is not taken.
+small the step is a fraction of a deviation, over which derivatives hold. From where a longer one
+leads the whole is refined; one that is none of a small part, or does not lead down, is not taken.
 """
 
 from __future__ import annotations
@@ -24,15 +24,21 @@ from ehadiag.identify.refine.first_part import (
     anchored_model,
     derivatives_of,
 )
-from ehadiag.identify.refine.least_squares import Refinement
+from ehadiag.identify.refine.least_squares import Refinement, refine
+from ehadiag.identify.refine.posterior import FEW
 from ehadiag.identify.search.stages import LEAD_S
 
 __all__ = ["add_last_part"]
 
 FARTHEST = 3.0
 """Length of the step, in deviations of the first part, beyond which it is none of a small part."""
+LONG = 1.0
+"""The same of a severity: the optimum of the whole is not where one step leads, and is looked for
+from there."""
 WORSE = 4.0
 """Cost by which the step may lead up: what break-aways make of a way down."""
+FREE = 1e-12
+"""Information on what nothing shows."""
 
 
 def add_last_part(
@@ -69,6 +75,12 @@ def add_last_part(
         step = first.jacobian[:, first.used].T @ (moved - x)
         if step @ step > FARTHEST**2:
             return None
+        std = np.sqrt(np.diag(np.linalg.inv(first.normal + FREE * np.eye(len(x)))))
+        if np.any(np.abs(moved - x)[whole.faults] > LONG * std[whole.faults]):
+            names = (item.name for item in whole.estimated)
+            start = dict(zip(names, (moved * whole.scale).tolist(), strict=True))
+            found = refine(whole, start, FEW.width * (std * whole.scale)[whole.curved])
+            return replace(found, evaluations=model.evaluations + found.evaluations)
         jacobian[:, :, rows.last] = slope.jacobian[:, :, rows.counted]
         used[:, rows.last] = taken[:, rows.counted]
         evaluations, others, x = model.evaluations, [x], moved
@@ -106,7 +118,7 @@ def _stepped(
     stands, pulls = before @ first.residuals[first.used], now @ slope.residuals[taken]
     # At the optimum of the first part nothing pulls, but into a bound.
     at_bound = (x == model.lower) | (x == model.upper)
-    normal = before @ before.T + now @ now.T + 1e-12 * np.eye(len(x))
+    normal = before @ before.T + now @ now.T + FREE * np.eye(len(x))
     gradient = np.where(at_bound, stands, 0.0) + pulls
     return bounded_step(x, normal, gradient, model.lower, model.upper)
 

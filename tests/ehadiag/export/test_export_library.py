@@ -207,6 +207,25 @@ def test_cmake_builds_the_export(place, tmp_path):
     assert done.stdout.startswith("alarms 0")
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not shutil.which("cmake") or not shutil.which("arm-none-eabi-gcc"), reason="no CMake for Arm"
+)
+def test_cmake_builds_the_export_with_the_target_s_compiler(place, tmp_path):
+    """Compiled and linked for the same calling convention."""
+    toolchain = {
+        "CMAKE_SYSTEM_NAME": "Generic",
+        "CMAKE_C_COMPILER": "arm-none-eabi-gcc",
+        "CMAKE_TRY_COMPILE_TARGET_TYPE": "STATIC_LIBRARY",
+        "CMAKE_EXE_LINKER_FLAGS": "--specs=rdimon.specs",
+    }
+    of_target = [f"-D{name}={value}" for name, value in toolchain.items()]
+    source = exported("cortex-m7", place)
+    for options in (["-S", source, "-B", tmp_path, *of_target], ["--build", tmp_path]):
+        subprocess.run(["cmake", *options], check=True, capture_output=True)
+    assert (tmp_path / "eha_example").is_file()
+
+
 def test_a_number_of_hours_that_no_threshold_gives(place):
     with pytest.raises(ConfigurationError, match="hours"):
         export_library(default_actuator(), target("host"), None, hours=1e9)
