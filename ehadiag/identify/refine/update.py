@@ -25,7 +25,7 @@ from ehadiag.identify.refine.first_part import (
     derivatives_of,
 )
 from ehadiag.identify.refine.least_squares import Refinement, refine
-from ehadiag.identify.refine.posterior import WIDTH
+from ehadiag.identify.refine.posterior import FEW
 from ehadiag.identify.search.stages import LEAD_S
 
 __all__ = ["add_last_part"]
@@ -79,7 +79,7 @@ def add_last_part(
         if np.any(np.abs(moved - x)[whole.faults] > LONG * std[whole.faults]):
             names = (item.name for item in whole.estimated)
             start = dict(zip(names, (moved * whole.scale).tolist(), strict=True))
-            found = refine(whole, start, WIDTH * (std * whole.scale)[whole.curved])
+            found = refine(whole, start, FEW.width * (std * whole.scale)[whole.curved])
             return replace(found, evaluations=model.evaluations + found.evaluations)
         jacobian[:, :, rows.last] = slope.jacobian[:, :, rows.counted]
         used[:, rows.last] = taken[:, rows.counted]
