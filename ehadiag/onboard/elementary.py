@@ -54,6 +54,8 @@ def square_root(x: float) -> float:
             x, scale = x * small, scale * 2.0 ** (power // 2)
         elif x < 4.0 * small:
             x, scale = x * large, scale * 0.5 ** (power // 2)
+    while x < 1.0:  # a subnormal number, at most 26 times
+        x, scale = 4.0 * x, 0.5 * scale
     left, root, rest = int(x * WHOLE), 0, 0
     for _ in range(54):
         rest = (rest << 2) | ((left >> 52) & 3)

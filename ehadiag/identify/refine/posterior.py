@@ -88,7 +88,7 @@ class Pace:
 
 
 MANY = Pace(
-    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=24, flat=10.0
+    0.5, 1.0, settled_ratio=0.85, settled_step=0.5, most_rounds=24, whole_rounds=1000, flat=10.0
 )
 """For many unknowns."""
 PATIENT = replace(MANY, least_ratio=0.85, most_rounds=70, whole_rounds=70, width=3.0)

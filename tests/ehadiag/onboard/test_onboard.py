@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from places import LOGS
 
@@ -112,6 +112,8 @@ def test_rounding_is_that_of_the_c_library(x):
 
 
 @given(st.floats(allow_nan=False) | st.integers(0, 2**53).map(lambda n: (n / 2.0**20) ** 2))
+@example(2.0**-1023)
+@example(5e-324)
 def test_the_root_is_that_of_ieee_754(x):
     with np.errstate(invalid="ignore"):
         expected = np.sqrt(np.float64(x))
