@@ -19,7 +19,7 @@ from ehadiag.assess.acceptance import (
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
 from ehadiag.assess.delays import in_time
-from ehadiag.assess.lost_ticks import can_be_told, told_by_response, widened
+from ehadiag.assess.lost_ticks import UNEASY, can_be_told, told_by_response, widened
 from ehadiag.assess.modelled import response_of
 from ehadiag.assess.other_faults import (
     OtherFault,
@@ -245,7 +245,8 @@ class DiagnosisSession:
         """Identify; where that does not explain the recordings, by what the response tells."""
         found = self._session.finish(experiments, progress)
         late: tuple[str, ...] = ()
-        if any(item.by_time for item in recordings):
+        by_time = any(item.by_time for item in recordings)
+        if by_time:
             experiments, found, late = in_time(
                 experiments, found, lambda item: self._session.finish(item, progress)
             )
@@ -254,6 +255,8 @@ class DiagnosisSession:
             told = self._told(recordings, experiments, progress)
             if told is not None:
                 return told
+        if by_time and found.fit.outliers > UNEASY and can_be_told(recordings, experiments):
+            found = widened(found)
         return experiments, found, late, why
 
     def _told(

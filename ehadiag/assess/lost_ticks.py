@@ -26,7 +26,11 @@ from ehadiag.identify.uncertainty import interval95
 from ehadiag.model.parameters import Unknowns
 from ehadiag.model.scalar.residuals import ScalarModel
 
-__all__ = ["can_be_told", "told_by_response", "widened"]
+__all__ = ["UNEASY", "can_be_told", "told_by_response", "widened"]
+
+UNEASY = 0.005
+"""Share of residuals beyond three deviations (0.003 for noise alone) from which on rows that time
+placed amidst lost ones are taken to stand beside their own here and there."""
 
 TOLD_STD = 1e-3
 """Deviation of each severity that this leaves: 0.0014 off was seen, changes and severities bearing
@@ -53,6 +57,9 @@ MOVED = 8.0
 """What moving rows must explain, in variances: they were placed by their time and their current."""
 CLEAR = 4.0
 """By how much the best of several positions must be better than the second one, in variances."""
+HOPELESS = 0.35
+"""Share of residuals beyond three deviations from which on the severities are too wrong to tell
+anything: 0.12 at most was mended."""
 CAP, CAP_CURRENT = 9.0, 16.0
 """Most that a residual counts, in variances."""
 CURRENT_NOISE = 0.6
@@ -98,7 +105,7 @@ class Change:
 
 
 def can_be_told(recordings: Sequence[Recording], experiments: Sequence[Experiment]) -> bool:
-    """Whether currents were guessed that the response may tell.
+    """Whether currents were guessed, or rows placed by time amidst lost ones, that it may tell.
 
     Parameters
     ----------
@@ -113,7 +120,11 @@ def can_be_told(recordings: Sequence[Recording], experiments: Sequence[Experimen
         False where none was, or more than this was tried for.
     """
     shares = [item.trace.guessed for item in experiments]
-    return len(recordings) == len(shares) and 0.0 < max(shares, default=0.0) <= MOST_GUESSED
+    if len(recordings) != len(shares) or max(shares, default=0.0) > MOST_GUESSED:
+        return False
+    return any(
+        share > 0.0 or _is_movable(item) for share, item in zip(shares, recordings, strict=True)
+    )
 
 
 def told_by_response(
@@ -143,7 +154,7 @@ def told_by_response(
     found, now = identify(experiments), list(experiments)
     rows = [_Rows(a, b, actuator) for a, b in zip(recordings, experiments, strict=True)]
     told = moved = 0
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if found.fit.outliers <= HOPELESS else 0):
         made = [change for item in rows for change in item.improve(found)]
         told += sum(not item.by for item in made)
         moved += sum(abs(item.by) * (item.end - item.begin) for item in made)
@@ -181,6 +192,12 @@ def widened(found: Identification) -> Identification:
     return replace(found, estimates=estimates, covariance=covariance)
 
 
+def _is_movable(recording: Recording) -> bool:
+    """Whether time alone has placed its rows, and ticks without one are among them."""
+    samples = recording.samples
+    return recording.by_time and samples is not None and bool(np.isnan(samples.position).any())
+
+
 class _Rows:
     """Samples of one recording, changed step by step."""
 
@@ -188,7 +205,7 @@ class _Rows:
         assert recording.samples is not None
         self._samples = recording.samples
         self._environment = recording.environment
-        self._movable = recording.by_time
+        self._movable = _is_movable(recording)
         self._begin = experiment
         self._actuator = actuator
         self._anchor: tuple[float, float] | None = ANCHOR_LSB
@@ -201,7 +218,7 @@ class _Rows:
         """Make the changes that explain more of the response at such severities."""
         made: list[Change] = []
         controller = self._actuator.controller
-        if not self._begin.trace.guessed or controller.GAI or controller.GAD:
+        if not (self._begin.trace.guessed or self._movable) or controller.GAI or controller.GAD:
             return made
         ways: dict[float, tuple[float, float] | None] = {
             float(self._misfit(self._samples, found, way).sum()): way for way in (ANCHOR_LSB, None)
@@ -235,7 +252,10 @@ class _Rows:
             return out
         step, ticks = self._begin.channels.position.lsb, np.arange(len(lost))
         bridged = np.interp(ticks, ticks[~lost], samples.position[~lost])
-        asked = guessed_positions(samples, test, self._actuator.controller, self._begin.channels)
+        asked = np.zeros(0, dtype=np.int64)
+        if test.closed_loop:
+            law = self._actuator.controller
+            asked = guessed_positions(samples, test, law, self._begin.channels)
         for tick in (asked - 1).tolist():
             if tick >= 0 and lost[tick]:
                 code = round(float(bridged[tick]) / step)

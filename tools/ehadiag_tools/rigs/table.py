@@ -133,7 +133,9 @@ def _show(found: Sequence[Found], *, verbose: bool) -> None:
     """One line for each bus and jitter."""
     usual = {run.recording: got["verdict"] for run, got in found if run.bus == DEFAULT}
     print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
-    for bus, jitter in dict.fromkeys((run.bus, run.how.jitter_ms) for run, _ in found):
+    names = [DEFAULT, *(item.name for item in BUSES), DAQ]
+    rows = {(run.bus, run.how.jitter_ms) for run, _ in found}
+    for bus, jitter in sorted(rows, key=lambda row: (names.index(row[0]), row[1])):
         part = [item for item in found if (item[0].bus, item[0].how.jitter_ms) == (bus, jitter)]
         print("| " + " | ".join([bus, f"{jitter:g} ms", *_cells(part, usual)]) + " |")
     for run, got in found if verbose else ():
