@@ -16,7 +16,7 @@ from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
-from ehadiag.identify.nuisance.further import looked_further
+from ehadiag.identify.nuisance.further import would_explain
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.refine.first_part import (
@@ -56,7 +56,7 @@ from ehadiag.identify.textbook import (
     unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance, independent
-from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
+from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
 __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 
@@ -64,6 +64,8 @@ __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 BEYOND_RESCUE = 0.05
 """Share of residuals beyond three deviations after a refinement from which on no further search is
 made: 0.04 at most on a textbook's actuator after the search before."""
+BEYOND_LOAD = 15.0
+"""Excess after all nuisances from which on a load is not tried besides."""
 NEARLY = 1.3
 """Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
 brings out what its model leaves, and loosened effects would stand in for that."""
@@ -231,27 +233,37 @@ class Session:
     ) -> Estimated:
         """Estimate with all nuisances free; before: excess that the severities alone leave."""
         tell("nuisances", 0.0)
-        found = self._estimated(experiments, self.knowledge, hint, before, tell)
+        found = self._estimated(experiments, self.knowledge, hint, tell, before=before)
         if found.explained:
             return found
         if not self.knowledge.doubts:
-            return looked_further(
-                experiments, found, self.seed, lambda share: tell("nuisances", share)
-            )
+            return self._with_load(experiments, found, tell)
         if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
-        loose = self._estimated(experiments, self.knowledge.loosened(), hint, before, tell)
+        loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
         return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
+
+    def _with_load(
+        self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
+    ) -> Estimated:
+        """Estimate a constant load, too, where that explains what the others do not."""
+        load = parameter("load")
+        if found.excess > BEYOND_LOAD or not would_explain(load, found, self.seed):
+            return found
+        return self._estimated(experiments, self.knowledge, found.refined.values, tell, (load,))
 
     def _estimated(
         self,
         experiments: Sequence[Experiment],
         knowledge: Knowledge,
         hint: Mapping[str, float] | None,
-        before: float,
         tell: Progress,
+        further: tuple[Parameter, ...] = (),
+        before: float = np.inf,
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        effects = (*effects, *further)
+        patient = any(item.test.closed_loop for item in experiments)
         free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
@@ -260,12 +272,13 @@ class Session:
             joint=knowledge.joint,
             considered=considered_in(experiments, free),
             hint=hint,
-            left_before=before,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
             give_up=not knowledge.doubts,
             explains=knowledge.explains,
+            patient=patient,
+            left_before=before,
         )
 
     def _said(

@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 from ehadiag.identify.nuisance.explained import excess, misses_only_pressure
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
-from ehadiag.identify.refine.posterior import robust_cost, sharpen
+from ehadiag.identify.refine.posterior import MANY, PATIENT, robust_cost, sharpen
 
 __all__ = ["Found", "Place", "search"]
 
+AGAIN = 0.1
+"""Spread of a further look about the best so far, in spreads of the first."""
+ALIAS_SPAN = 1.25
+"""Half-width over which a parameter is moved against what it passes for, in units of its scale."""
 SAME, TWICE = 4.0, 2
 """Objective up to which two ends are of the same place (a parameter one deviation off costs 1), and
 ends there after which it is the optimum, if break-aways come at the right ticks there."""
 NO_LESS = 0.98
 """Share of the excess with fewer unknowns that is as much."""
-AGAIN = 0.1
-"""Spread of a further look about the best so far, in spreads of the first."""
-ALIAS_SPAN = 1.25
-"""Half-width over which a parameter is moved against what it passes for, in units of its scale."""
+ALIKE = 10.0
+"""By how much the cost of the same place differs (a parameter one deviation off costs 1)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +90,7 @@ def search(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     hopeless: Callable[[NDArray[np.float64], int], bool] | None = None,
+    patient: bool = False,
     confirms: bool = False,
     before: float = np.inf,
 ) -> Found:
@@ -113,6 +116,9 @@ def search(
         what it raises ends the search.
     hopeless : callable, optional
         Of the best residuals and the number of starts: whether further ones will not help.
+    patient : bool
+        Whether all starts but the first take their time, each from the last origin, until two have
+        come to the same place; else every other one begins beside the best so far.
     confirms : bool
         Whether a place that only misses the pressure ends the search, too, if it is found again or
         leaves as much as `before`.
@@ -129,14 +135,17 @@ def search(
     confirmed = False
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
+        pace = PATIENT if patient and best is not None else MANY
         turn, beside = divmod(len(places), 2)
-        if best is None or not beside:
+        if patient:
+            begin = origins[0 if best is None else -1]
+        elif best is None or not beside:
             begin = origins[turn % len(origins)]
         else:
             begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
         rng = np.random.default_rng([seed, len(places)])
         linearise = partial(linearised, rng=rng)
-        sharpened = sharpen(model, known, begin, information, linearise, between=between)
+        sharpened = sharpen(model, known, begin, information, linearise, pace, between)
         belief, settled = sharpened.belief, sharpened.settled
         residuals = model.many(belief.x[None, :])[0]
         cost = float(robust_cost(residuals))
@@ -145,6 +154,8 @@ def search(
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
         confirmed = confirms and _is_confirmed(best, places, before)
         if confirmed or (hopeless is not None and hopeless(best.residuals, len(places))):
+            break
+        if patient and _meet(places, int(np.count_nonzero(residuals))):
             break
         between()
     return replace(best, places=tuple(places), confirmed=confirmed)
@@ -158,6 +169,12 @@ def _is_confirmed(best: Found, places: Sequence[Place], before: float) -> bool:
     unit = max(best.cost / max(int(np.count_nonzero(best.residuals)), 1), 1.0)
     ends = sum(place.cost - best.cost <= SAME * unit for place in places)
     return ends >= TWICE or excess(best.residuals) >= NO_LESS * before
+
+
+def _meet(places: Sequence[Place], count: int) -> bool:
+    """Whether the best two starts came to the same place, by their costs of so many residuals."""
+    costs = sorted(place.cost for place in places)[:2]
+    return len(costs) == 2 and costs[1] - costs[0] < ALIKE * max(costs[0] / max(count, 1), 1.0)
 
 
 def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:

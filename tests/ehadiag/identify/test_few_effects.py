@@ -1,4 +1,4 @@
-"""Units with one effect or two, which a search over all effects at once does not find."""
+"""Units with one effect or two, which a fast search over all effects misses in closed loop."""
 
 from __future__ import annotations
 
