@@ -251,14 +251,14 @@ class Session:
     ) -> Estimated:
         """Estimate with all nuisances free; before: excess that the severities alone leave."""
         tell("nuisances", 0.0)
-        found = self._estimated(experiments, self.knowledge, hint, before, tell)
+        found = self._estimated(experiments, self.knowledge, hint, tell, before=before)
         if found.explained:
             return found
         if not self.knowledge.doubts:
             return self._with_load(experiments, found, tell)
         if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
-        loose = self._estimated(experiments, self.knowledge.loosened(), hint, before, tell)
+        loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
         return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
     def _with_load(
@@ -278,9 +278,9 @@ class Session:
         experiments: Sequence[Experiment],
         knowledge: Knowledge,
         hint: Mapping[str, float] | None,
-        before: float,
         tell: Progress,
         further: tuple[Parameter, ...] = (),
+        before: float = np.inf,
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
         effects = (*effects, *further)
@@ -293,13 +293,13 @@ class Session:
             joint=knowledge.joint,
             considered=considered_in(experiments, free),
             hint=hint,
-            left_before=before,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
             give_up=not knowledge.doubts,
             explains=knowledge.explains,
             patient=patient,
+            left_before=before,
         )
 
     def _said(

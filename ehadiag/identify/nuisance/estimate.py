@@ -179,7 +179,9 @@ def estimate(
     belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
     if not (give_up and not found.explained and is_hopeless(found.residuals, found.starts)):
         draw = partial(linearised, rng=np.random.default_rng([seed, -1 % 2**32]))
-        if patient:  # a break-away may stand between the end of the search and the optimum
+        if (
+            patient and not found.confirmed
+        ):  # a break-away may stand between the end of the search and the optimum
             root = AGAIN * before[0].root
             belief = _looked_about(fine, belief, root, before, draw, between, OTHER_PLACE)
         belief = _looked_about(fine, belief, LOOK * belief.root, before, draw, between)

@@ -49,6 +49,9 @@ HELD_BACK_WHERE_LINEAR = 1e-3
 """The same where the model is linear over it: a belief that became too narrow on its way would
 creep."""
 FREE = 1e-9
+MEAN_STEP = 0.25
+"""Last step of a mean of rounds, in widths of the belief, below which it has come to rest: where the
+cost has steps as wide as the belief no round alone does."""
 
 
 def nothing() -> None:
@@ -159,6 +162,8 @@ def sharpen(
         share = 1.0 / (1 + max(rounds - pace.whole_rounds, 0))
         belief, ratio, step = _narrowed(model, linear, known, belief, information, pace, share)
         settled = ratio > pace.settled_ratio and step < pace.settled_step
+    if not settled and share < 1.0:
+        settled = ratio > pace.settled_ratio and share * step < MEAN_STEP
     if pace.flat:
         course.passed(belief.x, model.many(belief.x[None, :])[0])
         belief = replace(belief, x=course.x)

@@ -73,7 +73,6 @@ def test_a_load_that_was_not_estimated_is_recognised_and_nothing_else_is_taken_f
         ("loose-pressure", "open"),
         ("lost-surface", "closed"),
         ("starved", "closed"),
-        ("scaled-pressure", "closed"),
     ],
 )
 def test_what_no_effect_explains_is_refused_after_the_first_attempts(kind: str, test: str) -> None:
