@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
-from ehadiag.identify.nuisance.astray import may_be_astray, would_explain
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
+from ehadiag.identify.nuisance.further import would_explain
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
-from ehadiag.identify.nuisance.stepwise import stepwise
 from ehadiag.identify.refine.first_part import (
     FirstPart,
     considered_in,
@@ -57,7 +56,7 @@ from ehadiag.identify.textbook import (
     unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance, independent
-from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, parameter
+from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
 
 __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 
@@ -65,8 +64,8 @@ __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 BEYOND_RESCUE = 0.05
 """Share of residuals beyond three deviations after a refinement from which on no further search is
 made: 0.04 at most on a textbook's actuator after the search before."""
-BEYOND_STEPS = 15.0
-"""Excess after all nuisances at once from which on they are not tried one after another."""
+BEYOND_LOAD = 15.0
+"""Excess after all nuisances from which on a load is not tried besides."""
 NEARLY = 1.3
 """Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
 brings out what its model leaves, and loosened effects would stand in for that."""
@@ -190,10 +189,10 @@ class Session:
         freed: Estimated | None = None
         if not alone and (best is None or not _leaves_nothing(best.refined)):
             hint = best.refined.values if best else named(found.best)
-            freed = self._freed(experiments, hint if near else None, tell)
+            alone_left = excess(best.refined.residuals) if best else np.inf
+            freed = self._freed(experiments, hint if near else None, alone_left, tell)
         if best is not None and (freed is None or _is_poorer(freed, best)):
-            elsewhere = freed is not None and is_of_the_pressure(freed.refined.residuals)
-            if near and outliers(best.refined) <= BEYOND_RESCUE and not elsewhere:
+            if near and outliers(best.refined) <= BEYOND_RESCUE and not _is_elsewhere(freed, best):
                 best = rescued(
                     experiments, best, self._first_part, self.solver, self.seed, tell,
                     time.perf_counter,
@@ -229,53 +228,45 @@ class Session:
         self,
         experiments: Sequence[Experiment],
         hint: Mapping[str, float] | None,
+        before: float,
         tell: Progress,
     ) -> Estimated:
-        """Estimate with all nuisances free."""
+        """Estimate with all nuisances free; before: excess that the severities alone leave."""
         tell("nuisances", 0.0)
-        found = self._estimated(experiments, self.knowledge, hint, tell)
+        found = self._estimated(experiments, self.knowledge, hint, before, tell)
         if found.explained:
             return found
         if not self.knowledge.doubts:
-            return self._stepwise(experiments, found, tell)
+            return self._with_load(experiments, found, tell)
         if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
-        loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
+        loose = self._estimated(experiments, self.knowledge.loosened(), hint, before, tell)
         return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
-    def _stepwise(
+    def _with_load(
         self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
     ) -> Estimated:
-        """Estimate one effect after another where that explains what all at once do not."""
+        """Estimate a constant load, too, where that explains what the others do not."""
         load = parameter("load")
-        if found.excess > BEYOND_STEPS:
+        if found.excess > BEYOND_LOAD or is_of_the_pressure(found.refined.residuals):
             return found
-        if not may_be_astray(experiments, found) and not would_explain(load, found, self.seed):
+        if not would_explain(load, found, self.seed):
             return found
-        few = stepwise(
-            experiments,
-            (*nuisances_of(REGISTRY), load),
-            least=found.excess,
-            considered=considered_in(experiments),
-            seed=self.seed,
-            tell=lambda share: tell("nuisances", share),
-        )
-        if few is None:
-            return found
-        return replace(
-            few,
-            evaluations=found.evaluations + few.evaluations,
-            starts=found.starts + few.starts,
-        )
+        hint = found.refined.values
+        return self._estimated(experiments, self.knowledge, hint, found.excess, tell, (load,))
 
     def _estimated(
         self,
         experiments: Sequence[Experiment],
         knowledge: Knowledge,
         hint: Mapping[str, float] | None,
+        before: float,
         tell: Progress,
+        further: tuple[Parameter, ...] = (),
     ) -> Estimated:
         effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
+        effects = (*effects, *further)
+        patient = any(item.test.closed_loop for item in experiments)
         free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
         return estimate(
             experiments,
@@ -284,11 +275,13 @@ class Session:
             joint=knowledge.joint,
             considered=considered_in(experiments, free),
             hint=hint,
+            left_before=before,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
             give_up=not knowledge.doubts,
             explains=knowledge.explains,
+            patient=patient,
         )
 
     def _said(
@@ -406,6 +399,15 @@ def _is_poorer(freed: Estimated, alone: Attempt) -> bool:
     """Whether nuisances explain a recording no better than the severities alone do: what is left
     is none of theirs, as where guessed positions stand in for lost ones."""
     return not freed.explained and freed.excess >= excess(alone.refined.residuals)
+
+
+def _is_elsewhere(freed: Estimated | None, alone: Attempt) -> bool:
+    """Whether what the severities alone leave is not for want of a search: of the pressure, or left
+    where all effects at once were found to end again and again."""
+    if freed is None:
+        return False
+    confirmed = freed.confirmed and not is_guessed(alone.refined)
+    return confirmed or is_of_the_pressure(freed.refined.residuals)
 
 
 def _stages_ready(experiment: Experiment) -> int:

@@ -14,13 +14,20 @@ def test_severities_are_below_the_one_level_or_one_of_them_is_above_the_other():
     assert worn.min() < 0.05
 
 
+def _item(faults, test, verdict, value):
+    interval = [[part - 0.02, part + 0.02] for part in value]
+    return {
+        "faults": faults, "test": test, "verdict": verdict, "value": value, "interval95": interval
+    }  # fmt: skip
+
+
 def test_rates_count_recordings_and_units_with_any(capsys):
     sound, worn = [0.1, 0.2, 0.0], [0.1, 0.4, 0.0]
     records = [
         {
             "tested": [
-                {"faults": sound, "verdict": first},
-                {"faults": worn, "verdict": second},
+                _item(sound, "open", first, [0.1, 0.2, 0.03]),
+                _item(worn, "closed", second, [0.1, 0.4, 0.0]),
             ]
         }
         for first, second in (("HEALTHY", "DEGRADED"), ("NOT_TESTED", "DEGRADED"))
@@ -36,3 +43,6 @@ def test_rates_count_recordings_and_units_with_any(capsys):
     assert rows["sound, not HEALTHY"][2:5] == ["2", "1", "50.00%"]
     assert rows["worn, HEALTHY"][2:5] == ["2", "0", "0.00%"]
     assert rows["worn, HEALTHY"][5].startswith("0: 0.00% … 84.19%")
+    # What is NOT TESTED states nothing: one recording in open loop, one severity of it 3 % off.
+    errors = next(line for line in said.splitlines() if line.startswith("| open"))
+    assert errors == "| open | 1 | 1.0000 | 1.0000 | 3.000 | 66.7 | 4.000 |"

@@ -20,10 +20,10 @@ from ehadiag.identify.nuisance.prior import (
     information_of,
     small_effects,
 )
-from ehadiag.identify.nuisance.starts import Found, search
+from ehadiag.identify.nuisance.starts import AGAIN, Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.least_squares import Refinement, described
-from ehadiag.identify.refine.linearisation import Belief, linearised
+from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
 from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
 from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
 from ehadiag.identify.uncertainty import independent
@@ -44,6 +44,10 @@ TWINS = {"Kintas": 2e-3, "FSS": 7e-4, "FDJ": 5e-5}
 """Deviation of each severity where there is so little: places beside the optimum explain such
 recordings as well, the noise deciding which break-aways there were. Errors in 48 of them (eight
 noises, six units) were 0.47, 0.19 and 0.02 % at most, up to 46 deviations without this."""
+OTHER_PLACE = 30.0
+"""Gain of a look further about from which on it is another place, not one as good."""
+Linearise = Callable[[Derivatives, Belief], Linearised]
+Hopeless = Callable[[NDArray[np.float64], int], bool]
 RELAXED = 100.0
 """Weight of the spool over the pressure while the spool is explained first."""
 
@@ -61,6 +65,8 @@ class Estimated:
     covariance : shape (k, k)
         SI, of what several optima of like cost leave open, beside that of the refinement.
     explained : bool
+    confirmed : bool
+        See `ehadiag.identify.nuisance.starts.Found`.
     excess : float
         See `ehadiag.identify.nuisance.explained.excess`.
     starts : int
@@ -73,6 +79,7 @@ class Estimated:
     experiments: list[Experiment]
     covariance: NDArray[np.float64]
     explained: bool
+    confirmed: bool
     excess: float
     starts: int
     evaluations: int
@@ -90,8 +97,9 @@ def estimate(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     give_up: bool = False,
-    look_again: bool = False,
+    left_before: float = np.inf,
     explains: Explains = is_noise,
+    patient: bool = False,
 ) -> Estimated:
     """Estimate parameters of one actuator from one or more recordings of it.
 
@@ -117,16 +125,18 @@ def estimate(
         estimation.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
-    look_again : bool
-        Whether to look about the optimum with the noise as judged even where it was given up.
+    left_before : float
+        Excess that is left with none of the effects.
     explains : callable
         Of residuals, shape (signals, N): whether there is nothing better to look for.
+    patient : bool
+        Whether further starts take their time, see `ehadiag.identify.nuisance.starts.search`.
     """
     known = known or {}
     coarse = _free_running(experiments, free)
     model = _scaled(coarse, experiments)
     first, information = belief_of(model, known, joint), information_of(model, known, joint)
-    origins = [first, small_effects(model, first)]
+    origins = [first] if patient else [first, small_effects(model, first)]
     if hint is not None:
         origins = [beside(model, first, hint), *origins[::-1]]
     guide: Derivatives | None = None
@@ -156,18 +166,23 @@ def estimate(
         budget=budget,
         seed=seed,
         tell=tell,
-        hopeless=is_hopeless if give_up else None,
+        hopeless=_hopeless(give_up=give_up, patient=patient),
+        patient=patient,
+        confirms=give_up,
+        before=left_before,
     )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
     fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
     before = belief_of(fine, known, joint), information_of(fine, known, joint)
     between = nothing if tell is None else partial(tell, 1.0)
-    given_up = give_up and not found.explained and is_hopeless(found.residuals, found.starts)
-    if given_up and not look_again:
-        belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
-    else:
-        belief = _last_look(fine, model, found, before, seed, between)
+    belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
+    if not (give_up and not found.explained and is_hopeless(found.residuals, found.starts)):
+        draw = partial(linearised, rng=np.random.default_rng([seed, -1 % 2**32]))
+        if patient:  # a break-away may stand between the end of the search and the optimum
+            root = AGAIN * before[0].root
+            belief = _looked_about(fine, belief, root, before, draw, between, OTHER_PLACE)
+        belief = _looked_about(fine, belief, LOOK * belief.root, before, draw, between)
     linear = linearised(fine, belief, np.random.default_rng(seed))
     refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
     return Estimated(
@@ -175,10 +190,18 @@ def estimate(
         experiments=judged,
         covariance=spread_of_optima(found, model.scale) + _spread_of_twins(refined, judged),
         explained=explains(refined.residuals),
+        confirmed=found.confirmed,
         excess=excess(refined.residuals),
         starts=found.starts,
         evaluations=sum(item.evaluations for item in (guide, model, fine) if item),
     )
+
+
+def _hopeless(*, give_up: bool, patient: bool) -> Hopeless | None:
+    """Judge when further starts will not help."""
+    if not give_up:
+        return None
+    return partial(is_hopeless, astray=True) if patient else is_hopeless
 
 
 def _spread_of_twins(refined: Refinement, experiments: Sequence[Experiment]) -> NDArray[np.float64]:
@@ -239,26 +262,23 @@ def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -
     return [judge_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
 
 
-def _last_look(
+def _looked_about(
     fine: Derivatives,
-    model: Derivatives,
-    found: Found,
+    there: Belief,
+    root: NDArray[np.float64],
     before: tuple[Belief, NDArray[np.float64]],
-    seed: int,
+    draw: Linearise,
     between: Callable[[], None],
+    least_gain: float = 0.0,
 ) -> Belief:
-    """Optimum by the noise as judged: of the search, or a better one beside it.
+    """Search about a place; where that ends, if it is better by so much, else the place.
 
-    before: what was known, and its information.
+    root: of the covariance over which it looks; before: what was known, and its information.
     """
-    ratio = model.scale / fine.scale
-    there = Belief(found.belief.x * ratio, found.belief.root)
-    wider = Belief(there.x, LOOK * there.root)
-    rng = np.random.default_rng([seed, -1 % 2**32])
-    draw = partial(linearised, rng=rng)
-    again = sharpen(fine, before[0], wider, before[1], draw, LAST, between).belief
-    costs = robust_cost(fine.many(np.vstack([there.x, again.x])))
-    return again if costs[1] < costs[0] else there
+    wider = Belief(there.x, root)
+    seen = sharpen(fine, before[0], wider, before[1], draw, LAST, between).belief
+    costs = robust_cost(fine.many(np.vstack([there.x, seen.x])))
+    return seen if costs[0] - costs[1] > least_gain else there
 
 
 def spread_of_optima(found: Found, scale: NDArray[np.float64]) -> NDArray[np.float64]:

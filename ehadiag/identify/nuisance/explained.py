@@ -19,6 +19,7 @@ __all__ = [
     "is_noise",
     "is_of_the_pressure",
     "leaves_no_more",
+    "misses_only_pressure",
     "outliers_of",
 ]
 
@@ -35,8 +36,10 @@ MOST_OUTLIERS = 0.01
 
 HOPELESS = (0.3, 0.05)
 """Share of residuals beyond three deviations after one start, and after two, from which on no more
-is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones; 0.21
-where a search went astray in closed loop."""
+is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones."""
+HOPELESS_ASTRAY = (0.45, 0.3)
+"""The same in closed loop, where searches that went astray on sound units left 0.4 after a first
+start, and 0.27 after one that took its time."""
 HOPELESS_EXCESS = 3.0
 """The same of the excess, after two starts: 1.6 at most on sound units that a further start
 explained, 2.0 with a load that is not estimated."""
@@ -81,11 +84,21 @@ def leaves_no_more(fit: Goodness) -> Explains:
     )
 
 
-def is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
-    """Whether so much is left after so many starts that further ones will not explain it."""
-    if outliers_of(residuals) > HOPELESS[min(starts, len(HOPELESS)) - 1]:
+def is_hopeless(residuals: NDArray[np.float64], starts: int, *, astray: bool = False) -> bool:
+    """Whether so much is left after so many starts that further ones will not explain it.
+
+    astray: whether a search may well end beside the optimum.
+    """
+    most = HOPELESS_ASTRAY if astray else HOPELESS
+    if outliers_of(residuals) > most[min(starts, len(most)) - 1]:
         return True
-    return starts > 1 and excess(residuals) > HOPELESS_EXCESS
+    return not astray and starts > 1 and excess(residuals) > HOPELESS_EXCESS
+
+
+def misses_only_pressure(residuals: NDArray[np.float64]) -> bool:
+    """Whether the spool is explained, so that break-aways come at the right ticks."""
+    excesses = excess_of_signals(residuals)
+    return excesses[0] <= SPOOL_EXPLAINED and max(excesses[1:], default=0.0) > SPOOL_EXPLAINED
 
 
 def is_of_the_pressure(residuals: NDArray[np.float64]) -> bool:

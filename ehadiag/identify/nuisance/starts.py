@@ -13,12 +13,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.identify.nuisance.explained import excess, misses_only_pressure
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
-from ehadiag.identify.refine.posterior import robust_cost, sharpen
+from ehadiag.identify.refine.posterior import MANY, PATIENT, robust_cost, sharpen
 
 __all__ = ["Found", "Place", "search"]
 
+SAME = 10.0
+"""Objective up to which two ends are of the same place (a parameter one deviation off costs 1)."""
+NO_LESS = 0.98
+"""Share of the excess with fewer unknowns that is as much."""
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
 ALIAS_SPAN = 1.25
@@ -53,6 +58,8 @@ class Found:
     explained : bool
     places : tuple of Place
         Where all starts ended.
+    confirmed : bool
+        Whether only the pressure is not explained there, and another search ended there, too.
     """
 
     belief: Belief
@@ -60,6 +67,7 @@ class Found:
     cost: float
     explained: bool
     places: tuple[Place, ...]
+    confirmed: bool = False
 
     @property
     def starts(self) -> int:
@@ -79,6 +87,9 @@ def search(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     hopeless: Callable[[NDArray[np.float64], int], bool] | None = None,
+    patient: bool = False,
+    confirms: bool = False,
+    before: float = np.inf,
 ) -> Found:
     """Search until the residuals are explained, or the budget is spent.
 
@@ -102,6 +113,14 @@ def search(
         what it raises ends the search.
     hopeless : callable, optional
         Of the best residuals and the number of starts: whether further ones will not help.
+    patient : bool
+        Whether all starts but the first take their time, each from the last origin, until two have
+        come to the same place; else every other one begins beside the best so far.
+    confirms : bool
+        Whether a place that only misses the pressure ends the search, too, if it is found again or
+        leaves as much as `before`.
+    before : float
+        Excess that another search left with fewer unknowns.
     """
     until = model.evaluations + budget
 
@@ -110,26 +129,47 @@ def search(
             tell(min(1.0 - (until - model.evaluations) / max(budget, 1), 1.0))
 
     best: Found | None = None
+    confirmed = False
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
+        pace = PATIENT if patient and best is not None else MANY
         turn, beside = divmod(len(places), 2)
-        if best is None or not beside:
+        if patient:
+            begin = origins[0 if best is None else -1]
+        elif best is None or not beside:
             begin = origins[turn % len(origins)]
         else:
             begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
         rng = np.random.default_rng([seed, len(places)])
         linearise = partial(linearised, rng=rng)
-        sharpened = sharpen(model, known, begin, information, linearise, between=between)
+        sharpened = sharpen(model, known, begin, information, linearise, pace, between)
         belief, settled = sharpened.belief, sharpened.settled
         residuals = model.many(belief.x[None, :])[0]
         cost = float(robust_cost(residuals))
         places.append(Place(belief.x, cost))
         if best is None or cost < best.cost:
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
-        if hopeless is not None and hopeless(best.residuals, len(places)):
+        confirmed = confirms and _is_confirmed(best, places, before)
+        if confirmed or (hopeless is not None and hopeless(best.residuals, len(places))):
+            break
+        if patient and _met(best, places):
             break
         between()
-    return replace(best, places=tuple(places))
+    return replace(best, places=tuple(places), confirmed=confirmed)
+
+
+def _is_confirmed(best: Found, places: Sequence[Place], before: float) -> bool:
+    """Whether further starts would end there, too: another one did, or the search with fewer
+    unknowns, which the others have nothing to add to."""
+    if best.explained or not misses_only_pressure(best.residuals):
+        return False
+    return _met(best, places) or excess(best.residuals) >= NO_LESS * before
+
+
+def _met(best: Found, places: Sequence[Place]) -> bool:
+    """Whether two starts came to the best place."""
+    unit = max(best.cost / max(int(np.count_nonzero(best.residuals)), 1), 1.0)
+    return sum(place.cost - best.cost <= SAME * unit for place in places) > 1
 
 
 def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:

@@ -4,7 +4,8 @@ The units are those of `tools/data_sheet`. Each is calibrated on one open- and o
 recording of it as new; every other recording after that is of a sound unit (all severities at most
 0.20), the rest of a worn one (at least one of 0.30 or more), both tests in turn, oil and supply
 of the day. Recordings of one unit share its calibration, so the interval is that of units: of the
-share of them with any such verdict (Clopper and Pearson, Biometrika 26, 1934).
+share of them with any such verdict (Clopper and Pearson, Biometrika 26, 1934). A second table has
+the errors of the severities, by test.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.diagnosis import Diagnosis, diagnose
 from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.unit import calibrate
 from ehadiag.core.actuator import default_actuator
@@ -38,6 +39,8 @@ TESTS = ("open", "closed")
 SOUND, WORN = 0.20, 0.30
 """Largest severity of a sound unit; least of the largest one of a worn unit."""
 HEADINGS = ("units", "what", "recordings", "of them", "rate", "units with any, 95 % interval")
+
+ERROR_HEADINGS = ("test", "recordings", "mean", "p95", "worst", "coverage, %", "mean width")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,23 +68,33 @@ def perform_unit(run: AlarmRun) -> dict[str, Any]:
     if found.actuator is not None:
         for k in range(run.recordings):
             faults = _severities(rng, sound=k % 2 == 0)
+            name = TESTS[k // 2 % 2]
             recording = record(
                 unit,
-                resolve_test(TESTS[k // 2 % 2]),
+                resolve_test(name),
                 Faults(*faults),
                 seed=int(rng.integers(2**31)),
                 step=COARSE_STEP,
             )
             done = diagnose([recording], found.actuator, bundled_tests().values())
-            tested.append(
-                {"faults": faults, "verdict": done.verdict.name, "reasons": list(done.reasons)}
-            )
+            tested.append({"faults": faults, "test": name, **_told(done)})
     return {
         **asdict(run),
         "refused": list(found.reasons),
         "tested": tested,
         "calibration_s": calibrated - begin,
         "diagnoses_s": time.process_time() - calibrated,
+    }
+
+
+def _told(done: Diagnosis) -> dict[str, Any]:
+    found = done.identification
+    estimates = () if found is None else found.estimates
+    return {
+        "verdict": done.verdict.name,
+        "reasons": list(done.reasons),
+        "value": [item.value for item in estimates],
+        "interval95": [list(item.interval95) for item in estimates],
     }
 
 
@@ -137,6 +150,29 @@ def print_table(records: Sequence[dict[str, Any]]) -> None:
     )
     words = [f"{kind} {name} {count}" for (name, kind), count in sorted(said.items())]
     print("\n" + ", ".join(words))
+    _print_errors([item for record in calibrated for item in record["tested"]])
+
+
+def _print_errors(items: Sequence[dict[str, Any]]) -> None:
+    """Errors in percent of damage of what is not NOT TESTED, and how often an interval holds."""
+    print("\n| " + " | ".join(ERROR_HEADINGS) + " |\n|" + " --- |" * len(ERROR_HEADINGS))
+    for test in TESTS:
+        told = [item for item in items if item["test"] == test and _is_told(item)]
+        if not told:
+            continue
+        truth = np.array([item["faults"] for item in told])
+        error = 100.0 * np.abs(np.array([item["value"] for item in told]) - truth)
+        low, high = np.moveaxis(np.array([item["interval95"] for item in told]), 2, 0)
+        print(
+            f"| {test} | {len(told)} | {error.mean():.4f} "
+            f"| {np.quantile(error.mean(axis=1), 0.95):.4f} | {error.max():.3f} "
+            f"| {100.0 * ((low <= truth) & (truth <= high)).mean():.1f} "
+            f"| {100.0 * (high - low).mean():.3f} |"
+        )
+
+
+def _is_told(item: dict[str, Any]) -> bool:
+    return bool(item["value"]) and item["verdict"] != Verdict.NOT_TESTED.name
 
 
 def _is_sound(item: dict[str, Any]) -> bool:

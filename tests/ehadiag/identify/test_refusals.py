@@ -1,4 +1,4 @@
-"""What no effect explains is told from a search that went astray, before more is tried."""
+"""What no effect explains is refused soon; a load that was not estimated is recognised."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ehadiag.assess.acceptance import objections_to_estimate
 from ehadiag.core.actuator import default_actuator
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.nuisance.astray import may_be_astray, would_explain
 from ehadiag.identify.nuisance.estimate import estimate
 from ehadiag.identify.nuisance.explained import (
     excess_of_signals,
     is_hopeless,
     is_of_the_pressure,
 )
+from ehadiag.identify.nuisance.further import would_explain
 from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.refine.first_part import CONSIDERED
 from ehadiag.identify.session import identify
@@ -24,8 +24,9 @@ from ehadiag_sim.faults.hardware import broken
 from ehadiag_sim.plant.conditions import Effects, Faults
 from ehadiag_sim.plant.simulator import simulate
 
-MOST_RUNS = 1200
-"""Of the model, to refuse a recording: on short windows among them."""
+MOST_RUNS = {"open": 1200, "closed": 2800}
+"""Of the model, to refuse a recording: on short windows among them. In closed loop a search may end
+beside the optimum, so that others are made which take their time."""
 
 
 def experiment_of(recording, test):
@@ -63,16 +64,22 @@ def test_a_load_that_was_not_estimated_is_recognised_and_nothing_else_is_taken_f
     assert would_explain(parameter("load"), missing, seed=0)
     starved = with_all_effects(broken_experiment("starved", "open"))
     assert not would_explain(parameter("load"), starved, seed=0)
-    assert not may_be_astray([loaded(50.0)], starved)  # an open loop leads nobody astray
 
 
 @pytest.mark.parametrize(
-    ("kind", "test"), [("starved", "open"), ("loose-pressure", "open"), ("lost-surface", "closed")]
+    ("kind", "test"),
+    [
+        ("starved", "open"),
+        ("loose-pressure", "open"),
+        ("lost-surface", "closed"),
+        ("starved", "closed"),
+        ("scaled-pressure", "closed"),
+    ],
 )
 def test_what_no_effect_explains_is_refused_after_the_first_attempts(kind: str, test: str) -> None:
     found = identify([broken_experiment(kind, test)])
     assert objections_to_estimate(found)
-    assert found.evaluations <= MOST_RUNS
+    assert found.evaluations <= MOST_RUNS[test]
 
 
 def test_hopeless_is_much_on_many_ticks_or_very_much_on_few() -> None:
@@ -87,6 +94,8 @@ def test_hopeless_is_much_on_many_ticks_or_very_much_on_few() -> None:
     bursts[1, 1000:1300] += 400.0
     assert not is_hopeless(bursts, 1)
     assert is_hopeless(bursts, 2)
+    assert not is_hopeless(bursts, 2, astray=True)
+    assert is_hopeless(waves, 1, astray=True)
     spool, pressure = excess_of_signals(noise)
     assert spool == pytest.approx(1.0, abs=0.1)
     assert pressure == pytest.approx(1.0, abs=0.1)

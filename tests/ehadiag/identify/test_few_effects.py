@@ -1,4 +1,4 @@
-"""Units with one effect or two, which a search over all effects at once does not find."""
+"""Units with one effect or two, which a fast search over all effects misses in closed loop."""
 
 from __future__ import annotations
 
@@ -47,6 +47,12 @@ def test_a_little_gain_in_closed_loop():
 def test_one_effect_alone(test, truth, effects, name, value):
     found = check(test, truth, effects)
     assert found.nuisances[name].value == pytest.approx(value, rel=0.1)
+
+
+def test_a_load_beside_other_effects_in_closed_loop():
+    effects = Effects(load=-40.0, gain_change=-0.03, hysteresis=0.03, backlash=2e-6)
+    found = check("closed", (0.2, 0.6, 0.7), effects)
+    assert found.nuisances["load"].value == pytest.approx(-40.0, rel=0.1)
 
 
 @pytest.mark.slow

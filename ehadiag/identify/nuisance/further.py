@@ -1,22 +1,17 @@
-"""Tells a search that went astray from a recording that no effect explains, before more is tried.
+"""Tells what a further effect would explain from what no effect does, before more is tried.
 
-Break-aways make many optima, and the spool is where they happen: a search that ends beside the
-optimum leaves most on the spool. Where the pressure is what is left, the place is right and
-something else is missing; of a sound unit's effects that is only a constant load, which is not
-among those that are estimated from the start.
+Of a sound unit's effects only a constant load is not among those that are estimated from the start.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.estimate import Estimated
-from ehadiag.identify.nuisance.explained import excess, excess_of_signals, outliers_of
+from ehadiag.identify.nuisance.explained import excess
 from ehadiag.identify.nuisance.prior import belief_of, beside, information_of
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import linearised
@@ -25,29 +20,11 @@ from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.model.parameters import Parameter
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["may_be_astray", "would_explain"]
+__all__ = ["would_explain"]
 
 FEW_ROUNDS = replace(FEW, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
-MOST_PRESSURE = 5.5
-"""Excess of the pressure where a search went astray."""
-ACCEPTED = 0.015
-"""Share of residuals beyond three deviations up to which the estimate would be believed as it is:
-its accuracy is worth the time."""
 ENOUGH = 0.5
 """Share of the excess over noise that an effect must leave at most."""
-
-
-def may_be_astray(experiments: Sequence[Experiment], found: Estimated) -> bool:
-    """Whether what all effects at once leave may be that of a search beside the optimum.
-
-    At such places of sound units the excess of the spool was 2.1 to 13, that of the pressure 1.2 to
-    4.9 and nearly always less. In open loop, where the cost falls towards the truth from anywhere,
-    there were none in 36 recordings.
-    """
-    if not any(item.test.closed_loop for item in experiments):
-        return False
-    spool, pressure = excess_of_signals(found.refined.residuals)[:2]
-    return pressure < min(spool, MOST_PRESSURE)
 
 
 def would_explain(effect: Parameter, found: Estimated, seed: int) -> bool:
@@ -66,8 +43,6 @@ def would_explain(effect: Parameter, found: Estimated, seed: int) -> bool:
     seed : int
         The same seed gives the same answer.
     """
-    if outliers_of(found.refined.residuals) <= ACCEPTED:
-        return True
     experiments = found.experiments
     unknowns = unknowns_of(experiments, (*found.refined.parameters, effect))
     model = Derivatives(SimdModel(lay_out(experiments), unknowns), experiments[0].noise)
