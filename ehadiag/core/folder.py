@@ -22,6 +22,7 @@ __all__ = [
     "append_to_file",
     "create_file",
     "refuse_foreign",
+    "reopen_file",
 ]
 
 RESULT_MODE = 0o644
@@ -35,14 +36,8 @@ NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 OPEN_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | NO_LINK
 # A FIFO in the place of a file must not make anybody wait.
 READ = os.O_RDONLY | NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-APPEND = (
-    os.O_WRONLY
-    | os.O_APPEND
-    | os.O_CREAT
-    | NO_LINK
-    | getattr(os, "O_NONBLOCK", 0)
-    | getattr(os, "O_BINARY", 0)
-)
+CHANGE = os.O_RDWR | NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+APPEND = (CHANGE & ~os.O_RDWR) | os.O_WRONLY | os.O_APPEND | os.O_CREAT
 CREATE = os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | getattr(os, "O_BINARY", 0)
 
 
@@ -113,11 +108,14 @@ class Folder:
 
         Returns a descriptor for writing, to be closed by the caller.
         """
-        descriptor = self._open(name, APPEND)
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            os.close(descriptor)
-            raise PermissionError(errno.EACCES, "not a regular file", name)
-        return descriptor
+        return self._open_regular(name, APPEND)
+
+    def reopen(self, name: str) -> int:
+        """Open a file that is there to go on with it; PermissionError for what is no file.
+
+        Returns a descriptor for reading and writing, to be closed by the caller.
+        """
+        return self._open_regular(name, CHANGE)
 
     def write(self, name: str, content: bytes, *, synced: bool = True) -> None:
         """Write a file whole, or leave what was there.
@@ -189,6 +187,13 @@ class Folder:
     def _open(self, name: str, flags: int) -> int:
         return os.open(self._place(name), flags, self._mode, dir_fd=self._descriptor)
 
+    def _open_regular(self, name: str, flags: int) -> int:
+        descriptor = self._open(name, flags)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise PermissionError(errno.EACCES, "not a regular file", name)
+        return descriptor
+
     @staticmethod
     def _draft_name() -> str:
         return f".ehadiag-{os.urandom(8).hex()}.part"
@@ -245,6 +250,15 @@ def append_to_file(path: Path) -> int:
     """
     with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
         return folder.append(path.name)
+
+
+def reopen_file(path: Path) -> int:
+    """Open a result to go on with; OSError for a link, for what is no file, and for none.
+
+    Returns a descriptor for reading and writing, to be closed by the caller.
+    """
+    with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
+        return folder.reopen(path.name)
 
 
 def refuse_foreign(info: os.stat_result, right_kind: Callable[[int], bool]) -> None:

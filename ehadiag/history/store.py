@@ -64,11 +64,15 @@ class History:
     ConfigurationError
         There is no file, or it is another program's or a later version's.
     InputOutputError
-        It cannot be opened.
+        It cannot be opened, or is a link: SQLite would follow it.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
         self.path = path
+        if path.is_symlink():
+            raise InputOutputError(f"history {path}: is a link; name the file it leads to")
+        if path.exists() and not path.is_file():
+            raise InputOutputError(f"history {path}: not a regular file")
         full = Path(os.path.abspath(path))
         self._writable = create or (os.access(full, os.W_OK) and os.access(full.parent, os.W_OK))
         if not create and not path.exists():

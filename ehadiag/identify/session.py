@@ -190,10 +190,10 @@ class Session:
         freed: Estimated | None = None
         if not alone and (best is None or not _leaves_nothing(best.refined)):
             hint = best.refined.values if best else named(found.best)
-            freed = self._freed(experiments, hint if near else None, tell)
+            alone_left = excess(best.refined.residuals) if best else np.inf
+            freed = self._freed(experiments, hint if near else None, alone_left, tell)
         if best is not None and (freed is None or _is_poorer(freed, best)):
-            elsewhere = freed is not None and is_of_the_pressure(freed.refined.residuals)
-            if near and outliers(best.refined) <= BEYOND_RESCUE and not elsewhere:
+            if near and outliers(best.refined) <= BEYOND_RESCUE and not _is_elsewhere(freed, best):
                 best = rescued(
                     experiments, best, self._first_part, self.solver, self.seed, tell,
                     time.perf_counter,
@@ -246,18 +246,19 @@ class Session:
         self,
         experiments: Sequence[Experiment],
         hint: Mapping[str, float] | None,
+        before: float,
         tell: Progress,
     ) -> Estimated:
-        """Estimate with all nuisances free."""
+        """Estimate with all nuisances free; before: excess that the severities alone leave."""
         tell("nuisances", 0.0)
-        found = self._estimated(experiments, self.knowledge, hint, tell)
+        found = self._estimated(experiments, self.knowledge, hint, before, tell)
         if found.explained:
             return found
         if not self.knowledge.doubts:
             return self._with_load(experiments, found, tell)
         if self.knowledge.joint is None or found.excess <= NEARLY:
             return found
-        loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
+        loose = self._estimated(experiments, self.knowledge.loosened(), hint, before, tell)
         return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
 
     def _with_load(
@@ -265,15 +266,19 @@ class Session:
     ) -> Estimated:
         """Estimate a constant load, too, where that explains what the others do not."""
         load = parameter("load")
-        if found.excess > BEYOND_LOAD or not would_explain(load, found, self.seed):
+        if found.excess > BEYOND_LOAD or is_of_the_pressure(found.refined.residuals):
             return found
-        return self._estimated(experiments, self.knowledge, found.refined.values, tell, (load,))
+        if not would_explain(load, found, self.seed):
+            return found
+        hint = found.refined.values
+        return self._estimated(experiments, self.knowledge, hint, found.excess, tell, (load,))
 
     def _estimated(
         self,
         experiments: Sequence[Experiment],
         knowledge: Knowledge,
         hint: Mapping[str, float] | None,
+        before: float,
         tell: Progress,
         further: tuple[Parameter, ...] = (),
     ) -> Estimated:
@@ -288,6 +293,7 @@ class Session:
             joint=knowledge.joint,
             considered=considered_in(experiments, free),
             hint=hint,
+            left_before=before,
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
@@ -400,6 +406,15 @@ def _is_poorer(freed: Estimated, alone: Attempt) -> bool:
     """Whether nuisances explain a recording no better than the severities alone do: what is left
     is none of theirs, as where guessed positions stand in for lost ones."""
     return not freed.explained and freed.excess >= excess(alone.refined.residuals)
+
+
+def _is_elsewhere(freed: Estimated | None, alone: Attempt) -> bool:
+    """Whether what the severities alone leave is not for want of a search: of the pressure, or left
+    where all effects at once were found to end again and again."""
+    if freed is None:
+        return False
+    confirmed = freed.confirmed and not is_guessed(alone.refined)
+    return confirmed or is_of_the_pressure(freed.refined.residuals)
 
 
 def _stages_ready(experiment: Experiment) -> int:

@@ -16,6 +16,7 @@ from ehadiag.core.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.asc_lines import open_asc, open_text
 from firmware_iface.logs.blf import BlfBlocks
 from firmware_iface.logs.budget import Budget, Spending
+from firmware_iface.logs.can_library import can_library, mf4_library
 from firmware_iface.logs.candump_log import candump_frames
 from firmware_iface.logs.packed import kind_of, unpacked
 from firmware_iface.transport.columns import ColumnBuilder
@@ -196,8 +197,7 @@ class LogReader:
             yield columns.table()
 
     def _open(self, dated: bool) -> Any:
-        import can  # noqa: PLC0415 - slow to import
-
+        can = can_library()
         if self._suffix == ".asc":
             lines = open_asc(self._file, self._spending.look_at_clock)
             return can.ASCReader(lines, relative_timestamp=not dated)
@@ -205,7 +205,7 @@ class LogReader:
         if self._suffix in kinds:
             return kinds[self._suffix](open_text(self._file, self._spending.look_at_clock))
         try:
-            return can.MF4Reader(str(self._file))
+            return mf4_library().MF4Reader(str(self._file))
         except NotImplementedError:
             raise InputOutputError(
                 f"log {self.path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"

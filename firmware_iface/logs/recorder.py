@@ -73,7 +73,11 @@ class Recorder:
         self._closed = False
         self._writer: Any = None
         with self._guarded():
-            self._begin()
+            try:
+                self._begin()
+            except BaseException:
+                self._leave_nothing()
+                raise
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -139,9 +143,7 @@ class Recorder:
                 try:
                     self._writer.stop()
                 finally:  # a full disk must not leave the file open
-                    if self._suffix != AT_THE_END:
-                        with contextlib.suppress(OSError):
-                            self._writer.file.close()
+                    self._let_go()
 
     def __enter__(self) -> Self:
         return self
@@ -159,6 +161,19 @@ class Recorder:
         self._writer = open_writer(path)
         self._paths.append(path)
         self._flush()
+
+    def _let_go(self) -> None:
+        """Close the file, though what is left in memory cannot be written."""
+        if self._suffix != AT_THE_END:
+            with contextlib.suppress(OSError):
+                self._writer.file.close()
+
+    def _leave_nothing(self) -> None:
+        """Remove the first file, into which not even its header could be written."""
+        for path in self._paths:
+            self._let_go()
+            with contextlib.suppress(OSError):
+                path.unlink()
 
     def _due(self) -> bool:
         return time.monotonic() - self._flushed >= FLUSH_PERIOD

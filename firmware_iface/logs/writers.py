@@ -12,6 +12,7 @@ import can
 
 from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.folder import create_file
+from firmware_iface.logs.can_library import mf4_library
 
 __all__ = ["FlushingBlfWriter", "open_writer"]
 
@@ -67,7 +68,7 @@ def open_writer(path: Path) -> Any:
     if suffix == ".mf4":
         file = begin("w+b")
         try:
-            return can.MF4Writer(file)
+            return mf4_library().MF4Writer(file)
         except (ImportError, NotImplementedError):
             file.close()
             path.unlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import stat
 import warnings
 from collections.abc import Iterable
 from contextlib import closing
@@ -125,9 +126,13 @@ def read_signals(
     """
     path = Path(path)
     try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+        info = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        reason = getattr(error, "strerror", None) or error
+        raise InputOutputError(f"log {path}: {reason}") from None
+    if not stat.S_ISREG(info.st_mode):
+        raise InputOutputError(f"log {path}: not a file")
+    size = info.st_size
     if size > budget.size:
         raise InputOutputError(f"log {path}: larger than --max-log-size allows")
     if size == 0:

@@ -82,9 +82,9 @@ class Job:
 
         begin = time.perf_counter()
         meaning = Meaning(self.bus_map, self.columns, self.sought)
-        found = tuple(recorded_tests(logs, meaning, self.budget))
-        if not self.every:
-            found = (choose(found),)
+        tests = recorded_tests(logs, meaning, self.budget)
+        # Of a long log's tests only one is held, unless all are wanted.
+        found = tuple(tests) if self.every else (choose(tests),)
         if self.label:
             found = tuple(labelled(item, self.label) for item in found)
         return Reading(found, log_file(logs[0]), time.perf_counter() - begin)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections import Counter
@@ -15,7 +16,7 @@ from ehadiag.cli.batch.alone import alone_with
 from ehadiag.cli.batch.job import Job
 from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.fingerprint import fingerprint
-from ehadiag.core.folder import RESULT_MODE, Folder, create_file
+from ehadiag.core.folder import RESULT_MODE, Folder, create_file, reopen_file
 from ehadiag.facade.inputs import log_file
 from ehadiag.report.origin import configuration, package
 
@@ -182,9 +183,12 @@ class Journal:
     def _open(self, resume: bool) -> BinaryIO:
         if not (resume and os.path.lexists(self._path)):
             return os.fdopen(create_file(self._path), "r+b")
-        if self._path.is_symlink() or not self._path.is_file():
-            raise InputOutputError(f"results {self._name}: not a regular file")
-        file = self._path.open("r+b")
+        try:
+            file = os.fdopen(reopen_file(self._path), "r+b")
+        except OSError as error:
+            link = error.errno == errno.ELOOP
+            why = "a link, which is not followed" if link else error.strerror or error
+            raise InputOutputError(f"results {self._name}: {why}") from None
         try:
             self._index(file)
         except BaseException:

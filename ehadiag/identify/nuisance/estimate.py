@@ -65,6 +65,8 @@ class Estimated:
     covariance : shape (k, k)
         SI, of what several optima of like cost leave open, beside that of the refinement.
     explained : bool
+    confirmed : bool
+        See `ehadiag.identify.nuisance.starts.Found`.
     excess : float
         See `ehadiag.identify.nuisance.explained.excess`.
     starts : int
@@ -77,6 +79,7 @@ class Estimated:
     experiments: list[Experiment]
     covariance: NDArray[np.float64]
     explained: bool
+    confirmed: bool
     excess: float
     starts: int
     evaluations: int
@@ -94,6 +97,7 @@ def estimate(
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
     give_up: bool = False,
+    left_before: float = np.inf,
     explains: Explains = is_noise,
     patient: bool = False,
 ) -> Estimated:
@@ -121,6 +125,8 @@ def estimate(
         estimation.
     give_up : bool
         Whether to stop early where nothing explains the recordings.
+    left_before : float
+        Excess that is left with none of the effects.
     explains : callable
         Of residuals, shape (signals, N): whether there is nothing better to look for.
     patient : bool
@@ -162,6 +168,8 @@ def estimate(
         tell=tell,
         hopeless=_hopeless(give_up=give_up, patient=patient),
         patient=patient,
+        confirms=give_up,
+        before=left_before,
     )
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
@@ -182,6 +190,7 @@ def estimate(
         experiments=judged,
         covariance=spread_of_optima(found, model.scale) + _spread_of_twins(refined, judged),
         explained=explains(refined.residuals),
+        confirmed=found.confirmed,
         excess=excess(refined.residuals),
         starts=found.starts,
         evaluations=sum(item.evaluations for item in (guide, model, fine) if item),

@@ -19,6 +19,7 @@ __all__ = [
     "is_noise",
     "is_of_the_pressure",
     "leaves_no_more",
+    "misses_only_pressure",
     "outliers_of",
 ]
 
@@ -92,6 +93,12 @@ def is_hopeless(residuals: NDArray[np.float64], starts: int, *, astray: bool = F
     if outliers_of(residuals) > most[min(starts, len(most)) - 1]:
         return True
     return not astray and starts > 1 and excess(residuals) > HOPELESS_EXCESS
+
+
+def misses_only_pressure(residuals: NDArray[np.float64]) -> bool:
+    """Whether the spool is explained, so that break-aways come at the right ticks."""
+    excesses = excess_of_signals(residuals)
+    return excesses[0] <= SPOOL_EXPLAINED and max(excesses[1:], default=0.0) > SPOOL_EXPLAINED
 
 
 def is_of_the_pressure(residuals: NDArray[np.float64]) -> bool:

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from ehadiag.identify.nuisance.estimate import Estimated
-from ehadiag.identify.nuisance.explained import excess, outliers_of
+from ehadiag.identify.nuisance.explained import excess
 from ehadiag.identify.nuisance.prior import belief_of, beside, information_of
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import linearised
@@ -23,9 +23,6 @@ from ehadiag.model.simd.model import SimdModel
 __all__ = ["would_explain"]
 
 FEW_ROUNDS = replace(FEW, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
-ACCEPTED = 0.015
-"""Share of residuals beyond three deviations up to which the estimate would be believed as it is:
-its accuracy is worth the time."""
 ENOUGH = 0.5
 """Share of the excess over noise that an effect must leave at most."""
 
@@ -46,8 +43,6 @@ def would_explain(effect: Parameter, found: Estimated, seed: int) -> bool:
     seed : int
         The same seed gives the same answer.
     """
-    if outliers_of(found.refined.residuals) <= ACCEPTED:
-        return True
     experiments = found.experiments
     unknowns = unknowns_of(experiments, (*found.refined.parameters, effect))
     model = Derivatives(SimdModel(lay_out(experiments), unknowns), experiments[0].noise)

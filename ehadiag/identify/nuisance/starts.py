@@ -13,18 +13,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.identify.nuisance.explained import excess, misses_only_pressure
 from ehadiag.identify.refine.derivatives import Derivatives
 from ehadiag.identify.refine.linearisation import BLOCK, Belief, linearised
 from ehadiag.identify.refine.posterior import MANY, PATIENT, robust_cost, sharpen
 
 __all__ = ["Found", "Place", "search"]
 
+SAME = 10.0
+"""Objective up to which two ends are of the same place (a parameter one deviation off costs 1)."""
+NO_LESS = 0.98
+"""Share of the excess with fewer unknowns that is as much."""
 AGAIN = 0.1
 """Spread of a further look about the best so far, in spreads of the first."""
 ALIAS_SPAN = 1.25
 """Half-width over which a parameter is moved against what it passes for, in units of its scale."""
-ALIKE = 10.0
-"""By how much the cost of the same place differs (a parameter one deviation off costs 1)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +58,8 @@ class Found:
     explained : bool
     places : tuple of Place
         Where all starts ended.
+    confirmed : bool
+        Whether only the pressure is not explained there, and another search ended there, too.
     """
 
     belief: Belief
@@ -62,6 +67,7 @@ class Found:
     cost: float
     explained: bool
     places: tuple[Place, ...]
+    confirmed: bool = False
 
     @property
     def starts(self) -> int:
@@ -82,6 +88,8 @@ def search(
     tell: Callable[[float], None] | None = None,
     hopeless: Callable[[NDArray[np.float64], int], bool] | None = None,
     patient: bool = False,
+    confirms: bool = False,
+    before: float = np.inf,
 ) -> Found:
     """Search until the residuals are explained, or the budget is spent.
 
@@ -108,6 +116,11 @@ def search(
     patient : bool
         Whether all starts but the first take their time, each from the last origin, until two have
         come to the same place; else every other one begins beside the best so far.
+    confirms : bool
+        Whether a place that only misses the pressure ends the search, too, if it is found again or
+        leaves as much as `before`.
+    before : float
+        Excess that another search left with fewer unknowns.
     """
     until = model.evaluations + budget
 
@@ -116,6 +129,7 @@ def search(
             tell(min(1.0 - (until - model.evaluations) / max(budget, 1), 1.0))
 
     best: Found | None = None
+    confirmed = False
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
         pace = PATIENT if patient and best is not None else MANY
@@ -135,18 +149,27 @@ def search(
         places.append(Place(belief.x, cost))
         if best is None or cost < best.cost:
             best = Found(belief, residuals, cost, settled and explains(residuals), ())
-        if hopeless is not None and hopeless(best.residuals, len(places)):
+        confirmed = confirms and _is_confirmed(best, places, before)
+        if confirmed or (hopeless is not None and hopeless(best.residuals, len(places))):
             break
-        if patient and _meet(places, int(np.count_nonzero(residuals))):
+        if patient and _met(best, places):
             break
         between()
-    return replace(best, places=tuple(places))
+    return replace(best, places=tuple(places), confirmed=confirmed)
 
 
-def _meet(places: Sequence[Place], count: int) -> bool:
-    """Whether the best two starts came to the same place, by their costs of so many residuals."""
-    costs = sorted(place.cost for place in places)[:2]
-    return len(costs) == 2 and costs[1] - costs[0] < ALIKE * max(costs[0] / max(count, 1), 1.0)
+def _is_confirmed(best: Found, places: Sequence[Place], before: float) -> bool:
+    """Whether further starts would end there, too: another one did, or the search with fewer
+    unknowns, which the others have nothing to add to."""
+    if best.explained or not misses_only_pressure(best.residuals):
+        return False
+    return _met(best, places) or excess(best.residuals) >= NO_LESS * before
+
+
+def _met(best: Found, places: Sequence[Place]) -> bool:
+    """Whether two starts came to the best place."""
+    unit = max(best.cost / max(int(np.count_nonzero(best.residuals)), 1), 1.0)
+    return sum(place.cost - best.cost <= SAME * unit for place in places) > 1
 
 
 def _past_alias(model: Derivatives, best: Found, alias: str) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ehadiag.core import folder as folder_module
-from ehadiag.core.folder import CACHE_MODE, RESULT_MODE, Folder, create_file
+from ehadiag.core.folder import CACHE_MODE, RESULT_MODE, Folder, create_file, reopen_file
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links and permissions")
 
@@ -169,3 +169,27 @@ def test_a_fifo_in_the_place_of_a_file_makes_nobody_wait(folder: Folder) -> None
     os.mkfifo(folder.path / "name")
     with pytest.raises(PermissionError, match="another kind"):
         folder.read("name", 100)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "pipe", "folder", "nothing"])
+def test_what_is_gone_on_with_is_a_file(kind: str, folder: Folder, tmp_path: Path) -> None:
+    place, other = folder.path / "name", tmp_path / "other"
+    if "link" in kind:
+        place.symlink_to(other)
+    if kind == "link":
+        other.write_bytes(b"precious")
+    if kind == "pipe":
+        os.mkfifo(place)
+    if kind == "folder":
+        place.mkdir()
+    with pytest.raises(OSError, match=r"symbolic|regular|directory|No such"):
+        os.close(reopen_file(place))
+    assert not other.exists() or other.read_bytes() == b"precious"
+
+
+def test_a_file_is_gone_on_with(folder: Folder) -> None:
+    folder.write("name", b"old")
+    with os.fdopen(reopen_file(folder.path / "name"), "r+b") as file:
+        assert file.read() == b"old"
+        file.write(b"new")
+    assert folder.read("name", 100) == b"oldnew"

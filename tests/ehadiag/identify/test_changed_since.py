@@ -37,5 +37,5 @@ def test_effects_are_loosened_only_where_that_explains_what_the_calibration_does
     monkeypatch.setattr(session, "estimate", answer)
     monkeypatch.setattr(session, "considered_in", lambda *_: ())
     known = replace(CALIBRATED, aliases=(object(),))
-    found = session.Session(knowledge=known)._freed([], None, lambda _stage, _share: None)
+    found = session.Session(knowledge=known)._freed([], None, 9.0, lambda _stage, _share: None)
     assert found.excess == taken

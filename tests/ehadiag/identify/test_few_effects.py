@@ -49,6 +49,12 @@ def test_one_effect_alone(test, truth, effects, name, value):
     assert found.nuisances[name].value == pytest.approx(value, rel=0.1)
 
 
+def test_a_load_beside_other_effects_in_closed_loop():
+    effects = Effects(load=-40.0, gain_change=-0.03, hysteresis=0.03, backlash=2e-6)
+    found = check("closed", (0.2, 0.6, 0.7), effects)
+    assert found.nuisances["load"].value == pytest.approx(-40.0, rel=0.1)
+
+
 @pytest.mark.slow
 def test_two_effects_of_a_healthy_unit_in_closed_loop():
     effects = Effects(null_bias=1e-4, gain_change=0.02)

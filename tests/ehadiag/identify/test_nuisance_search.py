@@ -150,6 +150,37 @@ def test_what_nothing_explains_ends_with_the_budget():
     assert told[-1] == 1.0
 
 
+@pytest.mark.parametrize(
+    ("row", "before", "confirms", "starts"),
+    [
+        (1, np.inf, True, 2),  # found again
+        (1, 2.0, True, 1),  # and not better than with fewer unknowns
+        (0, 2.0, True, None),  # the spool may be explained elsewhere
+        (1, 2.0, False, None),
+    ],
+)
+def test_a_place_that_only_misses_the_pressure_is_left_once_it_is_found_again(
+    row, before, confirms, starts
+):
+    wave = np.zeros((2, SAMPLES))
+    wave[row] = 4.0 * np.sin(np.arange(SAMPLES) / 5.0)
+    problem = Problem(lambda p: curved((0.8, 0.5, 0.7))(p) + wave)
+    first = Belief(np.array([0.5, 0.5, 0.5, 0.0]), 0.4 * np.eye(3))
+    found = search(
+        problem,
+        first,
+        np.zeros((4, 4)),
+        [first],
+        is_noise,
+        confirms=confirms,
+        before=before,
+    )
+    assert not found.explained
+    assert found.confirmed == (starts is not None)
+    assert found.starts == starts or (starts is None and found.starts > 2)
+    assert found.belief.x[2] == pytest.approx(0.7, abs=0.05) or row == 1
+
+
 def test_a_settled_belief_is_as_wide_as_the_noise_allows():
     truth = (0.8, 0.5, 0.7)
     values = []

@@ -24,7 +24,7 @@ from ehadiag_sim.faults.hardware import broken
 from ehadiag_sim.plant.conditions import Effects, Faults
 from ehadiag_sim.plant.simulator import simulate
 
-MOST_RUNS = {"open": 1200, "closed": 2400}
+MOST_RUNS = {"open": 1200, "closed": 2800}
 """Of the model, to refuse a recording: on short windows among them. In closed loop a search may end
 beside the optimum, so that others are made which take their time."""
 
@@ -67,7 +67,14 @@ def test_a_load_that_was_not_estimated_is_recognised_and_nothing_else_is_taken_f
 
 
 @pytest.mark.parametrize(
-    ("kind", "test"), [("starved", "open"), ("loose-pressure", "open"), ("lost-surface", "closed")]
+    ("kind", "test"),
+    [
+        ("starved", "open"),
+        ("loose-pressure", "open"),
+        ("lost-surface", "closed"),
+        ("starved", "closed"),
+        ("scaled-pressure", "closed"),
+    ],
 )
 def test_what_no_effect_explains_is_refused_after_the_first_attempts(kind: str, test: str) -> None:
     found = identify([broken_experiment(kind, test)])

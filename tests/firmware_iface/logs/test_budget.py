@@ -23,6 +23,8 @@ from firmware_iface.logs.reader import iterate_recordings, read_frames, read_rec
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.mapping.bus_map import load_map
 from firmware_iface.mapping.dbc import MAX_MESSAGE_SIGNALS, MAX_SIGNALS, parse_dbc
+from firmware_iface.signals.columns import ColumnMap
+from firmware_iface.signals.tables import read_signals
 from firmware_iface.transport.frames import Frame
 
 SECRET = "root:x:0:0:topsecret:/root:/bin/sh\n"
@@ -165,12 +167,21 @@ def test_all_tests_of_a_long_log_are_there(tmp_path: Path) -> None:
     assert np.diff(starts).tolist() == [2_560_000_000] * 49
 
 
+def read_table(path: Path) -> object:
+    """Decoded signals instead of frames."""
+    pytest.importorskip("pyarrow", reason="tables need the extra ehadiag[daq]")
+    return read_signals(path, ColumnMap(), Budget())
+
+
 READERS: dict[str, Callable[[Path], object]] = {
     "mapping": load_map,
     "dbc": lambda path: load_map(path.parent / "map.toml", path),
     "actuator": load_actuator,
     "test": lambda path: resolve_test(str(path)),
     **dict.fromkeys(SUFFIXES, read_recording),
+    **dict.fromkeys([f"{suffix}.gz" for suffix in (".blf", ".log")], read_recording),
+    ".parquet": read_table,
+    ".parquet.gz": read_table,
 }
 
 
