@@ -270,8 +270,9 @@ class Session:
             return found
         if not would_explain(load, found, self.seed):
             return found
-        hint = found.refined.values
-        return self._estimated(experiments, self.knowledge, hint, found.excess, tell, (load,))
+        return self._estimated(
+            experiments, self.knowledge, found.refined.values, tell, (load,), before=found.excess
+        )
 
     def _estimated(
         self,

@@ -50,8 +50,8 @@ HELD_BACK_WHERE_LINEAR = 1e-3
 creep."""
 FREE = 1e-9
 MEAN_STEP = 0.25
-"""Last step of a mean of rounds, in widths of the belief, below which it has come to rest: where the
-cost has steps as wide as the belief no round alone does."""
+"""Last step of a mean of rounds, in widths of the belief, below which it has come to rest: where
+the cost has steps as wide as the belief no round alone does."""
 
 
 def nothing() -> None:
