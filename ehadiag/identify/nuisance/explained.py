@@ -92,7 +92,11 @@ def is_hopeless(residuals: NDArray[np.float64], starts: int, *, astray: bool = F
     most = HOPELESS_ASTRAY if astray else HOPELESS
     if outliers_of(residuals) > most[min(starts, len(most)) - 1]:
         return True
-    return not astray and starts > 1 and excess(residuals) > HOPELESS_EXCESS
+    excesses = excess_of_signals(residuals)
+    if astray and len(excesses) > 1:
+        # Where a search went astray the spool shows it more than the pressure.
+        return starts > 1 and max(excesses[1:]) > max(excesses[0], HOPELESS_EXCESS)
+    return not astray and starts > 1 and max(excesses, default=0.0) > HOPELESS_EXCESS
 
 
 def misses_only_pressure(residuals: NDArray[np.float64]) -> bool:
