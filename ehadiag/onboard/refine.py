@@ -54,8 +54,9 @@ WIDTH = 4.0
 """Of the belief, in variances of what the linear problem leaves."""
 HELD_BACK, FREE = 0.1, 1e-9
 """Share of the belief's information that a step is held back by."""
-LEAST_RATIO, LEAST_RATIO_OF_LINEAR, MOST_RATIO = 0.3, 0.05, 1.5
-"""By which a belief may become narrower in a round; where the model is linear over it; wider."""
+LEAST_RATIO, LEAST_RATIO_OF_LINEAR = 0.3, 0.05
+"""By which a belief may become narrower in a round; the same where the model is linear over it. It
+never becomes wider: in single precision it would not come to rest."""
 WHOLE_ROUNDS = 10.0
 """Rounds that are taken whole, see `ehadiag.identify.refine.posterior.Pace`."""
 LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
@@ -149,7 +150,7 @@ def _narrow(address: int, excess: float, linear: bool, rounds: float) -> tuple[f
     for j in range(GENES):
         ratio = math.sqrt(max(spread[j, j], 0.0))
         narrowest = min(narrowest, ratio)
-        kept = min(max(ratio, least), MOST_RATIO)
+        kept = min(max(ratio, least), 1.0)
         if part > 1.0:
             kept = exponential(logarithm(kept) / part)
         for i in range(GENES):
