@@ -189,7 +189,3 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
     for item in subparsers.choices.values():
         item.add_argument("-v", "--verbose", action="store_true", help="tell more on the way")
     return parser, subparsers.choices
-
-
-if __name__ == "__main__":
-    process()

@@ -11,7 +11,7 @@ from typing import Any
 from places import ROOT
 
 REPOSITORY = ROOT
-COMMAND = (sys.executable, "-m", "ehadiag.cli.main")
+COMMAND = (sys.executable, "-m", "ehadiag")
 
 
 @dataclass(frozen=True)

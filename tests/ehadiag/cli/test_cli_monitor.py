@@ -190,7 +190,7 @@ def test_a_bus_whose_ticks_cannot_be_told_is_refused_before_it_is_opened(run: Ru
 
 def test_ctrl_c_ends_it_in_order(tmp_path: Path, environment: dict[str, str]) -> None:
     log = tmp_path / "a.jsonl"
-    command = [sys.executable, "-m", "ehadiag.cli.main", "monitor", "--log-file", str(log)]
+    command = [sys.executable, "-m", "ehadiag", "monitor", "--log-file", str(log)]
     with subprocess.Popen(
         [*command, "-i", "virtual", "-c", "monitor-stop"], env=environment, cwd=tmp_path,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,

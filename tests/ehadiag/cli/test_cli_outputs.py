@@ -249,7 +249,7 @@ def test_odd_names_in_errors(tmp_path: Path, environment: dict[str, str]) -> Non
 
 def test_a_terminal_without_the_characters(tmp_path: Path, environment: dict[str, str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "ehadiag.cli.main", "diagnose", str(HEALTHY)],
+        [sys.executable, "-m", "ehadiag", "diagnose", str(HEALTHY)],
         cwd=tmp_path,
         env=environment | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"},
         capture_output=True,

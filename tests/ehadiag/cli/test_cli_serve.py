@@ -53,7 +53,7 @@ def test_options_are_handed_on_as_they_were_given():
 @pytest.mark.slow
 def test_a_simulated_test_is_run_from_the_page(tmp_path):
     command = ["serve", "--simulate", "--allow-tests", "--port", "0", "--out", str(tmp_path)]
-    program = [sys.executable, "-m", "ehadiag.cli.main", *command]
+    program = [sys.executable, "-m", "ehadiag", *command]
     with subprocess.Popen(program, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
         try:
             said = process.stderr.readline()

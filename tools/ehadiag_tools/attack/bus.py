@@ -184,7 +184,7 @@ def _replay(bus: PythonCanTransport, healthy: Healthy, stop: Event) -> None:
 @contextmanager
 def computer(serial: int, *faults: str) -> Iterator[None]:
     """Run an emulated flight-control computer in a process of its own."""
-    command = [sys.executable, "-m", "ehadiag.cli.main", "sim", "--interface", BUS.interface]
+    command = [sys.executable, "-m", "ehadiag", "sim", "--interface", BUS.interface]
     process = subprocess.Popen(
         [*command, "--serial-number", str(serial), *faults], stderr=subprocess.DEVNULL
     )
@@ -222,7 +222,7 @@ def attempt(kind: str, seed: int, healthy: Healthy) -> tuple[str, str]:
         elif kind != NONE:
             stack.enter_context(attacker(kind, seed, healthy))
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        command = [sys.executable, "-m", "ehadiag.cli.main", "bit", "--test", TEST, "--json"]
+        command = [sys.executable, "-m", "ehadiag", "bit", "--test", TEST, "--json"]
         done = subprocess.run(
             [*command, "--interface", BUS.interface, "--out", folder],
             capture_output=True,

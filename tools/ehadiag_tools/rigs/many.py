@@ -45,7 +45,7 @@ PATIENCE_S = 60.0
 KILL_AT = 1 / 3
 """Share of the results at which a Dask worker is killed."""
 COMMAND = (
-    sys.executable, "-m", "ehadiag.cli.main", "diagnose",
+    sys.executable, "-m", "ehadiag", "diagnose",
     "--json", "--no-history", "--no-picture",
 )  # fmt: skip
 

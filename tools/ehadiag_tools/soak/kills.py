@@ -23,7 +23,7 @@ from firmware_iface.logs.reader import read_frames, read_recording
 
 __all__ = ["Kill", "kill_run", "main", "whole_run"]
 
-COMMAND = (sys.executable, "-m", "ehadiag.cli.main")
+COMMAND = (sys.executable, "-m", "ehadiag")
 POLL_S = 0.005
 ENDED = (BitState.COMPLETE, BitState.ABORTED, BitState.REFUSED)
 MOST_LOST_S = 1.0
