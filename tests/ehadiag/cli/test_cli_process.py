@@ -23,13 +23,13 @@ PAPER = ((0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
 CASES = [(test, faults) for test in ("open", "closed") for faults in PAPER]
 DEFAULT_CASE = ("closed", PAPER[0])
 BOTH_ENDS = """
-"$PYTHON" -m ehadiag.cli.main sim --interface udp_multicast "$@" 2> sim.err &
+"$PYTHON" -m ehadiag sim --interface udp_multicast "$@" 2> sim.err &
 sim=$!
 until grep -q 'Ctrl-C stops it' sim.err; do
     kill -0 $sim || { cat sim.err >&2; exit 99; }
     sleep 0.05
 done
-"$PYTHON" -m ehadiag.cli.main bit --test "$TEST" --interface udp_multicast --json --out out
+"$PYTHON" -m ehadiag bit --test "$TEST" --interface udp_multicast --json --out out
 code=$?
 kill -TERM $sim
 wait $sim
@@ -160,7 +160,7 @@ def in_shell(
 ) -> subprocess.CompletedProcess[str]:
     """Run ehadiag with arguments and redirections as a shell reads them."""
     return subprocess.run(
-        ["sh", "-c", f'"$0" -m ehadiag.cli.main {command}', sys.executable],
+        ["sh", "-c", f'"$0" -m ehadiag {command}', sys.executable],
         cwd=folder,
         env=environment,
         capture_output=True,

@@ -66,7 +66,7 @@ def follow(page: str, folder: Path, environment: dict[str, str]) -> dict[str, tu
     tools = folder / "bin"
     tools.mkdir()
     launcher = tools / "ehadiag"
-    launcher.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ehadiag.cli.main "$@"\n')
+    launcher.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ehadiag "$@"\n')
     launcher.chmod(0o755)
     environment = environment | {"PATH": f"{tools}:{environment['PATH']}"}
     typed = [item for item in commands(page) if item[0] != IN_GUEST]
