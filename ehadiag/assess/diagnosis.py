@@ -269,14 +269,15 @@ class DiagnosisSession:
         nothing."""
         if not can_be_told(recordings, experiments):
             return None
-        now, found, note = told_by_response(
+        told = told_by_response(
             recordings,
             experiments,
             self._actuator,
             lambda item: self._session.finish(item, progress),
         )
-        if objections_to_estimate(found, self._actuator.calibration):
+        if told is None or objections_to_estimate(told[1], self._actuator.calibration):
             return None
+        now, found, note = told
         return now, widened(found), (note,), ()
 
     def _experiments(

@@ -4,7 +4,7 @@ In closed loop the noise of the jack's sensor is part of the current: a lost sam
 current of the next tick unknown by some steps, and spool and pressure, tens of steps of the
 pressure's converter for one of the spool's, show it for some ticks. So does a row of samples that
 stands a tick beside its own amidst lost ones. What explains the measured response best is kept, the
-severities are identified anew, and so on until nothing changes (coordinate descent: J. Besag, On
+severities are identified anew, a few times over (coordinate descent: J. Besag, On
 the statistical analysis of dirty pictures, J. R. Statist. Soc. B 48(3), 1986).
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.recording import Recording, Samples
 from ehadiag.identify.commanded_current import guessed_positions
-from ehadiag.identify.experiment import Experiment, build_experiment
+from ehadiag.identify.experiment import Experiment, build_experiment, share_offsets
 from ehadiag.identify.result import Identification
 from ehadiag.identify.spans import ANCHOR_LSB, lay_out
 from ehadiag.identify.uncertainty import interval95
@@ -132,7 +132,7 @@ def told_by_response(
     experiments: Sequence[Experiment],
     actuator: Actuator,
     identify: Callable[[Sequence[Experiment]], Identification],
-) -> tuple[list[Experiment], Identification, str]:
+) -> tuple[list[Experiment], Identification, str] | None:
     """Find lost positions and misplaced rows, and identify anew.
 
     Parameters
@@ -148,11 +148,13 @@ def told_by_response(
 
     Returns
     -------
-    tuple[list[Experiment], Identification, str]
-        The experiments with what the response told, what they say, and a note.
+    tuple[list[Experiment], Identification, str] | None
+        The experiments with what the response told, what they say, and a note; None where it told
+        nothing.
     """
     found, now = identify(experiments), list(experiments)
-    rows = [_Rows(a, b, actuator) for a, b in zip(recordings, experiments, strict=True)]
+    shared = share_offsets(experiments)
+    rows = [_Rows(*each, actuator) for each in zip(recordings, experiments, shared, strict=True)]
     told = moved = 0
     for _ in range(ROUNDS if found.fit.outliers <= HOPELESS else 0):
         made = [change for item in rows for change in item.improve(found)]
@@ -164,10 +166,11 @@ def told_by_response(
         found = identify(now)
         if len(made) < FEW:
             break
-    return now, found, (
-        f"the response told {told} lost jack positions that the control law worked on, and that "
-        f"{moved} rows of samples stood a tick beside their own"
-    )  # fmt: skip
+    if not told and not moved:
+        return None
+    words = [f"{told} lost jack positions that the control law worked on"] if told else []
+    words += [f"that {moved} rows of samples stood a tick beside their own"] if moved else []
+    return now, found, f"the response told {', and '.join(words)}"
 
 
 def widened(found: Identification) -> Identification:
@@ -195,24 +198,33 @@ def widened(found: Identification) -> Identification:
 def _is_movable(recording: Recording) -> bool:
     """Whether time alone has placed its rows, and ticks without one are among them."""
     samples = recording.samples
-    return recording.by_time and samples is not None and bool(np.isnan(samples.position).any())
+    return recording.by_time and samples is not None and bool(_empty(samples).any())
+
+
+def _empty(samples: Samples) -> NDArray[np.bool_]:
+    """Ticks of which nothing came, shape (n,)."""
+    channels = (samples.current, samples.spool, samples.pressure, samples.position)
+    return np.asarray(np.isnan(channels).all(axis=0))
 
 
 class _Rows:
     """Samples of one recording, changed step by step."""
 
-    def __init__(self, recording: Recording, experiment: Experiment, actuator: Actuator) -> None:
+    def __init__(
+        self, recording: Recording, experiment: Experiment, shared: Experiment, actuator: Actuator
+    ) -> None:
         assert recording.samples is not None
         self._samples = recording.samples
         self._environment = recording.environment
         self._movable = _is_movable(recording)
         self._begin = experiment
+        self._shared = shared
         self._actuator = actuator
         self._anchor: tuple[float, float] | None = ANCHOR_LSB
 
     def experiment(self) -> Experiment:
         """Return what is identified from."""
-        return self._build(self._samples)
+        return self._build(self._samples, self._begin)
 
     def improve(self, found: Identification) -> list[Change]:
         """Make the changes that explain more of the response at such severities."""
@@ -263,11 +275,10 @@ class _Rows:
                     Change(tick, tick + 1, 0, (code + off) * step, off * off / UNLIKELY)
                     for off in CODES
                 ]
-        return out + (_moves(lost) if self._movable else [])
+        return out + (_moves(_empty(samples)) if self._movable else [])
 
-    def _build(self, samples: Samples) -> Experiment:
-        """Experiment of some samples, noise and offsets as they were judged at first."""
-        begin = self._begin
+    def _build(self, samples: Samples, begin: Experiment) -> Experiment:
+        """Experiment of some samples, noise and offsets those of another."""
         item = build_experiment(samples, self._environment, begin.test, self._actuator)
         return replace(
             item,
@@ -287,7 +298,7 @@ class _Rows:
 
         anchor: see `ehadiag.identify.spans.lay_out`.
         """
-        item = self._build(samples)
+        item = self._build(samples, self._shared)
         constants = found.constants(item.constants)
         model = ScalarModel(lay_out([item], anchor_lsb=anchor), Unknowns((), (constants,), {}))
         left = model.residuals(np.zeros((1, 0)))[0][0]

@@ -60,7 +60,8 @@ def lost_positions(experiment: Experiment) -> str:
         return ""
     return (
         f"{guessed:.1%} of the jack positions that the control law worked on are lost "
-        f"(limit {MOST_GUESSED:.1%}): the servovalve current cannot be rebuilt"
+        f"(limit {MOST_GUESSED:.1%}) and not told by the response: the servovalve current cannot "
+        "be rebuilt"
     )
 
 

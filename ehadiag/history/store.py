@@ -69,9 +69,14 @@ class History:
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
         self.path = path
-        if path.is_symlink():
+        try:
+            link, other = path.is_symlink(), path.exists() and not path.is_file()
+        except (OSError, ValueError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise InputOutputError(f"history {path}: {why}") from None
+        if link:
             raise InputOutputError(f"history {path}: is a link; name the file it leads to")
-        if path.exists() and not path.is_file():
+        if other:
             raise InputOutputError(f"history {path}: not a regular file")
         full = Path(os.path.abspath(path))
         self._writable = create or (os.access(full, os.W_OK) and os.access(full.parent, os.W_OK))

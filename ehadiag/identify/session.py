@@ -240,7 +240,7 @@ class Session:
         other = searched_whole(experiments, found, self.solver, self.seed + len(STAGES))
         other = replace(other, evaluations=found.evaluations + other.evaluations)
         near = unlikeness(experiments, other.best) <= HOPELESS
-        return (other if near else found), near
+        return (other if near else replace(found, evaluations=other.evaluations)), near
 
     def _freed(
         self,
@@ -270,8 +270,14 @@ class Session:
             return found
         if not would_explain(load, found, self.seed):
             return found
-        return self._estimated(
+        more = self._estimated(
             experiments, self.knowledge, found.refined.values, tell, (load,), before=found.excess
+        )
+        best = more if more.explained or more.excess < found.excess else found
+        return replace(
+            best,
+            evaluations=found.evaluations + more.evaluations,
+            starts=found.starts + more.starts,
         )
 
     def _estimated(

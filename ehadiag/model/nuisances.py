@@ -9,6 +9,9 @@ from ehadiag.model.parameter import Kind, Parameter
 
 __all__ = ["NUISANCES"]
 
+WIDEST_LAP = 0.8
+"""Of the travel that opens a land; one as wide as that would turn the pressure about the middle."""
+
 
 def _gain(signal: str, symbol: str, sensor: str) -> Parameter:
     """Relative error of a sensor's gain."""
@@ -301,7 +304,7 @@ NUISANCES: tuple[Parameter, ...] = (
         scale=1e-6,
         short="lap of the lands",
         meaning="travel that the overlap of the lands takes, below 0 an underlap",
-        changes=lambda c, value: {"LAP": c.LAP + value},
+        changes=lambda c, value: {"LAP": np.minimum(c.LAP + value, WIDEST_LAP * c.PSR / c.GP)},
     ),
     Parameter(
         name="jack_stribeck",

@@ -58,7 +58,10 @@ LEAST_RATIO, LEAST_RATIO_OF_LINEAR = 0.3, 0.05
 """By which a belief may become narrower in a round; the same where the model is linear over it. It
 never becomes wider: in single precision it would not come to rest."""
 WHOLE_ROUNDS = 10.0
-"""Rounds that are taken whole, see `ehadiag.identify.refine.posterior.Pace`."""
+"""Rounds that are taken whole, see `ehadiag.identify.refine.posterior.Pace`; there are more of them
+than there."""
+MEAN_STEP = 0.25
+"""See `ehadiag.identify.refine.posterior`."""
 LINEAR_SCATTER, LINEAR_SHARE = 0.1, 0.01
 """Scatter, and share of samples with more of it, up to which it is."""
 SQUARE = PARAMETERS * PARAMETERS
@@ -172,5 +175,7 @@ def refine(address: int, plan_address: int, plan: Array, ticks_address: int, cou
     done = a.steps + 1.0
     ratio, step = _narrow(address, excess, jumped < LINEAR_SHARE, done)
     settled = ratio > SETTLED_RATIO and step < SETTLED_STEP
+    if done >= ROUNDS:
+        settled = ratio > SETTLED_RATIO and step < MEAN_STEP * (1.0 + ROUNDS - WHOLE_ROUNDS)
     phase = CONCLUSION if settled or ratio < 0.0 or done >= ROUNDS else a.phase
     keep_advance(p, Advance(phase, done, a.best, a.judged, 1.0 if settled else 0.0))

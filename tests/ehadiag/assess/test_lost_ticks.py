@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from places import LOGS
@@ -51,13 +52,16 @@ def test_what_the_response_tells_is_what_the_computer_saw(
     bare = without_pairs(recording, 60)
     before = experiment(bare)
     assert can_be_told([bare], [before])
-    (after,), _, note = told_by_response([bare], [before], ACTUATOR, lambda _items: found)
+    answer = told_by_response([bare], [before], ACTUATOR, lambda _items: found)
+    assert answer is not None
+    (after,), _, note = answer
     told = np.isfinite(after.position) & np.isnan(before.position)
     right = np.abs(after.position - true.position)[told] < 0.3 * true.channels.position.lsb
     assert told.sum() > 25
     assert right.mean() > 0.9
     assert after.trace.guessed < 0.7 * before.trace.guessed
-    assert "0 rows of samples" in note
+    assert "lost jack positions" in note
+    assert "rows of samples" not in note
 
 
 def test_rows_that_stand_a_tick_beside_their_own_are_moved_back_where_no_counter_placed_them(
@@ -82,10 +86,44 @@ def test_rows_that_stand_a_tick_beside_their_own_are_moved_back_where_no_counter
     left = {}
     for by_time in (True, False):
         bare = replace(mixed, by_time=by_time)
-        (after,), _, _ = told_by_response([bare], [before], ACTUATOR, lambda _items: found)
-        left[by_time] = misplaced(after)
+        answer = told_by_response([bare], [before], ACTUATOR, lambda _items: found)
+        left[by_time] = misplaced(answer[0][0] if answer else before)
     assert left[False] == misplaced(before)
     assert left[True] < 0.5 * misplaced(before)
+
+
+def test_samples_are_not_moved_away_from_ticks_of_which_other_signals_came(
+    whole: tuple[Recording, Experiment, Identification],
+) -> None:
+    recording, true, found = whole
+    samples = recording.samples
+    assert samples is not None
+    odd = np.arange(samples.ticks) % 2 == 1
+    spikes = np.random.default_rng(2).random(samples.ticks) < 0.03
+    bare = replace(
+        recording,
+        by_time=True,
+        samples=replace(
+            samples,
+            position=np.where(odd, np.nan, samples.position),
+            spool=samples.spool + 8.0 * true.channels.spool.lsb * spikes,
+        ),
+    )
+    before = experiment(bare)
+    answer = told_by_response([bare], [before], ACTUATOR, lambda _items: found)
+    after = answer[0][0] if answer else before
+    np.testing.assert_array_equal(np.isfinite(after.spool), np.isfinite(before.spool))
+    assert answer is None or "rows of samples" not in answer[2]
+
+
+def test_a_controller_with_memory_tells_nothing(
+    whole: tuple[Recording, Experiment, Identification],
+) -> None:
+    recording, _, found = whole
+    bare = without_pairs(recording, 60)
+    law = msgspec.structs.replace(ACTUATOR.controller, GAI=1.0)
+    other = msgspec.structs.replace(ACTUATOR, controller=law)
+    assert told_by_response([bare], [experiment(bare)], other, lambda _items: found) is None
 
 
 def test_nothing_is_told_where_nothing_was_guessed(

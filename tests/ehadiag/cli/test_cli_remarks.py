@@ -178,8 +178,9 @@ def test_closed_loop_with_lost_positions_is_judged_up_to_a_stated_share(
         assert came.verdict is Verdict.NOT_TESTED
         (reason,) = came.reasons
         assert reason.startswith(
-            "11.1% of the jack positions that the control law worked on are lost (limit 1.5%): "
-            "the servovalve current cannot be rebuilt: Kintas, FSS not observable, but FDJ "
+            "11.1% of the jack positions that the control law worked on are lost (limit 1.5%) and "
+            "not told by the response: the servovalve current cannot be rebuilt: Kintas, FSS not "
+            "observable, but FDJ "
         )
         assert came.identification is not None
         clogging, friction, jack = came.identification.estimates

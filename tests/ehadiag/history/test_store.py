@@ -215,6 +215,11 @@ def test_another_programs_database_is_refused(tmp_path: Path) -> None:
         History(tmp_path / "h", create=True)
 
 
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputOutputError, match="too long"):
+        History(tmp_path / ("a" * 300), create=True)
+
+
 def test_no_file_is_no_history(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="ehadiag history init"):
         History(tmp_path / "h")
