@@ -28,7 +28,7 @@ ABORT_S = 15.0
 """In which a test that is told to stop has asked for the abort and written what it has."""
 
 
-PROGRAM = (sys.executable, "-m", "ehadiag.cli.main")
+PROGRAM = (sys.executable, "-m", "ehadiag")
 
 
 class BusyError(EhadiagError):
