@@ -68,6 +68,7 @@ def test_a_simulated_test_is_run_from_the_page(tmp_path):
             answer, ending, running = stream.getresponse(), None, True
             while ending is None or running:
                 line = answer.readline()
+                assert line, "the page's stream ended before the test"
                 data = json.loads(line[6:]) if line.startswith(b"data: {") else {}
                 ending = data.get("ending", ending)
                 running = data.get("running", running)
