@@ -119,7 +119,7 @@ def kill_run(folder: Path, number: int, after_s: float) -> Kill:
     wrong = _history_faults(folder, before, log if told else None)
     lost = None
     if log.exists():
-        lost, fault = _lost(log, seen, killed)
+        lost, fault = _lost(log, seen, killed, ended)
         wrong += fault
     elif seen is not None:
         wrong.append("the recording is gone")
@@ -176,7 +176,9 @@ def _history_faults(folder: Path, before: list[Entry], log: Path | None) -> list
     return wrong
 
 
-def _lost(log: Path, seen: float | None, killed: float) -> tuple[float | None, list[str]]:
+def _lost(
+    log: Path, seen: float | None, killed: float, ended: bool
+) -> tuple[float | None, list[str]]:
     """How much of a recording before the kill is missing, s; None where its test has ended."""
     try:
         last = max(read_frames(log).time_ns.tolist(), default=None)
@@ -186,9 +188,9 @@ def _lost(log: Path, seen: float | None, killed: float) -> tuple[float | None, l
         last, unread = None, [f"recording: {error}"]
     else:
         unread = []
-    # Of what was begun less than a second ago all may be missing.
+    # Of what was begun less than a second before a kill all may be missing.
     since = killed - (seen or killed) if last is None else killed - last * 1e-9
-    if since <= MOST_LOST_S:
+    if since <= MOST_LOST_S and not (ended and unread):
         return since, []
     return since, [*unread, f"recording: its last {since:.2f} s are missing"]
 
