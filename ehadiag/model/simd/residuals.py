@@ -293,7 +293,7 @@ def _block(
     position, weight, levels, start = batch.position, batch.weight, work.levels, batch.start
     located = weight.shape[0] > POSITION_ROW
     count, wanted = candidates.shape[0], out.shape[0]
-    # Lanes that hold no candidate repeat the last one and take no events; a half of none is left.
+    # Lanes that hold no candidate repeat the last one; a half of none is left out.
     end = WIDTH if count <= WIDTH else LANES
     backlash = creeps = shaped = senses = False
     sums[:] = 0.0
@@ -331,7 +331,7 @@ def _block(
             with_jack = k <= last
             if busy:
                 busy = halved_lanes(
-                    count, end, tick, with_jack, state, path, coefficients, slides, rings, pieces
+                    end, tick, with_jack, state, path, coefficients, slides, rings, pieces
                 )
             if busy:
                 event_ticks(count, tick, with_jack, state, path, coefficients, moving, loose, stuck)

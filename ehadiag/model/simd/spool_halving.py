@@ -13,6 +13,8 @@ on its neighbours.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +35,7 @@ from ehadiag.compile.vector import (
 from ehadiag.model.laws import SpoolLaw, slide_base, still_flapper
 from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.simd.coefficients import HALVINGS
-from ehadiag.model.simd.jack_pieces import MOST_PIECES, PIECE, jack_over_pieces
+from ehadiag.model.simd.jack_pieces import PIECE, jack_over_pieces
 from ehadiag.model.simd.layout import (
     BUSY,
     CLAMPED,
@@ -61,17 +63,10 @@ MOST_EVENTS = 5
 
 
 @packed
-def _slid(
-    t: SpoolLaw, m: NDArray[np.float64], k: int, h: float, fine: bool, deflection: Vector,
-    xf: Vector, wf: Vector, xs: Vector, vs: Vector, d: Vector,
-) -> tuple[Vector, Vector, Vector, Vector, Mask, Mask]:  # fmt: skip
-    """Moving spool and flapper after a step of `h` seconds, by the transitions from `k` on.
-
-    Returns the state, where an event has come or may hide (unless the step is the finest), and
-    where spool or flapper has met a stop.
-    """
-    base = slide_base(t, deflection, d)
-    a, w, b, v = xf * d - t.dry, wf * d, (xs - base) * d, vs * d
+def _step4(
+    m: NDArray[np.float64], k: int, a: Vector, w: Vector, b: Vector, v: Vector
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Moving flapper and spool after a step, by the transitions from `k` on."""
     na = load(m, k) * a + load(m, k + LANES) * w
     na = na + load(m, k + 2 * LANES) * b + load(m, k + 3 * LANES) * v
     nw = load(m, k + 4 * LANES) * a + load(m, k + 5 * LANES) * w
@@ -80,35 +75,39 @@ def _slid(
     nb = nb + load(m, k + 10 * LANES) * b + load(m, k + 11 * LANES) * v
     nv = load(m, k + 12 * LANES) * a + load(m, k + 13 * LANES) * w
     nv = nv + load(m, k + 14 * LANES) * b + load(m, k + 15 * LANES) * v
-    size = magnitude(na + t.dry)
-    stops = (nb >= t.stroke - base * d) | (size >= t.flapper_stop)
-    found = (nv <= 0.0) | stops
+    return na, nw, nb, nv
+
+
+@packed
+def _moving_may_end(
+    t: SpoolLaw, h: Any, fine: bool, a: Vector, w: Vector, na: Vector, nw: Vector, nv: Vector
+) -> Mask:
+    """Whether a moving spool stops in a step of `h` seconds, or may unless the step is the finest.
+
+    Positive along the motion, a and na beyond the flapper deflection that balances dry friction.
+    """
+    found = nv <= 0.0
     if not fine:
         # Where an extreme of the flapper lies inside the step the spool may stop, it may touch.
         swing = 0.25 * h * most(magnitude(w), magnitude(nw))
         low = least(a, na) - swing <= 0.0
-        far = most(magnitude(a + t.dry), size) + swing >= t.flapper_stop
+        far = most(magnitude(a + t.dry), magnitude(na + t.dry)) + swing >= t.flapper_stop
         found = found | ((w * nw < 0.0) & (low | far))
-    return (na + t.dry) * d, nw * d, nb * d + base, nv * d, found, stops
+    return found
 
 
 @packed
-def _rung(
-    t: SpoolLaw, m: NDArray[np.float64], k: int, h: float, fine: bool, still: Vector,
-    xf: Vector, wf: Vector,
-) -> tuple[Vector, Vector, Mask, Mask]:  # fmt: skip
-    """As `_slid` for a spool at rest, whose flapper rings about `still`, m: flapper and rate."""
-    a = xf - still
-    new_xf = load(m, k) * a + load(m, k + LANES) * wf + still
-    new_wf = load(m, k + 2 * LANES) * a + load(m, k + 3 * LANES) * wf
+def _rest_may_end(
+    t: SpoolLaw, h: Any, fine: bool, xf: Vector, wf: Vector, new_xf: Vector, new_wf: Vector
+) -> Mask:
+    """As `_moving_may_end` of a spool at rest, which breaks away."""
     size = magnitude(new_xf)
-    stops = size >= t.flapper_stop
-    found = (size > t.breakaway) | stops
+    found = size > t.breakaway
     if not fine:
         swing = 0.25 * h * most(magnitude(wf), magnitude(new_wf))
         far = most(magnitude(xf), size) + swing > least(t.breakaway, t.flapper_stop)
         found = found | ((wf * new_wf < 0.0) & far)
-    return new_xf, new_wf, found, stops
+    return found
 
 
 @packed
@@ -151,70 +150,120 @@ def _halved(
     before, since, events, kinks = vs, zero, zero, zero
     count = 0
     for node in range(NODES):
-        done, limit = zero, zero + QUARTER
-        top = HALVINGS
-        while True:
-            going = (good != 0.0) & (done < QUARTER)
-            if not anywhere(going):
-                break
-            # Where an event was suspected in vain.
-            limit = where(done < limit, limit, QUARTER)
-            for n in range(top + 2):
-                level = max(top - n, 0)
-                units = float(1 << level)
-                fine = level == 0
-                wants = (good != 0.0) & (done + units <= limit)
-                if n > top:  # the second half of the last halving
-                    wants = wants & (limit < QUARTER)
-                if not anywhere(wants):
-                    continue
-                moves = wants & (d != 0.0)
-                rests = wants & (d == 0.0)
-                new_xf, new_wf, new_xs, new_vs = xf, wf, xs, vs
-                suspected = zero
-                if anywhere(moves):
-                    k = level * 16 * LANES + o
-                    m_xf, m_wf, m_xs, m_vs, found, stops = _slid(
-                        t, slides, k, units * unit, fine, deflection, xf, wf, xs, vs, d
-                    )
-                    new_xf, new_wf = where(moves, m_xf, xf), where(moves, m_wf, wf)
-                    new_xs, new_vs = where(moves, m_xs, xs), where(moves, m_vs, vs)
-                    suspected = where(moves & found, 1.0, suspected)
-                    good = where(moves & stops, 0.0, good)
-                if anywhere(rests):
+        done, limit, first = zero, zero, True
+        going = good != 0.0
+        while anywhere(going):
+            # On to the node at once, where no event may hide before it.
+            rest = where(going, QUARTER - done, 0.0)
+            may_end = zero
+            new_xf, new_wf, new_xs, new_vs = xf, wf, xs, vs
+            moves, rests = going & (d != 0.0), going & (d == 0.0)
+            if anywhere(moves):
+                base = slide_base(t, deflection, d)
+                a, w, b, v = xf * d - t.dry, wf * d, (xs - base) * d, vs * d
+                na, nw, nb, nv = a, w, b, v
+                if first:
+                    na, nw, nb, nv = _step4(slides, HALVINGS * 16 * LANES + o, a, w, b, v)
+                else:
+                    left = rest
+                    for level in range(HALVINGS - 1, -1, -1):
+                        units = float(1 << level)
+                        takes = left >= units
+                        left = where(takes, left - units, left)
+                        ka, kw, kb, kv = _step4(slides, level * 16 * LANES + o, na, nw, nb, nv)
+                        na, nw = where(takes, ka, na), where(takes, kw, nw)
+                        nb, nv = where(takes, kb, nb), where(takes, kv, nv)
+                size = magnitude(na + t.dry)
+                stops = (nb >= t.stroke - base * d) | (size >= t.flapper_stop)
+                good = where(moves & stops, 0.0, good)
+                found = _moving_may_end(t, rest * unit, False, a, w, na, nw, nv)
+                may_end = where(moves & found, 1.0, may_end)
+                new_xf, new_wf = where(moves, (na + t.dry) * d, xf), where(moves, nw * d, wf)
+                new_xs, new_vs = where(moves, nb * d + base, xs), where(moves, nv * d, vs)
+            if anywhere(rests):
+                still = still_flapper(t.ratio, deflection, wire)
+                a, w = xf - still, wf
+                left = rest
+                for level in range(HALVINGS, -1, -1):
+                    units = float(1 << level)
+                    takes = left >= units
+                    left = where(takes, left - units, left)
                     k = level * 4 * LANES + o
-                    still = still_flapper(t.ratio, deflection, wire)
-                    r_xf, r_wf, found, stops = _rung(
-                        t, rings, k, units * unit, fine, still, xf, wf
-                    )
-                    new_xf, new_wf = where(rests, r_xf, new_xf), where(rests, r_wf, new_wf)
-                    suspected = where(rests & found, 1.0, suspected)
-                    good = where(rests & stops, 0.0, good)
-                if not fine:
-                    limit = where(suspected != 0.0, done + units, limit)
-                    wants = wants & (suspected == 0.0)
-                xf, wf = where(wants, new_xf, xf), where(wants, new_wf, wf)
-                xs, vs = where(wants, new_xs, xs), where(wants, new_vs, vs)
-                wire = where(wants, xs, wire)
-                done = where(wants, done + units, done)
-                since = where(wants, since + units, since)
-                if fine:
-                    switches = suspected != 0.0
-                    if anywhere(switches):
-                        # A spool that stops rests, or moves back; one at rest breaks away.
-                        _cut(pieces, count, where(switches, since * unit, 0.0), xs, before, vs)
-                        count += 1
-                        since = where(switches, 0.0, since)
-                        vs = where(switches, 0.0, vs)
-                        before = where(switches, vs, before)
-                        side = where(xf > 0.0, 1.0, zero - 1.0)
-                        side = where(magnitude(xf) > t.breakaway, side, 0.0)
-                        d = where(switches, side, d)
-                        kinks = where(switches & (d != 0.0), 1.0, kinks)
-                        limit = where(switches, QUARTER, limit)
-                        events = where(switches, events + 1.0, events)
-                        good = where(events > MOST_EVENTS * 1.0, 0.0, good)
-            top = HALVINGS - 1
+                    na = load(rings, k) * a + load(rings, k + LANES) * w
+                    nw = load(rings, k + 2 * LANES) * a + load(rings, k + 3 * LANES) * w
+                    a, w = where(takes, na, a), where(takes, nw, w)
+                    if first:
+                        break
+                good = where(rests & (magnitude(a + still) >= t.flapper_stop), 0.0, good)
+                found = _rest_may_end(t, rest * unit, False, xf, wf, a + still, w)
+                may_end = where(rests & found, 1.0, may_end)
+                new_xf, new_wf = where(rests, a + still, new_xf), where(rests, w, new_wf)
+            goes = going & (may_end == 0.0)
+            xf, wf = where(goes, new_xf, xf), where(goes, new_wf, wf)
+            xs, vs = where(goes, new_xs, xs), where(goes, new_vs, vs)
+            wire = where(goes, xs, wire)
+            since = where(goes, since + rest, since)
+            done = where(goes, QUARTER, done)
+            limit = QUARTER + zero
+            first = False
+            hunted = (may_end != 0.0) & (good != 0.0)
+            if anywhere(hunted):
+                hunts = where(hunted, 1.0, zero)
+                for n in range(HALVINGS + 1):
+                    level = max(HALVINGS - 1 - n, 0)
+                    units = float(1 << level)
+                    fine = level == 0
+                    wants = (hunts != 0.0) & (done + units <= limit)
+                    suspected = zero
+                    new_xf, new_wf, new_xs, new_vs = xf, wf, xs, vs
+                    moves, rests = wants & (d != 0.0), wants & (d == 0.0)
+                    if anywhere(moves):
+                        base = slide_base(t, deflection, d)
+                        a, w, b, v = xf * d - t.dry, wf * d, (xs - base) * d, vs * d
+                        na, nw, nb, nv = _step4(slides, level * 16 * LANES + o, a, w, b, v)
+                        size = magnitude(na + t.dry)
+                        stops = (nb >= t.stroke - base * d) | (size >= t.flapper_stop)
+                        good = where(moves & stops, 0.0, good)
+                        found = _moving_may_end(t, units * unit, fine, a, w, na, nw, nv)
+                        suspected = where(moves & found, 1.0, suspected)
+                        new_xf = where(moves, (na + t.dry) * d, xf)
+                        new_wf = where(moves, nw * d, wf)
+                        new_xs, new_vs = where(moves, nb * d + base, xs), where(moves, nv * d, vs)
+                    if anywhere(rests):
+                        still = still_flapper(t.ratio, deflection, wire)
+                        a, w = xf - still, wf
+                        k = level * 4 * LANES + o
+                        na = load(rings, k) * a + load(rings, k + LANES) * w
+                        nw = load(rings, k + 2 * LANES) * a + load(rings, k + 3 * LANES) * w
+                        good = where(rests & (magnitude(na + still) >= t.flapper_stop), 0.0, good)
+                        found = _rest_may_end(t, units * unit, fine, xf, wf, na + still, nw)
+                        suspected = where(rests & found, 1.0, suspected)
+                        new_xf, new_wf = where(rests, na + still, new_xf), where(rests, nw, new_wf)
+                    if not fine:
+                        limit = where(suspected != 0.0, done + units, limit)
+                        wants = wants & (suspected == 0.0)
+                    xf, wf = where(wants, new_xf, xf), where(wants, new_wf, wf)
+                    xs, vs = where(wants, new_xs, xs), where(wants, new_vs, vs)
+                    wire = where(wants, xs, wire)
+                    done = where(wants, done + units, done)
+                    since = where(wants, since + units, since)
+                    if fine:
+                        switches = suspected != 0.0
+                        if anywhere(switches):
+                            # A spool that stops rests, or moves back; one at rest breaks away.
+                            _cut(pieces, count, where(switches, since * unit, 0.0), xs, before, vs)
+                            count += 1
+                            since = where(switches, 0.0, since)
+                            vs = where(switches, 0.0, vs)
+                            before = where(switches, vs, before)
+                            side = where(xf > 0.0, 1.0, zero - 1.0)
+                            side = where(magnitude(xf) > t.breakaway, side, 0.0)
+                            d = where(switches, side, d)
+                            kinks = where(switches & (d != 0.0), 1.0, kinks)
+                            hunts = where(switches, 0.0, hunts)
+                            events = where(switches, events + 1.0, events)
+                            good = where(events > MOST_EVENTS * 1.0, 0.0, good)
+            going = (good != 0.0) & (done < QUARTER)
         _cut(pieces, count, since * unit, xs, before, vs)
         count += 1
         since, before = zero, vs
@@ -230,14 +279,11 @@ def _halved(
     store(state, DIRECTION * LANES + o, where(mine, d, load(state, DIRECTION * LANES + o)))
     store(state, BUSY * LANES + o, where(mine, 0.0, busy))
     if with_jack and anywhere(mine & (kinks != 0.0)):
-        jack_over_pieces(
-            o, where(mine, kinks, 0.0), count, tick, state, path, coefficients, pieces
-        )
+        jack_over_pieces(o, where(mine, kinks, 0.0), count, tick, state, path, coefficients, pieces)
 
 
 @bare_kernel
 def halved_lanes(
-    count: int,
     end: int,
     tick: float,
     with_jack: bool,
@@ -255,14 +301,11 @@ def halved_lanes(
 
     Parameters
     ----------
-    count: lanes that hold a candidate; others take no events.
     with_jack: whether the jack is to go along the pieces of the spool's path that events cut.
     slides, rings: transitions over 2^0 … 2^HALVINGS finest steps, see
         `ehadiag.model.simd.coefficients`.
     pieces: scratch, see `ehadiag.model.simd.jack_pieces`.
     """
-    for i in range(count, end):
-        state[BUSY * LANES + i] = 0.0
     any_busy = False
     for o in range(0, end, WIDTH):
         _halved(o, tick, with_jack, state, path, coefficients, slides, rings, pieces)
