@@ -116,15 +116,24 @@ def crossed(model: Derivatives, belief: Belief) -> Linearised:
         points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
         offsets[k, 1:] = above, -below
     runs = model.many(points)
-    jacobian = model.additive_slopes()
-    scatter = np.zeros(runs.shape[1:])
-    for k, j in enumerate(curved):
-        line = runs[[0, 1 + 2 * k, 2 + 2 * k]]
+    shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+    # By differences from the middle: what slopes, and, at unit length, what a line through the
+    # three runs of a coordinate does not explain.
+    shares = np.zeros((2 * count, len(runs) - 1))
+    for k in range(count):
+        mine = slice(2 * k, 2 * k + 2)
         along = offsets[k] - offsets[k].mean()
-        jacobian[j] = np.tensordot(along / (along @ along), line, 1)
-        left = line - line.mean(axis=0) - along[:, None, None] * jacobian[j]
-        scatter += np.einsum("ijk,ijk->jk", left, left)
-    return Linearised(points.mean(axis=0), runs.mean(axis=0), jacobian, scatter / count, runs[0])
+        across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
+        shares[k, mine] = (along / (along @ along))[1:]
+        shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
+    differences = flat[1:] - flat[0]
+    out = shares @ differences
+    jacobian = model.additive_slopes()
+    jacobian[curved] = out[:count].reshape(count, *shape)
+    left = out[count:]
+    scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
+    mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
+    return Linearised(points.mean(axis=0), mean, jacobian, scatter, runs[0])
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

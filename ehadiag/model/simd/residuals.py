@@ -137,7 +137,7 @@ def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64
 
     Parameters
     ----------
-    scattered : shape (LANES, tests, FIELDS)
+    scattered : shape (LANES or less, tests, FIELDS)
         Their constants.
 
     Returns
@@ -148,7 +148,7 @@ def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64
     if batch.weight[PRESSURE_ROW:].any():
         # Without weights the jack is left out, and the spool's path is all that is looked at.
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
-        block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(LANES))
+        block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(len(scattered)))
     return levels
 
 
