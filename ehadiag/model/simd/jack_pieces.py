@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.kernels import bare_kernel
 from ehadiag.compile.vector import (
     WIDTH,
+    Mask,
     Vector,
     anywhere,
     least,
@@ -19,7 +20,7 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.collocation import C1, C2, radau_velocity
-from ehadiag.model.jack import FINE_RATIO, FINE_TRAVEL
+from ehadiag.model.jack import FINE_RATIO, FINE_TRAVEL, FRESH_DECAY
 from ehadiag.model.jack_state import Piece, Probe, place_on
 from ehadiag.model.lands import open_piece
 from ehadiag.model.laws import excess, resistance
@@ -40,7 +41,7 @@ from ehadiag.model.simd.layout import (
     sensor_laws,
 )
 
-__all__ = ["MOST_PIECES", "PIECE", "PIECES_SIZE", "jack_over_pieces"]
+__all__ = ["ALONE", "MOST_PIECES", "PIECE", "PIECES_SIZE", "jack_over_pieces"]
 
 PIECE = 4 * WIDTH
 """Numbers of a piece, WIDTH lanes each: duration (s; 0 in a lane that has no such piece), place at
@@ -64,14 +65,14 @@ def jack_over_pieces(
 ) -> None:
     """Jack over a tick, by `count` pieces, of the lanes from `o` in which `these` is not 0.
 
-    A lane in which it starts, stops or creeps, or whose second stage, lands or sensor are not the
-    plain ones, goes on alone from there.
+    A lane in which it starts or stops within a piece goes over that alone, and one whose second
+    stage, lands or sensor are not the plain ones over all of them.
     """
     j, law = jack_laws(coefficients, o), sensor_laws(coefficients, o)
     place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
     d, fresh = load(state, JACK_DIRECTION * LANES + o), load(state, FRESH * LANES + o)
     plain = (j.oil == 0.0) & (j.extra == 0.0) & (j.shaped == 0.0) & (law.lag + law.lead == 0.0)
-    these_left = where(plain, these, 0.0)
+    plain = plain & (these != 0.0)
     if anywhere((these != 0.0) & ~plain):
         store(pieces, ALONE, where(plain, 0.0, these))
         _alone(o, 0, count, tick, state, path, coefficients, pieces)
@@ -79,15 +80,18 @@ def jack_over_pieces(
     for n in range(count):
         k = n * PIECE
         span, x1 = load(pieces, k), load(pieces, k + WIDTH)
-        here = (these_left != 0.0) & (span > 0.0)
+        here = plain & (span > 0.0)
         if anywhere(here):
             hold = j.spring * place
             up, down = excess(j, x1, hold + j.static), excess(j, x1, hold - j.static)
             rests = here & (d == 0.0) & (up <= 0.0) & (down >= 0.0)
-            slides = here & (d != 0.0) & (fresh == 0.0)
+            slides = here & (d != 0.0)
             if anywhere(slides):
                 near = where(x0 * x1 > 0.0, least(magnitude(x0), magnitude(x1)), 0.0)
                 slides = slides & (magnitude(x1 - x0) < most(near * FINE_RATIO, FINE_TRAVEL))
+                if anywhere(slides & (fresh != 0.0)):
+                    rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
+                    slides = slides & ((fresh == 0.0) | (span * rate < FRESH_DECAY))
                 piece = Piece(
                     span, x0, x1, load(pieces, k + 2 * WIDTH) * span,
                     load(pieces, k + 3 * WIDTH) * span,
@@ -101,24 +105,26 @@ def jack_over_pieces(
                 slides = slides & (later * d > 0.0) & (magnitude(moved) < j.stroke)
                 place, velocity = where(slides, moved, place), where(slides, later, velocity)
             alone = here & ~rests & ~slides
-            fresh = where(rests, 0.0, fresh)
+            fresh = where(rests | slides, 0.0, fresh)
             if anywhere(alone):
-                _keep(o, these_left, place, velocity, d, fresh, state)
+                _keep(o, plain, place, velocity, d, fresh, state)
                 store(pieces, ALONE, where(alone, 1.0, 0.0))
-                _alone(o, n, count, tick, state, path, coefficients, pieces)
-                these_left = where(alone, 0.0, these_left)
+                _alone(o, n, n + 1, tick, state, path, coefficients, pieces)
+                place = load(state, JACK * LANES + o)
+                velocity = load(state, JACK_VELOCITY * LANES + o)
+                d, fresh = load(state, JACK_DIRECTION * LANES + o), load(state, FRESH * LANES + o)
             x0 = where(span > 0.0, x1, x0)
-    _keep(o, these_left, place, velocity, d, fresh, state)
+    _keep(o, plain, place, velocity, d, fresh, state)
     store(state, DONE * LANES + o, where(these != 0.0, 1.0, load(state, DONE * LANES + o)))
 
 
 @packed
 def _keep(
-    o: int, these: Vector, place: Vector, velocity: Vector, d: Vector, fresh: Vector,
+    o: int, mine: Mask, place: Vector, velocity: Vector, d: Vector, fresh: Vector,
     state: NDArray[np.float64],
 ) -> None:  # fmt: skip
     """Write the jack of these lanes."""
-    mine, k = these != 0.0, JACK * LANES + o
+    k = JACK * LANES + o
     store(state, k, where(mine, place, load(state, k)))
     k = JACK_VELOCITY * LANES + o
     store(state, k, where(mine, velocity, load(state, k)))
@@ -139,7 +145,7 @@ def _alone(
     coefficients: NDArray[np.float64],
     pieces: NDArray[np.float64],
 ) -> None:
-    """Jack of the lanes marked ALONE, one after the other, over the pieces from `first` on."""
+    """Jack of the lanes marked ALONE, one after the other, over the pieces first … count - 1."""
     for lane in range(WIDTH):
         if pieces[ALONE + lane] == 0.0:
             continue

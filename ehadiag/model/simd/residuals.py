@@ -331,7 +331,7 @@ def _block(
             with_jack = k <= last
             if busy:
                 busy = halved_lanes(
-                    end, tick, with_jack, state, path, coefficients, slides, rings, pieces
+                    count, end, tick, with_jack, state, path, coefficients, slides, rings, pieces
                 )
             if busy:
                 event_ticks(count, tick, with_jack, state, path, coefficients, moving, loose, stuck)

@@ -35,7 +35,7 @@ from ehadiag.compile.vector import (
 from ehadiag.model.laws import SpoolLaw, slide_base, still_flapper
 from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.simd.coefficients import HALVINGS
-from ehadiag.model.simd.jack_pieces import PIECE, jack_over_pieces
+from ehadiag.model.simd.jack_pieces import ALONE, PIECE, jack_over_pieces
 from ehadiag.model.simd.layout import (
     BUSY,
     CLAMPED,
@@ -125,6 +125,7 @@ def _cut(
 @inlined
 def _halved(
     o: int,
+    count: int,
     tick: float,
     with_jack: bool,
     state: NDArray[np.float64],
@@ -148,7 +149,7 @@ def _halved(
     zero = d * 0.0
     good = where(mine, 1.0, zero)
     before, since, events, kinks = vs, zero, zero, zero
-    count = 0
+    cuts = 0
     for node in range(NODES):
         done, limit, first = zero, zero, True
         going = good != 0.0
@@ -251,8 +252,8 @@ def _halved(
                         switches = suspected != 0.0
                         if anywhere(switches):
                             # A spool that stops rests, or moves back; one at rest breaks away.
-                            _cut(pieces, count, where(switches, since * unit, 0.0), xs, before, vs)
-                            count += 1
+                            _cut(pieces, cuts, where(switches, since * unit, 0.0), xs, before, vs)
+                            cuts += 1
                             since = where(switches, 0.0, since)
                             vs = where(switches, 0.0, vs)
                             before = where(switches, vs, before)
@@ -264,8 +265,8 @@ def _halved(
                             events = where(switches, events + 1.0, events)
                             good = where(events > MOST_EVENTS * 1.0, 0.0, good)
             going = (good != 0.0) & (done < QUARTER)
-        _cut(pieces, count, since * unit, xs, before, vs)
-        count += 1
+        _cut(pieces, cuts, since * unit, xs, before, vs)
+        cuts += 1
         since, before = zero, vs
         place, slope = (PLACE + node + 1) * LANES + o, (SLOPE + node + 1) * LANES + o
         store(path, place, where(good != 0.0, xs, load(path, place)))
@@ -278,12 +279,18 @@ def _halved(
     store(state, WIRE * LANES + o, where(mine, wire, load(state, WIRE * LANES + o)))
     store(state, DIRECTION * LANES + o, where(mine, d, load(state, DIRECTION * LANES + o)))
     store(state, BUSY * LANES + o, where(mine, 0.0, busy))
-    if with_jack and anywhere(mine & (kinks != 0.0)):
-        jack_over_pieces(o, where(mine, kinks, 0.0), count, tick, state, path, coefficients, pieces)
+    if with_jack:
+        store(pieces, ALONE, where(mine, kinks, 0.0))
+        for lane in range(max(count - o, 0), WIDTH):
+            pieces[ALONE + lane] = 0.0
+        kinks = load(pieces, ALONE)
+        if anywhere(kinks != 0.0):
+            jack_over_pieces(o, kinks, cuts, tick, state, path, coefficients, pieces)
 
 
 @bare_kernel
 def halved_lanes(
+    count: int,
     end: int,
     tick: float,
     with_jack: bool,
@@ -301,6 +308,7 @@ def halved_lanes(
 
     Parameters
     ----------
+    count: lanes that hold a candidate; the jacks of others are left as they were.
     with_jack: whether the jack is to go along the pieces of the spool's path that events cut.
     slides, rings: transitions over 2^0 … 2^HALVINGS finest steps, see
         `ehadiag.model.simd.coefficients`.
@@ -308,7 +316,7 @@ def halved_lanes(
     """
     any_busy = False
     for o in range(0, end, WIDTH):
-        _halved(o, tick, with_jack, state, path, coefficients, slides, rings, pieces)
+        _halved(o, count, tick, with_jack, state, path, coefficients, slides, rings, pieces)
         if anywhere(load(state, BUSY * LANES + o) != 0.0):
             any_busy = True
     return any_busy
