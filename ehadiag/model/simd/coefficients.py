@@ -188,6 +188,7 @@ def tabulate(
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
     slides: NDArray[np.float64],
+    free_slides: NDArray[np.float64],
     rings: NDArray[np.float64],
 ) -> tuple[bool, bool, bool, bool]:
     """Coefficients of all lanes; returns whether any has backlash, Stribeck's friction of the
@@ -202,7 +203,8 @@ def tabulate(
         shape (LANES, 3, MOVING_ROWS, WIDTH), flat.
     loose: out, the same without the feedback wire, where a lane has backlash.
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
-    slides, rings: out, transitions over 2^0 … 2^HALVINGS finest steps, moving and at rest, shapes
+    slides, free_slides, rings: out, transitions over 2^0 … 2^HALVINGS finest steps, moving with the
+        feedback wire and (where a lane has backlash) without it, and at rest; shapes
         (HALVINGS + 1, 16, LANES) and (HALVINGS + 1, 4, LANES), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
@@ -243,7 +245,9 @@ def tabulate(
             _filter(sensor_law(plant_of(candidates[i])), tick, i, coefficients)
     if any_backlash:
         rates[6 * LANES : 7 * LANES] = 0.0
-        quarter, _ = _powers(_smallest(rates, 4, tick), 4, MOVING_ROWS, loose)
+        smallest = _smallest(rates, 4, tick)
+        _doubled(smallest, 4, free_slides)
+        quarter, _ = _powers(smallest, 4, MOVING_ROWS, loose)
         _copy(quarter, coefficients, LOOSE * LANES)
         for i in range(LANES):
             for level in range(len(SHIFTS)):

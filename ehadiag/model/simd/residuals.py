@@ -102,7 +102,7 @@ class Scratch(NamedTuple):
         the jack is left out.
     state, path, coefficients
         See `ehadiag.model.simd.layout`.
-    moving, loose, stuck, slides, rings
+    moving, loose, stuck, slides, free_slides, rings
         See `ehadiag.model.simd.coefficients`.
     pieces
         See `ehadiag.model.simd.jack_pieces`.
@@ -122,6 +122,7 @@ class Scratch(NamedTuple):
     loose: NDArray[np.float64]
     stuck: NDArray[np.float64]
     slides: NDArray[np.float64]
+    free_slides: NDArray[np.float64]
     rings: NDArray[np.float64]
     pieces: NDArray[np.float64]
     rows: NDArray[np.float64]
@@ -163,6 +164,7 @@ def scratch_for(levels: NDArray[np.int64]) -> Scratch:
         loose=_aligned(MOVING_SIZE),
         stuck=_aligned(STUCK_SIZE),
         slides=_aligned(SLIDES_SIZE),
+        free_slides=_aligned(SLIDES_SIZE),
         rings=_aligned(RINGS_SIZE),
         pieces=_aligned(PIECES_SIZE),
         rows=np.zeros((LANES, FIELDS)),
@@ -287,7 +289,8 @@ def _block(
     """
     state, path, coefficients = work.state, work.path, work.coefficients
     moving, loose, stuck, rows = work.moving, work.loose, work.stuck, work.rows
-    slides, rings, pieces = work.slides, work.rings, work.pieces
+    slides, free_slides, rings = work.slides, work.free_slides, work.rings
+    pieces = work.pieces
     sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
     position, weight, levels, start = batch.position, batch.weight, work.levels, batch.start
@@ -307,7 +310,7 @@ def _block(
                 for field in range(FIELDS):
                     rows[i, field] = candidates[min(i, count - 1), test, field]
             backlash, creeps, shaped, senses = tabulate(
-                rows, tick, coefficients, moving, loose, stuck, slides, rings
+                rows, tick, coefficients, moving, loose, stuck, slides, free_slides, rings
             )
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
@@ -331,8 +334,9 @@ def _block(
             with_jack = k <= last
             if busy:
                 busy = halved_lanes(
-                    count, end, tick, with_jack, state, path, coefficients, slides, rings, pieces
-                )
+                    count, end, tick, backlash, with_jack, state, path, coefficients,
+                    slides, free_slides, rings, pieces,
+                )  # fmt: skip
             if busy:
                 event_ticks(count, tick, with_jack, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
