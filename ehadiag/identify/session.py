@@ -138,6 +138,7 @@ class Session:
         self.nuisances = nuisances
         self.knowledge = knowledge
         self._memory = Memory()
+        self._looked: tuple[bytes, Look] | None = None
         self.so_far: SoFar | None = None
         """What the latest `feed` showed; None before the first. Another thread may look."""
 
@@ -359,7 +360,7 @@ class Session:
         """Refinement on the first parts of the tests, from memory if the inputs are the same."""
         until = [first_ticks(item) for item in experiments]
         return self._memory.recall(
-            _of_first_parts("first part", experiments, until, start),
+            _of_first_parts(experiments, until, start),
             FirstPart,
             lambda: refine_first_part(
                 experiments, until, named(start), between, self._look(experiments, start)
@@ -367,13 +368,12 @@ class Session:
         )
 
     def _look(self, experiments: Sequence[Experiment], start: NDArray[np.float64]) -> Look:
-        """Look at the first parts of the tests, from memory if the inputs are the same."""
+        """Look at the first parts of the tests; the latest one is kept."""
         until = [first_ticks(item) for item in experiments]
-        return self._memory.recall(
-            _of_first_parts("look", experiments, until, start),
-            Look,
-            lambda: look_at(experiments, until, named(start)),
-        )
+        key = _of_first_parts(experiments, until, start)
+        if self._looked is None or self._looked[0] != key:
+            self._looked = key, look_at(experiments, until, named(start))
+        return self._looked[1]
 
 
 def identify(
@@ -390,7 +390,6 @@ def identify(
 
 
 def _of_first_parts(
-    label: str,
     experiments: Sequence[Experiment],
     until: Sequence[int],
     start: NDArray[np.float64],
@@ -398,7 +397,7 @@ def _of_first_parts(
     """Fingerprint of the first parts of the tests and a start among the severities."""
     free = lay_out(experiments, first_spans(experiments, until))
     base = [np.array(item.constants) for item in experiments]
-    return digest(label, [*free, *base, start])
+    return digest("first part", [*free, *base, start])
 
 
 def _guessed(refinement: Refinement) -> NDArray[np.float64]:
