@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO, cast
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.printable import printable, printable_lines
 from ehadiag.facade.compiling import compiling_notice
 
@@ -66,7 +66,7 @@ def emit(text: str) -> None:
         sys.stdout.flush()
     except OSError as error:
         abandon(sys.stdout)
-        raise InputOutputError(f"standard output: {error.strerror or error}") from None
+        raise InputOutputError(f"standard output: {reason_of(error)}") from None
 
 
 def abandon(stream: TextIO) -> None:

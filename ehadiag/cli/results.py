@@ -16,7 +16,7 @@ from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import emit, put, rendered, say
 from ehadiag.cli.report_page import need_report_library, report_of
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import plain_name
 
@@ -56,7 +56,7 @@ def make_folder(name: str) -> Folder:
         path.mkdir(parents=True, exist_ok=True)
         return Folder.at(path, RESULT_MODE)
     except OSError as error:
-        raise InputOutputError(f"output folder {name}: {error.strerror or error}") from None
+        raise InputOutputError(f"output folder {name}: {reason_of(error)}") from None
 
 
 class Results:
@@ -224,7 +224,7 @@ class Results:
                 continue
             except OSError as error:
                 place = folder.path / name
-                raise InputOutputError(f"result {place}: {error.strerror or error}") from None
+                raise InputOutputError(f"result {place}: {reason_of(error)}") from None
             self._names.add(stem)
             return stem
         raise AssertionError("numbers have no end")
@@ -236,7 +236,7 @@ class Results:
             self._folder.write(name, content)
         except OSError as error:
             place = self._folder.path / name
-            raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
+            raise InputOutputError(f"picture {place}: {reason_of(error)}") from None
 
     def _report(self, diagnosis: Diagnosis, line: str, name: str) -> None:
         assert self._folder is not None
@@ -246,7 +246,7 @@ class Results:
             self._folder.write(name, page)
         except OSError as error:
             place = self._folder.path / name
-            raise InputOutputError(f"report {place}: {error.strerror or error}") from None
+            raise InputOutputError(f"report {place}: {reason_of(error)}") from None
 
 
 @contextlib.contextmanager

@@ -32,7 +32,7 @@ from ehadiag.compile.object_code import (
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import Channel
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.folder import Folder
 from ehadiag.core.printable import plain_name
 from ehadiag.export.archive import archive
@@ -341,4 +341,4 @@ def write(folder: Folder, files: Mapping[str, bytes]) -> None:
         try:
             folder.write(name, data)
         except OSError as error:
-            raise InputOutputError(f"{folder.path / name}: {error.strerror or error}") from None
+            raise InputOutputError(f"{folder.path / name}: {reason_of(error)}") from None

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.history.records import (
     DIAGNOSIS,
     EVENT,
@@ -72,7 +72,7 @@ class History:
         try:
             link, other = path.is_symlink(), path.exists() and not path.is_file()
         except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", None) or error
+            why = reason_of(error)
             raise InputOutputError(f"history {path}: {why}") from None
         if link:
             raise InputOutputError(f"history {path}: is a link; name the file it leads to")

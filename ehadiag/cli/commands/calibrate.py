@@ -15,7 +15,7 @@ from ehadiag.cli.matplotlib_alone import matplotlib_alone
 from ehadiag.cli.output import emit, progress_bar, rendered, say, say_if_compiling
 from ehadiag.cli.report_page import add_report_option, calibration_report, need_report_library
 from ehadiag.cli.results import make_folder
-from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError, reason_of
 from ehadiag.core.stored_test import resolve_test
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _bring_out(
         try:
             folder.write(page.name, calibration_report(found))
         except OSError as error:
-            raise InputOutputError(f"report {page}: {error.strerror or error}") from None
+            raise InputOutputError(f"report {page}: {reason_of(error)}") from None
         written.append(page)
     return written
 
@@ -168,7 +168,7 @@ def _digest(log: str) -> str:
         with Path(log).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputOutputError(f"log {log}: {error.strerror or error}") from None
+        raise InputOutputError(f"log {log}: {reason_of(error)}") from None
 
 
 def _learn(
@@ -224,9 +224,7 @@ def _write(folder: Folder, name: str, unit: Actuator, *, replaced: bool) -> None
         put = folder.write if replaced else folder.write_new
         put(name, actuator_toml(unit))
     except OSError as error:
-        raise InputOutputError(
-            f"actuator file {folder.path / name}: {error.strerror or error}"
-        ) from None
+        raise InputOutputError(f"actuator file {folder.path / name}: {reason_of(error)}") from None
 
 
 def _draw(folder: Folder, name: str, found: Calibrated) -> None:
@@ -236,4 +234,4 @@ def _draw(folder: Folder, name: str, found: Calibrated) -> None:
         folder.write(name, draw_calibration(found))
     except OSError as error:
         place = folder.path / name
-        raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
+        raise InputOutputError(f"picture {place}: {reason_of(error)}") from None

@@ -13,7 +13,7 @@ import msgspec
 
 from ehadiag.cli import argument_types, asked_for, options
 from ehadiag.cli.output import emit, progress_bar, put, rendered, say, say_if_compiling
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.stored_test import SAME_RATE, StoredTest, encode_test, resolve_test
 
@@ -178,7 +178,7 @@ def _write(path: Path, content: bytes) -> None:
     except FileExistsError:
         raise InputOutputError(f"{path}: exists already; name another file") from None
     except OSError as error:
-        raise InputOutputError(f"{path}: {error.strerror or error}") from None
+        raise InputOutputError(f"{path}: {reason_of(error)}") from None
 
 
 def _print(arguments: argparse.Namespace, found: list[tuple[StoredTest, Score]]) -> None:

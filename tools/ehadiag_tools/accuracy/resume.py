@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -65,7 +65,7 @@ def perform_all(
                 bar = progress.add_task(label, total=len(runs), completed=len(runs) - len(waiting))
                 _work(worker, waiting, jobs, keep, lambda: progress.advance(bar))
     except OSError as error:
-        raise InputOutputError(f"results {results}: {error.strerror or error}") from None
+        raise InputOutputError(f"results {results}: {reason_of(error)}") from None
     return [done[key] for key in keys]
 
 
