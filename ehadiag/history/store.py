@@ -70,7 +70,8 @@ class History:
     def __init__(self, path: Path, *, create: bool = False) -> None:
         self.path = path
         try:
-            link, other = path.is_symlink(), path.exists() and not path.is_file()
+            link, exists = path.is_symlink(), path.exists()
+            other = exists and not path.is_file()
         except (OSError, ValueError) as error:
             why = reason_of(error)
             raise InputOutputError(f"history {path}: {why}") from None
@@ -80,7 +81,7 @@ class History:
             raise InputOutputError(f"history {path}: not a regular file")
         full = Path(os.path.abspath(path))
         self._writable = create or (os.access(full, os.W_OK) and os.access(full.parent, os.W_OK))
-        if not create and not path.exists():
+        if not create and not exists:
             raise ConfigurationError(
                 f"no history {path}: name one by --history, or begin one by ehadiag history init"
             )
