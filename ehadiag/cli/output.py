@@ -24,6 +24,7 @@ __all__ = [
     "counting_bar",
     "damage",
     "emit",
+    "failure_said",
     "progress_bar",
     "put",
     "rendered",
@@ -67,6 +68,16 @@ def emit(text: str) -> None:
     except OSError as error:
         abandon(sys.stdout)
         raise InputOutputError(f"standard output: {reason_of(error)}") from None
+
+
+@contextmanager
+def failure_said(codes: list[int]) -> Iterator[None]:
+    """Say what could not be brought out, add its exit code, and go on with the rest."""
+    try:
+        yield
+    except InputOutputError as error:
+        codes.append(error.exit_code)
+        say(str(error))
 
 
 def abandon(stream: TextIO) -> None:

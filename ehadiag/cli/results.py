@@ -14,7 +14,7 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.cli.exit_codes import worst_code
 from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
-from ehadiag.cli.output import emit, put, rendered, say
+from ehadiag.cli.output import emit, failure_said, put, rendered, say
 from ehadiag.cli.report_page import need_report_library, report_of
 from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
@@ -124,20 +124,20 @@ class Results:
         with contextlib.suppress(KeyboardInterrupt):
             written = []
             stem = None
-            with _said(codes):
+            with failure_said(codes):
                 stem = self._write_json(self._said_as(line), plain_name(name))
-            with _said(codes):
+            with failure_said(codes):
                 self._keeper.keep(diagnosis, line)
             if stem is not None:
                 written.append(f"{stem}.json")
-            with _said(codes):
+            with failure_said(codes):
                 self._print(diagnosis, line, spent)
             if stem is not None and draw is not None and self.pictures and not came.is_set():
-                with _said(codes):
+                with failure_said(codes):
                     self._draw(draw, f"{stem}.png")
                     written.append(f"{stem}.png")
             if stem is not None and self._arguments.report and not came.is_set():
-                with _said(codes):
+                with failure_said(codes):
                     self._report(diagnosis, line, f"{stem}.html")
                     written.append(f"{stem}.html")
             if self._folder is not None and written:
@@ -247,16 +247,6 @@ class Results:
         except OSError as error:
             place = self._folder.path / name
             raise InputOutputError(f"report {place}: {reason_of(error)}") from None
-
-
-@contextlib.contextmanager
-def _said(codes: list[int]) -> Iterator[None]:
-    """Say what could not be brought out, and go on with the rest."""
-    try:
-        yield
-    except InputOutputError as error:
-        codes.append(error.exit_code)
-        say(str(error))
 
 
 def _numbered(name: str) -> Iterator[str]:
