@@ -180,6 +180,30 @@ def test_what_took_long_is_told_where_it_cannot_be_written(
         assert len(result.out) > 100
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+@pytest.mark.parametrize("output", ["full", "closed"])
+@pytest.mark.parametrize("kind", ["calibrated unit", "designed test", "exported library"])
+def test_what_took_long_is_written_where_it_cannot_be_told(
+    kind: str,
+    output: str,
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, command = written(kind, place)
+    if output == "full":
+        writer = os.open("/dev/full", os.O_WRONLY)
+    else:
+        reader, writer = os.pipe()
+        os.close(reader)
+    with open(writer, "w", encoding="utf-8") as stream:
+        monkeypatch.setattr("sys.stdout", stream)
+        assert main(command) == 3
+    said = "Broken pipe" if output == "closed" else "No space left on device"
+    assert f"ehadiag: standard output: {said}\n" in capsys.readouterr().err
+    assert path.stat().st_size > 0
+
+
 @posix
 @pytest.mark.parametrize("kind", [item for item in WRITTEN if item not in ("template",)])
 def test_an_odd_name_is_written_as_it_is_and_shown_as_text(
