@@ -118,8 +118,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Watch until the end, and say how it was."""
-    if arguments.log is None:
-        bus_options.need_one_bus(arguments)
+    bus_options.need_bus_or_log(arguments)
     actuator, bus_map = asked_for.the_actuator(arguments), asked_for.the_bus_map(arguments)
     tests = asked_for.known_tests(arguments.test)
     reads = [("the log", arguments.log), ("--from", arguments.from_result)]
