@@ -302,7 +302,8 @@ class DiagnosisSession:
             reasons += objections
         if len({recording.serial for recording in recordings} - {None}) > 1:
             reasons.append("the recordings are of actuators with different serial numbers")
-        reasons += repetitions(recordings)
+        else:
+            reasons += repetitions(recordings)
         reasons += objections_to_unit(recordings, self._actuator)
         return experiments, reasons
 
