@@ -16,6 +16,7 @@ from ehadiag.cli.output import say, say_if_compiling
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.screen.show import add_screen_options, shown
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,9 +67,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     group.add_argument(
         "--hours",
         type=argument_types.positive,
-        default=100.0,
+        default=HOURS_BETWEEN,
         metavar="H",
-        help="mean time between false alarms of the sums (default 100); between tests only what"
+        help="mean time between false alarms of the sums (default %(default)g); between tests only what"
         " lasts is an alarm",
     )
     group.add_argument(
