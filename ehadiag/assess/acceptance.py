@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.assess.unobservable import lost_positions
+from ehadiag.assess.wrong_units import beyond_reach
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.calibration import CHANGED, Calibration
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.conversion import conversion_of, reach_of
+from ehadiag.core.conversion import conversion_of
 from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
 from ehadiag.core.stored_test import SAME_RATE, StoredTest
 from ehadiag.identify.commanded_current import CONTROL_LAW_LSB, FRAME_TOLERANCE
@@ -58,8 +58,6 @@ TEMPERATURES = (-54.0, 135.0)
 """degC; the range in which the oil's law is used."""
 LEAST_SUPPLY = 0.5
 """Share of the actuator's own supply pressure."""
-BEYOND_REACH = 10.0
-"""Times the actuator's reach that no sensor reads, whatever is wrong with it."""
 NOISE_SHARE = 2.0
 """Gap of the current, in units of noise, that noise does not make."""
 MOST_OUTLIERS = 0.015
@@ -104,7 +102,7 @@ def objections_to_recording(
     samples = recording.samples
     if samples is None:
         return [*recording.quality.refused, "no telemetry of a test in the recording"]
-    beyond = _beyond_reach(samples, actuator)
+    beyond = beyond_reach(samples, actuator)
     if test is None and recording.test_id is None:
         return beyond or ["the recording does not say which test it is of: name the test by --test"]
     if test is None:
@@ -145,22 +143,6 @@ def repetitions(recordings: Sequence[Recording]) -> list[str]:
         if key in seen:
             out.append(f"{recording.source} has the samples of {seen[key]}: name each test once")
         seen.setdefault(key, recording.source)
-    return out
-
-
-def _beyond_reach(samples: Samples, actuator: Actuator) -> list[str]:
-    """Channels that read so much that their unit or scale must be wrong."""
-    out = []
-    for channel in CHANNELS:
-        values = np.abs(np.asarray(getattr(samples, channel.name)))
-        values = values[np.isfinite(values)]
-        reach, unit = reach_of(actuator, channel), channel.per_unit
-        top = float(np.quantile(values, 0.99)) if values.size else 0.0
-        if top > BEYOND_REACH * reach:
-            out.append(
-                f"{channel.name} reads {top / unit:.3g} {channel.unit}, the actuator reaches"
-                f" {reach / unit:.3g} {channel.unit}: check unit and scale of its signal"
-            )
     return out
 
 

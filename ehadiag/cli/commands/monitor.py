@@ -69,8 +69,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=argument_types.positive,
         default=HOURS_BETWEEN,
         metavar="H",
-        help="mean time between false alarms of the sums (default %(default)g); between tests only what"
-        " lasts is an alarm",
+        help="mean time between false alarms of the sums (default %(default)g); between tests only"
+        " what lasts is an alarm",
     )
     group.add_argument(
         "--log-file", metavar="FILE", help="append alarms to this file, JSON lines with their time"
