@@ -1,5 +1,7 @@
-"""Finds a wrong unit or sign in a mapping by physics: what the channels must have to do with
-each other on any motion, whatever the faults."""
+"""Finds a wrong unit or sign of a channel by physics.
+
+What the channels must have to do with each other holds on any motion, whatever the faults; and none
+reads many times what the actuator reaches."""
 
 from __future__ import annotations
 
