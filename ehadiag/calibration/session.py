@@ -14,6 +14,7 @@ from ehadiag.assess.acceptance import (
     objections_to_recording,
     objections_to_unit,
     remarks_on_recording,
+    repetitions,
 )
 from ehadiag.assess.diagnosis import match_tests
 from ehadiag.calibration.judging import severities_of
@@ -67,7 +68,7 @@ class Session:
             out.append(f"the recordings are of units with different serial numbers: {words}")
         return [
             *out,
-            *_repeated(self.recordings),
+            *repetitions(self.recordings),
             *objections_to_unit(self.recordings, self.start),
         ]
 
@@ -220,21 +221,3 @@ def _evidence(tried: Sequence[Learned]) -> tuple[Tried, ...]:
     return tuple(
         Tried(item.model.words, item.estimated.excess, item.criterion - best) for item in tried
     )
-
-
-def _repeated(recordings: Sequence[Recording]) -> list[str]:
-    """Say which recordings are others once more: what they show would count twice."""
-    seen: dict[bytes, str] = {}
-    out = []
-    for recording in recordings:
-        if recording.samples is None:
-            continue
-        samples = recording.samples
-        key = b"".join(
-            part.tobytes()
-            for part in (samples.current, samples.spool, samples.pressure, samples.position)
-        )
-        if key in seen:
-            out.append(f"{recording.source} has the samples of {seen[key]}: name each test once")
-        seen.setdefault(key, recording.source)
-    return out

@@ -55,6 +55,8 @@ def make_folder(name: str) -> Folder:
             raise InputOutputError(f"output folder {name}: is a link; name the folder it leads to")
         path.mkdir(parents=True, exist_ok=True)
         return Folder.at(path, RESULT_MODE)
+    except FileExistsError:
+        raise InputOutputError(f"output folder {name}: is a file; name a folder") from None
     except OSError as error:
         raise InputOutputError(f"output folder {name}: {reason_of(error)}") from None
 

@@ -118,6 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         with failure_said(codes):
             _write(Path(arguments.out), encode_test(better))
             written = True
+            say(f"wrote {arguments.out}")
     # What was found is printed also where it could not be written.
     with failure_said(codes):
         _print(arguments, found, arguments.out if written else None)
