@@ -1,7 +1,7 @@
 """Chooses the model that a unit is learned by: simple ones first, then all effects, then fewer.
 
 A simple model that leaves nothing is taken. Else what a unit may have besides is freed, and what
-the recordings do not ask for is taken out again (`ehadiag.calibration.further`). One recording of
+the recordings do not ask for is taken out again (`ehadiag.calibration.effects`). One recording of
 each test suffices to choose; all are learned from.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ehadiag.calibration.further import asked_for_by, with_further_effects
+from ehadiag.calibration.effects import asked_for_by, with_further_effects
 from ehadiag.calibration.judging import MOST_LEFT, is_explained
 from ehadiag.calibration.models import ONE_START, SMOOTH, Learned, Model, simple_models
 from ehadiag.calibration.session import Session

@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
@@ -335,7 +335,7 @@ def save_actuator(actuator: Actuator, path: PathLike) -> None:
         with Folder.at(target.parent, RESULT_MODE, follow=True) as folder:
             folder.write(target.name, actuator_toml(actuator))
     except OSError as error:
-        raise InputOutputError(f"actuator file {path}: {error.strerror or error}") from None
+        raise InputOutputError(f"actuator file {path}: {reason_of(error)}") from None
 
 
 def _tests(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.printable import printable
 from firmware_iface.logs.budget import Budget
 from firmware_iface.logs.packed import beginning_of, kind_of, unpacked
@@ -92,7 +92,7 @@ def _head(path: Path) -> str:
     try:
         text = beginning_of(path, HEADER_BYTES)
     except OSError as error:
-        raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+        raise InputOutputError(f"log {path}: {reason_of(error)}") from None
     return text.decode("utf-8-sig", "replace").lstrip()
 
 
@@ -128,7 +128,7 @@ def read_signals(
     try:
         info = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
-        reason = getattr(error, "strerror", None) or error
+        reason = reason_of(error)
         raise InputOutputError(f"log {path}: {reason}") from None
     if not stat.S_ISREG(info.st_mode):
         raise InputOutputError(f"log {path}: not a file")

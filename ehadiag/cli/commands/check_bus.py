@@ -17,7 +17,7 @@ from ehadiag.cli.output import progress_bar, put, say
 from ehadiag.cli.would_diagnose import Outlook, outlook
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import conversion_of
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import valid_text
 from ehadiag.core.recording import Samples
@@ -117,7 +117,7 @@ def _plot(path: Path, samples: Samples, actuator: Actuator, heard: str) -> None:
         with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
             folder.write(path.name, content)
     except OSError as error:
-        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+        raise InputOutputError(f"picture {path}: {reason_of(error)}") from None
     say(f"wrote {path}")
 
 

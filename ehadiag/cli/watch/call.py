@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ehadiag.cli.output import say
+from ehadiag.core.errors import reason_of
 
 __all__ = ["AlarmCommand"]
 
@@ -65,4 +66,4 @@ class AlarmCommand:
             if done.returncode:
                 self.failed = f"ended with code {done.returncode}"
         except (OSError, ValueError) as error:
-            self.failed = getattr(error, "strerror", None) or str(error)
+            self.failed = reason_of(error)

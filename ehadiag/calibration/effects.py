@@ -1,4 +1,4 @@
-"""Learns what a unit has beyond its data and the basic effects, where the recordings ask for it.
+"""Finds which further effects a unit has, beyond its data and the basic ones, and learns them.
 
 Effects are freed at once, since one left out bends the others; but friction that falls with the
 velocity, which passes for hysteresis and takes a run of the model several times as long, only where
