@@ -23,6 +23,7 @@ from ehadiag.identify.nuisance.prior import (
 )
 from ehadiag.identify.nuisance.starts import AGAIN, Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
+from ehadiag.identify.refine.last_round import by_a_finer_model
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
 from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
@@ -174,6 +175,7 @@ def estimate(
         belief = _looked_about(fine, belief, LOOK * belief.root, at_first, draw, between)
     linear = linearised(fine, belief, np.random.default_rng(seed))
     refined = described(fine, belief.x, linear, settled=found.explained, information=at_first[1])
+    refined = by_a_finer_model(fine, refined, linear)
     return Estimated(
         refined=refined,
         experiments=judged,
