@@ -53,9 +53,9 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     out: list[Learned] = []
     for model in models:
         out.append(_searched(session, model, first=not out))
-        if out[-1].estimated.explained and not compare:
+        if _has_all_effects(out[-1]) and not compare:
             return out
-    if any(item.estimated.explained or _only_search_failed(item) for item in out):
+    if any(_has_all_effects(item) for item in out):
         return out
     smooth = [_smooth(session, out, simple) for simple in simple_models(start)]
     if not compare:
@@ -69,11 +69,14 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     return out
 
 
-def _only_search_failed(found: Learned) -> bool:
-    """Whether all of open loop is explained: no effect is missing, break-aways are at wrong ticks.
+def _has_all_effects(found: Learned) -> bool:
+    """Whether all is explained, or all of open loop: no effect is missing.
 
-    In closed loop there are so many that a search may end beside the optimum.
+    In closed loop the spool breaks away so often that a search may end with some of it at wrong
+    ticks.
     """
+    if found.estimated.explained:
+        return True
     ends = np.cumsum([item.ticks for item in found.experiments])[:-1]
     parts = np.split(found.estimated.refined.residuals, ends, axis=1)
     first = [
@@ -152,7 +155,7 @@ def _searched(session: Session, model: Model, *, first: bool) -> Learned:
         other = session.learn(model, nearly_new=turn != 1, brief=True, some=True, turn=turn)
         found = min(found, other, key=lambda item: item.criterion)
         turn += 1
-        if found.estimated.excess > WORTH_ANOTHER:
+        if found.estimated.excess > WORTH_ANOTHER or _has_all_effects(found):
             break
     return found
 
