@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ehadiag.cli.option_keys import Called, key_of, keys_of
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError, reason_of
 from ehadiag.core.folder import refuse_foreign
 from ehadiag.core.toml_file import read_toml
 
@@ -208,4 +208,4 @@ def _refuse_others(path: Path, where: str) -> None:
             return
         refuse_foreign(info, stat.S_ISREG)
     except OSError as error:
-        raise ConfigurationError(f"{where}: {error.strerror or error}") from None
+        raise ConfigurationError(f"{where}: {reason_of(error)}") from None

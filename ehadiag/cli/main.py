@@ -36,7 +36,7 @@ from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_
 from ehadiag.cli.output import abandon, say
 from ehadiag.cli.verbose import tell_all
 from ehadiag.cli.version import ShowVersions
-from ehadiag.core.errors import EhadiagError
+from ehadiag.core.errors import EhadiagError, reason_of
 from ehadiag.core.printable import printable
 
 __all__ = ["main", "process"]
@@ -102,7 +102,7 @@ def _run(argv: Sequence[str] | None, interrupted: threading.Event) -> int:
         return worst_code((code, FAILED))
     except OSError as error:
         abandon(sys.stdout)
-        say(f"{error.filename or 'standard output'}: {error.strerror or error}")
+        say(f"{error.filename or 'standard output'}: {reason_of(error)}")
         return worst_code((code, FAILED))
     except KeyboardInterrupt:
         say("interrupted")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO, cast
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.printable import printable, printable_lines
 from ehadiag.facade.compiling import compiling_notice
 
@@ -24,6 +24,7 @@ __all__ = [
     "counting_bar",
     "damage",
     "emit",
+    "failure_said",
     "progress_bar",
     "put",
     "rendered",
@@ -66,7 +67,17 @@ def emit(text: str) -> None:
         sys.stdout.flush()
     except OSError as error:
         abandon(sys.stdout)
-        raise InputOutputError(f"standard output: {error.strerror or error}") from None
+        raise InputOutputError(f"standard output: {reason_of(error)}") from None
+
+
+@contextmanager
+def failure_said(codes: list[int]) -> Iterator[None]:
+    """Say what could not be brought out, add its exit code, and go on with the rest."""
+    try:
+        yield
+    except InputOutputError as error:
+        codes.append(error.exit_code)
+        say(str(error))
 
 
 def abandon(stream: TextIO) -> None:

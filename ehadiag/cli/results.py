@@ -14,9 +14,9 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.cli.exit_codes import worst_code
 from ehadiag.cli.history_file import Keeper
 from ehadiag.cli.interrupt import keep_signals
-from ehadiag.cli.output import emit, put, rendered, say
+from ehadiag.cli.output import emit, failure_said, put, rendered, say
 from ehadiag.cli.report_page import need_report_library, report_of
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import plain_name
 
@@ -55,8 +55,10 @@ def make_folder(name: str) -> Folder:
             raise InputOutputError(f"output folder {name}: is a link; name the folder it leads to")
         path.mkdir(parents=True, exist_ok=True)
         return Folder.at(path, RESULT_MODE)
+    except FileExistsError:
+        raise InputOutputError(f"output folder {name}: is a file; name a folder") from None
     except OSError as error:
-        raise InputOutputError(f"output folder {name}: {error.strerror or error}") from None
+        raise InputOutputError(f"output folder {name}: {reason_of(error)}") from None
 
 
 class Results:
@@ -124,20 +126,20 @@ class Results:
         with contextlib.suppress(KeyboardInterrupt):
             written = []
             stem = None
-            with _said(codes):
+            with failure_said(codes):
                 stem = self._write_json(self._said_as(line), plain_name(name))
-            with _said(codes):
+            with failure_said(codes):
                 self._keeper.keep(diagnosis, line)
             if stem is not None:
                 written.append(f"{stem}.json")
-            with _said(codes):
+            with failure_said(codes):
                 self._print(diagnosis, line, spent)
             if stem is not None and draw is not None and self.pictures and not came.is_set():
-                with _said(codes):
+                with failure_said(codes):
                     self._draw(draw, f"{stem}.png")
                     written.append(f"{stem}.png")
             if stem is not None and self._arguments.report and not came.is_set():
-                with _said(codes):
+                with failure_said(codes):
                     self._report(diagnosis, line, f"{stem}.html")
                     written.append(f"{stem}.html")
             if self._folder is not None and written:
@@ -224,7 +226,7 @@ class Results:
                 continue
             except OSError as error:
                 place = folder.path / name
-                raise InputOutputError(f"result {place}: {error.strerror or error}") from None
+                raise InputOutputError(f"result {place}: {reason_of(error)}") from None
             self._names.add(stem)
             return stem
         raise AssertionError("numbers have no end")
@@ -236,7 +238,7 @@ class Results:
             self._folder.write(name, content)
         except OSError as error:
             place = self._folder.path / name
-            raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
+            raise InputOutputError(f"picture {place}: {reason_of(error)}") from None
 
     def _report(self, diagnosis: Diagnosis, line: str, name: str) -> None:
         assert self._folder is not None
@@ -246,17 +248,7 @@ class Results:
             self._folder.write(name, page)
         except OSError as error:
             place = self._folder.path / name
-            raise InputOutputError(f"report {place}: {error.strerror or error}") from None
-
-
-@contextlib.contextmanager
-def _said(codes: list[int]) -> Iterator[None]:
-    """Say what could not be brought out, and go on with the rest."""
-    try:
-        yield
-    except InputOutputError as error:
-        codes.append(error.exit_code)
-        say(str(error))
+            raise InputOutputError(f"report {place}: {reason_of(error)}") from None
 
 
 def _numbered(name: str) -> Iterator[str]:

@@ -25,6 +25,7 @@ from numba.core import caching, environment, serialize
 from numba.core.runtime import rtsys
 
 from ehadiag.core.cache_folder import private_folder, tell
+from ehadiag.core.errors import reason_of
 from ehadiag.core.folder import Folder
 
 __all__ = ["KernelCache", "cache_folder", "kept_kernels", "source_hash"]
@@ -109,7 +110,7 @@ class KernelCache(caching.FunctionCache):
         except FileNotFoundError:
             return None
         except OSError as error:
-            _discard(folder, name, str(error.strerror or error))
+            _discard(folder, name, reason_of(error))
             return None
         size = DIGEST().digest_size
         if DIGEST(content[size:]).digest() != content[:size]:
@@ -133,7 +134,7 @@ class KernelCache(caching.FunctionCache):
             folder.write(self._name(key), DIGEST(content).digest() + content, synced=False)
         except OSError as error:
             tell(
-                f"cache folder {folder.path}: {error.strerror or error}; the compiled kernels are"
+                f"cache folder {folder.path}: {reason_of(error)}; the compiled kernels are"
                 " not kept for the next run"
             )
 
@@ -148,7 +149,7 @@ def _discard(folder: Folder, name: str, why: str) -> None:
     try:
         folder.remove(name)
     except OSError as error:
-        tell(f"cache folder {folder.path}: {error.strerror or error}")
+        tell(f"cache folder {folder.path}: {reason_of(error)}")
 
 
 class _Contents(caching.CompileResultCacheImpl):

@@ -16,6 +16,7 @@ import stat
 from functools import cache
 from pathlib import Path
 
+from ehadiag.core.errors import reason_of
 from ehadiag.core.folder import BY_DESCRIPTOR, CACHE_MODE, OPEN_FOLDER, Folder, refuse_foreign
 from ehadiag.core.printable import printable
 
@@ -37,7 +38,7 @@ def private_folder(leaf: str) -> Folder | None:
     try:
         return _open(base / leaf)
     except OSError as error:
-        why = error.strerror or error
+        why = reason_of(error)
         tell(f"cache folder {base}: {why}; nothing is kept for the next run: {ADVICE}")
         return None
 

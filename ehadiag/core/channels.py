@@ -20,6 +20,7 @@ __all__ = [
     "Channels",
     "Scales",
     "Stated",
+    "near_ends",
 ]
 
 USUAL_LEVELS: Final = 4096.0
@@ -68,6 +69,11 @@ class Channel:
         """
         return 2.0 * self.full_scale / min(self.levels, USUAL_LEVELS)
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Values at and beyond which the converter stands at its lower and upper end, SI unit."""
+        return near_ends(-self.full_scale, self.full_scale - self.lsb, self.lsb)
+
     def encode(self, value: NDArray[np.float64]) -> NDArray[np.int64]:
         """Digitise SI values to codes 0 … 2 half - 1 (zero is code half)."""
         code = np.floor(np.asarray(value) / self.lsb + 0.5) + self.half
@@ -77,6 +83,11 @@ class Channel:
         """SI value of each code."""
         centred: NDArray[np.float64] = np.asarray(code, dtype=np.float64) - self.half
         return centred * self.lsb
+
+
+def near_ends(low: float, high: float, step: float) -> tuple[float, float]:
+    """Values half a step inside both ends of a range: what is at or beyond one stands at an end."""
+    return low + 0.5 * step, high - 0.5 * step
 
 
 class Channels(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS, Channel, Channels, Stated
+from ehadiag.core.channels import CHANNELS, Channel, Channels, Stated, near_ends
 from ehadiag.core.converters import Converter
 from ehadiag.core.recording import Samples
 from ehadiag.core.step_seen import step_seen
@@ -140,8 +140,8 @@ def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
         if filed and low is None:
             low, high = -channel.full_scale, channel.full_scale - channel.lsb
         if low is not None and high is not None:
-            slack = 0.5 * channels[-1].lsb
-            at_end = (values <= low + slack) | (values >= high - slack)
+            lower, upper = near_ends(low, high, channels[-1].lsb)
+            at_end = (values <= lower) | (values >= upper)
             if (at_end & ~saturated[index]).any():
                 saturated = saturated.copy()
                 saturated[index] |= at_end

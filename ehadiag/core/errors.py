@@ -5,6 +5,14 @@ from __future__ import annotations
 from typing import ClassVar
 
 
+def reason_of(error: Exception) -> str:
+    """Why a file could not be used: the system's own words, without number and name.
+
+    A name that holds a null character raises ValueError, which has none: then its text.
+    """
+    return getattr(error, "strerror", None) or str(error)
+
+
 class EhadiagError(Exception):
     """Base of all errors of the package; the text is one line: what, where, how to mend."""
 

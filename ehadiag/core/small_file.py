@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 
 __all__ = ["read_small_file"]
 
@@ -46,7 +46,7 @@ def read_small_file(path: Path, limit: int, what: str) -> bytes:
         finally:
             os.close(handle)
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
-        reason = getattr(error, "strerror", None) or error
+        reason = reason_of(error)
         raise InputOutputError(f"{what} {path}: {reason}") from None
     if not regular:
         raise InputOutputError(f"{what} {path}: not a regular file")

@@ -16,7 +16,7 @@ from ehadiag.core.recording import CommandMode, Environment, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.noise import TYPICAL_NOISE_LSB
-from ehadiag.model.control import ControlLaw, ControlState, control
+from ehadiag.model.control import ControlLaw, ControlState, control, control_law
 from ehadiag.monitor.monitor import Monitor, Tick
 
 __all__ = ["Played", "play"]
@@ -83,8 +83,7 @@ def play(
     monitor = Monitor(actuator, severities, mode=CommandMode.CURRENT, effects=effects)
     channels = actuator_channels(actuator)
     lsb = channels.position.lsb
-    data = actuator.controller
-    law = ControlLaw(data.IM, data.GAP, data.GAI, data.GAD, 1.0 / test.rate)
+    law = control_law(actuator.controller, 1.0 / test.rate)
     commands = test.command()
     noise = np.random.default_rng(SEED).normal(0.0, NOISE_LSB, len(commands))
     answers, seen = np.empty((len(commands), 3)), np.empty(len(commands))

@@ -30,9 +30,9 @@ from ehadiag.compile.object_code import (
     tool_versions,
 )
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import Channel
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.folder import Folder
 from ehadiag.core.printable import plain_name
 from ehadiag.export.archive import archive
@@ -109,7 +109,12 @@ FUNCTIONS: Final = (*MONITOR, *SURROUNDINGS, *IDENTIFICATION)
 
 
 def export_library(
-    actuator: Actuator, target: Target, folder: Folder, *, hours: float = 100.0, shift: float = 1.0
+    actuator: Actuator,
+    target: Target,
+    folder: Folder,
+    *,
+    hours: float = HOURS_BETWEEN,
+    shift: float = 1.0,
 ) -> list[str]:
     """Write a library of monitor and identification for a target into a folder.
 
@@ -210,7 +215,7 @@ def rules(actuator: Actuator) -> Rules:
         The limits.
     """
     levels, (outliers, rms) = Levels(), most_left(actuator.calibration)
-    _, spool, pressure, position = map(_ends, actuator_channels(actuator))
+    _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
     return Rules(
         advisory=levels.advisory,
         limit=levels.limit,
@@ -230,12 +235,6 @@ def rules(actuator: Actuator) -> Rules:
         position_low=position[0],
         position_high=position[1],
     )
-
-
-def _ends(channel: Channel) -> tuple[float, float]:
-    """Values from which on a converter stands at its ends, SI."""
-    half = 0.5 * channel.lsb
-    return half - channel.full_scale, channel.full_scale - 3.0 * half
 
 
 def _own_functions(processor: Processor) -> Mapping[str, Any]:
@@ -341,4 +340,4 @@ def write(folder: Folder, files: Mapping[str, bytes]) -> None:
         try:
             folder.write(name, data)
         except OSError as error:
-            raise InputOutputError(f"{folder.path / name}: {error.strerror or error}") from None
+            raise InputOutputError(f"{folder.path / name}: {reason_of(error)}") from None

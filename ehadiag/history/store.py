@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.history.records import (
     DIAGNOSIS,
     EVENT,
@@ -70,9 +70,10 @@ class History:
     def __init__(self, path: Path, *, create: bool = False) -> None:
         self.path = path
         try:
-            link, other = path.is_symlink(), path.exists() and not path.is_file()
+            link, exists = path.is_symlink(), path.exists()
+            other = exists and not path.is_file()
         except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", None) or error
+            why = reason_of(error)
             raise InputOutputError(f"history {path}: {why}") from None
         if link:
             raise InputOutputError(f"history {path}: is a link; name the file it leads to")
@@ -80,7 +81,7 @@ class History:
             raise InputOutputError(f"history {path}: not a regular file")
         full = Path(os.path.abspath(path))
         self._writable = create or (os.access(full, os.W_OK) and os.access(full.parent, os.W_OK))
-        if not create and not path.exists():
+        if not create and not exists:
             raise ConfigurationError(
                 f"no history {path}: name one by --history, or begin one by ehadiag history init"
             )

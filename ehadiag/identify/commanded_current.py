@@ -19,7 +19,7 @@ from ehadiag.core.channels import CHANNELS, CURRENT, POSITION, Channels
 from ehadiag.core.recording import CommandMode, Samples
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.command_step import step_by_current
-from ehadiag.model.control import ControlLaw, commanded_currents
+from ehadiag.model.control import ControlLaw, commanded_currents, control_law
 
 __all__ = ["CurrentTrace", "commanded_current", "guessed_positions"]
 
@@ -77,9 +77,7 @@ def commanded_current(
     known = np.isfinite(samples.command)
     deviation = np.abs(samples.command - stored)[known]
     command_deviation = float(deviation.max()) if deviation.size else 0.0
-    law = ControlLaw(
-        controller.IM, controller.GAP, controller.GAI, controller.GAD, samples.period_ns * 1e-9
-    )
+    law = control_law(controller, samples.period_ns * 1e-9)
     command, step = _command(stored, samples, law, channels, closed=test.closed_loop)
     guessed = 0.0
     if not test.closed_loop:
@@ -109,9 +107,7 @@ def guessed_positions(
 ) -> NDArray[np.int64]:
     """Ticks of a closed loop whose current follows from a position that nothing tells."""
     stored = _fit_length(test.command(), samples.ticks)
-    law = ControlLaw(
-        controller.IM, controller.GAP, controller.GAI, controller.GAD, samples.period_ns * 1e-9
-    )
+    law = control_law(controller, samples.period_ns * 1e-9)
     command, _ = _command(stored, samples, law, channels, closed=True)
     return np.flatnonzero(_positions_seen(command, samples, controller, channels)[1])
 

@@ -95,15 +95,15 @@ def build_experiment(
     trace = commanded_current(samples, test, actuator.controller, channels)
     rest = _ticks_at_rest(trace.current)
     constants = unit_constants(actuator, environment)
-    spool_offset, pressure_offset = _mean(spool[:rest]), _mean(pressure[:rest])
+    spool_offset, rest_pressure = _mean(spool[:rest]), _mean(pressure[:rest])
+    # What the jack's load or displaced lands ask for is no offset.
+    least, most = _pressures_asked_for(constants)
+    pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
     origin = 0.0
-    if constants.FR != 0.0 or constants.XLD != 0.0:
-        # What the jack's load or displaced lands ask for is no offset.
-        pressure_offset = 0.0
-    elif abs(pressure_offset) > DISPLACED * channels.pressure.full_scale:
+    if abs(pressure_offset) > DISPLACED * channels.pressure.full_scale:
         # So much pressure is that of a spool that friction holds beside the middle.
-        leak = 1.0 + constants.GP / constants.GQ * constants.CLK
-        origin = min(max(pressure_offset * leak / constants.GP, -constants.XSM), constants.XSM)
+        origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
+        origin = min(max(origin, -constants.XSM), constants.XSM)
         spool_offset, pressure_offset = spool_offset - origin, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
     position_offset = _first(position)
@@ -128,6 +128,24 @@ def build_experiment(
         channels=channels,
         viscosity_std=_viscosity_std(environment),
     )
+
+
+def _rise_with_spool(constants: PlantConstants) -> float:
+    """Pressure on a jack at rest over the opening of the lands, Pa/m (PHY-6)."""
+    return constants.GP / (1.0 + constants.GP / constants.GQ * constants.CLK)
+
+
+def _pressures_asked_for(constants: PlantConstants) -> tuple[float, float]:
+    """Least and largest pressure at rest, Pa, that a spool in its middle may leave.
+
+    That which displaced lands ask for falls to nothing where the jack gives way; it is bounded by
+    what lands of their shape open at most.
+    """
+    lap = abs(constants.LAP) * constants.GP / constants.PSR
+    shape = 1.0 + abs(constants.LD2) + abs(constants.LD3) + lap
+    lands = -_rise_with_spool(constants) * shape * constants.XLD
+    load = abs(constants.FR) / constants.AJ
+    return min(lands, 0.0) - load, max(lands, 0.0) + load
 
 
 def _viscosity_std(environment: Environment) -> float:

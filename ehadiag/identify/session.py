@@ -16,9 +16,9 @@ from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.nuisance.estimate import Estimated, estimate
 from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
-from ehadiag.identify.nuisance.further import would_explain
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
+from ehadiag.identify.nuisance.trial import would_explain
 from ehadiag.identify.refine.first_part import (
     FirstPart,
     Look,

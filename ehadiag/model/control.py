@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import inlined_exact, kernel
+from ehadiag.core.actuator import Controller
 
-__all__ = ["ControlLaw", "ControlState", "commanded_currents", "control"]
+__all__ = ["ControlLaw", "ControlState", "commanded_currents", "control", "control_law"]
 
 
 class ControlLaw(NamedTuple):
@@ -42,6 +43,11 @@ class ControlState(NamedTuple):
     integral: float
     before: float
     started: float
+
+
+def control_law(controller: Controller, tick: float) -> ControlLaw:
+    """Gains of an actuator's controller, run once each `tick` (s)."""
+    return ControlLaw(controller.IM, controller.GAP, controller.GAI, controller.GAD, tick)
 
 
 @inlined_exact

@@ -11,7 +11,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import Channels
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.model.anchor import Anchor
-from ehadiag.model.control import ControlLaw
+from ehadiag.model.control import control_law
 from ehadiag.model.plant import PlantConstants
 from ehadiag.monitor.cusum import CusumDesign
 from ehadiag.monitor.layout import Settings
@@ -90,5 +90,5 @@ def monitor_plan(
         limit=RESIDUAL_LIMIT,
         deviation=DEVIATION_LSB * channels.current.grain,
     )
-    control = ControlLaw(law.IM, law.GAP, law.GAI, law.GAD, 1.0 / law.rate)
+    control = control_law(law, 1.0 / law.rate)
     return np.array([*constants, *control, *settings], dtype=np.float64)

@@ -14,7 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from ehadiag.core.errors import ConfigurationError, EhadiagError
+from ehadiag.core.errors import ConfigurationError, EhadiagError, reason_of
 from ehadiag.serve.sessions import BusyError, Sessions
 
 __all__ = ["HOST", "Page", "Site", "serve"]
@@ -92,7 +92,7 @@ def serve(site: Site, port: int) -> ThreadingHTTPServer:
         server = _Server((HOST, port), Handler)
     except OSError as error:
         raise ConfigurationError(
-            f"--port {port}: {error.strerror or error}: name another, or 0 for any"
+            f"--port {port}: {reason_of(error)}: name another, or 0 for any"
         ) from None
     Handler.port = server.server_port
     return server

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.channels import Stated
+from ehadiag.core.channels import Stated, near_ends
 from firmware_iface.codec.validity import rows_of, sound_rows
 from firmware_iface.mapping.bus_map import BusMap, MessageMap, Role
 from firmware_iface.mapping.signal_layout import SignalLayout
@@ -195,13 +195,13 @@ def _outside(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.
 def value_ends(signal: SignalLayout) -> tuple[float, float]:
     """Physical values at and beyond which a converter stands at its end: those of the DBC's range,
     or of the raw number where it gives none."""
-    slack = 0.0 if signal.is_float else 0.5 * abs(signal.scale)
+    step = 0.0 if signal.is_float else abs(signal.scale)
     low, high = -np.inf, np.inf
     if not signal.is_float:
         low, high = raw_ends(signal)
     if signal.minimum is not None and signal.maximum is not None:
         low, high = max(low, signal.minimum), min(high, signal.maximum)
-    return low + slack, high - slack
+    return near_ends(low, high, step)
 
 
 def _at_end(physical: NDArray[np.float64], signal: SignalLayout) -> NDArray[np.bool_]:
@@ -213,5 +213,6 @@ def _at_stated_end(value: NDArray[np.float64], role: Role, stated: Stated) -> ND
     """Values at the ends that the mapping states, SI, but for half a step."""
     if stated.low is None or stated.high is None:
         return np.zeros(len(value), dtype=np.bool_)
-    slack = 0.5 * (stated.step or abs(role.signal.scale * role.gain))
-    return (value <= stated.low + slack) | (value >= stated.high - slack)
+    step = stated.step or abs(role.signal.scale * role.gain)
+    low, high = near_ends(stated.low, stated.high, step)
+    return (value <= low) | (value >= high)

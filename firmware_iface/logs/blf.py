@@ -17,7 +17,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from firmware_iface.logs.budget import Spending
 from firmware_iface.transport.columns import ColumnBuilder
 from firmware_iface.transport.frames import FrameTable
@@ -90,7 +90,7 @@ class BlfBlocks:
                     if parser.trouble:
                         break
         except OSError as error:
-            raise InputOutputError(f"log {self._path}: {error.strerror or error}") from None
+            raise InputOutputError(f"log {self._path}: {reason_of(error)}") from None
         self.trouble = self.trouble or parser.trouble
 
     def _batches(self, file: BinaryIO) -> Iterator[bytes]:

@@ -12,7 +12,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.logs.asc_lines import open_asc, open_text
 from firmware_iface.logs.blf import BlfBlocks
 from firmware_iface.logs.budget import Budget, Spending
@@ -89,7 +89,7 @@ class LogReader:
                 pass
         except (OSError, ValueError) as error:
             missing = isinstance(error, FileNotFoundError | NotADirectoryError)
-            reason = "no such file" if missing else getattr(error, "strerror", None) or error
+            reason = "no such file" if missing else reason_of(error)
             raise InputOutputError(f"log {path}: {reason}") from None
         if self._suffix not in SUFFIXES:
             kind = self._suffix or "without a suffix"

@@ -1,7 +1,8 @@
-"""python-can for reading and writing logs, loaded without what its MF4 files alone need.
+"""Loads python-can for reading logs, without asammdf, which it needs for MF4 files alone.
 
 Where asammdf is installed python-can loads it, and pandas with it, at its own import: 80 MB and a
-second, whatever the kind of the log.
+second, whatever the kind of the log. Writers and adapters, which are not as hurried, import `can`
+itself.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 
 __all__ = ["Unpacked", "beginning_of", "kind_of", "unpacked"]
 
@@ -102,7 +102,7 @@ def unpacked(path: Path, most: int) -> Iterator[Unpacked]:
             with gzip.open(path, "rb") as source, plain.open("wb") as target:
                 broken = _unpack(source, target, path, most)
         except OSError as error:
-            raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+            raise InputOutputError(f"log {path}: {reason_of(error)}") from None
         if plain.stat().st_size == 0:
             reason = "not packed by gzip, or damaged" if broken else "the file is empty"
             raise InputOutputError(f"log {path}: {reason}")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.transport.frames import Frame
 from firmware_iface.transport.python_can import message_of
 
@@ -202,6 +202,4 @@ class Recorder:
                     f"recording {self._first}: exists, and is not overwritten; name another file"
                 ) from None
             except OSError as error:
-                raise InputOutputError(
-                    f"recording {self._first}: {error.strerror or error}"
-                ) from None
+                raise InputOutputError(f"recording {self._first}: {reason_of(error)}") from None

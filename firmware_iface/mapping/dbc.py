@@ -17,7 +17,7 @@ from typing import Any, Literal
 import msgspec
 
 from ehadiag.core.cache_folder import private_folder, tell
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError, reason_of
 from ehadiag.core.folder import Folder
 
 __all__ = ["MAX_DBC_BYTES", "DbcMessage", "DbcSignal", "parse_dbc", "recall_dbc"]
@@ -215,4 +215,4 @@ def _keep(found: Dbc, folder: Folder, name: str) -> None:
             for old in islice(by_age, MAX_KEPT, None):
                 folder.remove(old)
         except OSError as error:
-            tell(f"cache folder {folder.path}: {error.strerror or error}; the DBC is not kept")
+            tell(f"cache folder {folder.path}: {reason_of(error)}; the DBC is not kept")

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from ehadiag.cli.batch.alone import alone_with
 from ehadiag.cli.batch.job import Job
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.folder import RESULT_MODE, Folder, create_file, reopen_file
 from ehadiag.facade.inputs import log_file
@@ -98,7 +98,7 @@ class Journal:
                 f"results {name}: there is such a file; go on with it by --resume, or name another"
             ) from None
         except OSError as error:
-            raise InputOutputError(f"results {name}: {error.strerror or error}") from None
+            raise InputOutputError(f"results {name}: {reason_of(error)}") from None
 
     @property
     def replaced(self) -> str:
@@ -135,7 +135,7 @@ class Journal:
             self._file.write(content)
             self._file.flush()
         except OSError as error:
-            raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
+            raise InputOutputError(f"results {self._name}: {reason_of(error)}") from None
         self._order.append((at, len(content)))
 
     def settle(self) -> None:
@@ -163,7 +163,7 @@ class Journal:
                     file.write(self._line(start, size).encode() + b"\n")
                 self._file.close()  # Windows replaces no file that is open
         except OSError as error:
-            raise InputOutputError(f"results {self._name}: {error.strerror or error}") from None
+            raise InputOutputError(f"results {self._name}: {reason_of(error)}") from None
 
     def _is_replaced(self, item: _Line) -> bool:
         return item.log in self._diagnosed or (item.failed and item.log in self._failed)
@@ -187,7 +187,7 @@ class Journal:
             file = os.fdopen(reopen_file(self._path), "r+b")
         except OSError as error:
             link = error.errno == errno.ELOOP
-            why = "a link, which is not followed" if link else error.strerror or error
+            why = "a link, which is not followed" if link else reason_of(error)
             raise InputOutputError(f"results {self._name}: {why}") from None
         try:
             self._index(file)

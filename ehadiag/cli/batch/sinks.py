@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ehadiag.cli.batch.own_tables import MARK
 from ehadiag.cli.batch.row import COLUMNS, row_of
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import printable
 
@@ -65,7 +65,7 @@ def whole_file(name: str, what: str) -> Iterator[BinaryIO]:
         ):
             yield file
     except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
+        why = reason_of(error)
         raise InputOutputError(f"{what} {name}: {why}") from None
 
 

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ehadiag.cli import asked_for, options
+from ehadiag.cli.exit_codes import worst_code
 from ehadiag.cli.interrupt import interrupt_on_signals, keep_signals
 from ehadiag.cli.matplotlib_alone import matplotlib_alone
-from ehadiag.cli.output import emit, progress_bar, rendered, say, say_if_compiling
+from ehadiag.cli.output import emit, failure_said, progress_bar, rendered, say, say_if_compiling
 from ehadiag.cli.report_page import add_report_option, calibration_report, need_report_library
 from ehadiag.cli.results import make_folder
-from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, NotTestedError, reason_of
 from ehadiag.core.stored_test import resolve_test
 
 if TYPE_CHECKING:
@@ -83,37 +84,46 @@ def run(arguments: argparse.Namespace) -> int:
         recordings, digests = _read(arguments)
         found = _learn(arguments, start, recordings, digests)
         keep_signals()
-        written = _bring_out(arguments, folder, out, found)
-    if arguments.json:
-        from ehadiag.report.calibration import calibration_json  # noqa: PLC0415
-
-        emit(calibration_json(found) + "\n")
-    else:
-        from ehadiag.report.calibration import print_calibration  # noqa: PLC0415
-
-        emit(rendered(lambda console: print_calibration(found, console)))
+        codes = [0 if found.actuator is not None else NotTestedError.exit_code]
+        written = _bring_out(arguments, folder, out, found, codes)
+    # What was learned is printed also where it could not be written.
+    with failure_said(codes):
+        _print(found, as_json=arguments.json)
     if written:
         say("wrote " + ", ".join(str(item) for item in written))
-    return 0 if found.actuator is not None else NotTestedError.exit_code
+    return worst_code(codes)
+
+
+def _print(found: Calibrated, *, as_json: bool) -> None:
+    from ehadiag.report.calibration import (  # noqa: PLC0415
+        calibration_json,
+        print_calibration,
+    )
+
+    if as_json:
+        emit(calibration_json(found) + "\n")
+    else:
+        emit(rendered(lambda console: print_calibration(found, console)))
 
 
 def _bring_out(
-    arguments: argparse.Namespace, folder: Folder, out: Path, found: Calibrated
+    arguments: argparse.Namespace, folder: Folder, out: Path, found: Calibrated, codes: list[int]
 ) -> list[Path]:
-    """Write file and picture of what was learned, and the report; return what was written."""
+    """Write file and picture of what was learned, and the report; return what was written.
+
+    What cannot be written is said, and its exit code added to `codes`.
+    """
     written = []
     if found.actuator is not None:
-        _write(folder, out.name, found.actuator, replaced=arguments.update)
-        written.append(out)
-        _draw(folder, _picture(out).name, found)
-        written.append(_picture(out))
+        with failure_said(codes):
+            _write(folder, out.name, found.actuator, replaced=arguments.update)
+            written.append(out)
+            _draw(folder, _picture(out).name, found)
+            written.append(_picture(out))
     if arguments.report:
-        page = out.with_suffix(".html")
-        try:
-            folder.write(page.name, calibration_report(found))
-        except OSError as error:
-            raise InputOutputError(f"report {page}: {error.strerror or error}") from None
-        written.append(page)
+        with failure_said(codes):
+            _report(folder, _page(out).name, found)
+            written.append(_page(out))
     return written
 
 
@@ -127,7 +137,8 @@ def _place(arguments: argparse.Namespace) -> Path:
     if arguments.update and arguments.compare:
         raise ConfigurationError("--update keeps the model that was chosen: --compare does nothing")
     same = arguments.update and _is_same(out, Path(arguments.actuator))
-    for path in () if same else (out, _picture(out)):
+    beside = (_picture(out), _page(out)) if arguments.report else (_picture(out),)
+    for path in () if same else (out, *beside):
         if os.path.lexists(path):
             raise ConfigurationError(
                 f"--out {arguments.out}: {path.name} exists; name another file, or remove it"
@@ -141,6 +152,10 @@ def _is_same(one: Path, other: Path) -> bool:
 
 def _picture(out: Path) -> Path:
     return out.with_suffix(".png")
+
+
+def _page(out: Path) -> Path:
+    return out.with_suffix(".html")
 
 
 def _read(arguments: argparse.Namespace) -> tuple[list[Recording], list[str]]:
@@ -168,7 +183,7 @@ def _digest(log: str) -> str:
         with Path(log).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputOutputError(f"log {log}: {error.strerror or error}") from None
+        raise InputOutputError(f"log {log}: {reason_of(error)}") from None
 
 
 def _learn(
@@ -224,9 +239,7 @@ def _write(folder: Folder, name: str, unit: Actuator, *, replaced: bool) -> None
         put = folder.write if replaced else folder.write_new
         put(name, actuator_toml(unit))
     except OSError as error:
-        raise InputOutputError(
-            f"actuator file {folder.path / name}: {error.strerror or error}"
-        ) from None
+        raise InputOutputError(f"actuator file {folder.path / name}: {reason_of(error)}") from None
 
 
 def _draw(folder: Folder, name: str, found: Calibrated) -> None:
@@ -236,4 +249,11 @@ def _draw(folder: Folder, name: str, found: Calibrated) -> None:
         folder.write(name, draw_calibration(found))
     except OSError as error:
         place = folder.path / name
-        raise InputOutputError(f"picture {place}: {error.strerror or error}") from None
+        raise InputOutputError(f"picture {place}: {reason_of(error)}") from None
+
+
+def _report(folder: Folder, name: str, found: Calibrated) -> None:
+    try:
+        folder.write(name, calibration_report(found))
+    except OSError as error:
+        raise InputOutputError(f"report {folder.path / name}: {reason_of(error)}") from None

@@ -17,7 +17,7 @@ from ehadiag.cli.output import progress_bar, put, say
 from ehadiag.cli.would_diagnose import Outlook, outlook
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import conversion_of
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import valid_text
 from ehadiag.core.recording import Samples
@@ -63,8 +63,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Listen and report."""
-    if arguments.log is None:
-        bus_options.need_one_bus(arguments)
+    bus_options.need_bus_or_log(arguments)
     bus_map, actuator = asked_for.the_bus_map(arguments), asked_for.the_actuator(arguments)
     from firmware_iface.logs.reader import read_frames  # noqa: PLC0415
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can
@@ -117,7 +116,7 @@ def _plot(path: Path, samples: Samples, actuator: Actuator, heard: str) -> None:
         with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
             folder.write(path.name, content)
     except OSError as error:
-        raise InputOutputError(f"picture {path}: {error.strerror or error}") from None
+        raise InputOutputError(f"picture {path}: {reason_of(error)}") from None
     say(f"wrote {path}")
 
 

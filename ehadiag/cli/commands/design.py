@@ -12,8 +12,17 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.cli import argument_types, asked_for, options
-from ehadiag.cli.output import emit, progress_bar, put, rendered, say, say_if_compiling
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.cli.exit_codes import worst_code
+from ehadiag.cli.output import (
+    emit,
+    failure_said,
+    progress_bar,
+    put,
+    rendered,
+    say,
+    say_if_compiling,
+)
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.stored_test import SAME_RATE, StoredTest, encode_test, resolve_test
 
@@ -96,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     scored = score(test, actuator)
     proposal = _proposal(arguments, test, actuator, scored) if arguments.out else None
-    found = [(test, scored)]
+    found, codes, written = [(test, scored)], [0], False
     if proposal is not None and proposal.better:
         better = msgspec.structs.replace(
             proposal.test,
@@ -105,13 +114,18 @@ def run(arguments: argparse.Namespace) -> int:
             description=f"made from {test.name!r} by ehadiag design, seed {arguments.seed}, "
             f"{proposal.scored} tests looked at",
         )
-        _write(Path(arguments.out), encode_test(better))
         found.append((better, proposal.score))
-    _print(arguments, found)
+        with failure_said(codes):
+            _write(Path(arguments.out), encode_test(better))
+            written = True
+            say(f"wrote {arguments.out}")
+    # What was found is printed also where it could not be written.
+    with failure_said(codes):
+        _print(arguments, found, arguments.out if written else None)
     if arguments.out and len(found) == 1:
         why = "all exceed the limits" if proposal is None else "none is better"
         say(f"no test written: of those looked at {why}; a larger --budget looks at more")
-    return 0
+    return worst_code(codes)
 
 
 def _proposal(
@@ -178,10 +192,12 @@ def _write(path: Path, content: bytes) -> None:
     except FileExistsError:
         raise InputOutputError(f"{path}: exists already; name another file") from None
     except OSError as error:
-        raise InputOutputError(f"{path}: {error.strerror or error}") from None
+        raise InputOutputError(f"{path}: {reason_of(error)}") from None
 
 
-def _print(arguments: argparse.Namespace, found: list[tuple[StoredTest, Score]]) -> None:
+def _print(
+    arguments: argparse.Namespace, found: list[tuple[StoredTest, Score]], written: str | None
+) -> None:
     from ehadiag.report.test_score import SCHEMA, json_of, print_score  # noqa: PLC0415
 
     if not arguments.json:
@@ -190,6 +206,6 @@ def _print(arguments: argparse.Namespace, found: list[tuple[StoredTest, Score]])
         return
     out = {"schema": SCHEMA, "actuator": arguments.actuator, "scored": json_of(*found[0])}
     if arguments.out:
-        out |= {"seed": arguments.seed, "file": arguments.out if len(found) > 1 else None}
+        out |= {"seed": arguments.seed, "file": written}
         out["proposed"] = json_of(*found[1]) if len(found) > 1 else None
     put(json.dumps(out, ensure_ascii=False))

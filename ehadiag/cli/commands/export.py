@@ -10,9 +10,12 @@ from ehadiag.cli.output import put, say
 from ehadiag.cli.results import make_folder
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.printable import printable
 
 __all__ = ["add_parser", "run"]
+
+COMPILING = "compiling; this may take half a minute"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -36,9 +39,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--hours",
         type=argument_types.positive,
-        default=100.0,
+        default=HOURS_BETWEEN,
         metavar="H",
-        help="mean time between false alarms of the monitor (default 100)",
+        help="mean time between false alarms of the monitor (default %(default)g)",
     )
     options.add_actuator_options(parser)
     parser.set_defaults(run=run)
@@ -49,13 +52,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         from ehadiag.export.targets import TARGETS  # noqa: PLC0415 - loads the compiler
 
+        width = max(len(item.name) for item in TARGETS)
         for item in TARGETS:
-            put(f"{item.name:<16}{item.meaning}")
+            put(f"{item.name:<{width}}  {item.meaning}")
         return 0
     if arguments.out is None:
         raise ConfigurationError("export: need --out DIR")
     actuator = asked_for.the_actuator(arguments)
-    say("compiling; this may take half a minute")
     names = _units(arguments, actuator) if arguments.fmu else _library(arguments, actuator)
     for name in names:
         put(printable(str(Path(arguments.out) / name)))
@@ -73,6 +76,7 @@ def _units(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
     from ehadiag.export.fmu import export_fmus  # noqa: PLC0415 - loads the compiler
 
     with make_folder(arguments.out) as folder:
+        say(COMPILING)
         return export_fmus(actuator, folder, hours=arguments.hours)
 
 
@@ -82,6 +86,7 @@ def _library(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
 
     chosen = target(arguments.target)
     with make_folder(arguments.out) as folder:
+        say(COMPILING)
         names = export_library(actuator, chosen, folder, hours=arguments.hours)
     if chosen.processor.shared and SHARED not in names:
         say("no C compiler (cc, or what CC names): no shared library, only the static one")

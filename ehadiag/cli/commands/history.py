@@ -17,7 +17,7 @@ from ehadiag.cli.history_file import (
 )
 from ehadiag.cli.output import emit, put, rendered, say
 from ehadiag.cli.overwriting import Output, refuse_overwriting
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.printable import printable, valid_text
 from ehadiag.history.records import DIAGNOSIS, EVENT
@@ -121,7 +121,7 @@ def _init(arguments: argparse.Namespace) -> None:
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputOutputError(f"history {place}: {error.strerror or error}") from None
+        raise InputOutputError(f"history {place}: {reason_of(error)}") from None
     History(place, create=True).close()
     put(f"history {place}: {'was there already' if there else 'begun'}")
 
@@ -332,6 +332,6 @@ def _write(name: str, content: bytes) -> None:
         with Folder.at(path.parent, RESULT_MODE, follow=True) as folder:
             folder.write(path.name, content)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = reason_of(error)
         raise InputOutputError(f"file {name}: {reason}") from None
     say(f"wrote {name}")

@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 
 from ehadiag.cli.output import put, say
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.folder import RESULT_MODE, Folder
 
 __all__ = ["add_parser", "run"]
@@ -67,6 +67,6 @@ def run(arguments: argparse.Namespace) -> int:
             f"{folder / str(error)}: is there already, not overwritten"
         ) from None
     except OSError as error:
-        raise InputOutputError(f"folder {folder}: {error.strerror or error}") from None
+        raise InputOutputError(f"folder {folder}: {reason_of(error)}") from None
     say(f"each key is explained in docs/reference/{PAGES[arguments.kind]}")
     return 0

@@ -14,7 +14,7 @@ from ehadiag.cli.history_file import add_history_file, history_place
 from ehadiag.cli.output import say, say_if_compiling
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.report_page import need_report_library, report_of
-from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError, reason_of
 from ehadiag.core.fingerprint import fingerprint
 from ehadiag.core.folder import RESULT_MODE, Folder
 from ehadiag.core.small_file import read_small_file
@@ -94,11 +94,13 @@ def _write(arguments: argparse.Namespace, path: Path, asked: Levels) -> None:
         with Folder.at(target.parent, RESULT_MODE, follow=True) as folder:
             folder.write(target.name, page)
     except OSError as error:
-        raise InputOutputError(f"report {target}: {error.strerror or error}") from None
+        raise InputOutputError(f"report {target}: {reason_of(error)}") from None
     say(f"wrote {target}")
 
 
 def _page_of(result: Path) -> Path:
+    if not result.name:
+        raise ConfigurationError(f"result {result}: is a folder, name a file in it")
     return result.with_suffix(".html")
 
 

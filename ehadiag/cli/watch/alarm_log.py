@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ehadiag.core.dates import utc_text
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 from ehadiag.core.folder import append_to_file
 from ehadiag.core.printable import valid_text
 
@@ -40,7 +40,7 @@ class AlarmLog:
                 None if path is None else os.fdopen(append_to_file(path), "a", encoding="utf-8")
             )
         except OSError as error:
-            raise InputOutputError(f"log {path}: {error.strerror or error}") from None
+            raise InputOutputError(f"log {path}: {reason_of(error)}") from None
 
     def write(self, event: str, **content: Any) -> dict[str, Any]:
         """Append an event, and return what was written.
@@ -73,7 +73,7 @@ class AlarmLog:
                 self._file.flush()
                 os.fsync(self._file.fileno())
             except OSError as error:
-                raise InputOutputError(f"log {self._path}: {error.strerror or error}") from None
+                raise InputOutputError(f"log {self._path}: {reason_of(error)}") from None
         return tree
 
     def close(self) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import threading
 from collections.abc import Sequence
 from typing import Any
 
 from ehadiag.cli.output import say
+from ehadiag.core.errors import ConfigurationError, reason_of
 
 __all__ = ["AlarmCommand"]
 
@@ -26,9 +28,16 @@ class AlarmCommand:
     ----------
     arguments : Sequence[str]
         Program and arguments; empty: nothing is called.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such program.
     """
 
     def __init__(self, arguments: Sequence[str]) -> None:
+        if arguments and shutil.which(arguments[0]) is None:
+            raise ConfigurationError(f"--on-alarm {arguments[0]}: no such program")
         self._arguments = list(arguments)
         self._thread: threading.Thread | None = None
         self.calls = 0
@@ -65,4 +74,4 @@ class AlarmCommand:
             if done.returncode:
                 self.failed = f"ended with code {done.returncode}"
         except (OSError, ValueError) as error:
-            self.failed = getattr(error, "strerror", None) or str(error)
+            self.failed = reason_of(error)

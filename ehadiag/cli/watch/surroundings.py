@@ -9,7 +9,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import InputOutputError, reason_of
 
 if TYPE_CHECKING:
     from firmware_iface.logs.recorder import Recorder
@@ -55,8 +55,10 @@ class Surroundings:
         if folder is not None:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
+            except FileExistsError:
+                raise InputOutputError(f"--record {folder}: is a file; name a folder") from None
             except OSError as error:
-                raise InputOutputError(f"folder {folder}: {error.strerror or error}") from None
+                raise InputOutputError(f"folder {folder}: {reason_of(error)}") from None
 
     def take(self, frame: Frame) -> None:
         """Take a frame, in order of arrival; InputOutputError where it cannot be written."""

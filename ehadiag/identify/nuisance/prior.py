@@ -101,10 +101,11 @@ def beside(model: Derivatives, belief: Belief, values: Mapping[str, float]) -> B
 
 
 def small_effects(model: Derivatives, belief: Belief) -> Belief:
-    """Belief of an actuator that is nearly the textbook's: nuisances about 0, severities anywhere.
+    """Belief about a unit with hardly any effects: all but the severities are close to 0.
 
-    With hardly any hysteresis the noise of closed loop keeps the spool breaking away, and a search
-    from the usual sizes ends where hysteresis that is not there smoothes that.
+    The second place from which a search begins. With hardly any hysteresis the noise of closed loop
+    keeps the spool breaking away, and a search from the usual sizes ends where hysteresis that is
+    not there smoothes that.
     """
     faults = np.array([item.kind is Kind.FAULT for item in model.estimated])
     x = np.where(faults, belief.x, 0.0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
 
-__all__ = ["Belief", "Linearised", "crossed", "linearised"]
+__all__ = ["Belief", "Cross", "Linearised", "crossed", "linearised"]
 
 BLOCK = 16
 """Runs come in blocks of that size."""
@@ -102,38 +102,63 @@ def crossed(model: Derivatives, belief: Belief) -> Linearised:
     coordinate does not move at all has exactly no slope by it, which a regression on all points at
     once does not give. At a bound both points are on the same side.
     """
-    curved, count = model.curved, len(model.curved)
-    reach = REACH * np.sqrt((belief.root**2).sum(axis=1))
-    points = np.repeat(belief.x[None, :], 1 + 2 * count, axis=0)
-    offsets = np.zeros((count, 3))
-    for k, j in enumerate(curved):
-        there, width = belief.x[j], reach[k]
-        above, below = min(width, model.upper[j] - there), min(width, there - model.lower[j])
-        if below < ONE_SIDED * width:
-            below = -0.5 * above
-        elif above < ONE_SIDED * width:
-            above = -0.5 * below
-        points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
-        offsets[k, 1:] = above, -below
-    runs = model.many(points)
-    shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
-    # By differences from the middle: what slopes, and, at unit length, what a line through the
-    # three runs of a coordinate does not explain.
-    shares = np.zeros((2 * count, len(runs) - 1))
-    for k in range(count):
-        mine = slice(2 * k, 2 * k + 2)
-        along = offsets[k] - offsets[k].mean()
-        across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
-        shares[k, mine] = (along / (along @ along))[1:]
-        shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
-    differences = flat[1:] - flat[0]
-    out = shares @ differences
-    jacobian = model.additive_slopes()
-    jacobian[curved] = out[:count].reshape(count, *shape)
-    left = out[count:]
-    scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
-    mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
-    return Linearised(points.mean(axis=0), mean, jacobian, scatter, runs[0])
+    cross = Cross.about(model, belief)
+    return cross.lines(model, model.many(cross.points))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cross:
+    """Points of `crossed`: the mean of a belief, and two on each coordinate through it.
+
+    Attributes
+    ----------
+    points : shape (1 + 2 c, k)
+    offsets : shape (c, 3)
+        Where on its coordinate the mean and its two points stand, from the mean.
+    """
+
+    points: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+
+    @classmethod
+    def about(cls, model: Derivatives, belief: Belief) -> Cross:
+        """Lay the points, within the bounds of the model."""
+        curved, count = model.curved, len(model.curved)
+        reach = REACH * np.sqrt((belief.root**2).sum(axis=1))
+        points = np.repeat(belief.x[None, :], 1 + 2 * count, axis=0)
+        offsets = np.zeros((count, 3))
+        for k, j in enumerate(curved):
+            there, width = belief.x[j], reach[k]
+            above, below = min(width, model.upper[j] - there), min(width, there - model.lower[j])
+            if below < ONE_SIDED * width:
+                below = -0.5 * above
+            elif above < ONE_SIDED * width:
+                above = -0.5 * below
+            points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
+            offsets[k, 1:] = above, -below
+        return cls(points, offsets)
+
+    def lines(self, model: Derivatives, runs: NDArray[np.float64]) -> Linearised:
+        """Fit a line along each coordinate to residuals at the points."""
+        count = len(model.curved)
+        shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+        # By differences from the middle: what slopes, and, at unit length, what a line through the
+        # three runs of a coordinate does not explain.
+        shares = np.zeros((2 * count, len(runs) - 1))
+        for k, offsets in enumerate(self.offsets):
+            mine = slice(2 * k, 2 * k + 2)
+            along = offsets - offsets.mean()
+            across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
+            shares[k, mine] = (along / (along @ along))[1:]
+            shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
+        differences = flat[1:] - flat[0]
+        out = shares @ differences
+        jacobian = model.additive_slopes()
+        jacobian[model.curved] = out[:count].reshape(count, *shape)
+        left = out[count:]
+        scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
+        mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
+        return Linearised(self.points.mean(axis=0), mean, jacobian, scatter, runs[0])
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ehadiag.calibration.further import asked_for
+from ehadiag.calibration.effects import asked_for
 
 NAMES = ("KSF", "load", "torque_odd", "spool_bow")
 BESIDE = NAMES[1:]

@@ -15,8 +15,8 @@ from ehadiag.identify.nuisance.explained import (
     is_hopeless,
     is_of_the_pressure,
 )
-from ehadiag.identify.nuisance.further import would_explain
 from ehadiag.identify.nuisance.prior import nuisances_of
+from ehadiag.identify.nuisance.trial import would_explain
 from ehadiag.identify.refine.first_part import CONSIDERED
 from ehadiag.identify.session import identify
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, parameter

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -27,10 +26,10 @@ from ehadiag.assess.diagnosis import Diagnosis, diagnose
 from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.unit import calibrate
 from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import EhadiagError
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.figures import holds_truth, percent_errors, percent_widths
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.simulator.units import COARSE_STEP, add_group, record, unit_with
 
 __all__ = ["AlarmRun", "main", "perform_unit"]
@@ -114,16 +113,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     runs = [
         AlarmRun(unit, options.seed, options.recordings, groups) for unit in range(options.units)
     ]
-    try:
-        records = perform_all(perform_unit, runs, options.results, options.jobs, "units")
-    except EhadiagError as error:
-        print(f"alarms: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"alarms: stopped; goes on from {options.results}", file=sys.stderr)
-        return 130
-    print_table(records)
-    return 0
+
+    def work() -> None:
+        print_table(perform_all(perform_unit, runs, options.results, options.jobs, "units"))
+
+    return carry_out("alarms", options.results, work)
 
 
 def print_table(records: Sequence[dict[str, Any]]) -> None:
@@ -160,14 +154,11 @@ def _print_errors(items: Sequence[dict[str, Any]]) -> None:
         told = [item for item in items if item["test"] == test and _is_told(item)]
         if not told:
             continue
-        truth = np.array([item["faults"] for item in told])
-        error = 100.0 * np.abs(np.array([item["value"] for item in told]) - truth)
-        low, high = np.moveaxis(np.array([item["interval95"] for item in told]), 2, 0)
+        error = np.abs(percent_errors(told))
         print(
             f"| {test} | {len(told)} | {error.mean():.4f} "
             f"| {np.quantile(error.mean(axis=1), 0.95):.4f} | {error.max():.3f} "
-            f"| {100.0 * ((low <= truth) & (truth <= high)).mean():.1f} "
-            f"| {100.0 * (high - low).mean():.3f} |"
+            f"| {100.0 * holds_truth(told).mean():.1f} | {percent_widths(told).mean():.3f} |"
         )
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 
 from ehadiag.assess.acceptance import objections_to_estimate
 from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import EhadiagError
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import Experiment, build_experiment, share_offsets
 from ehadiag.identify.nuisance.prior import information_of, nuisances_of
@@ -31,7 +29,8 @@ from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.model.parameters import FAULT_NAMES, FAULTS, OFFSETS, REGISTRY
 from ehadiag.model.simd.model import SimdModel
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.figures import holds_truth, percent_errors
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.simulator.units import Unit, record
 
 __all__ = ["TextbookRun", "bound_of", "main", "perform_textbook"]
@@ -88,28 +87,20 @@ def bound_of(experiment: Experiment, faults: Sequence[float]) -> NDArray[np.floa
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; exit code 0, or that of the error."""
     options = _parser().parse_args(argv)
+    return carry_out("all_unknown", options.results, lambda: _print_table(options))
+
+
+def _print_table(options: argparse.Namespace) -> None:
     print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
-    try:
-        for test in options.test or ["open", "closed"]:
-            runs = [TextbookRun(test, case, options.seed) for case in range(options.cases)]
-            print_rows(
-                test, perform_all(perform_textbook, runs, options.results, options.jobs, test)
-            )
-    except EhadiagError as error:
-        print(f"all_unknown: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"all_unknown: stopped; goes on from {options.results}", file=sys.stderr)
-        return 130
-    return 0
+    for test in options.test or ["open", "closed"]:
+        runs = [TextbookRun(test, case, options.seed) for case in range(options.cases)]
+        print_rows(test, perform_all(perform_textbook, runs, options.results, options.jobs, test))
 
 
 def print_rows(test: str, records: Sequence[dict[str, Any]]) -> None:
     """One row for each severity, in percent of damage."""
-    truth = np.array([record["faults"] for record in records])
-    error = 100.0 * np.abs(np.array([record["value"] for record in records]) - truth)
-    low, high = np.moveaxis(np.array([record["interval95"] for record in records]), 2, 0)
-    held = 100.0 * ((low <= truth) & (truth <= high)).mean(axis=0)
+    error = np.abs(percent_errors(records))
+    held = 100.0 * holds_truth(records).mean(axis=0)
     bound = 100.0 * np.sqrt(np.mean(np.square([record["bound"] for record in records]), axis=0))
     rms = np.sqrt((error**2).mean(axis=0))
     for k, name in enumerate(FAULT_NAMES):

@@ -22,7 +22,6 @@ import numpy as np
 from ehadiag.assess.acceptance import objections_to_estimate
 from ehadiag.calibration.unit import calibrate
 from ehadiag.core.actuator import Actuator, default_actuator, with_tolerance
-from ehadiag.core.errors import EhadiagError
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag.identify.experiment import build_experiment
@@ -30,7 +29,7 @@ from ehadiag.identify.nuisance.knowledge import knowledge_of
 from ehadiag.identify.session import Nuisances, identify
 from ehadiag_sim.plant.conditions import Faults
 from ehadiag_tools.accuracy.nuisances import HEADINGS, row_of
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, add_group, record, unit_with
 
 __all__ = ["LINES", "SheetRun", "main", "perform_sheet"]
@@ -118,25 +117,21 @@ def _calibrated(seed: int, case: int, groups: tuple[str, ...]) -> tuple[Actuator
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; exit code 0, or that of the error."""
     options = _parser().parse_args(argv)
+    return carry_out("data_sheet", options.results, lambda: _print_table(options))
+
+
+def _print_table(options: argparse.Namespace) -> None:
     print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
     groups = tuple(sorted(set(options.group)))
-    try:
-        for line in options.line or list(LINES):
-            for nuisances in options.nuisances or ["auto", "none"]:
-                runs = [
-                    SheetRun(line, case, options.seed, nuisances, groups)
-                    for case in range(options.cases)
-                ]
-                label = f"{line}, nuisances {nuisances}"
-                records = perform_all(perform_sheet, runs, options.results, options.jobs, label)
-                print("| " + " | ".join(row_of(line, nuisances, records)) + " |", flush=True)
-    except EhadiagError as error:
-        print(f"data_sheet: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"data_sheet: stopped; goes on from {options.results}", file=sys.stderr)
-        return 130
-    return 0
+    for line in options.line or list(LINES):
+        for nuisances in options.nuisances or ["auto", "none"]:
+            runs = [
+                SheetRun(line, case, options.seed, nuisances, groups)
+                for case in range(options.cases)
+            ]
+            label = f"{line}, nuisances {nuisances}"
+            records = perform_all(perform_sheet, runs, options.results, options.jobs, label)
+            print("| " + " | ".join(row_of(line, nuisances, records)) + " |", flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:

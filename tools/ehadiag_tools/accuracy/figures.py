@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 
 from ehadiag.model.parameters import FAULT_NAMES
 
-__all__ = ["Figures", "figures_of", "percent_errors", "print_figures"]
+__all__ = [
+    "Figures",
+    "figures_of",
+    "holds_truth",
+    "percent_errors",
+    "percent_widths",
+    "print_figures",
+]
+
+SAME = 1e-12
+"""An estimate on the bound is told as such; the last digit of a sum must not decide."""
 
 Record = Mapping[str, Any]
 
@@ -56,15 +66,31 @@ def percent_errors(records: Sequence[Record], stage: str = "value") -> NDArray[n
     return np.asarray(100.0 * (estimate - truth))
 
 
+def holds_truth(records: Sequence[Record]) -> NDArray[np.bool_]:
+    """Whether the 95 % interval of each severity holds the truth, shape (n, 3)."""
+    low, high = _ends(records)
+    truth = np.array([record["faults"] for record in records])
+    return np.asarray((low <= truth + SAME) & (truth - SAME <= high))
+
+
+def percent_widths(records: Sequence[Record]) -> NDArray[np.float64]:
+    """Width of the 95 % interval of each severity in percent, shape (n, 3)."""
+    low, high = _ends(records)
+    return 100.0 * (high - low)
+
+
+def _ends(records: Sequence[Record]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    interval = np.array([record["interval95"] for record in records])
+    return interval[..., 0], interval[..., 1]
+
+
 def figures_of(records: Sequence[Record]) -> Figures:
     """Figures of a non-empty list of records of `ehadiag_tools.accuracy.runs.perform`."""
     error = percent_errors(records)
     case = np.abs(error).mean(axis=1)
     truth = np.array([record["faults"] for record in records])
     inside = (truth > 0.0) & (truth < 1.0)
-    interval = np.array([record["interval95"] for record in records])
-    # An estimate on the bound is told as such; the last digit of a sum must not decide.
-    held = (interval[..., 0] <= truth + 1e-12) & (truth - 1e-12 <= interval[..., 1])
+    held = holds_truth(records)
     bound = 100.0 * np.array([record["bound"] for record in records])
     ratio = np.where(inside, error / bound, np.nan)
     return Figures(

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -25,12 +24,12 @@ import numpy as np
 from ehadiag.assess.diagnosis import Diagnosis, diagnose
 from ehadiag.assess.verdict import Levels, Verdict
 from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import ConfigurationError, EhadiagError
+from ehadiag.core.errors import ConfigurationError
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag_sim.faults.hardware import KINDS, broken
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.simulator.units import COARSE_STEP
 
 __all__ = ["HardwareRun", "main", "perform_broken", "row_of", "wrong_class"]
@@ -111,24 +110,19 @@ def row_of(records: Sequence[dict[str, Any]], test: str, kind: str) -> list[str]
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; exit code 0, 1 if a verdict was not allowed, or that of the error."""
     options = _parser().parse_args(argv)
-    try:
-        if options.cases < 1 or options.jobs < 1:
-            raise ConfigurationError("--cases and --jobs: need at least 1")
-        runs = [
-            HardwareRun(test, kind, case, options.seed)
-            for test in options.test or TESTS
-            for kind in options.kind or KINDS
-            for case in range(options.cases)
-        ]
-        records = perform_all(
-            perform_broken, runs, options.results, options.jobs, "broken hardware"
-        )
-    except EhadiagError as error:
-        print(f"hardware: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"hardware: stopped; goes on from {options.results}", file=sys.stderr)
-        return 130
+    return carry_out("hardware", options.results, lambda: _perform(options))
+
+
+def _perform(options: argparse.Namespace) -> int:
+    if options.cases < 1 or options.jobs < 1:
+        raise ConfigurationError("--cases and --jobs: need at least 1")
+    runs = [
+        HardwareRun(test, kind, case, options.seed)
+        for test in options.test or TESTS
+        for kind in options.kind or KINDS
+        for case in range(options.cases)
+    ]
+    records = perform_all(perform_broken, runs, options.results, options.jobs, "broken hardware")
     _print_table(records)
     if options.reasons:
         _print_reasons(records)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -21,12 +20,12 @@ import numpy as np
 
 from ehadiag.assess.acceptance import objections_to_estimate
 from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import EhadiagError
 from ehadiag.core.stored_test import resolve_test
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.session import Nuisances, identify
 from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.figures import holds_truth, percent_errors, percent_widths
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.simulator.units import random_unit, record
 
 __all__ = ["LINES", "UnitRun", "main", "perform_unit", "row_of"]
@@ -87,12 +86,8 @@ def row_of(line: str, nuisances: str, records: Sequence[dict[str, Any]]) -> list
     Errors are of every case, 95th percentile and mean of the cases' mean; coverage and width are
     those of the intervals that are stated, NOT TESTED states none.
     """
-    truth = np.array([record["faults"] for record in records])
-    error = 100.0 * np.abs(np.array([record["value"] for record in records]) - truth)
-    low, high = np.moveaxis(np.array([record["interval95"] for record in records]), 2, 0)
-    tested = ~np.array([record["not_tested"] for record in records])
-    stated = tested.any()
-    inside = ((low <= truth) & (truth <= high))[tested]
+    error = np.abs(percent_errors(records))
+    stated = [record for record in records if not record["not_tested"]]
     return [
         line,
         nuisances,
@@ -100,9 +95,9 @@ def row_of(line: str, nuisances: str, records: Sequence[dict[str, Any]]) -> list
         f"{error.mean():.4f}",
         f"{np.quantile(error.mean(axis=1), 0.95):.4f}",
         f"{error.max():.3f}",
-        f"{100.0 * inside.mean():.1f}" if stated else "-",
-        f"{100.0 * (high - low)[tested].mean():.3f}" if stated else "-",
-        f"{100.0 * (1.0 - tested.mean()):.1f}",
+        f"{100.0 * holds_truth(stated).mean():.1f}" if stated else "-",
+        f"{percent_widths(stated).mean():.3f}" if stated else "-",
+        f"{100.0 * (1.0 - len(stated) / len(records)):.1f}",
         f"{np.mean([record['evaluations'] for record in records]):.0f}",
         f"{1e3 * np.mean([record['processor_s'] for record in records]):.0f}",
     ]
@@ -111,28 +106,24 @@ def row_of(line: str, nuisances: str, records: Sequence[dict[str, Any]]) -> list
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; exit code 0, or that of the error."""
     options = _parser().parse_args(argv)
+    return carry_out("nuisances", options.results, lambda: _print_table(options))
+
+
+def _print_table(options: argparse.Namespace) -> None:
     print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
-    try:
-        for line in options.line or list(LINES):
-            for nuisances in options.nuisances or ["auto", "none"]:
-                runs = [UnitRun(line, i, options.seed, nuisances) for i in range(options.cases)]
-                label = f"{line}, nuisances {nuisances}"
-                records = perform_all(perform_unit, runs, options.results, options.jobs, label)
-                print("| " + " | ".join(row_of(line, nuisances, records)) + " |", flush=True)
-                if options.worst:
-                    _print_worst(records, options.worst)
-    except EhadiagError as error:
-        print(f"nuisances: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"nuisances: stopped; goes on from {options.results}", file=sys.stderr)
-        return 130
-    return 0
+    for line in options.line or list(LINES):
+        for nuisances in options.nuisances or ["auto", "none"]:
+            runs = [UnitRun(line, i, options.seed, nuisances) for i in range(options.cases)]
+            label = f"{line}, nuisances {nuisances}"
+            records = perform_all(perform_unit, runs, options.results, options.jobs, label)
+            print("| " + " | ".join(row_of(line, nuisances, records)) + " |", flush=True)
+            if options.worst:
+                _print_worst(records, options.worst)
 
 
 def _print_worst(records: Sequence[dict[str, Any]], count: int) -> None:
     truth = np.array([record["faults"] for record in records])
-    error = 100.0 * (np.array([record["value"] for record in records]) - truth)
+    error = percent_errors(records)
     std = 100.0 * np.array([record["std"] for record in records])
     for index in np.argsort(-np.abs(error).max(axis=1))[:count]:
         record = records[index]

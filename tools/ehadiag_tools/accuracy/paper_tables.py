@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
+from ehadiag.core.errors import ConfigurationError
 from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag_tools.accuracy.cases import PAPER, PaperCase
 from ehadiag_tools.accuracy.figures import percent_errors
 from ehadiag_tools.accuracy.pictures import draw_all
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.accuracy.runs import Run, perform
 from ehadiag_tools.simulator.compare_logs import read_truth
 
@@ -46,25 +45,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--results", type=Path, default=Path("out/accuracy.jsonl"), help="(%(default)s)")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
     options = parser.parse_args(argv)
-    try:
-        if options.seeds < 1 or options.jobs < 1:
-            raise ConfigurationError("--seeds and --jobs: need at least 1")
-        runs = _runs(options.recordings, options.seeds)
-        records = perform_all(perform, runs, options.results, options.jobs, "paper's tables")
-        source = str(options.recordings) if options.recordings else "simulated"
-        for test in TITLES:
-            print_table(test, records, source)
-        if not options.no_pictures:
-            prefix = "recordings" if options.recordings else "simulated"
-            for path in draw_all(runs, records, options.out, prefix):
-                print(f"wrote {path}")
-    except EhadiagError as error:
-        print(f"paper_tables: {error}", file=sys.stderr)
-        return error.exit_code
-    except OSError as error:
-        print(f"paper_tables: {error.filename}: {error.strerror}", file=sys.stderr)
-        return InputOutputError.exit_code
-    return 0
+    return carry_out("paper_tables", options.results, lambda: _perform(options))
+
+
+def _perform(options: argparse.Namespace) -> None:
+    if options.seeds < 1 or options.jobs < 1:
+        raise ConfigurationError("--seeds and --jobs: need at least 1")
+    runs = _runs(options.recordings, options.seeds)
+    records = perform_all(perform, runs, options.results, options.jobs, "paper's tables")
+    source = str(options.recordings) if options.recordings else "simulated"
+    for test in TITLES:
+        print_table(test, records, source)
+    if not options.no_pictures:
+        prefix = "recordings" if options.recordings else "simulated"
+        for path in draw_all(runs, records, options.out, prefix):
+            print(f"wrote {path}")
 
 
 def print_table(test: str, records: Sequence[dict[str, Any]], source: str) -> None:

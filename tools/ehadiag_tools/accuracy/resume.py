@@ -18,19 +18,36 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ehadiag.core.errors import InputOutputError
+from ehadiag.core.errors import EhadiagError, InputOutputError, reason_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["key_of", "perform_all"]
+__all__ = ["carry_out", "key_of", "perform_all"]
 
 R = TypeVar("R", bound="DataclassInstance")
 """Settings of a run."""
 Worker = Callable[[R], dict[str, Any]]
 
+STOPPED = 130
+"""Exit code after Ctrl-C."""
 CODE = ("ehadiag", "ehadiag_sim", "firmware_iface")
 """Packages on whose sources, those of their own packages too, a result depends."""
+
+
+def carry_out(tool: str, results: Path, work: Callable[[], int | None]) -> int:
+    """Exit code of a tool's work: its own, else 0, or that of an error, which stderr tells."""
+    try:
+        return work() or 0
+    except EhadiagError as error:
+        print(f"{tool}: {error}", file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        print(f"{tool}: {error.filename}: {reason_of(error)}", file=sys.stderr)
+        return InputOutputError.exit_code
+    except KeyboardInterrupt:
+        print(f"{tool}: stopped; the same command goes on from {results}", file=sys.stderr)
+        return STOPPED
 
 
 def perform_all(
@@ -65,7 +82,7 @@ def perform_all(
                 bar = progress.add_task(label, total=len(runs), completed=len(runs) - len(waiting))
                 _work(worker, waiting, jobs, keep, lambda: progress.advance(bar))
     except OSError as error:
-        raise InputOutputError(f"results {results}: {error.strerror or error}") from None
+        raise InputOutputError(f"results {results}: {reason_of(error)}") from None
     return [done[key] for key in keys]
 
 

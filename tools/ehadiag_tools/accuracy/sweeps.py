@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from ehadiag.core.errors import ConfigurationError, EhadiagError
+from ehadiag.core.errors import ConfigurationError
 from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag_tools.accuracy.cases import PAPER, random_faults
 from ehadiag_tools.accuracy.contest import contest, print_contest
 from ehadiag_tools.accuracy.figures import figures_of, percent_errors, print_figures
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.accuracy.runs import PLANTS, TESTS, Run, perform
 from ehadiag_tools.simulator.compare_logs import read_truth
 
@@ -52,6 +51,10 @@ class Request:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print tables; exit code 0, or that of the error."""
     options = _parser().parse_args(argv)
+    return carry_out("accuracy", options.results, lambda: _perform(options))
+
+
+def _perform(options: argparse.Namespace) -> None:
     modes: dict[str, Callable[[Request], Any]] = {
         "sweep": sweep,
         "paper": paper,
@@ -60,38 +63,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         "solvers": solvers,
         "joint": joint,
     }
-    try:
-        for name in ("cases", "noise_seeds", "search_seeds", "jobs"):
-            if getattr(options, name) < 1:
-                raise ConfigurationError(f"--{name.replace('_', '-')}: need at least 1")
-        request = Request(
-            mode=options.mode,
-            tests=tuple(options.test or ("open", "closed")),
-            cases=options.cases,
-            seed=options.seed,
-            plant=options.plant,
-            noise_seeds=options.noise_seeds,
-            search_seeds=options.search_seeds,
-            solver=options.solver,
-            recordings=options.recordings,
-            results=options.results,
-            jobs=options.jobs,
-        )
-        outcome = modes[request.mode](request)
-        if options.json is not None:
-            options.json.write_text(json.dumps(outcome, indent=1) + "\n", encoding="utf-8")
-    except EhadiagError as error:
-        print(f"accuracy: {error}", file=sys.stderr)
-        return error.exit_code
-    except OSError as error:
-        print(f"accuracy: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 3
-    except KeyboardInterrupt:
-        print(
-            f"accuracy: stopped; the same command goes on from {options.results}", file=sys.stderr
-        )
-        return 130
-    return 0
+    for name in ("cases", "noise_seeds", "search_seeds", "jobs"):
+        if getattr(options, name) < 1:
+            raise ConfigurationError(f"--{name.replace('_', '-')}: need at least 1")
+    request = Request(
+        mode=options.mode,
+        tests=tuple(options.test or ("open", "closed")),
+        cases=options.cases,
+        seed=options.seed,
+        plant=options.plant,
+        noise_seeds=options.noise_seeds,
+        search_seeds=options.search_seeds,
+        solver=options.solver,
+        recordings=options.recordings,
+        results=options.results,
+        jobs=options.jobs,
+    )
+    outcome = modes[request.mode](request)
+    if options.json is not None:
+        options.json.write_text(json.dumps(outcome, indent=1) + "\n", encoding="utf-8")
 
 
 def _parser() -> argparse.ArgumentParser:

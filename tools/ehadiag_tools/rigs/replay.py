@@ -15,7 +15,7 @@ from ehadiag.assess.diagnosis import Diagnosis, diagnose
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.core.errors import EhadiagError
 from ehadiag.core.find_test import Sought
-from ehadiag.core.recording import Recording
+from ehadiag.core.recording import Recording, Samples
 from ehadiag.core.stored_test import StoredTest, bundled_tests
 from ehadiag.model.parameters import FAULT_NAMES
 from ehadiag_tools.rigs.buses import BUSES, ForeignBus
@@ -123,11 +123,9 @@ def on_bus(
     seed: int,
 ) -> Recording:
     """Play a recording on a bus, and read it there as a log of that bus is read."""
-    if recording.samples is None:
-        raise ValueError(f"{recording.source}: nothing to play")
-    this = played(recording.samples, as_sent(test), how.lead_in_s)
+    this = played(_samples_of(recording), as_sent(test), how.lead_in_s)
     table, bus_map = frames_on(bus, recording, this, how, seed)
-    sought = Sought(tuple(bundled_tests().values()), actuator.controller)
+    sought = Sought(_tests(), actuator.controller)
     name = f"{Path(recording.source).stem} on {bus.name}"
     return choose(recordings_of([table], bus_map, name, len(table) + 1, sought=sought))
 
@@ -143,18 +141,23 @@ def on_daq(
     """Write a recording as a decoded CSV at a rate (Hz), and read it as `diagnose` does."""
     import pandas  # noqa: PLC0415 - optional, and slow
 
-    if recording.samples is None:
-        raise ValueError(f"{recording.source}: nothing to play")
-    this = played(recording.samples, as_sent(test), how.lead_in_s)
-    columns = logged(this, how, rate, recording.samples.period_ns, seed)
+    samples = _samples_of(recording)
+    this = played(samples, as_sent(test), how.lead_in_s)
+    columns = logged(this, how, rate, samples.period_ns, seed)
     known = recording.environment
     for name in ("supply_pressure", "return_pressure", "oil_temperature"):
         columns[name] = np.full(len(columns["time"]), getattr(known, name))
-    sought = Sought(tuple(bundled_tests().values()), actuator.controller)
+    sought = Sought(_tests(), actuator.controller)
     with tempfile.TemporaryDirectory(prefix="ehadiag-") as folder:
         path = Path(folder) / f"{Path(recording.source).stem}.csv"
         pandas.DataFrame(columns).to_csv(path, index=False, float_format="%.9g")
         return choose(recorded_tests([path], Meaning(default_map(), None, sought)))
+
+
+def _samples_of(recording: Recording) -> Samples:
+    if recording.samples is None:
+        raise ValueError(f"{recording.source}: nothing to play")
+    return recording.samples
 
 
 def as_sent(test: StoredTest) -> NDArray[np.float64]:

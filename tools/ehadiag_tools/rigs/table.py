@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.core.errors import EhadiagError
 from ehadiag.model.parameters import FAULT_NAMES
-from ehadiag_tools.accuracy.resume import perform_all
+from ehadiag_tools.accuracy.resume import carry_out, perform_all
 from ehadiag_tools.rigs.buses import BUSES
 from ehadiag_tools.rigs.replay import DAQ, DEFAULT, Replay, perform_replay
 from ehadiag_tools.rigs.rerecord import Disturbance
@@ -40,22 +38,21 @@ Found = tuple[Replay, dict[str, Any]]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table; exit code 0, or that of the error."""
     given = _parser().parse_args(arguments)
-    try:
-        cases = [case for folder in given.folder for case in _cases(folder, given)]
-        runs = [run for case in cases for run in _runs(case, given)]
-        # Those of the default bus, then the others in any order: a part of them is a sample.
-        usual = [place for place, run in enumerate(runs) if run.bus == DEFAULT]
-        drawn = np.random.default_rng(given.seed).permutation(len(runs)).tolist()
-        others = [place for place in drawn if runs[place].bus != DEFAULT]
-        order = (usual + others)[: given.at_most]
-        mixed = [runs[place] for place in order]
-        records = perform_all(perform_replay, mixed, given.results, given.jobs, "recordings")
-    except EhadiagError as error:
-        print(f"foreign_buses: {error}", file=sys.stderr)
-        return error.exit_code
+    return carry_out("foreign_buses", given.results, lambda: _perform(given))
+
+
+def _perform(given: argparse.Namespace) -> None:
+    cases = [case for folder in given.folder for case in _cases(folder, given)]
+    runs = [run for case in cases for run in _runs(case, given)]
+    # Those of the default bus, then the others in any order: a part of them is a sample.
+    usual = [place for place, run in enumerate(runs) if run.bus == DEFAULT]
+    drawn = np.random.default_rng(given.seed).permutation(len(runs)).tolist()
+    others = [place for place in drawn if runs[place].bus != DEFAULT]
+    order = (usual + others)[: given.at_most]
+    mixed = [runs[place] for place in order]
+    records = perform_all(perform_replay, mixed, given.results, given.jobs, "recordings")
     found = dict(zip(order, records, strict=True))
     _show([(runs[place], found[place]) for place in sorted(found)], verbose=given.verbose)
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:

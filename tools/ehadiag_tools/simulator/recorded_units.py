@@ -12,7 +12,7 @@ import msgspec
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import CHANNELS
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
 from ehadiag_sim.plant.conditions import DataErrors, Effects
 from ehadiag_tools.simulator.units import Unit
 
@@ -31,7 +31,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         with path.open(encoding="utf-8", newline="") as file:
             return list(csv.DictReader(file))
     except OSError as error:
-        raise InputOutputError(f"{path}: {error.strerror or error}") from None
+        raise InputOutputError(f"{path}: {reason_of(error)}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigurationError(f"{path}: not a table of comma-separated text: {error}") from None
 

@@ -1,4 +1,4 @@
-"""Tells what a further effect would explain from what no effect does, before more is tried.
+"""Tries whether one more effect would explain what those estimated leave, before a full search.
 
 Of a sound unit's effects only a constant load is not among those that are estimated from the start.
 """
