@@ -62,6 +62,9 @@ NOISE_SHARE = 2.0
 """Gap of the current, in units of noise, that noise does not make."""
 MOST_OUTLIERS = 0.015
 MOST_RMS = 1.25
+BROUGHT_OUT = 6.0
+"""By which wear may make more outliers of what effects beyond the usual ones stand in for: worn
+units with such effects had up to 8 % of them, and errors well within their intervals."""
 
 
 def nothing_is_under_way(recording: Recording, test: StoredTest) -> bool:
@@ -296,7 +299,7 @@ def most_left(calibration: Calibration | None) -> tuple[float, float]:
         return MOST_OUTLIERS, MOST_RMS
     fit = calibration.fit
     return (
-        (CHANGED if further else 1.0) * MOST_OUTLIERS + CHANGED * fit.outliers,
+        (BROUGHT_OUT if further else 1.0) * MOST_OUTLIERS + CHANGED * fit.outliers,
         MOST_RMS * CHANGED * max(fit.spool_rms, fit.pressure_rms),
     )
 

@@ -15,6 +15,8 @@ from ehadiag.model.exponential import exponential
 from ehadiag.model.plant import PlantConstants
 
 __all__ = [
+    "BEND",
+    "ESTIMATED_BEND",
     "DriveLaw",
     "JackLaw",
     "SpoolLaw",
@@ -46,6 +48,9 @@ MOST_FADED = 40.0
 BEND, FINE_BEND = 0.05e-6, 0.5e-9
 """Bend of the spool's path (m) that the jack does not feel: with a linear second stage, which
 follows the spool at once, and with one that stores what flows."""
+ESTIMATED_BEND = 0.02e-6
+"""The same where severities are estimated, m: with a monitor's 0.05e-6 jack friction would be up to
+0.2 deviations off."""
 
 
 class DriveLaw(NamedTuple):
@@ -152,8 +157,11 @@ class SpoolLaw(NamedTuple):
 
 
 @inlined
-def spool_law(c: PlantConstants) -> SpoolLaw:
-    """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14)."""
+def spool_law(c: PlantConstants, bend: float = BEND) -> SpoolLaw:
+    """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14).
+
+    bend: of the spool's path that a linear second stage does not feel, m.
+    """
     force = c.AS * c.GPF
     ring_damping = 0.5 * c.CF / c.JF
     square = c.KF / c.JF - ring_damping * ring_damping
@@ -171,7 +179,7 @@ def spool_law(c: PlantConstants) -> SpoolLaw:
         c.XFM,
         c.XSM,
         c.BKL,
-        FINE_BEND if c.OIL > 0.0 else BEND,
+        FINE_BEND if c.OIL > 0.0 else bend,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.address import array_at
 from ehadiag.compile.kernels import brief_kernel, inlined_exact
-from ehadiag.model.laws import SpoolLaw
+from ehadiag.model.laws import ESTIMATED_BEND, SpoolLaw
 from ehadiag.monitor.kernel import push_tick
 from ehadiag.monitor.layout import NUMBER, RESIDUAL, SETTINGS, SPOOL_LAW, Settings
 from ehadiag.monitor.layout import SIZE as MONITOR_SIZE
@@ -45,9 +45,6 @@ PRESSURE_WEIGHT = PLAN_SETTINGS + Settings._fields.index("pressure_weight")
 ANCHOR_SMALL = SETTINGS + Settings._fields.index("anchor_small")
 ANCHOR_LARGE = SETTINGS + Settings._fields.index("anchor_large")
 BEND = SPOOL_LAW + SpoolLaw._fields.index("bend")
-FINE_BEND = 0.02e-6
-"""Of the spool's path that the second stage does not feel, m: finer than a monitor's, by which
-jack friction would be up to 0.2 deviations off."""
 REACH = 3.0
 """Variances of a belief from its mean to the points on an axis."""
 ONE_SIDED = 0.25
@@ -71,7 +68,7 @@ def start_lane(address: int, plan_address: int, plan: Array, lane: int, point: A
     place = address + NUMBER * (LANES + lane * MONITOR_SIZE)
     wrong = int(prepare(place, plan_address, address + NUMBER * UNIT))
     numbers = array_at(place, (MONITOR_SIZE,))
-    numbers[BEND] = min(numbers[BEND], FINE_BEND)
+    numbers[BEND] = min(numbers[BEND], ESTIMATED_BEND)
     return wrong
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.explained import Explains, excess, is_hopeless, is_noise
+from ehadiag.identify.nuisance.open_loop_first import carried_over, open_loop_first
 from ehadiag.identify.nuisance.prior import (
     ALIAS,
     Joint,
@@ -22,6 +23,7 @@ from ehadiag.identify.nuisance.prior import (
 )
 from ehadiag.identify.nuisance.starts import AGAIN, Found, search
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
+from ehadiag.identify.refine.last_round import by_a_finer_model
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
 from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
@@ -44,6 +46,11 @@ TWINS = {"Kintas": 2e-3, "FSS": 7e-4, "FDJ": 5e-5}
 """Deviation of each severity where there is so little: places beside the optimum explain such
 recordings as well, the noise deciding which break-aways there were. Errors in 48 of them (eight
 noises, six units) were 0.47, 0.19 and 0.02 % at most, up to 46 deviations without this."""
+NEARLY_EXPLAINED = 1.3
+"""Excess of open loop alone up to which what is believed after it is gone on with: where more is
+left the search has ended beside the optimum, and believes too much."""
+CLOSER = 0.3
+"""Spread of a further look about the best place, in spreads of what open loop alone leaves."""
 OTHER_PLACE = 30.0
 """Gain of a look further about from which on it is another place, not one as good."""
 Linearise = Callable[[Derivatives, Belief], Linearised]
@@ -133,6 +140,96 @@ def estimate(
         Whether further starts take their time, see `ehadiag.identify.nuisance.starts.search`.
     """
     known = known or {}
+    searched = partial(
+        _searched,
+        free=free,
+        known=known,
+        joint=joint,
+        hint=hint,
+        budget=budget,
+        seed=seed,
+        tell=tell,
+        give_up=give_up,
+        left_before=left_before,
+        explains=explains,
+        patient=patient,
+    )
+    part = open_loop_first(experiments)
+    before = searched(part) if part else None
+    led = before is not None and excess(before.found.residuals) <= NEARLY_EXPLAINED
+    whole = searched(experiments, before=before if led else None)
+    model, found = whole.model, whole.found
+    judged = _judged(experiments, found.residuals)
+    held = [item.parameter for item in considered]
+    fine = _scaled(_free_running(judged, (*free, *held), whole.levels), judged, considered)
+    at_first = belief_of(fine, known, joint), information_of(fine, known, joint)
+    between = nothing if tell is None else partial(tell, 1.0)
+    belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
+    if not (give_up and not found.explained and is_hopeless(found.residuals, found.starts)):
+        draw = partial(linearised, rng=np.random.default_rng([seed, -1 % 2**32]))
+        if (
+            patient and not found.confirmed
+        ):  # a break-away may stand between the end of the search and the optimum
+            root = whole.again
+            belief = _looked_about(fine, belief, root, at_first, draw, between, OTHER_PLACE)
+        belief = _looked_about(fine, belief, LOOK * belief.root, at_first, draw, between)
+    linear = linearised(fine, belief, np.random.default_rng(seed))
+    refined = described(fine, belief.x, linear, settled=found.explained, information=at_first[1])
+    refined = by_a_finer_model(fine, refined, linear)
+    return Estimated(
+        refined=refined,
+        experiments=judged,
+        covariance=spread_of_optima(found, model.scale) + _spread_of_twins(refined, judged),
+        explained=explains(refined.residuals),
+        confirmed=found.confirmed,
+        excess=excess(refined.residuals),
+        starts=found.starts,
+        evaluations=sum(item.evaluations for item in (before, whole, fine) if item),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Searched:
+    """What a search found.
+
+    Attributes
+    ----------
+    model : Derivatives
+        Of whole tests, which it ran.
+    found : Found
+    levels : NDArray[np.int64]
+        Of that model.
+    again : shape (c, c)
+        Root of the covariance over which a further look is taken.
+    evaluations : int
+        Runs of the model, with those of the search that showed where to begin.
+    """
+
+    model: Derivatives
+    found: Found
+    levels: NDArray[np.int64]
+    again: NDArray[np.float64]
+    evaluations: int
+
+
+def _searched(
+    experiments: Sequence[Experiment],
+    *,
+    before: _Searched | None = None,
+    free: Sequence[Parameter],
+    known: Mapping[str, Known],
+    joint: Joint | None,
+    hint: Mapping[str, float] | None,
+    budget: int,
+    seed: int,
+    tell: Callable[[float], None] | None,
+    give_up: bool,
+    left_before: float,
+    explains: Explains,
+    patient: bool,
+) -> _Searched:
+    """Search with some recordings; before: with a part of them, see `open_loop_first`."""
+    patient = patient and before is None and any(item.test.closed_loop for item in experiments)
     coarse = _free_running(experiments, free)
     model = _scaled(coarse, experiments)
     first, information = belief_of(model, known, joint), information_of(model, known, joint)
@@ -140,7 +237,13 @@ def estimate(
     if hint is not None:
         origins = [beside(model, first, hint), *origins[::-1]]
     guide: Derivatives | None = None
-    if any(item.constants.OIL > 0.0 for item in experiments):
+    again = AGAIN * first.root
+    if before is not None:
+        there = carried_over(before.model, before.found.belief, model)
+        origins, again = [there], CLOSER * there.root
+        if hint is not None:
+            origins = [Belief(beside(model, first, hint).x, again), there]
+    elif any(item.constants.OIL > 0.0 for item in experiments):
         guide = _spool_guide(experiments, free, coarse.levels)
         guided = search(
             guide,
@@ -153,15 +256,17 @@ def estimate(
             hopeless=_spool_is_hopeless if give_up else None,
             tell=tell,
         )
-        there = guided.belief.x * guide.scale
+        values = (guided.belief.x * guide.scale).tolist()
         names = [item.name for item in guide.estimated]
-        origins = [beside(model, first, dict(zip(names, there.tolist(), strict=True))), *origins]
+        origins = [beside(model, first, dict(zip(names, values, strict=True))), *origins]
     found = search(
         model,
         first,
         information,
         origins,
         explains,
+        again=again,
+        calmly=before is not None,
         alias=ALIAS,
         budget=budget,
         seed=seed,
@@ -171,32 +276,8 @@ def estimate(
         confirms=give_up,
         before=left_before,
     )
-    judged = _judged(experiments, found.residuals)
-    held = [item.parameter for item in considered]
-    fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
-    before = belief_of(fine, known, joint), information_of(fine, known, joint)
-    between = nothing if tell is None else partial(tell, 1.0)
-    belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
-    if not (give_up and not found.explained and is_hopeless(found.residuals, found.starts)):
-        draw = partial(linearised, rng=np.random.default_rng([seed, -1 % 2**32]))
-        if (
-            patient and not found.confirmed
-        ):  # a break-away may stand between the end of the search and the optimum
-            root = AGAIN * before[0].root
-            belief = _looked_about(fine, belief, root, before, draw, between, OTHER_PLACE)
-        belief = _looked_about(fine, belief, LOOK * belief.root, before, draw, between)
-    linear = linearised(fine, belief, np.random.default_rng(seed))
-    refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
-    return Estimated(
-        refined=refined,
-        experiments=judged,
-        covariance=spread_of_optima(found, model.scale) + _spread_of_twins(refined, judged),
-        explained=explains(refined.residuals),
-        confirmed=found.confirmed,
-        excess=excess(refined.residuals),
-        starts=found.starts,
-        evaluations=sum(item.evaluations for item in (guide, model, fine) if item),
-    )
+    runs = sum(item.evaluations for item in (guide, model) if item)
+    return _Searched(model, found, coarse.levels, again, runs)
 
 
 def _hopeless(*, give_up: bool, patient: bool) -> Hopeless | None:

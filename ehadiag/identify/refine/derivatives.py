@@ -118,11 +118,11 @@ class Derivatives:
 
     def many(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weighted residuals of points, shape (n, signals, N) for points of shape (n, k)."""
-        return self.model.residuals(self._values(points))[0]
+        return self.model.residuals(self.values(points))[0]
 
     def at(
         self, x: NDArray[np.float64], *others: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], int, list[float]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], int, NDArray[np.float64]]:
         """Residuals at a point, what the considered parameters do there, how often anchored.
 
         Returns
@@ -131,10 +131,10 @@ class Derivatives:
         considered : shape (c, signals, N)
             Change of the residuals by a standard deviation of each considered parameter.
         anchored : int
-        costs : list of float
-            Of other points, run in the same block.
+        runs : shape (n, signals, N)
+            Residuals at other points, run in the same blocks.
         """
-        points = self._values(np.vstack([x, *[x] * len(self.considered), *others]))
+        points = self.values(np.vstack([x, *[x] * len(self.considered), *others]))
         changed = slice(1, 1 + len(self.considered))
         for j, item in enumerate(self.considered):
             points[1 + j, len(x) + j] = item.std
@@ -144,8 +144,7 @@ class Derivatives:
         for change, item in zip(considered, self.considered, strict=True):
             if item.rows is not None:
                 change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
-        costs = [capped(run) for run in runs[changed.stop :]]
-        return runs[0], considered, int(anchored[0]), costs
+        return runs[0], considered, int(anchored[0]), runs[changed.stop :]
 
     def slopes(self, centres: Sequence[NDArray[np.float64]]) -> list[Slope]:
         """Residuals and derivatives at several points, all runs of the model together."""
@@ -184,7 +183,7 @@ class Derivatives:
         """Points about x for derivatives over a wider difference, see `_sides`."""
         return self._sides(x, WIDE_STEP)
 
-    def _values(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values of all unknowns of the model, the considered ones at 0."""
         out = np.zeros((len(points), len(self.estimated) + len(self.considered)))
         out[:, : len(self.estimated)] = points * self.scale

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
 
-__all__ = ["Belief", "Linearised", "crossed", "linearised"]
+__all__ = ["Belief", "Cross", "Linearised", "crossed", "linearised"]
 
 BLOCK = 16
 """Runs come in blocks of that size."""
@@ -102,29 +102,54 @@ def crossed(model: Derivatives, belief: Belief) -> Linearised:
     coordinate does not move at all has exactly no slope by it, which a regression on all points at
     once does not give. At a bound both points are on the same side.
     """
-    curved, count = model.curved, len(model.curved)
-    reach = REACH * np.sqrt((belief.root**2).sum(axis=1))
-    points = np.repeat(belief.x[None, :], 1 + 2 * count, axis=0)
-    offsets = np.zeros((count, 3))
-    for k, j in enumerate(curved):
-        there, width = belief.x[j], reach[k]
-        above, below = min(width, model.upper[j] - there), min(width, there - model.lower[j])
-        if below < ONE_SIDED * width:
-            below = -0.5 * above
-        elif above < ONE_SIDED * width:
-            above = -0.5 * below
-        points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
-        offsets[k, 1:] = above, -below
-    runs = model.many(points)
-    jacobian = model.additive_slopes()
-    scatter = np.zeros(runs.shape[1:])
-    for k, j in enumerate(curved):
-        line = runs[[0, 1 + 2 * k, 2 + 2 * k]]
-        along = offsets[k] - offsets[k].mean()
-        jacobian[j] = np.tensordot(along / (along @ along), line, 1)
-        left = line - line.mean(axis=0) - along[:, None, None] * jacobian[j]
-        scatter += np.einsum("ijk,ijk->jk", left, left)
-    return Linearised(points.mean(axis=0), runs.mean(axis=0), jacobian, scatter / count, runs[0])
+    cross = Cross.about(model, belief)
+    return cross.lines(model, model.many(cross.points))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cross:
+    """Points of `crossed`: the mean of a belief, and two on each coordinate through it.
+
+    Attributes
+    ----------
+    points : shape (1 + 2 c, k)
+    offsets : shape (c, 3)
+        Where on its coordinate the mean and its two points stand, from the mean.
+    """
+
+    points: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+
+    @classmethod
+    def about(cls, model: Derivatives, belief: Belief) -> Cross:
+        """Lay the points, within the bounds of the model."""
+        curved, count = model.curved, len(model.curved)
+        reach = REACH * np.sqrt((belief.root**2).sum(axis=1))
+        points = np.repeat(belief.x[None, :], 1 + 2 * count, axis=0)
+        offsets = np.zeros((count, 3))
+        for k, j in enumerate(curved):
+            there, width = belief.x[j], reach[k]
+            above, below = min(width, model.upper[j] - there), min(width, there - model.lower[j])
+            if below < ONE_SIDED * width:
+                below = -0.5 * above
+            elif above < ONE_SIDED * width:
+                above = -0.5 * below
+            points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
+            offsets[k, 1:] = above, -below
+        return cls(points, offsets)
+
+    def lines(self, model: Derivatives, runs: NDArray[np.float64]) -> Linearised:
+        """Fit a line along each coordinate to residuals at the points."""
+        jacobian = model.additive_slopes()
+        scatter = np.zeros(runs.shape[1:])
+        for k, j in enumerate(model.curved):
+            line = runs[[0, 1 + 2 * k, 2 + 2 * k]]
+            along = self.offsets[k] - self.offsets[k].mean()
+            jacobian[j] = np.tensordot(along / (along @ along), line, 1)
+            left = line - line.mean(axis=0) - along[:, None, None] * jacobian[j]
+            scatter += np.einsum("ijk,ijk->jk", left, left)
+        mean, scatter = self.points.mean(axis=0), scatter / len(model.curved)
+        return Linearised(mean, runs.mean(axis=0), jacobian, scatter, runs[0])
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

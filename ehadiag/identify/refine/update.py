@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.bounded_step import bounded_step
-from ehadiag.identify.refine.derivatives import CAP, Derivatives, Slope, capped
+from ehadiag.identify.refine.derivatives import Derivatives, Slope
 from ehadiag.identify.refine.first_part import (
     FirstPart,
     anchored_derivatives,
     anchored_model,
     derivatives_of,
 )
-from ehadiag.identify.refine.least_squares import Refinement, refine
+from ehadiag.identify.refine.last_round import last_round
+from ehadiag.identify.refine.least_squares import SPREAD, Refinement, refine
+from ehadiag.identify.refine.linearisation import Belief
 from ehadiag.identify.refine.posterior import FEW
 from ehadiag.identify.search.stages import LEAD_S
 
@@ -60,47 +62,31 @@ def add_last_part(
         last = anchored_model(experiments, rows.spans, lead=LEAD_S)
         levels[rows.last] = last.levels[rows.counted]
     whole = anchored_derivatives(experiments, levels=levels)
-    x = first.x * first.scale / whole.scale
-    weight = whole.model.batch.weight
-    jacobian = np.zeros((len(x), *weight.shape))
-    used = np.zeros(weight.shape, dtype=np.bool_)
-    jacobian[:, :, rows.first], used[:, rows.first] = first.jacobian, first.used
+    x, normal, settled = first.x * first.scale / whole.scale, first.normal, first.converged
     others: list[NDArray[np.float64]] = []
     evaluations = 0
     if len(rows.last):
         model = derivatives_of(last, experiments)
         slope = model.trusted_slope(x)
         taken = slope.used & (last.batch.weight > 0.0)
-        moved = _stepped(x, first, slope, taken, model)
+        moved, normal = _stepped(x, first, slope, taken, model)
         step = first.jacobian[:, first.used].T @ (moved - x)
         if step @ step > FARTHEST**2:
             return None
-        std = np.sqrt(np.diag(np.linalg.inv(first.normal + FREE * np.eye(len(x)))))
+        std = _deviations(first.normal)
+        others, evaluations = [x], model.evaluations
         if np.any(np.abs(moved - x)[whole.faults] > LONG * std[whole.faults]):
             names = (item.name for item in whole.estimated)
             start = dict(zip(names, (moved * whole.scale).tolist(), strict=True))
             found = refine(whole, start, FEW.width * (std * whole.scale)[whole.curved])
-            return replace(found, evaluations=model.evaluations + found.evaluations)
-        jacobian[:, :, rows.last] = slope.jacobian[:, :, rows.counted]
-        used[:, rows.last] = taken[:, rows.counted]
-        evaluations, others, x = model.evaluations, [x], moved
-    residuals, considered, anchored, before = whole.at(x, *others)
-    if before and capped(residuals) > before[0] + WORSE:
+            others, moved, normal, settled = [], found.x, found.normal, found.converged
+        x = moved
+    width = FEW.width * _deviations(normal)[whole.curved]
+    root = np.diag(np.minimum(width, SPREAD / whole.scale[whole.curved]))
+    found, (cost, *before) = last_round(whole, Belief(x, root), settled, *others)
+    if before and cost > before[0] + WORSE:
         return None
-    used &= residuals**2 < CAP
-    return replace(
-        first,
-        x=x,
-        scale=whole.scale,
-        cost=capped(residuals),
-        residuals=residuals,
-        jacobian=np.where(used, jacobian, 0.0),
-        considered=considered,
-        used=used,
-        weighted=weight > 0.0,
-        evaluations=evaluations + whole.evaluations,
-        anchored=anchored,
-    )
+    return replace(found, evaluations=evaluations + found.evaluations)
 
 
 def _stepped(
@@ -109,8 +95,8 @@ def _stepped(
     slope: Slope,
     taken: NDArray[np.bool_],
     model: Derivatives,
-) -> NDArray[np.float64]:
-    """Where the residuals of the last part lead to.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the residuals of the last part lead to, and the information of both parts.
 
     taken: those that count, shape (signals, n).
     """
@@ -120,7 +106,12 @@ def _stepped(
     at_bound = (x == model.lower) | (x == model.upper)
     normal = before @ before.T + now @ now.T + FREE * np.eye(len(x))
     gradient = np.where(at_bound, stands, 0.0) + pulls
-    return bounded_step(x, normal, gradient, model.lower, model.upper)
+    return bounded_step(x, normal, gradient, model.lower, model.upper), normal
+
+
+def _deviations(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviations of the estimates by their information."""
+    return np.sqrt(np.diag(np.linalg.inv(normal + FREE * np.eye(len(normal)))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

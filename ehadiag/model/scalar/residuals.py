@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import inlined, kernel
 from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch, longest_span
+from ehadiag.model.laws import BEND
 from ehadiag.model.parameters import Unknowns
 from ehadiag.model.plant import plant_of
 from ehadiag.model.scalar.jack import jack_response
@@ -54,7 +55,11 @@ def _weighted(error: float, weight: float) -> float:
 
 @kernel
 def _residuals(
-    batch: Batch, candidate: NDArray[np.float64], work: _Workspace, out: NDArray[np.float64]
+    batch: Batch,
+    candidate: NDArray[np.float64],
+    bend: float,
+    work: _Workspace,
+    out: NDArray[np.float64],
 ) -> int:
     """Weighted residuals of one candidate, rows of constants of shape (tests, FIELDS)."""
     anchored, signals = 0, batch.weight.shape[0]
@@ -64,7 +69,7 @@ def _residuals(
         constants, tick = plant_of(candidate[batch.test[index]]), batch.tick[index]
         anchored += spool_response(
             constants,
-            spool_tables(constants, tick),
+            spool_tables(constants, tick, bend),
             batch.current[batch.since[index] : batch.since[index] + n],
             tick,
             batch.origin[index],
@@ -102,11 +107,18 @@ def _residuals(
 
 
 class ScalarModel:
-    """A `ehadiag.model.interface.ResidualModel` of scalar kernels."""
+    """A `ehadiag.model.interface.ResidualModel` of scalar kernels.
 
-    def __init__(self, batch: Batch, unknowns: Unknowns) -> None:
+    Parameters
+    ----------
+    bend : float
+        Of the spool's path that a linear second stage does not feel, m.
+    """
+
+    def __init__(self, batch: Batch, unknowns: Unknowns, bend: float = BEND) -> None:
         self.batch = batch
         self.unknowns = unknowns
+        self._bend = bend
         self.evaluations = 0
         self._work = _workspace(batch)
 
@@ -117,7 +129,7 @@ class ScalarModel:
         out = np.empty((len(points), *self.batch.weight.shape))
         anchored = np.empty(len(points), dtype=np.int64)
         for i, candidate in enumerate(self.unknowns.candidates(points)):
-            anchored[i] = _residuals(self.batch, candidate, self._work, out[i])
+            anchored[i] = _residuals(self.batch, candidate, self._bend, self._work, out[i])
         self.evaluations += len(points)
         return out, anchored
 

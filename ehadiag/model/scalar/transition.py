@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.kernels import bare_kernel, kernel
 from ehadiag.model.exponential import exponential
-from ehadiag.model.laws import SpoolLaw, spool_law
+from ehadiag.model.laws import BEND, SpoolLaw, spool_law
 from ehadiag.model.plant import PlantConstants
 
 __all__ = ["FINEST", "SCRATCH", "SpoolTables", "fill_tables", "spool_tables"]
@@ -117,9 +117,9 @@ def fill_tables(
 
 
 @kernel
-def spool_tables(constants: PlantConstants, tick: float) -> SpoolTables:
-    """Law and transition matrices of a candidate, tick in s."""
-    law = spool_law(constants)
+def spool_tables(constants: PlantConstants, tick: float, bend: float = BEND) -> SpoolTables:
+    """Law and transition matrices of a candidate, tick in s; bend: see `spool_law`."""
+    law = spool_law(constants, bend)
     moving, loose = np.empty((FINEST + 1, 4, 4)), np.empty((FINEST + 1, 4, 4))
     stuck, decay = np.empty((FINEST + 1, 2, 2)), np.empty(FINEST + 1)
     fill_tables(constants, law, tick, np.empty((SCRATCH, 4, 4)), moving, loose, stuck, decay)

@@ -92,10 +92,11 @@ def test_what_is_considered_moves_the_residuals_but_is_not_estimated():
     free = (*FAULTS, LEAD)
     model = Derivatives(Formula(formula, free), NOISE, [Considered(LEAD, 0.15e-6)])
     beside = np.full(len(FAULTS), 0.25)
-    residuals, considered, anchored, costs = model.at(np.full(len(FAULTS), 0.5), beside)
+    residuals, considered, anchored, runs = model.at(np.full(len(FAULTS), 0.5), beside)
     assert not residuals.any()
     np.testing.assert_allclose(considered[0], 0.15e-6 * shape)
-    assert costs == [0.0]
+    assert runs.shape == (1, *residuals.shape)
+    assert not runs.any()
     assert (anchored, len(considered), len(model.estimated)) == (0, 1, len(FAULTS))
 
 

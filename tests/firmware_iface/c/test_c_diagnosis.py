@@ -321,5 +321,8 @@ def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place
         EMULATED[0], exported("host", place), surrounded(heard), ticks_of(heard)[:ticks], tmp_path
     ).outcome
     check(told, heard, found)
+    if ticks == TICKS:
+        for name, own in told["faults"].items():
+            assert abs(getattr(found, name) - own["estimate"]) < 0.1 * own["std"]
     if bits is not None:
         assert np.array(found[: len(bits)]).tobytes() == np.array(bits).tobytes()
