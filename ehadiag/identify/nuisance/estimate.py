@@ -167,9 +167,8 @@ def estimate(
     belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
     if not (give_up and not found.explained and is_hopeless(found.residuals, found.starts)):
         draw = partial(linearised, rng=np.random.default_rng([seed, -1 % 2**32]))
-        if (
-            patient and not found.confirmed
-        ):  # a break-away may stand between the end of the search and the optimum
+        if patient and not found.confirmed:
+            # A break-away may stand between the end of the search and the optimum.
             root = whole.again
             belief = _looked_about(fine, belief, root, at_first, draw, between, OTHER_PLACE)
         belief = _looked_about(fine, belief, LOOK * belief.root, at_first, draw, between)
