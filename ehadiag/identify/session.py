@@ -21,8 +21,10 @@ from ehadiag.identify.nuisance.prior import nuisances_of
 from ehadiag.identify.nuisance.trial import would_explain
 from ehadiag.identify.refine.first_part import (
     FirstPart,
+    Look,
     considered_in,
     first_spans,
+    look_at,
     refine_first_part,
 )
 from ehadiag.identify.refine.least_squares import Refinement
@@ -54,7 +56,6 @@ from ehadiag.identify.textbook import (
     named,
     rescued,
     searched_whole,
-    unlikeness,
 )
 from ehadiag.identify.uncertainty import covariance, independent
 from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
@@ -137,6 +138,7 @@ class Session:
         self.nuisances = nuisances
         self.knowledge = knowledge
         self._memory = Memory()
+        self._looked: tuple[bytes, Look] | None = None
         self.so_far: SoFar | None = None
         """What the latest `feed` showed; None before the first. Another thread may look."""
 
@@ -158,7 +160,7 @@ class Session:
         ):
             best = result.best
             self.so_far = SoFar(f"search, stage {stage + 1} of {len(STAGES)}", named(best))
-        if ready == len(STAGES) and unlikeness(experiments, best) <= HOPELESS:
+        if ready == len(STAGES) and self._look(experiments, best).unlikeness <= HOPELESS:
             self.so_far = _refined(self._first_part(experiments, best, nothing).refined)
 
     def finish(
@@ -231,15 +233,15 @@ class Session:
         """Return what a refinement begins from, and whether it may explain the recordings: the
         optimum of the search, unless only what the search began from resembles them, or a search
         over the whole window where currents were guessed."""
-        if unlikeness(experiments, found.best) <= HOPELESS:
+        if self._look(experiments, found.best).unlikeness <= HOPELESS:
             return found, True
-        if unlikeness(experiments, start) <= HOPELESS:
+        if self._look(experiments, start).unlikeness <= HOPELESS:
             return replace(found, best=start), True
         if not any(item.trace.guessed for item in experiments):
             return found, False
         other = searched_whole(experiments, found, self.solver, self.seed + len(STAGES))
         other = replace(other, evaluations=found.evaluations + other.evaluations)
-        near = unlikeness(experiments, other.best) <= HOPELESS
+        near = self._look(experiments, other.best).unlikeness <= HOPELESS
         return (other if near else replace(found, evaluations=other.evaluations)), near
 
     def _freed(
@@ -357,13 +359,21 @@ class Session:
     ) -> FirstPart:
         """Refinement on the first parts of the tests, from memory if the inputs are the same."""
         until = [first_ticks(item) for item in experiments]
-        free = lay_out(experiments, first_spans(experiments, until))
-        base = [np.array(item.constants) for item in experiments]
         return self._memory.recall(
-            digest("first part", [*free, *base, start]),
+            _of_first_parts(experiments, until, start),
             FirstPart,
-            lambda: refine_first_part(experiments, until, named(start), between),
+            lambda: refine_first_part(
+                experiments, until, named(start), between, self._look(experiments, start)
+            ),
         )
+
+    def _look(self, experiments: Sequence[Experiment], start: NDArray[np.float64]) -> Look:
+        """Look at the first parts of the tests; the latest one is kept."""
+        until = [first_ticks(item) for item in experiments]
+        key = _of_first_parts(experiments, until, start)
+        if self._looked is None or self._looked[0] != key:
+            self._looked = key, look_at(experiments, until, named(start))
+        return self._looked[1]
 
 
 def identify(
@@ -377,6 +387,17 @@ def identify(
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
     return Session(solver, seed, nuisances, knowledge).finish(experiments, progress)
+
+
+def _of_first_parts(
+    experiments: Sequence[Experiment],
+    until: Sequence[int],
+    start: NDArray[np.float64],
+) -> bytes:
+    """Fingerprint of the first parts of the tests and a start among the severities."""
+    free = lay_out(experiments, first_spans(experiments, until))
+    base = [np.array(item.constants) for item in experiments]
+    return digest("first part", [*free, *base, start])
 
 
 def _guessed(refinement: Refinement) -> NDArray[np.float64]:

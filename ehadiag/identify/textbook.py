@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import outliers
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.refine.derivatives import CAP
 from ehadiag.identify.refine.first_part import FirstPart, refine_first_part, residuals_at
 from ehadiag.identify.refine.least_squares import Refinement, median_offsets
 from ehadiag.identify.refine.posterior import nothing
@@ -45,7 +44,6 @@ __all__ = [
     "named",
     "rescued",
     "searched_whole",
-    "unlikeness",
 ]
 
 
@@ -191,21 +189,6 @@ def explains(refinement: Refinement) -> bool:
 def is_guessed(refinement: Refinement) -> bool:
     """Whether the model left the spool so often that the current was not what it went by."""
     return refinement.anchored > MOST_ANCHORED
-
-
-def unlikeness(experiments: Sequence[Experiment], severities: NDArray[np.float64]) -> float:
-    """Return the share of residuals beyond the cap at such severities, offsets aside.
-
-    Above `HOPELESS` a refinement from there will not explain the recordings.
-    """
-    free, residuals = residuals_at(experiments, None, named(severities))
-    offsets = median_offsets(free, residuals)
-    weighted = free.batch.weight > 0.0
-    for item in OFFSETS:
-        if item.adds_to is not None:
-            row = item.adds_to
-            residuals[row] -= offsets[item.name] * free.batch.weight[row]
-    return float(np.mean(residuals[weighted] ** 2 >= CAP))
 
 
 def first_ticks(experiment: Experiment) -> int:

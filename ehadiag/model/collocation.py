@@ -36,7 +36,7 @@ A31, A32, A33 = (16.0 - ROOT) / 36.0, (16.0 + ROOT) / 36.0, 1.0 / 9.0
 
 @packed
 def _solved(
-    j: JackLaw, h: float, load: Any, velocity: Any,
+    j: JackLaw, h: Any, load: Any, velocity: Any,
     x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any, g1: Any, g2: Any, g3: Any,
 ) -> Any:  # fmt: skip
     """Pressures (Pa) at the three stages of a step of `h` seconds of the moving jack.
@@ -75,7 +75,7 @@ def _solved(
 
 @packed
 def radau_pressures(
-    j: JackLaw, h: float, load: Any, velocity: Any,
+    j: JackLaw, h: Any, load: Any, velocity: Any,
     x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
 ) -> Any:  # fmt: skip
     """Pressures (Pa) at the three stages, Stribeck's friction left out: see `radau_velocity`."""
@@ -84,7 +84,7 @@ def radau_pressures(
 
 @packed
 def creeping_pressures(
-    j: JackLaw, h: float, load: Any, d: Any, velocity: Any,
+    j: JackLaw, h: Any, load: Any, d: Any, velocity: Any,
     x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
 ) -> Any:  # fmt: skip
     """Pressures (Pa) at the three stages, Stribeck's friction included.
@@ -104,7 +104,7 @@ def creeping_pressures(
 
 @packed
 def radau_velocity(
-    j: JackLaw, h: float, load: Any, velocity: Any,
+    j: JackLaw, h: Any, load: Any, velocity: Any,
     x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
 ) -> Any:  # fmt: skip
     """Velocity (m/s) of the moving jack after a step of `h` seconds, Stribeck's friction left out.

@@ -34,7 +34,7 @@ class JackState(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Piece of the spool's path, a cubic.
+    """Piece of the spool's path, a cubic; numbers, or vectors of as many lanes.
 
     Attributes
     ----------
@@ -43,11 +43,11 @@ class Piece(NamedTuple):
     rise0, rise1: slopes there times `span`, m.
     """
 
-    span: float
-    x0: float
-    x1: float
-    rise0: float
-    rise1: float
+    span: Any
+    x0: Any
+    x1: Any
+    rise0: Any
+    rise1: Any
 
 
 class Probe(NamedTuple):
@@ -65,7 +65,7 @@ class Probe(NamedTuple):
 
 
 @packed
-def place_on(p: Piece, q: float) -> float:
+def place_on(p: Piece, q: float) -> Any:
     """Spool at the share q of a piece, m."""
     r = 1.0 - q
     return p.x0 + q * q * (3.0 - 2.0 * q) * (p.x1 - p.x0) + q * r * (r * p.rise0 - q * p.rise1)

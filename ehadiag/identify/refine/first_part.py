@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.refine.derivatives import Considered, Derivatives
+from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives
 from ehadiag.identify.refine.least_squares import SPREAD, Refinement, median_offsets, refine
 from ehadiag.identify.refine.posterior import nothing
 from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
@@ -25,11 +25,13 @@ __all__ = [
     "JUDGEMENTS",
     "NOISE_SETTLED",
     "FirstPart",
+    "Look",
     "anchored_derivatives",
     "anchored_model",
     "considered_in",
     "derivatives_of",
     "first_spans",
+    "look_at",
     "refine_first_part",
     "residuals_at",
 ]
@@ -72,20 +74,60 @@ class FirstPart:
         return [item.with_noise(noise) for item, noise in zip(experiments, self.noise, strict=True)]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """What a model that runs free leaves of the first parts of the tests at some severities.
+
+    Attributes
+    ----------
+    residuals : shape (signals, N)
+        Weighted, no offsets taken off.
+    offsets : mapping
+        Constant errors of the sensors, as medians show them, SI by name.
+    weight : shape (signals, N)
+    """
+
+    residuals: NDArray[np.float64]
+    offsets: Mapping[str, float]
+    weight: NDArray[np.float64]
+
+    @property
+    def unlikeness(self) -> float:
+        """Share of residuals beyond the cap, offsets aside.
+
+        Above `ehadiag.identify.textbook.HOPELESS` a refinement from there will not explain them.
+        """
+        residuals = self.residuals.copy()
+        for item in OFFSETS:
+            if item.adds_to is not None:
+                residuals[item.adds_to] -= self.offsets[item.name] * self.weight[item.adds_to]
+        return float(np.mean(residuals[self.weight > 0.0] ** 2 >= CAP))
+
+
+def look_at(
+    experiments: Sequence[Experiment], until: Sequence[int], start: Mapping[str, float]
+) -> Look:
+    """Run the first `until` ticks of each test at severities by name."""
+    free, residuals = residuals_at(experiments, first_spans(experiments, until), start)
+    return Look(residuals, median_offsets(free, residuals), free.batch.weight)
+
+
 def refine_first_part(
     experiments: Sequence[Experiment],
     until: Sequence[int],
     start: Mapping[str, float],
     between: Callable[[], None] = nothing,
+    look: Look | None = None,
 ) -> FirstPart:
     """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
     `start`: severities by name. `between`: called between rounds; what it raises ends the search.
+    `look`: of `look_at` there, if there was one.
     """
     spans = first_spans(experiments, until)
-    free, residuals = residuals_at(experiments, spans, start)
-    start = {**start, **median_offsets(free, residuals)}
-    experiments = _judged(experiments, until, residuals)
+    look = look or look_at(experiments, until, start)
+    start = {**start, **look.offsets}
+    experiments = _judged(experiments, until, look.residuals)
     levels = anchored_model(experiments, spans).levels
     best = _refine(experiments, spans, start, levels, SPREAD, between)
     evaluations = 1 + best.evaluations

@@ -140,16 +140,25 @@ class Cross:
 
     def lines(self, model: Derivatives, runs: NDArray[np.float64]) -> Linearised:
         """Fit a line along each coordinate to residuals at the points."""
+        count = len(model.curved)
+        shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+        # By differences from the middle: what slopes, and, at unit length, what a line through the
+        # three runs of a coordinate does not explain.
+        shares = np.zeros((2 * count, len(runs) - 1))
+        for k, offsets in enumerate(self.offsets):
+            mine = slice(2 * k, 2 * k + 2)
+            along = offsets - offsets.mean()
+            across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
+            shares[k, mine] = (along / (along @ along))[1:]
+            shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
+        differences = flat[1:] - flat[0]
+        out = shares @ differences
         jacobian = model.additive_slopes()
-        scatter = np.zeros(runs.shape[1:])
-        for k, j in enumerate(model.curved):
-            line = runs[[0, 1 + 2 * k, 2 + 2 * k]]
-            along = self.offsets[k] - self.offsets[k].mean()
-            jacobian[j] = np.tensordot(along / (along @ along), line, 1)
-            left = line - line.mean(axis=0) - along[:, None, None] * jacobian[j]
-            scatter += np.einsum("ijk,ijk->jk", left, left)
-        mean, scatter = self.points.mean(axis=0), scatter / len(model.curved)
-        return Linearised(mean, runs.mean(axis=0), jacobian, scatter, runs[0])
+        jacobian[model.curved] = out[:count].reshape(count, *shape)
+        left = out[count:]
+        scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
+        mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
+        return Linearised(self.points.mean(axis=0), mean, jacobian, scatter, runs[0])
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

@@ -17,7 +17,6 @@ ranges, each with the other's value.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,14 +24,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.kernels import kernel
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.spans import ANCHOR_LSB, lay_out, unknowns_of
 from ehadiag.model.batch import Batch
 from ehadiag.model.parameters import FAULTS, Unknowns
-from ehadiag.model.plant import plant_of
-from ehadiag.model.scalar.jack import jack_response
+from ehadiag.model.simd.jack_driven import driven_costs
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = ["PRECISION", "FirstApproximation", "FirstInputs", "first_approximation", "first_inputs"]
@@ -117,7 +114,17 @@ def first_approximation(inputs: FirstInputs) -> FirstApproximation:
 
     def fdj_cost(grid: NDArray[np.float64]) -> NDArray[np.float64]:
         candidates = inputs.unknowns.candidates(_points(inputs.unknowns, FDJ=grid))
-        costs = [_pressure_costs(creep, candidates, CREEP_PRESSURE_CAP) for creep in inputs.creeps]
+        costs = [
+            driven_costs(
+                np.ascontiguousarray(candidates[:, creep.test]),
+                creep.nodes,
+                creep.before,
+                creep.pressure,
+                creep.noise,
+                CREEP_PRESSURE_CAP,
+            )
+            for creep in inputs.creeps
+        ]
         return np.asarray(np.sum(costs, axis=0))
 
     def kintas_cost(grid: NDArray[np.float64], fss: float) -> NDArray[np.float64]:
@@ -234,25 +241,3 @@ def _straight_path(spool: NDArray[np.float64], before: float, tick: float) -> ND
     rate = np.diff(spool, prepend=before) / tick
     length = np.full(len(spool), tick)
     return np.ascontiguousarray(np.column_stack([length, spool, rate, rate, 0.0 * length]))
-
-
-@kernel
-def _pressure_costs(
-    creep: _Creep, candidates: NDArray[np.float64], cap: float
-) -> NDArray[np.float64]:
-    """Capped squared pressure residuals of candidates, rows of constants; shape (n,)."""
-    n = creep.pressure.shape[0]
-    node_end = np.arange(1, n + 1)
-    pressure, position = np.empty(n), np.empty(n)
-    out = np.zeros(candidates.shape[0])
-    for i in range(candidates.shape[0]):
-        constants = plant_of(candidates[i, creep.test])
-        jack_response(
-            constants, creep.nodes[0, 0], creep.before, 0.0, 0.0, position,
-            creep.nodes, node_end, pressure, position,
-        )  # fmt: skip
-        for k in range(n):
-            residual = (creep.pressure[k] - constants.OPD - pressure[k]) / creep.noise
-            if math.isfinite(residual):
-                out[i] += min(residual * residual, cap)
-    return out

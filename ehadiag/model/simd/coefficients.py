@@ -33,7 +33,15 @@ from ehadiag.model.simd.layout import (
     spool_law_of_lane,
 )
 
-__all__ = ["MOVING_SIZE", "SHIFTS", "STUCK_SIZE", "tabulate"]
+__all__ = [
+    "HALVINGS",
+    "MOVING_SIZE",
+    "RINGS_SIZE",
+    "SHIFTS",
+    "SLIDES_SIZE",
+    "STUCK_SIZE",
+    "tabulate",
+]
 
 SHIFTS = (FINEST - 3, FINEST - 6, 0)
 """Lengths of the steps of a tick with events, as powers of two of the finest: an eighth of the
@@ -45,6 +53,9 @@ MOVING_ROWS, STUCK_ROWS = 18, 4
 the flapper on its stop; 2 x 2 transitions."""
 MOVING_SIZE = LANES * len(SHIFTS) * MOVING_ROWS * WIDTH
 STUCK_SIZE = LANES * len(SHIFTS) * STUCK_ROWS * WIDTH
+HALVINGS = FINEST - 2
+"""Of a quarter of the tick, down to the finest step."""
+SLIDES_SIZE, RINGS_SIZE = (HALVINGS + 1) * 16 * LANES, (HALVINGS + 1) * 4 * LANES
 TAYLOR_ORDER = 8
 NEVER = 1e30
 
@@ -98,17 +109,29 @@ def _smallest(rates: NDArray[np.float64], n: int, tick: float) -> NDArray[np.flo
 
 
 @kernel
+def _doubled(smallest: NDArray[np.float64], n: int, out: NDArray[np.float64]) -> None:
+    """Transitions over 2^0 … 2^HALVINGS finest steps: out, a matrix of all lanes behind another."""
+    power, spare = smallest.copy(), np.empty_like(smallest)
+    _copy(power, out, 0)
+    for level in range(1, HALVINGS + 1):
+        _product(power, power, spare, n, 1.0)
+        power, spare = spare, power
+        _copy(power, out, level * n * n * LANES)
+
+
+@kernel
 def _powers(
-    rates: NDArray[np.float64], n: int, tick: float, rows: int, table: NDArray[np.float64]
+    smallest: NDArray[np.float64], n: int, rows: int, table: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Transitions over the steps of `SHIFTS`.
 
+    smallest: over the finest step, overwritten.
     table: out, shape (LANES, 3, rows, WIDTH), flat; the first n² rows are written.
     Returns transitions of all lanes over a quarter of a tick and over a whole one.
     """
     size = n * n
-    one, power = _smallest(rates, n, tick), np.empty_like(rates)
-    spare, quarter = np.empty_like(rates), np.empty_like(rates)
+    one, power = smallest, np.empty_like(smallest)
+    spare, quarter = np.empty_like(smallest), np.empty_like(smallest)
     for level in range(len(SHIFTS) - 1, -1, -1):
         _copy(one, power, 0)
         for step in range(WIDTH):
@@ -164,6 +187,9 @@ def tabulate(
     moving: NDArray[np.float64],
     loose: NDArray[np.float64],
     stuck: NDArray[np.float64],
+    slides: NDArray[np.float64],
+    free_slides: NDArray[np.float64],
+    rings: NDArray[np.float64],
 ) -> tuple[bool, bool, bool, bool]:
     """Coefficients of all lanes; returns whether any has backlash, Stribeck's friction of the
     spool, lands of a shape of their own, and a filter, a lead or Stribeck's friction of the jack.
@@ -177,6 +203,9 @@ def tabulate(
         shape (LANES, 3, MOVING_ROWS, WIDTH), flat.
     loose: out, the same without the feedback wire, where a lane has backlash.
     stuck: out, the same with the spool at rest, shape (LANES, 3, STUCK_ROWS, WIDTH), flat.
+    slides, free_slides, rings: out, transitions over 2^0 … 2^HALVINGS finest steps, moving with the
+        feedback wire and (where a lane has backlash) without it, and at rest; shapes
+        (HALVINGS + 1, 16, LANES) and (HALVINGS + 1, 4, LANES), flat.
     """
     rates, ring = np.zeros(16 * LANES), np.zeros(4 * LANES)
     any_backlash = any_creep = any_shape = any_other = False
@@ -194,7 +223,9 @@ def tabulate(
         rates[12 * LANES + i] = t.force / t.mass
         rates[15 * LANES + i] = -t.damping / t.mass
         ring[1 * LANES + i], ring[2 * LANES + i], ring[3 * LANES + i] = 1.0, stiffness, friction
-    quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, moving)
+    smallest = _smallest(rates, 4, tick)
+    _doubled(smallest, 4, slides)
+    quarter, _ = _powers(smallest, 4, MOVING_ROWS, moving)
     _copy(quarter, coefficients, MOVE * LANES)
     for i in range(LANES):
         t = spool_law_of_lane(coefficients, i)
@@ -205,14 +236,18 @@ def tabulate(
                 place = ((i * len(SHIFTS) + level) * MOVING_ROWS + 16) * WIDTH + step
                 moving[place] = time
                 moving[place + WIDTH] = math.exp(-time * rate)
-    _, whole = _powers(ring, 2, tick, STUCK_ROWS, stuck)
+    smallest = _smallest(ring, 2, tick)
+    _doubled(smallest, 2, rings)
+    _, whole = _powers(smallest, 2, STUCK_ROWS, stuck)
     _copy(whole, coefficients, REST * LANES)
     if any_other:
         for i in range(LANES):
             _filter(sensor_law(plant_of(candidates[i])), tick, i, coefficients)
     if any_backlash:
         rates[6 * LANES : 7 * LANES] = 0.0
-        quarter, _ = _powers(rates, 4, tick, MOVING_ROWS, loose)
+        smallest = _smallest(rates, 4, tick)
+        _doubled(smallest, 4, free_slides)
+        quarter, _ = _powers(smallest, 4, MOVING_ROWS, loose)
         _copy(quarter, coefficients, LOOSE * LANES)
         for i in range(LANES):
             for level in range(len(SHIFTS)):

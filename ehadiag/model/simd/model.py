@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.compile.vector import WIDTH
 from ehadiag.model.batch import Batch
 from ehadiag.model.parameters import Unknowns
 from ehadiag.model.simd.layout import LANES
@@ -108,10 +109,11 @@ class SimdModel:
 
 
 def _scattered(unknowns: Unknowns) -> NDArray[np.float64]:
-    """Points all over the space, shape (LANES, k): a lattice; 0 where a bound is infinite."""
+    """Points all over the space, shape (n, k): a lattice; 0 where a bound is infinite."""
     lower, upper = unknowns.lower, unknowns.upper
     bounded = np.isfinite(lower) & np.isfinite(upper)
-    shares = np.linspace(0.0, 1.0, LANES)[:, None] * STEPS ** np.arange(len(lower)) % WRAP
+    count = WIDTH if len(lower) <= WIDTH else LANES
+    shares = np.linspace(0.0, 1.0, count)[:, None] * STEPS ** np.arange(len(lower)) % WRAP
     width = np.where(bounded, upper - lower, 0.0)
     return np.where(bounded, lower, 0.0) + shares * width
 

@@ -23,7 +23,13 @@ from ehadiag.compile.vector import (
 from ehadiag.model.batch import POSITION_ROW, PRESSURE_ROW, SPOOL_ROW, Batch
 from ehadiag.model.plant import FIELDS, plant_of
 from ehadiag.model.sensors import read_pressure, read_spool
-from ehadiag.model.simd.coefficients import MOVING_SIZE, STUCK_SIZE, tabulate
+from ehadiag.model.simd.coefficients import (
+    MOVING_SIZE,
+    RINGS_SIZE,
+    SLIDES_SIZE,
+    STUCK_SIZE,
+    tabulate,
+)
 from ehadiag.model.simd.jack import (
     follow_lanes,
     jack_lanes,
@@ -34,6 +40,7 @@ from ehadiag.model.simd.jack import (
     sensed_jack_lanes,
 )
 from ehadiag.model.simd.jack_events import jack_events
+from ehadiag.model.simd.jack_pieces import PIECES_SIZE
 from ehadiag.model.simd.layout import (
     ANCHORED,
     COEFFICIENT_ROWS,
@@ -58,6 +65,7 @@ from ehadiag.model.simd.spool import (
 )
 from ehadiag.model.simd.spool_creep import creeping_lanes
 from ehadiag.model.simd.spool_events import SCRATCH_SIZE, event_ticks
+from ehadiag.model.simd.spool_halving import halved_lanes
 
 __all__ = [
     "Scratch",
@@ -92,8 +100,12 @@ class Scratch(NamedTuple):
         How often the jack's ticks are halved, 0 … 4. The same for every candidate, so that no
         answer depends on the others in its block. Of no meaning where no pressure counts: there
         the jack is left out.
-    state, path, coefficients, moving, loose, stuck
+    state, path, coefficients
         See `ehadiag.model.simd.layout`.
+    moving, loose, stuck, slides, free_slides, rings
+        See `ehadiag.model.simd.coefficients`.
+    pieces
+        See `ehadiag.model.simd.jack_pieces`.
     rows : shape (LANES, FIELDS)
         Candidates of a block, in the test of the span at hand.
     sums, sample : shape (LANES,)
@@ -109,6 +121,10 @@ class Scratch(NamedTuple):
     moving: NDArray[np.float64]
     loose: NDArray[np.float64]
     stuck: NDArray[np.float64]
+    slides: NDArray[np.float64]
+    free_slides: NDArray[np.float64]
+    rings: NDArray[np.float64]
+    pieces: NDArray[np.float64]
     rows: NDArray[np.float64]
     sums: NDArray[np.float64]
     sample: NDArray[np.float64]
@@ -122,7 +138,7 @@ def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64
 
     Parameters
     ----------
-    scattered : shape (LANES, tests, FIELDS)
+    scattered : shape (LANES or less, tests, FIELDS)
         Their constants.
 
     Returns
@@ -133,7 +149,7 @@ def levels_for(batch: Batch, scattered: NDArray[np.float64]) -> NDArray[np.int64
     if batch.weight[PRESSURE_ROW:].any():
         # Without weights the jack is left out, and the spool's path is all that is looked at.
         spool_only = batch._replace(weight=np.zeros_like(batch.weight))
-        block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(LANES))
+        block_costs(spool_only, scattered, 1.0, scratch_for(levels), np.empty(len(scattered)))
     return levels
 
 
@@ -147,6 +163,10 @@ def scratch_for(levels: NDArray[np.int64]) -> Scratch:
         moving=_aligned(MOVING_SIZE),
         loose=_aligned(MOVING_SIZE),
         stuck=_aligned(STUCK_SIZE),
+        slides=_aligned(SLIDES_SIZE),
+        free_slides=_aligned(SLIDES_SIZE),
+        rings=_aligned(RINGS_SIZE),
+        pieces=_aligned(PIECES_SIZE),
         rows=np.zeros((LANES, FIELDS)),
         sums=_aligned(LANES),
         sample=_aligned(LANES),
@@ -269,23 +289,29 @@ def _block(
     """
     state, path, coefficients = work.state, work.path, work.coefficients
     moving, loose, stuck, rows = work.moving, work.loose, work.stuck, work.rows
+    slides, free_slides, rings = work.slides, work.free_slides, work.rings
+    pieces = work.pieces
     sums, sample = work.sums, work.sample
     current, spool, pressure = batch.current, batch.spool, batch.pressure
     position, weight, levels, start = batch.position, batch.weight, work.levels, batch.start
     located = weight.shape[0] > POSITION_ROW
     count, wanted = candidates.shape[0], out.shape[0]
-    # Lanes that hold no candidate repeat the last one and take no events; a half of none is left.
+    # Lanes that hold no candidate repeat the last one; a half of none is left out.
     end = WIDTH if count <= WIDTH else LANES
+    backlash = creeps = shaped = senses = False
     sums[:] = 0.0
     state[:] = 0.0
     for index in range(batch.tick.shape[0]):
         tick, test = batch.tick[index], batch.test[index]
         gain, small, large, follow = batch.anchor[index]
         anchored = math.isfinite(small) or math.isfinite(large)
-        for i in range(LANES):
-            for field in range(FIELDS):
-                rows[i, field] = candidates[min(i, count - 1), test, field]
-        backlash, creeps, shaped, senses = tabulate(rows, tick, coefficients, moving, loose, stuck)
+        if index == 0 or test != batch.test[index - 1] or tick != batch.tick[index - 1]:
+            for i in range(LANES):
+                for field in range(FIELDS):
+                    rows[i, field] = candidates[min(i, count - 1), test, field]
+            backlash, creeps, shaped, senses = tabulate(
+                rows, tick, coefficients, moving, loose, stuck, slides, free_slides, rings
+            )
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
@@ -304,8 +330,15 @@ def _block(
             busy = spool_lanes(end, tick, backlash, state, path, coefficients)
             if busy and creeps:
                 busy = creeping_lanes(end, tick, state, path, coefficients)
+            # Nothing depends on the jack but pressure and position.
+            with_jack = k <= last
             if busy:
-                event_ticks(count, tick, state, path, coefficients, moving, loose, stuck)
+                busy = halved_lanes(
+                    count, end, tick, backlash, with_jack, state, path, coefficients,
+                    slides, free_slides, rings, pieces,
+                )  # fmt: skip
+            if busy:
+                event_ticks(count, tick, with_jack, state, path, coefficients, moving, loose, stuck)
             seen = math.isfinite(spool[k])
             if senses:
                 see_lanes(end, tick, state, path, coefficients)
@@ -320,7 +353,7 @@ def _block(
                 open_lanes(end, path, coefficients)
             if levels[k] < 0:
                 levels[k] = orifice_level(tick, coefficients) if orifice else _level(path)
-            if k <= last:  # nothing depends on the jack but pressure and position
+            if with_jack:
                 if senses or orifice:
                     _other_jack_tick(
                         count, end, orifice, senses, tick, levels[k], state, path, coefficients

@@ -1,5 +1,7 @@
 """First stage and spool of one lane over a tick with events, and the jack beside them.
 
+For lanes that `ehadiag.model.simd.spool_halving` leaves.
+
 The vectors that else hold candidates hold instants here: the state after 1 … WIDTH steps of one
 length, each by a transition of its own from the same start. The first of them that lies past an
 event is looked into with shorter steps, down to the finest.
@@ -83,6 +85,7 @@ SCRATCH_SIZE = 4 * MOST_PIECES + 4 * WIDTH
 def event_ticks(
     count: int,
     tick: float,
+    with_jack: bool,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
@@ -92,11 +95,11 @@ def event_ticks(
 ) -> None:
     """Flapper and spool of BUSY lanes, of the first `count`, over a tick with events.
 
-    Events are located to tick / 2^FINEST.
+    Events are located to tick / 2^FINEST. with_jack: whether the jack is to go along.
     """
     for i in range(count):
         if state[BUSY * LANES + i] != 0.0:
-            _event_tick(i, tick, state, path, coefficients, moving, loose, stuck)
+            _event_tick(i, tick, with_jack, state, path, coefficients, moving, loose, stuck)
 
 
 @packed
@@ -228,6 +231,7 @@ def _clamped_instants(
 def _event_tick(
     i: int,
     tick: float,
+    with_jack: bool,
     state: NDArray[np.float64],
     path: NDArray[np.float64],
     coefficients: NDArray[np.float64],
@@ -324,7 +328,7 @@ def _event_tick(
                 path[(PLACE + done // QUARTER) * LANES + i] = s.xs
                 path[(SLOPE + done // QUARTER) * LANES + i] = s.vs
         level = 0 if fine or steps == whole else level + 1
-    if kinks:
+    if kinks and with_jack:
         _jack_beside(i, tick, from_xs, count, state, path, coefficients)
     state[FLAPPER * LANES + i], state[FLAPPER_RATE * LANES + i] = s.xf, s.wf
     state[SPOOL * LANES + i], state[SPOOL_RATE * LANES + i] = s.xs, s.vs

@@ -1,0 +1,398 @@
+"""First stage and spool of all lanes at once over a tick with events, located by halving.
+
+A lane alone (`ehadiag.model.simd.spool_events`) takes as long as all of them here: most of the
+candidates of a search break away and stop within the same ticks. Lanes step together, a quarter of
+the tick, an eighth, … down to the finest step; a lane takes a step in which no event may hide, and
+leaves it to shorter ones where one may. Past its event it goes on by the longest steps up to the
+next node of the path, in which the next event is looked for alike.
+
+What is rare is left to a lane alone: stops, a flapper on its stop, friction that falls with the
+velocity, more than `MOST_EVENTS` events in a tick. Which way a lane goes does not depend on its
+neighbours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.kernels import bare_kernel, inlined
+from ehadiag.compile.vector import (
+    WIDTH,
+    Mask,
+    Vector,
+    anywhere,
+    least,
+    load,
+    magnitude,
+    most,
+    packed,
+    store,
+    where,
+)
+from ehadiag.model.laws import SpoolLaw, play, slide_base, still_flapper
+from ehadiag.model.scalar.transition import FINEST
+from ehadiag.model.simd.coefficients import HALVINGS
+from ehadiag.model.simd.jack_pieces import ALONE, PIECE, jack_over_pieces
+from ehadiag.model.simd.layout import (
+    BUSY,
+    CLAMPED,
+    DEFLECTION,
+    DIRECTION,
+    FLAPPER,
+    FLAPPER_RATE,
+    LANES,
+    NODES,
+    PLACE,
+    SLOPE,
+    SPOOL,
+    SPOOL_RATE,
+    WIRE,
+    spool_laws,
+)
+from ehadiag.model.spool_events import TOUCH
+
+__all__ = ["MOST_EVENTS", "halved_lanes"]
+
+WHOLE = float(1 << FINEST)
+QUARTER = float(1 << HALVINGS)
+"""Finest steps between two nodes of the path."""
+MOST_EVENTS = 6
+"""Of a lane in a tick. Each cuts a piece of the path for all lanes of a vector; so do the nodes."""
+
+
+class _Motion(NamedTuple):
+    """Flapper and spool of WIDTH lanes at an instant: `ehadiag.model.spool_events.SpoolState`."""
+
+    xf: Vector
+    wf: Vector
+    xs: Vector
+    vs: Vector
+    wire: Vector
+    d: Vector
+
+
+class _Tables(NamedTuple):
+    """Transitions over 2^0 … 2^HALVINGS finest steps (`ehadiag.model.simd.coefficients`).
+
+    slides, loose: moving, with the feedback wire and without it; rings: at rest.
+    """
+
+    slides: NDArray[np.float64]
+    loose: NDArray[np.float64]
+    rings: NDArray[np.float64]
+
+
+@packed
+def _slid(
+    t: SpoolLaw, m: NDArray[np.float64], o: int, longest: int, shortest: int, rest: Vector,
+    h: Vector, fine: bool, deflection: Vector, s: _Motion,
+) -> tuple[Vector, Vector, Vector, Vector, Mask, Mask]:  # fmt: skip
+    """Moving spool, with the wire, after `rest` finest steps or `h` seconds, by its binary digits.
+
+    Returns the state, where the spool has stopped or (unless the step is the finest) may have
+    within it, and where spool or flapper has met a stop.
+    """
+    d, base = s.d, slide_base(t, deflection, s.d)
+    a, w, b, v = s.xf * d - t.dry, s.wf * d, (s.xs - base) * d, s.vs * d
+    na, nw, nb, nv = a, w, b, v
+    for level in range(longest, shortest - 1, -1):
+        units, k = float(1 << level), level * 16 * LANES + o
+        takes = rest >= units
+        rest = where(takes, rest - units, rest)
+        ka = load(m, k) * na + load(m, k + LANES) * nw
+        ka = ka + load(m, k + 2 * LANES) * nb + load(m, k + 3 * LANES) * nv
+        kw = load(m, k + 4 * LANES) * na + load(m, k + 5 * LANES) * nw
+        kw = kw + load(m, k + 6 * LANES) * nb + load(m, k + 7 * LANES) * nv
+        kb = load(m, k + 8 * LANES) * na + load(m, k + 9 * LANES) * nw
+        kb = kb + load(m, k + 10 * LANES) * nb + load(m, k + 11 * LANES) * nv
+        kv = load(m, k + 12 * LANES) * na + load(m, k + 13 * LANES) * nw
+        kv = kv + load(m, k + 14 * LANES) * nb + load(m, k + 15 * LANES) * nv
+        na, nw = where(takes, ka, na), where(takes, kw, nw)
+        nb, nv = where(takes, kb, nb), where(takes, kv, nv)
+    size = magnitude(na + t.dry)
+    stops = (nb >= t.stroke - base * d) | (size >= t.flapper_stop)
+    found = nv <= 0.0
+    if not fine:
+        # Where an extreme of the flapper lies inside the step the spool may stop, it may touch.
+        swing = 0.25 * h * most(magnitude(w), magnitude(nw))
+        low = least(a, na) - swing <= 0.0
+        far = most(magnitude(a + t.dry), size) + swing >= t.flapper_stop
+        found = found | ((w * nw < 0.0) & (low | far))
+    return (na + t.dry) * d, nw * d, nb * d + base, nv * d, found, stops
+
+
+@packed
+def _slid_loose(
+    t: SpoolLaw, m: NDArray[np.float64], o: int, longest: int, shortest: int, rest: Vector,
+    h: Vector, fine: bool, still: Vector, s: _Motion,
+) -> tuple[Vector, Vector, Vector, Vector, Mask, Mask]:  # fmt: skip
+    """As `_slid` within the backlash, without the wire, which it may meet."""
+    d = s.d
+    lift = still * d
+    steady = (t.force * lift - t.dynamic) / t.damping
+    a, w, v = s.xf * d - lift, s.wf * d, s.vs * d - steady
+    na, nw, nb, nv = a, w, steady * h, v
+    for level in range(longest, shortest - 1, -1):
+        units, k = float(1 << level), level * 16 * LANES + o
+        takes = rest >= units
+        rest = where(takes, rest - units, rest)
+        ka = load(m, k) * na + load(m, k + LANES) * nw
+        kw = load(m, k + 4 * LANES) * na + load(m, k + 5 * LANES) * nw
+        kb = nb + load(m, k + 8 * LANES) * na + load(m, k + 9 * LANES) * nw
+        kb = kb + load(m, k + 11 * LANES) * nv
+        kv = load(m, k + 12 * LANES) * na + load(m, k + 13 * LANES) * nw
+        kv = kv + load(m, k + 15 * LANES) * nv
+        na, nw = where(takes, ka, na), where(takes, kw, nw)
+        nb, nv = where(takes, kb, nb), where(takes, kv, nv)
+    nv = nv + steady
+    size = magnitude(na + lift)
+    stops = (nb >= t.stroke - s.xs * d) | (size >= t.flapper_stop)
+    found = (nv <= 0.0) | (nb >= t.backlash - TOUCH - (s.xs - s.wire) * d)
+    if not fine:
+        swing = 0.25 * h * most(magnitude(w), magnitude(nw))
+        low = least(a, na) - swing <= t.dry - lift
+        far = most(magnitude(a + lift), size) + swing >= t.flapper_stop
+        found = found | ((w * nw < 0.0) & (low | far))
+    return (na + lift) * d, nw * d, nb * d + s.xs, nv * d, found, stops
+
+
+@packed
+def _rung(
+    t: SpoolLaw, m: NDArray[np.float64], o: int, longest: int, shortest: int, rest: Vector,
+    h: Vector, fine: bool, still: Vector, s: _Motion,
+) -> tuple[Vector, Vector, Mask, Mask]:  # fmt: skip
+    """As `_slid` for a spool at rest, which breaks away: flapper and its rate."""
+    a, w = s.xf - still, s.wf
+    for level in range(longest, shortest - 1, -1):
+        units, k = float(1 << level), level * 4 * LANES + o
+        takes = rest >= units
+        rest = where(takes, rest - units, rest)
+        ka = load(m, k) * a + load(m, k + LANES) * w
+        kw = load(m, k + 2 * LANES) * a + load(m, k + 3 * LANES) * w
+        a, w = where(takes, ka, a), where(takes, kw, w)
+    xf = a + still
+    size = magnitude(xf)
+    found = size > t.breakaway
+    if not fine:
+        swing = 0.25 * h * most(magnitude(s.wf), magnitude(w))
+        far = most(magnitude(s.xf), size) + swing > least(t.breakaway, t.flapper_stop)
+        found = found | ((s.wf * w < 0.0) & far)
+    return xf, w, found, size >= t.flapper_stop
+
+
+@packed
+def _advanced(
+    t: SpoolLaw, tables: _Tables, o: int, longest: int, shortest: int, rest: Vector, unit: float,
+    fine: bool, backlash: bool, deflection: Vector, going: Mask, s: _Motion,
+) -> tuple[_Motion, Vector, Vector]:  # fmt: skip
+    """Lanes that go, after `rest` steps of `unit` seconds in one go.
+
+    longest, shortest: which of their binary digits may be 1. fine: whether it is the finest step;
+    backlash: whether any lane has some.
+
+    Returns the state, where an event has come or may hide, and where there is a stop; not 0 there.
+    """
+    zero, h = s.d * 0.0, rest * unit
+    xf, wf, xs, vs = s.xf, s.wf, s.xs, s.vs
+    found_in, stops_in = zero, zero
+    moves, rests = going & (s.d != 0.0), going & (s.d == 0.0)
+    if backlash:
+        free = moves & (s.d * (s.xs - s.wire) < t.backlash - TOUCH)
+        moves = moves & ~free
+        if anywhere(free):
+            still = still_flapper(t.ratio, deflection, s.wire)
+            nxf, nwf, nxs, nvs, found, stops = _slid_loose(
+                t, tables.loose, o, longest, shortest, rest, h, fine, still, s
+            )
+            xf, wf = where(free, nxf, xf), where(free, nwf, wf)
+            xs, vs = where(free, nxs, xs), where(free, nvs, vs)
+            found_in = where(free & found, 1.0, found_in)
+            stops_in = where(free & stops, 1.0, stops_in)
+    if anywhere(moves):
+        nxf, nwf, nxs, nvs, found, stops = _slid(
+            t, tables.slides, o, longest, shortest, rest, h, fine, deflection, s
+        )
+        xf, wf = where(moves, nxf, xf), where(moves, nwf, wf)
+        xs, vs = where(moves, nxs, xs), where(moves, nvs, vs)
+        found_in = where(moves & found, 1.0, found_in)
+        stops_in = where(moves & stops, 1.0, stops_in)
+    if anywhere(rests):
+        still = still_flapper(t.ratio, deflection, s.wire)
+        nxf, nwf, found, stops = _rung(
+            t, tables.rings, o, longest, shortest, rest, h, fine, still, s
+        )
+        xf, wf = where(rests, nxf, xf), where(rests, nwf, wf)
+        found_in = where(rests & found, 1.0, found_in)
+        stops_in = where(rests & stops, 1.0, stops_in)
+    return _Motion(xf, wf, xs, vs, play(s.wire, xs, t.backlash), s.d), found_in, stops_in
+
+
+@packed
+def _chosen(these: Mask, new: _Motion, old: _Motion) -> _Motion:
+    """State of which these lanes are new."""
+    return _Motion(
+        where(these, new.xf, old.xf), where(these, new.wf, old.wf), where(these, new.xs, old.xs),
+        where(these, new.vs, old.vs), where(these, new.wire, old.wire), old.d,
+    )  # fmt: skip
+
+
+@packed
+def _cut(
+    pieces: NDArray[np.float64], count: int, span: Vector, xs: Vector, before: Vector, end: Vector
+) -> None:
+    """Write a piece of the path: its duration (s, 0 in lanes that have none), place, velocities."""
+    o = count * PIECE
+    store(pieces, o, span)
+    store(pieces, o + WIDTH, xs)
+    store(pieces, o + 2 * WIDTH, before)
+    store(pieces, o + 3 * WIDTH, end)
+
+
+@inlined
+def _halved(
+    o: int,
+    count: int,
+    tick: float,
+    backlash: bool,
+    with_jack: bool,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+    tables: _Tables,
+    pieces: NDArray[np.float64],
+) -> None:
+    """Lanes from `o`."""
+    unit = tick / WHOLE
+    t, deflection = spool_laws(coefficients, o), load(state, DEFLECTION * LANES + o)
+    busy = load(state, BUSY * LANES + o)
+    s = _Motion(
+        load(state, FLAPPER * LANES + o), load(state, FLAPPER_RATE * LANES + o),
+        load(state, SPOOL * LANES + o), load(state, SPOOL_RATE * LANES + o),
+        load(state, WIRE * LANES + o), load(state, DIRECTION * LANES + o),
+    )  # fmt: skip
+    mine = (busy != 0.0) & (load(state, CLAMPED * LANES + o) == 0.0) & (t.extra == 0.0)
+    mine = mine & (magnitude(s.xs) < t.stroke)
+    if not anywhere(mine):
+        return
+    zero = s.d * 0.0
+    good = where(mine, 1.0, zero)
+    before, since, events, kinks = s.vs, zero, zero, zero
+    cuts = 0
+    for node in range(NODES):
+        done, limit, longest, shortest = zero, zero, HALVINGS, HALVINGS
+        going = good != 0.0
+        while anywhere(going):
+            # On to the node at once, where no event may hide before it.
+            rest = where(going, QUARTER - done, 0.0)
+            new, found, stops = _advanced(
+                t, tables, o, longest, shortest, rest, unit, False, backlash, deflection, going, s
+            )
+            good = where(stops != 0.0, 0.0, good)
+            goes = going & (found == 0.0)
+            s = _chosen(goes, new, s)
+            since = where(goes, since + rest, since)
+            done = where(goes, QUARTER, done)
+            longest, shortest = HALVINGS - 1, 0
+            hunts = where(good != 0.0, found, 0.0)
+            if anywhere(hunts != 0.0):
+                # Where it may, by shorter and shorter steps up to it, the last of them twice.
+                limit = QUARTER + zero
+                for n in range(HALVINGS + 1):
+                    level = max(HALVINGS - 1 - n, 0)
+                    units, fine = float(1 << level), level == 0
+                    wants = (hunts != 0.0) & (done + units <= limit)
+                    new, found, stops = _advanced(
+                        t, tables, o, level, level, where(wants, units, 0.0), unit, fine, backlash,
+                        deflection, wants, s,
+                    )  # fmt: skip
+                    good = where(stops != 0.0, 0.0, good)
+                    if not fine:
+                        limit = where(found != 0.0, done + units, limit)
+                        wants = wants & (found == 0.0)
+                    s = _chosen(wants, new, s)
+                    since = where(wants, since + units, since)
+                    done = where(wants, done + units, done)
+                    comes = found != 0.0
+                    if fine and anywhere(comes):
+                        _cut(pieces, cuts, where(comes, since * unit, 0.0), s.xs, before, s.vs)
+                        cuts += 1
+                        # A spool that stops rests, or moves back; one at rest breaks away; else it
+                        # meets the wire.
+                        turns = comes & (s.vs * s.d <= 0.0)
+                        side = where(s.xf > 0.0, 1.0, zero - 1.0)
+                        side = where(magnitude(s.xf) > t.breakaway, side, 0.0)
+                        vs, d = where(turns, 0.0, s.vs), where(turns, side, s.d)
+                        s = _Motion(s.xf, s.wf, s.xs, vs, s.wire, d)
+                        kinks = where(turns & (d != 0.0), 1.0, kinks)
+                        before, since = where(comes, vs, before), where(comes, 0.0, since)
+                        hunts = where(comes, 0.0, hunts)
+                        events = where(comes, events + 1.0, events)
+                        good = where(events > MOST_EVENTS * 1.0, 0.0, good)
+            going = (good != 0.0) & (done < QUARTER)
+        _cut(pieces, cuts, since * unit, s.xs, before, s.vs)
+        cuts += 1
+        since, before = zero, s.vs
+        place, slope = (PLACE + node + 1) * LANES + o, (SLOPE + node + 1) * LANES + o
+        store(path, place, where(good != 0.0, s.xs, load(path, place)))
+        store(path, slope, where(good != 0.0, s.vs, load(path, slope)))
+    mine = good != 0.0
+    _put(state, FLAPPER * LANES + o, mine, s.xf)
+    _put(state, FLAPPER_RATE * LANES + o, mine, s.wf)
+    _put(state, SPOOL * LANES + o, mine, s.xs)
+    _put(state, SPOOL_RATE * LANES + o, mine, s.vs)
+    _put(state, WIRE * LANES + o, mine, s.wire)
+    _put(state, DIRECTION * LANES + o, mine, s.d)
+    store(state, BUSY * LANES + o, where(mine, 0.0, busy))
+    if with_jack:
+        store(pieces, ALONE, where(mine, kinks, 0.0))
+        for lane in range(max(count - o, 0), WIDTH):
+            pieces[ALONE + lane] = 0.0
+        kinks = load(pieces, ALONE)
+        if anywhere(kinks != 0.0):
+            jack_over_pieces(o, kinks, cuts, tick, state, path, coefficients, pieces)
+
+
+@packed
+def _put(state: NDArray[np.float64], k: int, these: Mask, value: Vector) -> None:
+    """Write these lanes."""
+    store(state, k, where(these, value, load(state, k)))
+
+
+@bare_kernel
+def halved_lanes(
+    count: int,
+    end: int,
+    tick: float,
+    backlash: bool,
+    with_jack: bool,
+    state: NDArray[np.float64],
+    path: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+    slides: NDArray[np.float64],
+    free_slides: NDArray[np.float64],
+    rings: NDArray[np.float64],
+    pieces: NDArray[np.float64],
+) -> bool:
+    """Flapper and spool of the BUSY lanes before `end` over a tick with events.
+
+    Events are located to tick / 2^FINEST. Lanes that must go alone stay BUSY and as they were;
+    returns whether there are any.
+
+    Parameters
+    ----------
+    count: lanes that hold a candidate; the jacks of others are left as they were.
+    with_jack: whether the jack is to go along the pieces of the spool's path that events cut.
+    backlash: whether any lane has some.
+    slides, free_slides, rings: transitions over 2^0 … 2^HALVINGS finest steps, see
+        `ehadiag.model.simd.coefficients`.
+    pieces: scratch, see `ehadiag.model.simd.jack_pieces`.
+    """
+    any_busy, tables = False, _Tables(slides, free_slides, rings)
+    for o in range(0, end, WIDTH):
+        _halved(o, count, tick, backlash, with_jack, state, path, coefficients, tables, pieces)
+        if anywhere(load(state, BUSY * LANES + o) != 0.0):
+            any_busy = True
+    return any_busy
