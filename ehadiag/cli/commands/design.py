@@ -183,6 +183,8 @@ def _refuse_place(path: Path) -> None:
         raise InputOutputError(f"{path}: exists already; name another file")
     if not path.parent.is_dir():
         raise InputOutputError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise InputOutputError(f"{path}: no right to write in its folder")
 
 
 def _write(path: Path, content: bytes) -> None:

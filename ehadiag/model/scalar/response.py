@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.model.anchor import FREE_RUN, Anchor
+from ehadiag.model.laws import BEND
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.scalar.jack import jack_response
 from ehadiag.model.scalar.spool import spool_response
@@ -58,7 +59,7 @@ def respond(
     nodes = np.empty((n * NODES_PER_TICK, NODE_COLUMNS))
     node_end = np.empty(n, dtype=np.int64)
     plant = PlantConstants(*(float(value) for value in constants))
-    tables = spool_tables(plant, tick)
+    tables = spool_tables(plant, tick, BEND)
     reference = np.full(n, np.nan) if measured is None else measured
     anchored = spool_response(
         plant,

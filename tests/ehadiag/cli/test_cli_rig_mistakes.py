@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +116,38 @@ def test_names_of_the_wrong_thing(
     assert found.code == code
     assert said in found.err
     assert found.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("diagnose", LOG, "--out", "closed"), "output folder closed: no right to write in it"),
+        (("diagnose", LOG, "--summary", "closed/s.json"), "closed/s.json: Permission denied"),
+        (("diagnose", LOG, "--results", "gone/r.jsonl"), "gone/r.jsonl: No such file"),
+        (("design", "--out", "closed/t.toml"), "closed/t.toml: no right to write in its folder"),
+        (("calibrate", LOG, "--out", "closed/u.toml"), "folder closed: no right to write in it"),
+        (("export", "--target", "cortex-m4", "--out", "closed"), "closed: no right to write"),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_anything_slow(
+    run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], said: str
+) -> None:
+    ask = os.access
+    monkeypatch.setattr(
+        "os.access", lambda path, how: Path(path).name != "closed" and ask(path, how)
+    )
+    Path("closed").mkdir()
+    found = run(*arguments)
+    assert (found.code, found.out, found.err.count("\n")) == (3, "", 1)
+    assert said in found.err
+
+
+def test_a_folder_that_cannot_be_read_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(path: str) -> None:
+        raise PermissionError(13, "Permission denied", path)
+
+    Path("rig").mkdir()
+    monkeypatch.setattr("os.scandir", refused)
+    found = run("diagnose", "rig")
+    assert found.code == 3
+    assert "folder rig: Permission denied" in found.err

@@ -18,6 +18,7 @@ from ehadiag.export.library import export_library
 from ehadiag.export.targets import TARGETS, target
 from ehadiag.monitor import Monitor
 from ehadiag.monitor.layout import CUSUM, PREDICTED, SIZE
+from ehadiag.onboard.layout import SIZE as IDENTIFICATION
 from ehadiag_tools.onboard.emulators import EMULATED, missing
 from ehadiag_tools.onboard.replay import identified, replayed, ticks_of, unit_of
 from ehadiag_tools.onboard.table import REFERENCE
@@ -182,6 +183,13 @@ def test_the_shared_library_is_found_by_pkg_config(place, tmp_path):
         [made], capture_output=True, text=True, check=True, env={"LD_LIBRARY_PATH": str(out)}
     )
     assert done.stdout.startswith("alarms 0")
+
+
+def test_the_page_says_what_memory_they_take():
+    page = (ROOT / "docs" / "how-to" / "export.md").read_text()
+    assert f"one `eha_monitor`\nof {8 * SIZE} bytes" in page
+    thousands, rest = divmod(8 * IDENTIFICATION, 1000)
+    assert f"`eha_identification` of {thousands} {rest:03} bytes" in page
 
 
 @pytest.mark.slow
