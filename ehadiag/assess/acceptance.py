@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.assess.unobservable import lost_positions
+from ehadiag.assess.wrong_units import beyond_reach
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.calibration import CHANGED, Calibration
 from ehadiag.core.conversion import conversion_of
@@ -30,6 +31,7 @@ __all__ = [
     "objections_to_unit",
     "out_of_range",
     "remarks_on_recording",
+    "repetitions",
 ]
 
 LATEST_S = 0.05
@@ -60,6 +62,9 @@ NOISE_SHARE = 2.0
 """Gap of the current, in units of noise, that noise does not make."""
 MOST_OUTLIERS = 0.015
 MOST_RMS = 1.25
+BROUGHT_OUT = 6.0
+"""By which wear may make more outliers of what effects beyond the usual ones stand in for: worn
+units with such effects had up to 8 % of them, and errors well within their intervals."""
 
 
 def nothing_is_under_way(recording: Recording, test: StoredTest) -> bool:
@@ -100,12 +105,14 @@ def objections_to_recording(
     samples = recording.samples
     if samples is None:
         return [*recording.quality.refused, "no telemetry of a test in the recording"]
+    beyond = beyond_reach(samples, actuator)
     if test is None and recording.test_id is None:
-        return ["the recording does not say which test it is of: name the test by --test"]
+        return beyond or ["the recording does not say which test it is of: name the test by --test"]
     if test is None:
         return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
     return [
         *recording.quality.refused,
+        *beyond,
         *_unlike_the_test(samples, test, actuator),
         *_gaps(samples, test, MOST_LOST_BY_TIME if recording.by_time else MOST_LOST),
         *out_of_range(recording.environment, samples, actuator),
@@ -122,6 +129,24 @@ def objections_to_unit(recordings: Sequence[Recording], actuator: Actuator) -> l
         f"the actuator file is calibrated for serial {own}, the recording is of serial "
         f"{', '.join(str(serial) for serial in sorted(others, key=str))}"
     ]
+
+
+def repetitions(recordings: Sequence[Recording]) -> list[str]:
+    """Say which recordings are others once more: what they show would count twice."""
+    seen: dict[bytes, str] = {}
+    out = []
+    for recording in recordings:
+        if recording.samples is None:
+            continue
+        samples = recording.samples
+        key = b"".join(
+            part.tobytes()
+            for part in (samples.current, samples.spool, samples.pressure, samples.position)
+        )
+        if key in seen:
+            out.append(f"{recording.source} has the samples of {seen[key]}: name each test once")
+        seen.setdefault(key, recording.source)
+    return out
 
 
 def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
@@ -274,7 +299,7 @@ def most_left(calibration: Calibration | None) -> tuple[float, float]:
         return MOST_OUTLIERS, MOST_RMS
     fit = calibration.fit
     return (
-        (CHANGED if further else 1.0) * MOST_OUTLIERS + CHANGED * fit.outliers,
+        (BROUGHT_OUT if further else 1.0) * MOST_OUTLIERS + CHANGED * fit.outliers,
         MOST_RMS * CHANGED * max(fit.spool_rms, fit.pressure_rms),
     )
 

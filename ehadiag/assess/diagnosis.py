@@ -16,6 +16,7 @@ from ehadiag.assess.acceptance import (
     objections_to_unit,
     out_of_range,
     remarks_on_recording,
+    repetitions,
 )
 from ehadiag.assess.culprit import Culprit, culprit_of
 from ehadiag.assess.delays import in_time
@@ -301,6 +302,8 @@ class DiagnosisSession:
             reasons += objections
         if len({recording.serial for recording in recordings} - {None}) > 1:
             reasons.append("the recordings are of actuators with different serial numbers")
+        else:
+            reasons += repetitions(recordings)
         reasons += objections_to_unit(recordings, self._actuator)
         return experiments, reasons
 

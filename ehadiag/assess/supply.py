@@ -1,5 +1,6 @@
-"""Finds a supply that is lower than its probe says: the measured pressure stops where the
-identified actuator's goes on."""
+"""Finds a supply that is lower than its probe says.
+
+The measured pressure stops where the identified actuator's goes on."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Holds the jack's travel against what the spool let through, before anything is identified: a
-sensor that shows another motion is refused at once, whatever the faults."""
+"""Holds the jack's travel against what the spool let through, before anything is identified.
+
+A sensor that shows another motion is refused at once, whatever the faults."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""Finds a wrong unit or sign in a mapping by physics: what the channels must have to do with
-each other on any motion, whatever the faults."""
+"""Finds a wrong unit or sign of a channel by physics.
+
+What the channels must have to do with each other holds on any motion, whatever the faults; and none
+reads many times what the actuator reaches."""
 
 from __future__ import annotations
 
@@ -10,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.channels import CHANNELS
+from ehadiag.core.conversion import reach_of
 from ehadiag.core.recording import CommandMode, Samples
 
-__all__ = ["Relation", "implausible", "relations"]
+__all__ = ["Relation", "beyond_reach", "implausible", "relations"]
 
 SMOOTHED_S = 0.05
 """Over which a velocity is taken."""
@@ -27,6 +31,8 @@ LEAST_MOVING = 200
 FRICTION_SPAN = (1.0, 1.2)
 """Share of the friction as new, and at the limit, between which the pressure that moves the jack
 lies; viscous friction comes on top."""
+BEYOND_REACH = 10.0
+"""Times the actuator's reach that no sensor reads, whatever is wrong with it."""
 FACTORS: tuple[tuple[float, str], ...] = (
     (-1.0, "its sign is reversed"),
     (1e-3, "a unit 1000 times larger was sent"),
@@ -114,6 +120,35 @@ def implausible(samples: Samples, actuator: Actuator) -> tuple[str, ...]:
     out = list(_explained(found))
     pressure = _pressure(samples, actuator, {item.lower for item in found})
     return (*out, *pressure)
+
+
+def beyond_reach(samples: Samples, actuator: Actuator) -> list[str]:
+    """Say which channels read so much that their unit or scale must be wrong.
+
+    Parameters
+    ----------
+    samples : Samples
+        Any motion.
+    actuator : Actuator
+        Data of the actuator.
+
+    Returns
+    -------
+    list[str]
+        One sentence for each channel.
+    """
+    out = []
+    for channel in CHANNELS:
+        values = np.abs(np.asarray(getattr(samples, channel.name)))
+        values = values[np.isfinite(values)]
+        reach, unit = reach_of(actuator, channel), channel.per_unit
+        top = float(np.quantile(values, 0.99)) if values.size else 0.0
+        if top > BEYOND_REACH * reach:
+            out.append(
+                f"{channel.name} reads {top / unit:.3g} {channel.unit}, the actuator reaches"
+                f" {reach / unit:.3g} {channel.unit}: check unit and scale of its signal"
+            )
+    return out
 
 
 def _explained(found: tuple[Relation, ...]) -> tuple[str, ...]:

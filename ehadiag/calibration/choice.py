@@ -10,15 +10,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ehadiag.calibration.effects import asked_for_by, with_further_effects
-from ehadiag.calibration.judging import MOST_LEFT, is_explained
-from ehadiag.calibration.models import ONE_START, SMOOTH, Learned, Model, simple_models
+from ehadiag.calibration.judging import WORTH_ANOTHER
+from ehadiag.calibration.models import ONE_START, SMOOTH, TWO_STARTS, Learned, Model, simple_models
 from ehadiag.calibration.session import Session
 from ehadiag.core.actuator import Actuator
+from ehadiag.identify.nuisance.explained import is_noise
+from ehadiag.identify.nuisance.knowledge import data_that_pass_for
 
 __all__ = ["choose", "learned_as_new"]
 
-MOST_SEARCHES = 4
+MOST_SEARCHES = 3
 """With one model, until two have come to the same place."""
 AS_MUCH = 1.1
 """Ratio of what two searches leave, over noise, up to which neither stopped beside the optimum."""
@@ -49,9 +53,9 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     out: list[Learned] = []
     for model in models:
         out.append(_searched(session, model, first=not out))
-        if out[-1].estimated.explained and not compare:
+        if _has_all_effects(out[-1]) and not compare:
             return out
-    if any(item.estimated.explained for item in out):
+    if any(_has_all_effects(item) for item in out):
         return out
     smooth = [_smooth(session, out, simple) for simple in simple_models(start)]
     if not compare:
@@ -60,9 +64,27 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
         return out
     for item in smooth:  # what they leave does not tell the second stage
         out.append(with_further_effects(session, item))
-        if is_explained(out[-1]):
+        if out[-1].estimated.excess <= WORTH_ANOTHER:
             break
     return out
+
+
+def _has_all_effects(found: Learned) -> bool:
+    """Whether all is explained, or all of open loop: no effect is missing.
+
+    In closed loop the spool breaks away so often that a search may end with some of it at wrong
+    ticks.
+    """
+    if found.estimated.explained:
+        return True
+    ends = np.cumsum([item.ticks for item in found.experiments])[:-1]
+    parts = np.split(found.estimated.refined.residuals, ends, axis=1)
+    first = [
+        is_noise(part)
+        for item, part in zip(found.experiments, parts, strict=True)
+        if not item.test.closed_loop
+    ]
+    return bool(first) and all(first)
 
 
 def _smooth(session: Session, tried: Sequence[Learned], simple: Model) -> Learned:
@@ -95,25 +117,33 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     Learned
         With the frictions.
     """
-    hint = best.estimated.refined.values
+    values = best.estimated.refined.values
+    hint = {**values, **data_that_pass_for(session.start, values)}
     model = replace(best.model, beside=asked_for_by(best)) if best.model.rich else best.model
-    found = [session.learn(model, new=True, hint=hint, budget=ONE_START)]
+    budget = ONE_START if model.rich else TWO_STARTS
+    found = [session.learn(model, new=True, hint=hint, budget=budget)]
     for turn in range(1, MOST_SEARCHES):
-        if best.model.rich and _as_good(found[0], best):
+        if _came_to(best, found[0]) or (best.model.rich and _as_good(found[0], best)):
             break
         around = None if turn % 2 and not best.model.rich else hint
-        found.append(session.learn(model, new=True, hint=around, budget=ONE_START, turn=turn))
+        found.append(session.learn(model, new=True, hint=around, budget=budget, turn=turn))
         found.sort(key=lambda item: item.criterion)
         if found[1].criterion - found[0].criterion < ALIKE:
             break
     return found[0]
 
 
+def _came_to(best: Learned, found: Learned) -> bool:
+    """Whether a search came to the place of another one with the same recordings."""
+    same = len(best.experiments) == len(found.experiments)
+    return same and found.criterion - best.criterion < ALIKE
+
+
 def _as_good(found: Learned, best: Learned) -> bool:
     """Whether what a search leaves is explained, or about as little as another one left."""
     if found.estimated.explained:
         return True
-    return found.estimated.excess <= min(MOST_LEFT, AS_MUCH * best.estimated.excess)
+    return found.estimated.excess <= min(WORTH_ANOTHER, AS_MUCH * best.estimated.excess)
 
 
 def _searched(session: Session, model: Model, *, first: bool) -> Learned:
@@ -125,7 +155,7 @@ def _searched(session: Session, model: Model, *, first: bool) -> Learned:
         other = session.learn(model, nearly_new=turn != 1, brief=True, some=True, turn=turn)
         found = min(found, other, key=lambda item: item.criterion)
         turn += 1
-        if found.estimated.excess > MOST_LEFT:
+        if found.estimated.excess > WORTH_ANOTHER or _has_all_effects(found):
             break
     return found
 
@@ -134,4 +164,4 @@ def _may_have_stopped_beside(found: Learned, *, first: bool) -> bool:
     """Whether another search with the same model may explain more."""
     if found.estimated.explained:
         return False
-    return first or found.estimated.excess <= MOST_LEFT
+    return first or found.estimated.excess <= WORTH_ANOTHER

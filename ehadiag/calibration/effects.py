@@ -6,7 +6,8 @@ the others leave something. After each search what the recordings do not ask for
 an effect stays if leaving it out would cost more than the Bayesian information criterion takes for
 one more unknown (a Wald test, A. Wald, Trans. AMS 54(3), 1943, of the optimum's own covariance). A
 search with those that stay, which begins there, is quick, and often finds the way on where the one
-with all of them crept along a valley.
+with all of them crept along a valley. Other searches begin afresh: beside the optimum of a model
+without the effects they mostly stay.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.calibration.judging import MOST_LEFT
+from ehadiag.calibration.judging import WORTH_ANOTHER
 from ehadiag.calibration.models import EFFECTS, ONE_START, SLOW, Learned, Model
 from ehadiag.calibration.session import Session
 from ehadiag.identify.refine.posterior import TAIL
@@ -40,7 +41,7 @@ TINY = 1e-300
 
 
 def with_further_effects(session: Session, smooth: Learned) -> Learned:
-    """Learn further effects, beginning where a smooth hysteresis alone explains most.
+    """Learn further effects beside a smooth hysteresis.
 
     Parameters
     ----------
@@ -54,15 +55,15 @@ def with_further_effects(session: Session, smooth: Learned) -> Learned:
     Learned
         With those that the recordings ask for, or, where that explains more, with all.
     """
-    best = _round(session, smooth, QUICK, 0)
-    if best.estimated.excess <= MOST_LEFT:
+    best = _round(session, smooth, QUICK, 0, afresh=True)
+    if best.estimated.excess <= WORTH_ANOTHER:
         best = _round(session, best, QUICK, 1)
     if _promising(best, SLOW):
         best = _round(session, best, SLOW, 2)
     if best.estimated.excess > LITTLE:
-        best = _round(session, best, QUICK, 3)
-    if best.estimated.excess > MOST_LEFT:
-        best = _round(session, best, QUICK, 4, afresh=True)
+        best = _round(session, best, QUICK, 3, afresh=True)
+    if best.estimated.excess > WORTH_ANOTHER:
+        best = _round(session, best, QUICK, 4)
     return best
 
 

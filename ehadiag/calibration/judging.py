@@ -19,6 +19,7 @@ __all__ = [
     "AS_NEW",
     "MOST_LEFT",
     "SURE",
+    "WORTH_ANOTHER",
     "is_explained",
     "not_as_new",
     "not_healthy",
@@ -30,15 +31,16 @@ AS_NEW = 0.05
 """Severity above which a unit is not as new."""
 SURE = 2.0
 """Deviations by which a severity must be beyond it, or stay below twice of it."""
-MOST_LEFT = 3.0
-"""Residuals over noise up to which the richest model may leave something, which widens what is
+MOST_LEFT = 5.0
+"""Residuals over noise up to which the best model may leave something, which widens what is
 learned and every interval after it (`ehadiag.identify.nuisance.knowledge`)."""
+WORTH_ANOTHER = 3.0
+"""The same up to which another search with a model may come to explain them."""
 
 
 def is_explained(learned: Learned) -> bool:
-    """Whether nothing is left, or no more than a unit with effects of its own may leave."""
-    found = learned.estimated
-    return found.explained or (learned.model.plays > 1 and found.excess <= MOST_LEFT)
+    """Whether nothing is left, or no more than what a calibration may leave."""
+    return learned.estimated.excess <= MOST_LEFT
 
 
 def severities_of(found: Estimated) -> tuple[Severity, ...]:

@@ -26,6 +26,7 @@ __all__ = [
     "SECOND_STAGES",
     "SLOW",
     "SMOOTH",
+    "TWO_STARTS",
     "Learned",
     "Model",
     "learn",
@@ -36,9 +37,11 @@ SECOND_STAGES = ("linear", "orifice")
 """Kinds that the monitoring model has."""
 SMOOTH = 8
 """Plays of a smooth hysteresis: more of them do the same within the noise."""
-BUDGET = 1600
+BUDGET = 4000
 ONE_START = 1
 """Budget of a search that ends after its first start."""
+TWO_STARTS = 800
+"""The same after two, unless the first one explains the recordings."""
 DATUM = Known(0.0, 0.05 / math.sqrt(3.0))
 """A data sheet's usual ±5 %."""
 REACH = 0.1

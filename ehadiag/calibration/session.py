@@ -14,6 +14,7 @@ from ehadiag.assess.acceptance import (
     objections_to_recording,
     objections_to_unit,
     remarks_on_recording,
+    repetitions,
 )
 from ehadiag.assess.diagnosis import match_tests
 from ehadiag.calibration.judging import severities_of
@@ -48,7 +49,7 @@ class Session:
         self._begin = time.perf_counter()
         self.recordings = tuple(recordings)
         self._tests = match_tests(recordings, tests, default)
-        self._start = start
+        self.start = start
         self.seed = seed
         self.evaluations = 0
         self.tell = progress or (lambda _stage, _share: None)
@@ -57,9 +58,9 @@ class Session:
         """Why the recordings cannot be learned from, each named."""
         out = []
         for recording, test in zip(self.recordings, self._tests, strict=True):
-            found = objections_to_recording(recording, test, self._start)
+            found = objections_to_recording(recording, test, self.start)
             if not found and test is not None and recording.samples is not None:
-                found = objections_to_experiment(self._experiment(recording, test, self._start))
+                found = objections_to_experiment(self._experiment(recording, test, self.start))
             out += [f"{recording.source}: {text}" for text in found]
         serials = {recording.serial for recording in self.recordings} - {None}
         if len(serials) > 1:
@@ -67,8 +68,8 @@ class Session:
             out.append(f"the recordings are of units with different serial numbers: {words}")
         return [
             *out,
-            *_repeated(self.recordings),
-            *objections_to_unit(self.recordings, self._start),
+            *repetitions(self.recordings),
+            *objections_to_unit(self.recordings, self.start),
         ]
 
     def build(self, actuator: Actuator) -> list[Experiment]:
@@ -113,7 +114,7 @@ class Session:
         found = learn(
             model,
             self.build_some if some else self.build,
-            self._start,
+            self.start,
             new=new,
             nearly_new=nearly_new,
             hint=hint,
@@ -135,7 +136,7 @@ class Session:
         return Calibrated(
             recordings=self.recordings,
             tests=self._tests,
-            start=self._start,
+            start=self.start,
             actuator=None,
             reasons=tuple(reasons),
             notes=self._notes(),
@@ -164,9 +165,9 @@ class Session:
             Source(name=recording.source, test=test.name if test else "")
             for recording, test in zip(self.recordings, self._tests, strict=True)
         ]
-        of_start = self._start.calibration
+        of_start = self.start.calibration
         serials = [item.serial for item in self.recordings if item.serial is not None]
-        start = learned.model.of(self._start)
+        start = learned.model.of(self.start)
         unit = unit_of(
             start,
             lesson,
@@ -180,12 +181,12 @@ class Session:
         return Calibrated(
             recordings=self.recordings,
             tests=self._tests,
-            start=self._start,
+            start=self.start,
             actuator=unit,
             reasons=(),
             notes=self._notes(),
             severities=severities_of(checked.estimated),
-            values=values_of(self._start, unit, lesson),
+            values=values_of(self.start, unit, lesson),
             tried=_evidence(tried),
             experiments=_with_constants(learned),
             seed=self.seed,
@@ -196,7 +197,7 @@ class Session:
     def _notes(self) -> tuple[str, ...]:
         """What the recordings say of themselves, each once."""
         each = (
-            (*recording.quality.notes, *remarks_on_recording(recording, test, self._start))
+            (*recording.quality.notes, *remarks_on_recording(recording, test, self.start))
             for recording, test in zip(self.recordings, self._tests, strict=True)
         )
         return tuple(dict.fromkeys(note for notes in each for note in notes))
@@ -220,21 +221,3 @@ def _evidence(tried: Sequence[Learned]) -> tuple[Tried, ...]:
     return tuple(
         Tried(item.model.words, item.estimated.excess, item.criterion - best) for item in tried
     )
-
-
-def _repeated(recordings: Sequence[Recording]) -> list[str]:
-    """Say which recordings are others once more: what they show would count twice."""
-    seen: dict[bytes, str] = {}
-    out = []
-    for recording in recordings:
-        if recording.samples is None:
-            continue
-        samples = recording.samples
-        key = b"".join(
-            part.tobytes()
-            for part in (samples.current, samples.spool, samples.pressure, samples.position)
-        )
-        if key in seen:
-            out.append(f"{recording.source} has the samples of {seen[key]}: name each test once")
-        seen.setdefault(key, recording.source)
-    return out

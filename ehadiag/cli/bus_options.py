@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = [
     "add_bus_options",
     "has_bus",
+    "need_bus_or_log",
     "need_one_bus",
     "open_transport",
     "refuse_two_buses",
@@ -102,6 +103,14 @@ def refuse_two_buses(arguments: argparse.Namespace) -> None:
         raise ConfigurationError("--serial and --interface exclude each other: name one bus")
     if arguments.serial and arguments.context:
         raise ConfigurationError("--serial and --context exclude each other: name one bus")
+
+
+def need_bus_or_log(arguments: argparse.Namespace) -> None:
+    """Raise ConfigurationError unless either `--log` or one bus or serial port was named."""
+    if arguments.log is None:
+        need_one_bus(arguments)
+    elif arguments.serial or arguments.interface not in (None, os.environ.get("CAN_INTERFACE")):
+        raise ConfigurationError("--log is of a recording: name it or a bus, not both")
 
 
 def need_one_bus(arguments: argparse.Namespace) -> None:

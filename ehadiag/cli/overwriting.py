@@ -1,8 +1,9 @@
-"""Keeps a call from writing over what it reads: all its files are compared before work begins."""
+"""Keeps a call from writing over what it reads, and from work whose result cannot be written."""
 
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -10,9 +11,10 @@ from pathlib import Path
 
 from ehadiag.cli.defaults import NAME, user_file
 from ehadiag.cli.history_file import history_place
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
+from ehadiag.core.folder import RESULT_MODE, Folder
 
-__all__ = ["Output", "names_taken", "refuse_overwriting"]
+__all__ = ["Output", "names_taken", "refuse_overwriting", "refuse_unwritable"]
 
 READ_BY_OPTIONS = ("actuator", "mapping", "dbc", "test")
 """Options, of any command, that name files to be read."""
@@ -69,6 +71,29 @@ def refuse_overwriting(
         key = _identity(name)
         if key in taken and isinstance(key, tuple):  # it is there
             _refuse(taken[key], f"{kind} {name}")
+
+
+def refuse_unwritable(outputs: Iterable[Output]) -> None:
+    """Refuse a call one of whose outputs is to be in a folder in which nothing can be written.
+
+    Parameters
+    ----------
+    outputs : Iterable[Output]
+        What it will write.
+
+    Raises
+    ------
+    InputOutputError
+        There is no such folder, or no right to write in it.
+    """
+    for output in outputs:
+        folder = Path(output.name).parent
+        try:
+            Folder.at(folder, RESULT_MODE, follow=True).close()
+            if not os.access(folder, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        except (OSError, ValueError) as error:
+            raise InputOutputError(f"{output}: {reason_of(error)}") from None
 
 
 def names_taken(folder: Path, outputs: Iterable[Output]) -> set[str]:

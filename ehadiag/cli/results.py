@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import itertools
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,14 +48,18 @@ def make_folder(name: str) -> Folder:
     Raises
     ------
     InputOutputError
-        It cannot be created, or is a link.
+        It cannot be created or written in, or is a link.
     """
     path = Path(name)
     try:
         if path.is_symlink():
             raise InputOutputError(f"output folder {name}: is a link; name the folder it leads to")
         path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK):
+            raise InputOutputError(f"output folder {name}: no right to write in it")
         return Folder.at(path, RESULT_MODE)
+    except FileExistsError:
+        raise InputOutputError(f"output folder {name}: is a file; name a folder") from None
     except OSError as error:
         raise InputOutputError(f"output folder {name}: {reason_of(error)}") from None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["SHOWN_IN", "told"]
+__all__ = ["factor_and_unit", "told"]
 
 SHOWN_IN = {
     "A": (1e3, "mA"),
@@ -17,6 +17,28 @@ SHOWN_IN = {
     "m²/s": (60.0, "L/min/mm"),
 }
 """Factor and unit by the SI unit; others are shown as they are."""
+SMALL_PRESSURE = 1e5
+"""Pa, below which a pressure is read in kPa."""
+
+
+def factor_and_unit(unit: str, size: float) -> tuple[float, str]:
+    """Return what turns a number in an SI unit into one for people, and the unit of that.
+
+    Parameters
+    ----------
+    unit : str
+        SI unit; `1` for a share.
+    size : float
+        The number, or the largest of those that are to be shown together.
+
+    Returns
+    -------
+    tuple[float, str]
+        Factor and unit.
+    """
+    if unit == "Pa" and abs(size) < SMALL_PRESSURE:
+        return 1e-3, "kPa"
+    return SHOWN_IN.get(unit, (1.0, unit))
 
 
 def told(value: float, unit: str) -> str:
@@ -34,5 +56,5 @@ def told(value: float, unit: str) -> str:
     str
         Such as `0.4 mA`.
     """
-    factor, name = SHOWN_IN.get(unit, (1.0, unit))
+    factor, name = factor_and_unit(unit, value)
     return f"{factor * value:.4g} {name}"

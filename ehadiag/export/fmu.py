@@ -14,6 +14,7 @@ from typing import Any, Final
 from ehadiag.compile.object_code import Function, Pointer, Processor, Table, object_code
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.folder import Folder
 from ehadiag.export.description import Variable, description
 from ehadiag.export.library import MANIFEST, MONITOR, OWN_FUNCTIONS, manifest, template, write
@@ -151,7 +152,7 @@ MEANINGS: Final = {
 }
 
 
-def export_fmus(actuator: Actuator, folder: Folder, *, hours: float = 100.0) -> list[str]:
+def export_fmus(actuator: Actuator, folder: Folder, *, hours: float = HOURS_BETWEEN) -> list[str]:
     """Write units of simulator and monitor, each for both versions of FMI, for this computer.
 
     Parameters

@@ -32,6 +32,7 @@ from ehadiag.compile.object_code import (
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import InputOutputError, reason_of
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.folder import Folder
 from ehadiag.core.printable import plain_name
 from ehadiag.export.archive import archive
@@ -108,7 +109,12 @@ FUNCTIONS: Final = (*MONITOR, *SURROUNDINGS, *IDENTIFICATION)
 
 
 def export_library(
-    actuator: Actuator, target: Target, folder: Folder, *, hours: float = 100.0, shift: float = 1.0
+    actuator: Actuator,
+    target: Target,
+    folder: Folder,
+    *,
+    hours: float = HOURS_BETWEEN,
+    shift: float = 1.0,
 ) -> list[str]:
     """Write a library of monitor and identification for a target into a folder.
 

@@ -14,7 +14,15 @@ from ehadiag.core.find_test import Sought
 from ehadiag.core.recording import Recording
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.facade.compiling import log_if_compiling
-from ehadiag.facade.inputs import PathLike, log_file, the_actuator, the_bus_map, the_test, the_tests
+from ehadiag.facade.inputs import (
+    PathLike,
+    log_file,
+    the_actuator,
+    the_bus_map,
+    the_seed,
+    the_test,
+    the_tests,
+)
 from ehadiag.report.spent import Spent
 
 if TYPE_CHECKING:
@@ -133,7 +141,7 @@ def simulate(
     if conditions:
         known = ", ".join(item.name for kind in given for item in fields(kind))
         raise TypeError(f"simulate: no condition {', '.join(conditions)}; there are {known}")
-    stored = the_test(test)
+    stored, seed = the_test(test), the_seed(seed)
     log_if_compiling(simulation=True, identification=False)
     done = run(the_actuator(actuator), stored, *suffered, seed=seed)
     return done.recording(f"simulated {stored.name}")
@@ -200,6 +208,7 @@ def diagnose(
     ConfigurationError
         A file, a name or a value is wrong; nothing to diagnose.
     """
+    seed = the_seed(seed)
     chosen, (tests, default) = the_actuator(actuator), _tests(test)
     found, begin = [], time.perf_counter()
     bus_map: BusMap | None = None
@@ -297,6 +306,7 @@ def calibrate(
     ConfigurationError
         A file, a name or a value is wrong; nothing to learn from.
     """
+    seed = the_seed(seed)
     start, (tests, default) = the_actuator(actuator), _tests(test)
     found: list[Recording] = []
     for item in _several(recordings, Recording):

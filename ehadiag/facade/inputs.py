@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, TypeAlias
@@ -14,7 +15,15 @@ from ehadiag.report.asked import LogFile
 if TYPE_CHECKING:
     from firmware_iface.mapping.bus_map import BusMap
 
-__all__ = ["PathLike", "log_file", "the_actuator", "the_bus_map", "the_test", "the_tests"]
+__all__ = [
+    "PathLike",
+    "log_file",
+    "the_actuator",
+    "the_bus_map",
+    "the_seed",
+    "the_test",
+    "the_tests",
+]
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
@@ -33,6 +42,17 @@ def the_actuator(given: Actuator | PathLike | None) -> Actuator:
     if given is None:
         return default_actuator()
     return given if isinstance(given, Actuator) else load_actuator(os.fspath(given))
+
+
+def the_seed(given: int) -> int:
+    """Return the seed as a plain number; ConfigurationError where it is none that is allowed."""
+    try:
+        seed = operator.index(given)
+    except TypeError:
+        seed = -1
+    if not 0 <= seed < 1 << 32:
+        raise ConfigurationError(f"seed {given!r}: need a whole number, 0 … 4294967295")
+    return seed
 
 
 def the_test(given: StoredTest | PathLike) -> StoredTest:

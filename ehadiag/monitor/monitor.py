@@ -16,6 +16,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.channels import Channels
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.recording import CommandMode, Environment
 from ehadiag.model.anchor import Anchor
 from ehadiag.model.parameters import FAULTS, REGISTRY, Unknowns
@@ -134,7 +135,7 @@ class Monitor:
         environment: Environment | None = None,
         *,
         mode: CommandMode = CommandMode.CURRENT,
-        hours: float = 100.0,
+        hours: float = HOURS_BETWEEN,
         shift: float = 1.0,
         noise: tuple[float, float] | None = None,
         offsets: tuple[float, float] = (0.0, 0.0),

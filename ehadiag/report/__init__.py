@@ -1,1 +1,1 @@
-"""Results as a table, as JSON and as a picture."""
+"""Results for people and programs: tables, JSON, pictures, HTML pages."""

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ehadiag.core.printable import printable, valid_text
-from ehadiag.core.shown_in import SHOWN_IN
+from ehadiag.core.shown_in import factor_and_unit
 
 if TYPE_CHECKING:
     from ehadiag.calibration.result import Calibrated, Value
@@ -138,7 +138,7 @@ def _values(values: tuple[Value, ...]) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     for item in values:
-        factor, unit = SHOWN_IN.get(item.unit, (1.0, item.unit))
+        factor, unit = factor_and_unit(item.unit, max(abs(item.start), abs(item.value)))
         table.add_row(
             item.symbol,
             f"{item.start * factor:.6g}",

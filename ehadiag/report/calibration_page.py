@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.printable import printable
-from ehadiag.core.shown_in import SHOWN_IN
+from ehadiag.core.shown_in import factor_and_unit
 from ehadiag.model.parameters import parameter
 from ehadiag.report.html import fill
 from ehadiag.report.responses import draw_responses, modelled
@@ -93,7 +93,7 @@ def calibration_page(found: Calibrated, version: str, made: str) -> str:
 
 
 def _value(item: Value) -> dict[str, str]:
-    factor, unit = SHOWN_IN.get(item.unit, (1.0, item.unit))
+    factor, unit = factor_and_unit(item.unit, max(abs(item.start), abs(item.value)))
     return {
         "symbol": item.symbol,
         "meaning": item.meaning,

@@ -8,6 +8,7 @@ from datetime import datetime
 from functools import partial
 
 import matplotlib
+import numpy as np
 
 from ehadiag.core.printable import printable
 from ehadiag.history.records import Entry, Event, Usage
@@ -18,7 +19,8 @@ __all__ = ["draw_history"]
 COLOURS = ("#0072b2", "#d55e00", "#009e73")
 """Okabe and Ito's, which colour-blind people tell apart; the markers differ too."""
 MARKERS = "os^"
-INTERVAL95 = 1.96
+LEAST_RANGE = 0.05
+"""Of the axis of severities: what differs by less is mostly noise."""
 
 
 def draw_history(entries: Sequence[Entry], events: Sequence[Event]) -> bytes:
@@ -44,12 +46,18 @@ def draw_history(entries: Sequence[Entry], events: Sequence[Event]) -> bytes:
         names = next(tuple(s.name for s in item.severities) for item in entries if item.severities)
         for index, name in enumerate(names):
             found = [
-                (place(entry.usage, entry.when), item.estimate, INTERVAL95 * item.std)
+                (place(entry.usage, entry.when), item.estimate, item.low, item.high)
                 for entry in entries
                 for item in entry.severities
-                if item.name == name and item.estimate is not None and item.std is not None
+                if item.name == name
+                and item.estimate is not None
+                and item.low is not None
+                and item.high is not None
             ]
-            at, values, errors = zip(*sorted(found, key=lambda row: row[0]), strict=True)
+            if not found:
+                continue
+            at, values, lows, highs = np.array(sorted(found)).T
+            errors = np.maximum([values - lows, highs - values], 0.0)
             colour, marker = COLOURS[index % 3], MARKERS[index % 3]
             axes.errorbar(
                 at, values, errors, label=name, color=colour, marker=marker, lw=1.0, ms=4.0,
@@ -66,7 +74,8 @@ def draw_history(entries: Sequence[Entry], events: Sequence[Event]) -> bytes:
             )  # fmt: skip
         if label == "time":
             axes.xaxis_date()
-        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        top = max(LEAST_RANGE, axes.get_ylim()[1])
+        axes.set_ylim(-0.02 * top, top)
         axes.set_xlabel(label)
         axes.set_ylabel("severity, 95 % interval")
         axes.legend(loc="upper left")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.core.printable import printable
-from ehadiag.core.shown_in import SHOWN_IN
+from ehadiag.core.shown_in import factor_and_unit
 from ehadiag.history.fingerprint import hash_of_file
 from ehadiag.model.parameters import parameter
 from ehadiag.report.html import fill
@@ -189,7 +189,7 @@ def _effects(diagnosis: Diagnosis | None) -> list[dict[str, str]]:
     out = []
     for name, item in diagnosis.identification.nuisances.items():
         known = parameter(name)
-        factor, unit = SHOWN_IN.get(known.unit, (1.0, known.unit))
+        factor, unit = factor_and_unit(known.unit, item.value)
         bound = " (at its bound)" if item.at_bound else ""
         cells = {
             "value": f"{factor * item.value:.4g}{bound}",

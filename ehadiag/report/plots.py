@@ -22,7 +22,6 @@ COLOURS = ("#0072b2", "#b34e00", "#007a5a")
 DASHES = ("solid", "dashed", "dotdash")
 ADVISORY, LIMIT = "#8a5a00", "#b3001b"
 TEXT = "#333333"
-INTERVAL95 = 1.96
 TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 
 Plots = Mapping[str, LayoutDOM]
@@ -126,18 +125,21 @@ def plot_trend(
     names = list(dict.fromkeys(item.name for entry in entries for item in entry.severities))
     for index, name in enumerate(names):
         rows = sorted(
-            (at, item.estimate, INTERVAL95 * item.std)
+            (at, item.estimate, item.low, item.high)
             for entry in entries
             for item in entry.severities
-            if item.name == name and item.estimate is not None and item.std is not None
+            if item.name == name
+            and item.estimate is not None
+            and item.low is not None
+            and item.high is not None
             for at in [_place(entry, unit)]
             if at is not None
         )
         data = {
             "at": [row[0] for row in rows],
             "value": [row[1] for row in rows],
-            "low": [row[1] - row[2] for row in rows],
-            "high": [row[1] + row[2] for row in rows],
+            "low": [row[2] for row in rows],
+            "high": [row[3] for row in rows],
         }
         lows += data["low"]
         highs += data["high"]

@@ -1,5 +1,6 @@
-"""Runs one session at a time, watching or testing, as a process of its own, and hands its
-snapshots on: neither a page nor its readers can cost the bus a frame."""
+"""Runs one session at a time, watching or testing, and hands its snapshots on.
+
+Each is a process of its own: neither a page nor its readers can cost the bus a frame."""
 
 from __future__ import annotations
 

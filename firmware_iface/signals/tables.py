@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import itertools
 import stat
@@ -30,6 +31,7 @@ FRAMES_HEADER = "timestamp,arbitration_id"
 HEADER_BYTES = 1 << 16
 DELIMITERS = ";\t,"
 LEAST_ROWS = 10
+UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 MOST_ROWS = 800_000
 """Of a table, which is held at once in some 300 MB: 13 minutes at 1 kHz, 40 s at 20 kHz."""
 MOST_CELLS = 10_000_000
@@ -71,7 +73,7 @@ def holds_signals(path: Path | str, *, mapped: bool) -> bool:
     Returns
     -------
     bool
-        False too where the file cannot be read: its reader says why.
+        True too where its beginning cannot be read: the reader of signals says why.
     """
     path, kind = Path(path), kind_of(Path(path))
     if kind == ".parquet":
@@ -83,7 +85,7 @@ def holds_signals(path: Path | str, *, mapped: bool) -> bool:
     try:
         header = _head(path)
     except InputOutputError:
-        return False
+        return True
     is_text = header != "" and all(c.isprintable() or c.isspace() for c in header)
     return is_text and not header.startswith(FRAMES_HEADER)
 
@@ -93,6 +95,8 @@ def _head(path: Path) -> str:
         text = beginning_of(path, HEADER_BYTES)
     except OSError as error:
         raise InputOutputError(f"log {path}: {reason_of(error)}") from None
+    if text.startswith(UTF16):
+        raise InputOutputError(f"log {path}: is in UTF-16: save it as UTF-8")
     return text.decode("utf-8-sig", "replace").lstrip()
 
 
@@ -180,6 +184,11 @@ def _read_table(
     wanted = {item.column for item in columns.resolve(names, f"log {path}").values()}
     if not wanted:
         return pandas.DataFrame(columns=names), units, names
+    twice = [name for name in names if name in wanted and names.count(name) > 1]
+    if twice:
+        raise InputOutputError(
+            f"log {path}: several columns are named {printable(twice[0])!r}: rename all but one"
+        )
     decimal = "," if delimiter != "," and "," in lines[-1] else "."
     try:
         # pandas warns of rows longer than the header, and of columns of mixed kinds: both are told
@@ -305,7 +314,10 @@ def _checked(
         if once.sum() >= LEAST_ROWS or (role.startswith("environment.") and once.any()):
             out[role] = Signal(at[once], values[once], jitter)
         elif role.startswith("channels."):
-            raise InputOutputError(f"log {path}: {role} has {int(once.sum())} numbers in all")
+            raise InputOutputError(
+                f"log {path}: {role} has {int(known.sum())} numbers, but only {int(once.sum())}"
+                f" different time stamps; at least {LEAST_ROWS} are needed"
+            )
     return out
 
 

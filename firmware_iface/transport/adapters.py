@@ -53,6 +53,7 @@ MEND: Mapping[str, str] = {
     "socketcan": "it needs Linux with CAN drivers, and the interface has to be up: ip link set"
     " CHANNEL up type can bitrate N",
     "socketcand": "is the daemon running, and does a firewall let its port through?",
+    "udp_multicast": "it needs msgpack: pip install 'ehadiag[multicast]'",
     "slcan": "is the adapter plugged in, the port the right one and not in use?",
 }
 """What to do where an interface cannot be opened."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ehadiag.cli.batch.own_tables import is_table_of_results
 from ehadiag.cli.output import say
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError, reason_of
 
 __all__ = ["Input", "expand"]
 
@@ -85,7 +85,8 @@ def _in_folder(folder: str) -> Iterator[Input]:
     known = {*SUFFIXES, *DECODED_SUFFIXES}
     links: list[str] = []
     inside = []
-    for place, folders, names in os.walk(folder):
+    closed: list[OSError] = []
+    for place, folders, names in os.walk(folder, onerror=closed.append):
         folders[:] = [name for name in folders if not name.startswith(".")]
         links += [path for name in folders if os.path.islink(path := os.path.join(place, name))]
         inside += [
@@ -97,7 +98,9 @@ def _in_folder(folder: str) -> Iterator[Input]:
     _tell(folder, links, "a link to a folder is not followed, name the folder to read it")
     _tell(folder, ours, "a table of results is no recording")
     recordings = sorted(set(inside).difference(ours))
-    if not recordings:
+    for error in closed:
+        yield Input(error.filename, f"folder {error.filename}: {reason_of(error)}")
+    if not recordings and not closed:
         yield Input(folder, f"folder {folder}: no recording in it ({', '.join(sorted(known))})")
     yield from map(Input, recordings)
 

@@ -63,8 +63,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Listen and report."""
-    if arguments.log is None:
-        bus_options.need_one_bus(arguments)
+    bus_options.need_bus_or_log(arguments)
     bus_map, actuator = asked_for.the_bus_map(arguments), asked_for.the_actuator(arguments)
     from firmware_iface.logs.reader import read_frames  # noqa: PLC0415
     from firmware_iface.session.assembler import Assembler  # noqa: PLC0415 - loads python-can

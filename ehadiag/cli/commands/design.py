@@ -118,6 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         with failure_said(codes):
             _write(Path(arguments.out), encode_test(better))
             written = True
+            say(f"wrote {arguments.out}")
     # What was found is printed also where it could not be written.
     with failure_said(codes):
         _print(arguments, found, arguments.out if written else None)
@@ -182,6 +183,8 @@ def _refuse_place(path: Path) -> None:
         raise InputOutputError(f"{path}: exists already; name another file")
     if not path.parent.is_dir():
         raise InputOutputError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise InputOutputError(f"{path}: no right to write in its folder")
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -15,7 +15,12 @@ from ehadiag.cli.exit_codes import code_of_inputs, worst_code
 from ehadiag.cli.history_file import add_keeping_options
 from ehadiag.cli.interrupt import keep_signals
 from ehadiag.cli.output import say, say_if_compiling
-from ehadiag.cli.overwriting import Output, names_taken, refuse_overwriting
+from ehadiag.cli.overwriting import (
+    Output,
+    names_taken,
+    refuse_overwriting,
+    refuse_unwritable,
+)
 from ehadiag.cli.report_page import add_report_option
 from ehadiag.cli.results import Results, make_folder
 from ehadiag.cli.units import Unit, add_unit_options, units_of
@@ -97,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     reads = [("the log", item.name) for item in inputs]
     reads += [("the DBC", job.bus_map.name) for job in jobs]
     refuse_overwriting(arguments, outputs, reads)
+    refuse_unwritable(outputs)
     folder = make_folder(arguments.out) if arguments.out else None
     results = Results(arguments, folder, names_taken(folder.path, outputs) if folder else ())
     say_if_compiling()

@@ -10,6 +10,7 @@ from ehadiag.cli.output import put, say
 from ehadiag.cli.results import make_folder
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.printable import printable
 
 __all__ = ["add_parser", "run"]
@@ -38,9 +39,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--hours",
         type=argument_types.positive,
-        default=100.0,
+        default=HOURS_BETWEEN,
         metavar="H",
-        help="mean time between false alarms of the monitor (default 100)",
+        help="mean time between false alarms of the monitor (default %(default)g)",
     )
     options.add_actuator_options(parser)
     parser.set_defaults(run=run)

@@ -16,6 +16,7 @@ from ehadiag.cli.output import say, say_if_compiling
 from ehadiag.cli.overwriting import Output, refuse_overwriting
 from ehadiag.cli.screen.show import add_screen_options, shown
 from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,10 +67,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     group.add_argument(
         "--hours",
         type=argument_types.positive,
-        default=100.0,
+        default=HOURS_BETWEEN,
         metavar="H",
-        help="mean time between false alarms of the sums (default 100); between tests only what"
-        " lasts is an alarm",
+        help="mean time between false alarms of the sums (default %(default)g); between tests only"
+        " what lasts is an alarm",
     )
     group.add_argument(
         "--log-file", metavar="FILE", help="append alarms to this file, JSON lines with their time"
@@ -118,8 +119,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Watch until the end, and say how it was."""
-    if arguments.log is None:
-        bus_options.need_one_bus(arguments)
+    bus_options.need_bus_or_log(arguments)
     actuator, bus_map = asked_for.the_actuator(arguments), asked_for.the_bus_map(arguments)
     tests = asked_for.known_tests(arguments.test)
     reads = [("the log", arguments.log), ("--from", arguments.from_result)]

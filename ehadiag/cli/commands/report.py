@@ -99,6 +99,8 @@ def _write(arguments: argparse.Namespace, path: Path, asked: Levels) -> None:
 
 
 def _page_of(result: Path) -> Path:
+    if not result.name:
+        raise ConfigurationError(f"result {result}: is a folder, name a file in it")
     return result.with_suffix(".html")
 
 

@@ -15,7 +15,7 @@ from ehadiag.cli.history_file import add_keeping_options, history_place
 from ehadiag.cli.output import say
 from ehadiag.cli.report_page import need_report_library
 from ehadiag.cli.results import make_folder
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.errors import ConfigurationError, InputOutputError
 from ehadiag.core.stored_test import resolve_test
 
 __all__ = ["add_parser", "run"]
@@ -90,6 +90,8 @@ def run(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     tests = {resolve_test(name).name: name for name in names}
     asked_for.the_actuator(arguments)
     asked_for.the_bus_map(arguments)
+    if watched:
+        _try_bus(arguments)
     folder = make_folder(arguments.out)
     from ehadiag.serve.pages import Pages  # noqa: PLC0415 - bokeh is slow
     from ehadiag.serve.server import HOST, Site, serve  # noqa: PLC0415
@@ -117,6 +119,15 @@ def run(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
         server.shutdown()
         server.server_close()
     return 0
+
+
+def _try_bus(arguments: argparse.Namespace) -> None:
+    """Refuse wrong options of the bus at once; a bus that is not there yet may come."""
+    with (
+        contextlib.suppress(InputOutputError),
+        bus_options.open_transport(arguments, transmit=False),
+    ):
+        pass
 
 
 def _test_command(arguments: argparse.Namespace, test: str, others: Sequence[str]) -> list[str]:

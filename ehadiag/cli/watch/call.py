@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import threading
 from collections.abc import Sequence
 from typing import Any
 
 from ehadiag.cli.output import say
-from ehadiag.core.errors import reason_of
+from ehadiag.core.errors import ConfigurationError, reason_of
 
 __all__ = ["AlarmCommand"]
 
@@ -27,9 +28,16 @@ class AlarmCommand:
     ----------
     arguments : Sequence[str]
         Program and arguments; empty: nothing is called.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such program.
     """
 
     def __init__(self, arguments: Sequence[str]) -> None:
+        if arguments and shutil.which(arguments[0]) is None:
+            raise ConfigurationError(f"--on-alarm {arguments[0]}: no such program")
         self._arguments = list(arguments)
         self._thread: threading.Thread | None = None
         self.calls = 0

@@ -11,6 +11,7 @@ from ehadiag.cli.watch.known import KnownUnit, as_new
 from ehadiag.cli.watch.watcher import Heard, Watcher
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.errors import EhadiagError
+from ehadiag.core.false_alarms import HOURS_BETWEEN
 from ehadiag.core.stored_test import StoredTest
 from ehadiag.live.snapshot import Alarm, Residuals
 from firmware_iface.mapping.bus_map import BusMap
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from firmware_iface.transport.frames import Frame
 
 __all__ = ["InTest"]
-
-HOURS = 100.0
-"""Mean time between false alarms, as `ehadiag monitor` has it unasked."""
 
 
 class InTest:
@@ -58,7 +56,7 @@ class InTest:
         """Why there are no residuals; empty where there are."""
         try:
             self._watcher = Watcher(
-                actuator, bus_map, as_new(actuator), tests, HOURS, self._take_alarm
+                actuator, bus_map, as_new(actuator), tests, HOURS_BETWEEN, self._take_alarm
             )
         except EhadiagError as error:
             self._end(error)

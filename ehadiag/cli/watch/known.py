@@ -162,8 +162,9 @@ def _of_line(line: bytes, actuator: Actuator, where: str) -> KnownUnit:
         if tree["fit"] is None:
             raise ConfigurationError(f"{where}: holds no severities, its test was not identified")
         return _of_tree(tree, where)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ConfigurationError(f"{where}: no result of a diagnosis: {error!r}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        # What is wrong in it is not said: it may be any file.
+        raise ConfigurationError(f"{where}: is none of ehadiag's JSON results") from None
 
 
 def _of_tree(tree: dict[str, Any], where: str) -> KnownUnit:

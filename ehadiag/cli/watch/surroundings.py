@@ -55,6 +55,8 @@ class Surroundings:
         if folder is not None:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
+            except FileExistsError:
+                raise InputOutputError(f"--record {folder}: is a file; name a folder") from None
             except OSError as error:
                 raise InputOutputError(f"folder {folder}: {reason_of(error)}") from None
 

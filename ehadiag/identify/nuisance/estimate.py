@@ -12,25 +12,21 @@ from numpy.typing import NDArray
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.nuisance.explained import Explains, excess, is_hopeless, is_noise
 from ehadiag.identify.nuisance.prior import (
-    ALIAS,
     Joint,
     Known,
     belief_of,
-    beside,
     information_of,
-    small_effects,
 )
-from ehadiag.identify.nuisance.starts import AGAIN, Found, search
+from ehadiag.identify.nuisance.staged import Settings, free_running, scaled, search_in_stages
+from ehadiag.identify.nuisance.starts import Found
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
 from ehadiag.identify.refine.last_round import by_a_finer_model
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
 from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
-from ehadiag.identify.spans import judge_noise, lay_out, unknowns_of
+from ehadiag.identify.spans import judge_noise
 from ehadiag.identify.uncertainty import independent
-from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import Parameter
-from ehadiag.model.simd.model import SimdModel
 
 __all__ = ["BUDGET", "Estimated", "estimate", "spread_of_optima"]
 
@@ -48,9 +44,6 @@ noises, six units) were 0.47, 0.19 and 0.02 % at most, up to 46 deviations witho
 OTHER_PLACE = 30.0
 """Gain of a look further about from which on it is another place, not one as good."""
 Linearise = Callable[[Derivatives, Belief], Linearised]
-Hopeless = Callable[[NDArray[np.float64], int], bool]
-RELAXED = 100.0
-"""Weight of the spool over the pressure while the spool is explained first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,60 +127,35 @@ def estimate(
         Whether further starts take their time, see `ehadiag.identify.nuisance.starts.search`.
     """
     known = known or {}
-    coarse = _free_running(experiments, free)
-    model = _scaled(coarse, experiments)
-    first, information = belief_of(model, known, joint), information_of(model, known, joint)
-    origins = [first] if patient else [first, small_effects(model, first)]
-    if hint is not None:
-        origins = [beside(model, first, hint), *origins[::-1]]
-    guide: Derivatives | None = None
-    if any(item.constants.OIL > 0.0 for item in experiments):
-        guide = _spool_guide(experiments, free, coarse.levels)
-        guided = search(
-            guide,
-            first,
-            information,
-            origins,
-            _spool_is_noise,
-            budget=budget // 2,
-            seed=seed,
-            hopeless=_spool_is_hopeless if give_up else None,
-            tell=tell,
-        )
-        there = guided.belief.x * guide.scale
-        names = [item.name for item in guide.estimated]
-        origins = [beside(model, first, dict(zip(names, there.tolist(), strict=True))), *origins]
-    found = search(
-        model,
-        first,
-        information,
-        origins,
-        explains,
-        alias=ALIAS,
+    settings = Settings(
+        free=tuple(free),
+        known=known,
+        joint=joint,
+        hint=hint,
         budget=budget,
         seed=seed,
         tell=tell,
-        hopeless=_hopeless(give_up=give_up, patient=patient),
+        give_up=give_up,
+        left_before=left_before,
+        explains=explains,
         patient=patient,
-        confirms=give_up,
-        before=left_before,
     )
+    staged = search_in_stages(experiments, settings)
+    model, found = staged.model, staged.found
     judged = _judged(experiments, found.residuals)
     held = [item.parameter for item in considered]
-    fine = _scaled(_free_running(judged, (*free, *held), coarse.levels), judged, considered)
-    before = belief_of(fine, known, joint), information_of(fine, known, joint)
+    fine = scaled(free_running(judged, (*free, *held), staged.levels), judged, considered)
+    at_first = belief_of(fine, known, joint), information_of(fine, known, joint)
     between = nothing if tell is None else partial(tell, 1.0)
     belief = Belief(found.belief.x * model.scale / fine.scale, found.belief.root)
     if not (give_up and not found.explained and is_hopeless(found.residuals, found.starts)):
         draw = partial(linearised, rng=np.random.default_rng([seed, -1 % 2**32]))
-        if (
-            patient and not found.confirmed
-        ):  # a break-away may stand between the end of the search and the optimum
-            root = AGAIN * before[0].root
-            belief = _looked_about(fine, belief, root, before, draw, between, OTHER_PLACE)
-        belief = _looked_about(fine, belief, LOOK * belief.root, before, draw, between)
+        if patient and not found.confirmed:
+            # A break-away may stand between the end of the search and the optimum.
+            belief = _looked_about(fine, belief, staged.again, at_first, draw, between, OTHER_PLACE)
+        belief = _looked_about(fine, belief, LOOK * belief.root, at_first, draw, between)
     linear = linearised(fine, belief, np.random.default_rng(seed))
-    refined = described(fine, belief.x, linear, settled=found.explained, information=before[1])
+    refined = described(fine, belief.x, linear, settled=found.explained, information=at_first[1])
     refined = by_a_finer_model(fine, refined, linear)
     return Estimated(
         refined=refined,
@@ -197,15 +165,8 @@ def estimate(
         confirmed=found.confirmed,
         excess=excess(refined.residuals),
         starts=found.starts,
-        evaluations=sum(item.evaluations for item in (guide, model, fine) if item),
+        evaluations=staged.evaluations + fine.evaluations,
     )
-
-
-def _hopeless(*, give_up: bool, patient: bool) -> Hopeless | None:
-    """Judge when further starts will not help."""
-    if not give_up:
-        return None
-    return partial(is_hopeless, astray=True) if patient else is_hopeless
 
 
 def _spread_of_twins(refined: Refinement, experiments: Sequence[Experiment]) -> NDArray[np.float64]:
@@ -217,46 +178,6 @@ def _spread_of_twins(refined: Refinement, experiments: Sequence[Experiment]) -> 
         and values[HYSTERESIS] + experiments[0].constants.HYS < LITTLE_HYSTERESIS
     )
     return independent(refined.parameters, TWINS if alike else {})
-
-
-def _free_running(
-    experiments: Sequence[Experiment],
-    parameters: Sequence[Parameter],
-    levels: NDArray[np.int64] | None = None,
-) -> SimdModel:
-    """Model of whole tests; `levels`: of one of the same tests, if there was one."""
-    return SimdModel(lay_out(experiments), unknowns_of(experiments, parameters), levels=levels)
-
-
-def _scaled(
-    model: SimdModel, experiments: Sequence[Experiment], considered: Sequence[Considered] = ()
-) -> Derivatives:
-    """Coordinates scaled by the noise."""
-    return Derivatives(model, experiments[0].noise, considered)
-
-
-def _spool_guide(
-    experiments: Sequence[Experiment], free: Sequence[Parameter], levels: NDArray[np.int64]
-) -> Derivatives:
-    """Model that shows where to begin where the oil stores the pressure: it goes by the spool.
-
-    Compressible oil remembers what the spool did for tenths of a second and rings, so that far from
-    the optimum the pressure says little and leads the search astray; the spool, which does not feel
-    it, is explained first.
-    """
-    relaxed = [
-        item.with_noise((item.spool_noise, RELAXED * item.pressure_noise, item.position_noise))
-        for item in experiments
-    ]
-    return Derivatives(_free_running(relaxed, free, levels), experiments[0].noise)
-
-
-def _spool_is_noise(residuals: NDArray[np.float64]) -> bool:
-    return is_noise(residuals[SPOOL_ROW : SPOOL_ROW + 1])
-
-
-def _spool_is_hopeless(residuals: NDArray[np.float64], starts: int) -> bool:
-    return is_hopeless(residuals[SPOOL_ROW : SPOOL_ROW + 1], starts)
 
 
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:

@@ -30,6 +30,7 @@ __all__ = [
     "Alias",
     "Knowledge",
     "covariance_of",
+    "data_that_pass_for",
     "datum_name",
     "has_further_effects",
     "knowledge_of",
@@ -203,14 +204,32 @@ def severities_below(actuator: Actuator, errors: Mapping[str, float]) -> tuple[P
     errors : mapping
         Largest relative errors by symbol.
     """
+    shares = _shares(actuator)
+    reach = {PASS_FOR_FAULTS[name]: shares[name] * error for name, error in errors.items()}
+    return tuple(replace(item, lower=item.lower - reach.get(item.name, 0.0)) for item in FAULTS)
+
+
+def data_that_pass_for(actuator: Actuator, values: Mapping[str, float]) -> dict[str, float]:
+    """Relative errors of data, by parameter name, that do what these severities do.
+
+    values : mapping
+        By name; others than severities are passed over.
+    """
+    return {
+        datum_name(symbol): values[PASS_FOR_FAULTS[symbol]] / share
+        for symbol, share in _shares(actuator).items()
+        if PASS_FOR_FAULTS[symbol] in values
+    }
+
+
+def _shares(actuator: Actuator) -> dict[str, float]:
+    """Severity that does what a datum that passes for a fault does where it is twice as large."""
     valve, jack = actuator.servovalve, actuator.jack
-    shares = {
+    return {
         "GQF": 1.0 / CLOGGED,
         "FSS0": valve.FSS0 / (valve.FSS1 - valve.FSS0),
         "FDJ0": jack.FDJ0 / (jack.FDJ1 - jack.FDJ0),
     }
-    reach = {PASS_FOR_FAULTS[name]: shares[name] * error for name, error in errors.items()}
-    return tuple(replace(item, lower=item.lower - reach.get(item.name, 0.0)) for item in FAULTS)
 
 
 def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:

@@ -82,6 +82,8 @@ def search(
     origins: Sequence[Belief],
     explains: Callable[[NDArray[np.float64]], bool],
     *,
+    again: NDArray[np.float64] | None = None,
+    calmly: bool = False,
     alias: str = "",
     budget: int = 1600,
     seed: int = 0,
@@ -104,6 +106,11 @@ def search(
     explains : callable
         Of residuals, shape (signals, N): whether there is nothing better to look for
         (a search that has not come to rest goes on all the same).
+    again : shape (c, c), optional
+        Root of the covariance over which a further start looks about the best place; default
+        a tenth of the first.
+    calmly : bool
+        Whether such a start takes its time.
     alias : str
         Name of a parameter that passes for a sensor's constant error.
     budget : int
@@ -123,6 +130,7 @@ def search(
         Excess that another search left with fewer unknowns.
     """
     until = model.evaluations + budget
+    again = AGAIN * known.root if again is None else again
 
     def between() -> None:
         if tell is not None:
@@ -132,14 +140,15 @@ def search(
     confirmed = False
     places: list[Place] = []
     while best is None or (not best.explained and model.evaluations < until):
-        pace = PATIENT if patient and best is not None else MANY
         turn, beside = divmod(len(places), 2)
+        takes_time = best is not None and (patient or (beside and calmly))
+        pace = PATIENT if takes_time else MANY
         if patient:
             begin = origins[0 if best is None else -1]
         elif best is None or not beside:
             begin = origins[turn % len(origins)]
         else:
-            begin = Belief(_past_alias(model, best, alias), AGAIN * known.root)
+            begin = Belief(_past_alias(model, best, alias), again)
         rng = np.random.default_rng([seed, len(places)])
         linearise = partial(linearised, rng=rng)
         sharpened = sharpen(model, known, begin, information, linearise, pace, between)

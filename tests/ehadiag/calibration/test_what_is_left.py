@@ -65,7 +65,7 @@ def test_effects_beyond_the_usual_ones_widen_what_they_bend():
 def test_what_wear_brings_out_of_effects_beyond_the_usual_ones_is_allowed():
     usual, further = calibration_of(1.1), calibration_of(1.1, "spool_bow")
     assert most_left(usual) == most_left(None)
-    assert most_left(further)[0] == pytest.approx(2.0 * most_left(None)[0] + 2.0 * 0.002)
+    assert most_left(further)[0] == pytest.approx(6.0 * most_left(None)[0] + 2.0 * 0.002)
     assert most_left(further)[1] > most_left(None)[1]
     assert most_left(calibration_of(1.5))[0] == pytest.approx(most_left(None)[0] + 2.0 * 0.002)
 

@@ -105,15 +105,15 @@ def test_a_unit_that_the_history_does_not_know_is_taken_as_new_and_said(run: Run
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("", "no result of a diagnosis"),
-        ("[]", "no result of a diagnosis"),
+        ("", "is none of ehadiag's JSON results"),
+        ("[]", "is none of ehadiag's JSON results"),
         ('{"schema": "other/1"}', "its schema is other/1"),
         ('{"schema": "ehadiag.diagnosis/2", "actuator": "left"}', "of actuator left"),
         (
             '{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": null}',
             "holds no severities",
         ),
-        ('{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": {}}', "no result"),
+        ('{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": {}}', "is none of"),
     ],
 )
 def test_what_is_no_result_is_refused(run: Run, tmp_path: Path, content: str, said: str) -> None:
@@ -151,9 +151,9 @@ def test_what_cannot_be_written_is_said(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_command_that_fails_is_said_and_changes_nothing(run: Run) -> None:
-    found = run("monitor", "--log", WORN, "--on-alarm", "/no/such/program")
+    found = run("monitor", "--log", WORN, "--on-alarm", "false")
     assert found.code == 40
-    assert "--on-alarm /no/such/program: No such file" in found.err
+    assert "--on-alarm false: ended with code 1" in found.err
 
 
 def test_a_projects_file_cannot_have_a_command_called(run: Run, tmp_path: Path) -> None:

@@ -142,8 +142,11 @@ def test_a_live_test_records_beside_its_history(place: Path, run: Run) -> None:
     ("arguments", "what"),
     [
         (("--log", "rec.csv", "--log-file", "rec.csv"), "the log rec.csv"),
-        (("--from", "r.json", "--log-file", "r.json"), "--from r.json"),
-        (("--history", "h.sqlite", "--log-file", "h.sqlite"), "the health history h.sqlite"),
+        (("-i", "virtual", "--from", "r.json", "--log-file", "r.json"), "--from r.json"),
+        (
+            ("-i", "virtual", "--history", "h.sqlite", "--log-file", "h.sqlite"),
+            "the health history h.sqlite",
+        ),
     ],
 )
 def test_alarms_are_appended_to_nothing_that_is_read(
@@ -151,7 +154,7 @@ def test_alarms_are_appended_to_nothing_that_is_read(
 ) -> None:
     (place / "r.json").write_text("{}")
     before = contents(place)
-    result = run("monitor", "-i", "virtual", *arguments)
+    result = run("monitor", *arguments)
     assert result.code == 2
     assert f": is {what} as well" in result.message
     assert contents(place) == before

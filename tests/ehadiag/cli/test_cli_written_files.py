@@ -1,5 +1,7 @@
-"""Every file that a command writes in the same predicaments: a link in its place, a full disk, an
-odd name; and its permissions. Results and pictures of `--out` have tests of their own.
+"""Every file that a command writes in the same predicaments.
+
+A link in its place, a full disk, an odd name; and its permissions. Results and pictures of `--out`
+have tests of their own.
 """
 
 from __future__ import annotations

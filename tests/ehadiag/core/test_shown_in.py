@@ -15,6 +15,7 @@ from ehadiag.model.parameters import REGISTRY
         (2.5e-6, "m", "2.5 µm"),
         (0.0123, "1", "1.23 %"),
         (1e6, "Pa", "1 MPa"),
+        (-466.9, "Pa", "-0.4669 kPa"),
         (300.0, "N", "300 N"),
     ],
 )

@@ -261,3 +261,10 @@ def test_who_will_wait_for_the_compiler_is_told(
         check=True,
     )
     assert done.stderr.startswith("ehadiag: compiling the model's kernels, once")
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 32, "x", 0.5])
+def test_a_seed_that_is_none_is_refused_at_once(seed: Any) -> None:
+    for call in (ehadiag.diagnose, ehadiag.calibrate, ehadiag.simulate):
+        with pytest.raises(ehadiag.ConfigurationError, match="need a whole number, 0 … 4294967295"):
+            call("open", seed=seed)

@@ -146,7 +146,9 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, text, words):
 def test_a_column_of_words_is_one_line(tmp_path):
     path = tmp_path / "bad.csv"
     path.write_text("time,spool,pressure,position\n" + "1,2,3,4\n" + "1,2,3,x\n" * 20)
-    with pytest.raises(InputOutputError, match="has 1 numbers in all"):
+    with pytest.raises(
+        InputOutputError, match="has 21 numbers, but only 1 different time stamps; at least 10"
+    ):
         read(path)
 
 

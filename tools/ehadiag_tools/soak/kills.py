@@ -84,7 +84,7 @@ def whole_run(folder: Path) -> float:
     return time.monotonic() - began
 
 
-def kill_run(folder: Path, number: int, after_s: float) -> Kill:
+def kill_run(folder: Path, number: int, after_s: float, most_lost_s: float = MOST_LOST_S) -> Kill:
     """Run a live test, kill it, and look at what it left.
 
     Parameters
@@ -95,6 +95,9 @@ def kill_run(folder: Path, number: int, after_s: float) -> Kill:
         Of the run, from 1; each once.
     after_s : float
         From the start of the process.
+    most_lost_s : float
+        How much of the recording before the kill may be missing: more on a machine that is short
+        of processor time.
 
     Returns
     -------
@@ -119,7 +122,7 @@ def kill_run(folder: Path, number: int, after_s: float) -> Kill:
     wrong = _history_faults(folder, before, log if told else None)
     lost = None
     if log.exists():
-        lost, fault = _lost(log, seen, killed, ended)
+        lost, fault = _lost(log, seen, killed, ended, most_lost_s)
         wrong += fault
     elif seen is not None:
         wrong.append("the recording is gone")
@@ -177,7 +180,7 @@ def _history_faults(folder: Path, before: list[Entry], log: Path | None) -> list
 
 
 def _lost(
-    log: Path, seen: float | None, killed: float, ended: bool
+    log: Path, seen: float | None, killed: float, ended: bool, most_lost_s: float
 ) -> tuple[float | None, list[str]]:
     """How much of a recording before the kill is missing, s; None where its test has ended."""
     try:
@@ -188,9 +191,9 @@ def _lost(
         last, unread = None, [f"recording: {error}"]
     else:
         unread = []
-    # Of what was begun less than a second before a kill all may be missing.
+    # Of what was begun shortly before a kill all may be missing.
     since = killed - (seen or killed) if last is None else killed - last * 1e-9
-    if since <= MOST_LOST_S and not (ended and unread):
+    if since <= most_lost_s and not (ended and unread):
         return since, []
     return since, [*unread, f"recording: its last {since:.2f} s are missing"]
 
