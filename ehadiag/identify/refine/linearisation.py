@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import Derivatives
 
-__all__ = ["Belief", "Cross", "Linearised", "crossed", "linearised"]
+__all__ = ["Belief", "Cross", "Linearised", "crossed", "linearised", "pseudo_inverse"]
 
 BLOCK = 16
 """Runs come in blocks of that size."""
 REACH = np.sqrt(3.0)
 """Deviations of a belief from its mean to the points on a coordinate."""
+LEAST_SINGULAR = 1e-6
+"""Singular value, over the largest, below which a direction is not seen."""
 ONE_SIDED = 0.25
 """Share of that distance to a bound from which the points lie on its other side."""
 
@@ -88,11 +90,24 @@ def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> 
     along = basis.T @ flat
     left = np.einsum("ij,ij->j", flat, flat) - np.einsum("ij,ij->j", along, along)
     scatter = np.maximum(left, 0.0) / max(len(points) - 1 - count, 1)
-    slopes = inverse.T @ np.linalg.pinv(triangle[1:, 1:], rcond=1e-6)
+    slopes = inverse.T @ pseudo_inverse(triangle[1:, 1:])
     jacobian = model.additive_slopes()
     jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
     mean = (along[0] * basis[0, 0]).reshape(shape)
     return Linearised(x, mean, jacobian, scatter.reshape(shape), runs[0])
+
+
+def pseudo_inverse(square: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pseudo-inverse of a square matrix.
+
+    Random rotations give many equal singular values, with which the library's decomposition (divide
+    and conquer) once in some thousand searches does not converge; that of the normal equations does.
+    """
+    try:
+        return np.asarray(np.linalg.pinv(square, rcond=LEAST_SINGULAR))
+    except np.linalg.LinAlgError:
+        normal = square.T @ square
+        return np.asarray(np.linalg.pinv(normal, LEAST_SINGULAR**2, hermitian=True) @ square.T)
 
 
 def crossed(model: Derivatives, belief: Belief) -> Linearised:
