@@ -101,7 +101,8 @@ def pseudo_inverse(square: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pseudo-inverse of a square matrix.
 
     Random rotations give many equal singular values, with which the library's decomposition (divide
-    and conquer) once in some thousand searches does not converge; that of the normal equations does.
+    and conquer) does not converge once in some thousand searches; that of the normal equations
+    does.
     """
     try:
         return np.asarray(np.linalg.pinv(square, rcond=LEAST_SINGULAR))

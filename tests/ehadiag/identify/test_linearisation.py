@@ -31,6 +31,6 @@ def test_it_is_the_same_where_the_decomposition_does_not_converge(monkeypatch):
     assert pseudo_inverse(triangle()) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_direction_without_points_is_not_seen(monkeypatch):
+def test_a_direction_without_points_is_not_seen():
     flat = triangle() @ np.diag([1.0] * 25 + [0.0])
     assert np.abs(pseudo_inverse(flat)[25]).max() < 1e-9
