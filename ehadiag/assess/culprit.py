@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ehadiag.core.recording import Environment
 from ehadiag.identify.experiment import Experiment, share_offsets
 from ehadiag.identify.result import Identification
-from ehadiag.identify.spans import lay_out, unknowns_of
+from ehadiag.identify.spans import by_experiment, lay_out, unknowns_of
 from ehadiag.model.parameters import REGISTRY, Kind, Parameter
 from ehadiag.model.plant import REFERENCE_TEMPERATURE, relative_viscosity
 from ehadiag.model.simd.model import SimdModel
@@ -266,8 +266,7 @@ def _place(
     experiments: Sequence[Experiment], residuals: NDArray[np.float64]
 ) -> tuple[int, int, float, float]:
     """Row, experiment, begin and end (s) of where most is unexplained."""
-    ends = np.cumsum([item.ticks for item in experiments])[:-1]
-    parts = [_cost(part) for part in np.split(residuals, ends, axis=1)]
+    parts = [_cost(part) for part in by_experiment(experiments, residuals)]
     sums = np.array([part.sum(axis=1) for part in parts])
     index, row = divmod(int(sums.argmax()), sums.shape[1])
     grown = np.cumsum(parts[index][row])

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from ehadiag.calibration.effects import asked_for_by, with_further_effects
 from ehadiag.calibration.judging import WORTH_ANOTHER
 from ehadiag.calibration.models import ONE_START, SMOOTH, TWO_STARTS, Learned, Model, simple_models
@@ -19,6 +17,7 @@ from ehadiag.calibration.session import Session
 from ehadiag.core.actuator import Actuator
 from ehadiag.identify.nuisance.explained import is_noise
 from ehadiag.identify.nuisance.knowledge import data_that_pass_for
+from ehadiag.identify.spans import by_experiment
 
 __all__ = ["choose", "learned_as_new"]
 
@@ -77,8 +76,7 @@ def _has_all_effects(found: Learned) -> bool:
     """
     if found.estimated.explained:
         return True
-    ends = np.cumsum([item.ticks for item in found.experiments])[:-1]
-    parts = np.split(found.estimated.refined.residuals, ends, axis=1)
+    parts = by_experiment(found.experiments, found.estimated.refined.residuals)
     first = [
         is_noise(part)
         for item, part in zip(found.experiments, parts, strict=True)

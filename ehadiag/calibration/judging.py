@@ -12,6 +12,7 @@ from ehadiag.calibration.result import Severity
 from ehadiag.core.recording import Recording
 from ehadiag.identify.nuisance.estimate import Estimated
 from ehadiag.identify.nuisance.explained import is_noise
+from ehadiag.identify.spans import by_experiment
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import FAULTS
 
@@ -86,9 +87,7 @@ def unexplained(best: Learned, recordings: Sequence[Recording] = ()) -> list[str
         " an effect that no model has"
     ]
     if len(recordings) > 1:
-        residuals = best.estimated.refined.residuals
-        ends = np.cumsum([item.ticks for item in best.experiments])[:-1]
-        parts = np.split(residuals, ends, axis=1)
+        parts = by_experiment(best.experiments, best.estimated.refined.residuals)
         bad = [
             recording.source
             for recording, part in zip(recordings, parts, strict=True)

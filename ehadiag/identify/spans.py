@@ -15,7 +15,7 @@ from ehadiag.model.batch import POSITION_ROW, Batch
 from ehadiag.model.parameter import sized
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, Unknowns
 
-__all__ = ["ANCHOR_LSB", "Spans", "judge_noise", "lay_out", "unknowns_of"]
+__all__ = ["ANCHOR_LSB", "Spans", "by_experiment", "judge_noise", "lay_out", "unknowns_of"]
 
 Spans = Sequence[Sequence[Window]]
 """Of each test, s."""
@@ -113,6 +113,16 @@ def _place(experiment: Experiment, first: int) -> float:
     before = experiment.position[max(0, first - 5) : first]
     seen = before[np.isfinite(before)]
     return float(seen.mean()) if seen.size else 0.0
+
+
+def by_experiment(
+    experiments: Sequence[Experiment], residuals: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Residuals of each of several experiments, all its ticks, shape (signals, ticks) each.
+
+    residuals: of all, one behind the other, shape (signals, N).
+    """
+    return np.split(residuals, np.cumsum([item.ticks for item in experiments])[:-1], axis=1)
 
 
 def judge_noise(experiment: Experiment, residuals: NDArray[np.float64]) -> Experiment:

@@ -24,7 +24,7 @@ from ehadiag.identify.refine.last_round import by_a_finer_model
 from ehadiag.identify.refine.least_squares import Refinement, described
 from ehadiag.identify.refine.linearisation import Belief, Linearised, linearised
 from ehadiag.identify.refine.posterior import LAST, nothing, robust_cost, sharpen
-from ehadiag.identify.spans import judge_noise
+from ehadiag.identify.spans import by_experiment, judge_noise
 from ehadiag.identify.uncertainty import independent
 from ehadiag.model.parameters import Parameter
 
@@ -182,8 +182,7 @@ def _spread_of_twins(refined: Refinement, experiments: Sequence[Experiment]) -> 
 
 def _judged(experiments: Sequence[Experiment], residuals: NDArray[np.float64]) -> list[Experiment]:
     """Weigh the experiments by the noise that residuals of all their ticks show."""
-    ends = np.cumsum([item.ticks for item in experiments])[:-1]
-    parts = np.split(residuals, ends, axis=1)
+    parts = by_experiment(experiments, residuals)
     return [judge_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
 
 
