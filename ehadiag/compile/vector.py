@@ -39,6 +39,7 @@ __all__ = [
     "packed",
     "root",
     "store",
+    "store_where",
     "where",
     "with_sign",
 ]
@@ -361,3 +362,9 @@ def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 lower_builtin(store, types.Array, types.Integer, _VECTOR)(_store)
 lower_builtin(store, types.Array, types.Integer, types.Float)(_store)
+
+
+@packed
+def store_where(array: NDArray[np.float64], start: int, mask: Mask, value: Any) -> None:
+    """Write those of WIDTH numbers that a mask chooses to a flat array from `start`."""
+    store(array, start, where(mask, value, load(array, start)))

@@ -17,6 +17,7 @@ from ehadiag.compile.vector import (
     most,
     packed,
     store,
+    store_where,
     where,
 )
 from ehadiag.model.collocation import C1, C2, radau_velocity
@@ -124,14 +125,10 @@ def _keep(
     state: NDArray[np.float64],
 ) -> None:  # fmt: skip
     """Write the jack of these lanes."""
-    k = JACK * LANES + o
-    store(state, k, where(mine, place, load(state, k)))
-    k = JACK_VELOCITY * LANES + o
-    store(state, k, where(mine, velocity, load(state, k)))
-    k = JACK_DIRECTION * LANES + o
-    store(state, k, where(mine, d, load(state, k)))
-    k = FRESH * LANES + o
-    store(state, k, where(mine, fresh, load(state, k)))
+    store_where(state, JACK * LANES + o, mine, place)
+    store_where(state, JACK_VELOCITY * LANES + o, mine, velocity)
+    store_where(state, JACK_DIRECTION * LANES + o, mine, d)
+    store_where(state, FRESH * LANES + o, mine, fresh)
 
 
 @bare_kernel

@@ -30,6 +30,7 @@ from ehadiag.compile.vector import (
     most,
     packed,
     store,
+    store_where,
     where,
 )
 from ehadiag.model.laws import SpoolLaw, play, slide_base, still_flapper
@@ -339,12 +340,12 @@ def _halved(
         store(path, place, where(good != 0.0, s.xs, load(path, place)))
         store(path, slope, where(good != 0.0, s.vs, load(path, slope)))
     mine = good != 0.0
-    _put(state, FLAPPER * LANES + o, mine, s.xf)
-    _put(state, FLAPPER_RATE * LANES + o, mine, s.wf)
-    _put(state, SPOOL * LANES + o, mine, s.xs)
-    _put(state, SPOOL_RATE * LANES + o, mine, s.vs)
-    _put(state, WIRE * LANES + o, mine, s.wire)
-    _put(state, DIRECTION * LANES + o, mine, s.d)
+    store_where(state, FLAPPER * LANES + o, mine, s.xf)
+    store_where(state, FLAPPER_RATE * LANES + o, mine, s.wf)
+    store_where(state, SPOOL * LANES + o, mine, s.xs)
+    store_where(state, SPOOL_RATE * LANES + o, mine, s.vs)
+    store_where(state, WIRE * LANES + o, mine, s.wire)
+    store_where(state, DIRECTION * LANES + o, mine, s.d)
     store(state, BUSY * LANES + o, where(mine, 0.0, busy))
     if with_jack:
         store(pieces, ALONE, where(mine, kinks, 0.0))
@@ -353,12 +354,6 @@ def _halved(
         kinks = load(pieces, ALONE)
         if anywhere(kinks != 0.0):
             jack_over_pieces(o, kinks, cuts, tick, state, path, coefficients, pieces)
-
-
-@packed
-def _put(state: NDArray[np.float64], k: int, these: Mask, value: Vector) -> None:
-    """Write these lanes."""
-    store(state, k, where(these, value, load(state, k)))
 
 
 @bare_kernel
