@@ -88,7 +88,7 @@ def against_peak(model: SimdModel, took: float, sizes: Sizes) -> list[Figure]:
             "share of the test's time for events",
             100.0 * (1.0 - together / took),
             "%",
-            "against the slow triangle; each lane that has one goes alone, behind branches",
+            "against the slow triangle; below zero: lost in the noise of both times",
         ),
     ]
     return [Figure(SECTION, *row) for row in figures]

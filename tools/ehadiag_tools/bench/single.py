@@ -52,12 +52,18 @@ def single_precision(model: SimdModel, in_c: float, took: float, sizes: Sizes) -
     remark = "the lanes' time, with the vectors of C in float32 for those in float64"
     return [
         *out,
-        Figure(
-            SECTION, "float32 lanes at best, faster than the lanes", took / best, "times", remark
-        ),
-        Figure(SECTION, "float32 lanes at best, faster than scalar C", in_c / best, "times"),
+        _at_best("faster than the lanes", took, best, remark),
+        _at_best("faster than scalar C", in_c, best, ""),
         *_accuracy(all_tests(sizes.logs) or [model]),
     ]
+
+
+def _at_best(than: str, other: float, best: float, remark: str) -> Figure:
+    """Ratio of times; `best` is a difference of times, which noise can make no time at all."""
+    name = f"float32 lanes at best, {than}"
+    if best <= 0.0:
+        return Figure(SECTION, name, None, "times", "left out: lost in the noise of its times")
+    return Figure(SECTION, name, other / best, "times", remark)
 
 
 @dataclass(frozen=True, slots=True)
