@@ -63,5 +63,8 @@ def relative_noise(residuals: NDArray[np.float64]) -> float:
     known = residuals != 0.0
     second = residuals[2:] - 2.0 * residuals[1:-1] + residuals[:-2]
     second = second[known[2:] & known[1:-1] & known[:-2]]
-    most = np.sort(np.abs(second))[: int(KEPT_SHARE * second.size)]
-    return float(np.mean(most) / (KEPT_MEAN * np.sqrt(6.0))) if most.size else 1.0
+    kept = int(KEPT_SHARE * second.size)
+    if not kept:
+        return 1.0
+    least = np.partition(np.abs(second), kept - 1)[:kept]
+    return float(np.mean(least) / (KEPT_MEAN * np.sqrt(6.0)))

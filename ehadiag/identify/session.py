@@ -139,6 +139,7 @@ class Session:
         self.knowledge = knowledge
         self._memory = Memory()
         self._looked: tuple[bytes, Look] | None = None
+        self._printed: tuple[tuple[Experiment, ...], bytes] = (), b""
         self.so_far: SoFar | None = None
         """What the latest `feed` showed; None before the first. Another thread may look."""
 
@@ -152,7 +153,7 @@ class Session:
         ready = min(_stages_ready(item) for item in experiments)
         if ready < 0:
             return
-        experiments = share_offsets(experiments)
+        experiments, self._printed = share_offsets(experiments), ((), b"")
         best = self._first(experiments)[1]
         self.so_far = SoFar("first approximation", named(best))
         for stage, result in enumerate(
@@ -176,7 +177,7 @@ class Session:
     def _identify(self, experiments: Sequence[Experiment], tell: Progress) -> Identification:
         begin = time.perf_counter()
         tell("first approximation", 0.0)
-        experiments = share_offsets(experiments)
+        experiments, self._printed = share_offsets(experiments), ((), b"")
         first, start = self._first(experiments)
         searched_at = time.perf_counter()
         found = staged_search(self._stages(experiments, start, partial(tell, "search")), tell)
@@ -360,7 +361,7 @@ class Session:
         """Refinement on the first parts of the tests, from memory if the inputs are the same."""
         until = [first_ticks(item) for item in experiments]
         return self._memory.recall(
-            _of_first_parts(experiments, until, start),
+            self._of_first_parts(experiments, until, start),
             FirstPart,
             lambda: refine_first_part(
                 experiments, until, named(start), between, self._look(experiments, start)
@@ -370,10 +371,23 @@ class Session:
     def _look(self, experiments: Sequence[Experiment], start: NDArray[np.float64]) -> Look:
         """Look at the first parts of the tests; the latest one is kept."""
         until = [first_ticks(item) for item in experiments]
-        key = _of_first_parts(experiments, until, start)
+        key = self._of_first_parts(experiments, until, start)
         if self._looked is None or self._looked[0] != key:
             self._looked = key, look_at(experiments, until, named(start))
         return self._looked[1]
+
+    def _of_first_parts(
+        self, experiments: Sequence[Experiment], until: Sequence[int], start: NDArray[np.float64]
+    ) -> bytes:
+        """Fingerprint of the first parts of the tests and a start among the severities.
+
+        That of the parts is worked out once in a call for the same experiments.
+        """
+        if self._printed[0] != tuple(experiments):
+            free = lay_out(experiments, first_spans(experiments, until))
+            base = [np.array(item.constants) for item in experiments]
+            self._printed = tuple(experiments), digest("first part", [*free, *base])
+        return digest("start", [np.frombuffer(self._printed[1], dtype=np.uint8), start])
 
 
 def identify(
@@ -387,17 +401,6 @@ def identify(
 ) -> Identification:
     """Estimate the severities from one or more recordings of one actuator, fed once."""
     return Session(solver, seed, nuisances, knowledge).finish(experiments, progress)
-
-
-def _of_first_parts(
-    experiments: Sequence[Experiment],
-    until: Sequence[int],
-    start: NDArray[np.float64],
-) -> bytes:
-    """Fingerprint of the first parts of the tests and a start among the severities."""
-    free = lay_out(experiments, first_spans(experiments, until))
-    base = [np.array(item.constants) for item in experiments]
-    return digest("first part", [*free, *base, start])
 
 
 def _guessed(refinement: Refinement) -> NDArray[np.float64]:

@@ -43,11 +43,15 @@ class Considered:
         Standard deviation of what is not known of it, in its unit.
     rows : tuple of int, optional
         Signals on which it counts; all unless given.
+    by_rate : bool
+        Whether it is an instant of sampling (s before the end of a tick), too short for the signals
+        to bend: what it does is worked out from how fast they change, without a run of the model.
     """
 
     parameter: Parameter
     std: float
     rows: tuple[int, ...] | None = None
+    by_rate: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,17 +138,36 @@ class Derivatives:
         runs : shape (n, signals, N)
             Residuals at other points, run in the same blocks.
         """
-        points = self.values(np.vstack([x, *[x] * len(self.considered), *others]))
-        changed = slice(1, 1 + len(self.considered))
-        for j, item in enumerate(self.considered):
-            points[1 + j, len(x) + j] = item.std
+        by_runs = [j for j, item in enumerate(self.considered) if not item.by_rate]
+        points = self.values(np.vstack([x, *[x] * len(by_runs), *others]))
+        for row, j in enumerate(by_runs):
+            points[1 + row, len(x) + j] = self.considered[j].std
         runs, anchored = self.model.residuals(points)
-        changes = runs[changed] - runs[0]
+        changes = np.empty((len(self.considered), *runs.shape[1:]))
+        changes[by_runs] = runs[1 : 1 + len(by_runs)] - runs[0]
+        for change, item in zip(changes, self.considered, strict=True):
+            if item.by_rate:
+                change[:] = item.std * self._rates(runs[0])
         considered = np.where(np.abs(changes) < JUMP, changes, 0.0)
         for change, item in zip(considered, self.considered, strict=True):
             if item.rows is not None:
                 change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
-        return runs[0], considered, int(anchored[0]), runs[changed.stop :]
+        return runs[0], considered, int(anchored[0]), runs[1 + len(by_runs) :]
+
+    def _rates(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How fast the modelled signals change, weighted, from their residuals; 1/s.
+
+        By the samples beside each one; 0 where one of them is missing.
+        """
+        batch, out = self.model.batch, np.zeros(residuals.shape)
+        measured = batch.spool, batch.pressure, batch.position
+        for rate, values, row, weight in zip(out, measured, residuals, batch.weight, strict=False):
+            counts = weight > 0.0
+            share = np.divide(row, weight, out=np.full(row.shape, np.nan), where=counts)
+            modelled = values - share
+            for a, b, tick in zip(batch.start[:-1], batch.start[1:], batch.tick, strict=True):
+                rate[a:b] = np.gradient(modelled[a:b], tick) * weight[a:b]
+        return np.nan_to_num(out, copy=False)
 
     def slopes(self, centres: Sequence[NDArray[np.float64]]) -> list[Slope]:
         """Residuals and derivatives at several points, all runs of the model together."""

@@ -43,7 +43,7 @@ JUDGEMENTS = 3
 NOISE_SETTLED = 0.15
 AGAIN = 3e-4
 """Spread of the severities about an optimum, of a look with the noise judged anew."""
-CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6, (SPOOL_ROW,)),)
+CONSIDERED = (Considered(parameter("sampling_lead"), 0.15e-6, (SPOOL_ROW,), by_rate=True),)
 """Half a step of a plant that is integrated at 0.25 µs is of this size; sized on the spool, which
 moves fastest."""
 VISCOSITY = parameter("oil_viscosity")

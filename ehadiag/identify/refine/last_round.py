@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.identify.refine.bounded_step import bounded_step
-from ehadiag.identify.refine.derivatives import CAP, Derivatives, capped
-from ehadiag.identify.refine.least_squares import CLEAR, Refinement
+from ehadiag.identify.refine.derivatives import Derivatives, capped
+from ehadiag.identify.refine.least_squares import Refinement, by_lines
 from ehadiag.identify.refine.linearisation import Belief, Cross, Linearised
 from ehadiag.identify.refine.posterior import robust_weights
 from ehadiag.model.laws import ESTIMATED_BEND
@@ -62,24 +62,9 @@ def last_round(
     x = _stepped(model, linear.x, finer, finer.residuals)
     if np.any(np.abs(x - belief.x)[model.curved] > FARTHEST * np.sqrt((belief.root**2).sum(1))):
         x = belief.x
-    weighted = model.model.batch.weight > 0.0
-    clear = linear.scatter < CLEAR
-    jacobian = np.where(clear, linear.jacobian, 0.0)
-    residuals = middle + np.tensordot(x - belief.x, jacobian, 1)
-    used = clear & (residuals**2 < CAP) & weighted
-    found = Refinement(
-        parameters=model.estimated,
-        x=x,
-        scale=model.scale,
-        cost=capped(residuals),
-        residuals=residuals,
-        jacobian=np.where(used, jacobian, 0.0),
-        considered=considered,
-        used=used,
-        weighted=weighted,
-        evaluations=model.evaluations + 1,
-        converged=settled,
-        anchored=anchored,
+    found = by_lines(model, x, linear, settled=settled)
+    found = replace(
+        found, considered=considered, anchored=anchored, evaluations=found.evaluations + 1
     )
     return found, [capped(middle), *map(capped, runs[len(sides) :])]
 

@@ -22,7 +22,15 @@ from ehadiag.identify.refine.posterior import FEW, nothing, sharpen
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Parameter
 
-__all__ = ["CLEAR", "SPREAD", "Refinement", "described", "median_offsets", "refine"]
+__all__ = [
+    "CLEAR",
+    "SPREAD",
+    "Refinement",
+    "by_lines",
+    "described",
+    "median_offsets",
+    "refine",
+]
 
 SPREAD = np.array([2e-3, 1e-3, 4e-4])
 """Of the severities, in the order of `FAULTS`, about the optimum of a search, which is mostly
@@ -87,7 +95,7 @@ class Refinement:
     @property
     def normal(self) -> NDArray[np.float64]:
         """JᵀJ of the rows that took part, in units of `scale`, shape (k, k)."""
-        rows = self.jacobian[:, self.used]
+        rows = self.jacobian.reshape(len(self.jacobian), -1)  # 0 where none took part
         return np.asarray(rows @ rows.T)
 
 
@@ -109,7 +117,35 @@ def refine(
         np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
     )
     found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, FEW, between)
-    return described(model, found.belief.x, found.linear, settled=found.settled)
+    return by_lines(model, found.belief.x, found.linear, settled=found.settled)
+
+
+def by_lines(
+    model: Derivatives, x: NDArray[np.float64], linear: Linearised, *, settled: bool
+) -> Refinement:
+    """Put together what is known at an optimum beside the middle of the last round.
+
+    Its residuals are the middle's, moved by the lines where these hold: no run of the model.
+    """
+    weighted = model.model.batch.weight > 0.0
+    clear = linear.scatter < CLEAR
+    jacobian = np.where(clear, linear.jacobian, 0.0)
+    residuals = linear.middle + np.tensordot(x - linear.at, jacobian, 1)
+    used = clear & (residuals**2 < CAP) & weighted
+    return Refinement(
+        parameters=model.estimated,
+        x=x,
+        scale=model.scale,
+        cost=capped(residuals),
+        residuals=residuals,
+        jacobian=np.where(used, jacobian, 0.0),
+        considered=np.zeros((0, *residuals.shape)),
+        used=used,
+        weighted=weighted,
+        evaluations=model.evaluations,
+        converged=settled,
+        anchored=0,
+    )
 
 
 def described(

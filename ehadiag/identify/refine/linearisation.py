@@ -56,14 +56,17 @@ class Linearised:
     jacobian : shape (k, signals, N)
     scatter : shape (signals, N)
         Variance about the linear function.
+    at : shape (k,)
+        Mean of the belief itself.
     middle : shape (signals, N)
-        Residuals at the mean of the belief itself.
+        Residuals there.
     """
 
     x: NDArray[np.float64]
     residuals: NDArray[np.float64]
     jacobian: NDArray[np.float64]
     scatter: NDArray[np.float64]
+    at: NDArray[np.float64]
     middle: NDArray[np.float64]
 
 
@@ -94,7 +97,7 @@ def linearised(model: Derivatives, belief: Belief, rng: np.random.Generator) -> 
     jacobian = model.additive_slopes()
     jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
     mean = (along[0] * basis[0, 0]).reshape(shape)
-    return Linearised(x, mean, jacobian, scatter.reshape(shape), runs[0])
+    return Linearised(x, mean, jacobian, scatter.reshape(shape), points[0], runs[0])
 
 
 def pseudo_inverse(square: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -174,7 +177,8 @@ class Cross:
         left = out[count:]
         scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
         mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
-        return Linearised(self.points.mean(axis=0), mean, jacobian, scatter, runs[0])
+        middle = self.points.mean(axis=0)
+        return Linearised(middle, mean, jacobian, scatter, self.points[0], runs[0])
 
 
 def _directions(rng: np.random.Generator, count: int, pairs: int) -> NDArray[np.float64]:

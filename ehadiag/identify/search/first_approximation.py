@@ -40,9 +40,11 @@ RANGES = ((0.2, 0.06), (0.05, 0.02))
 """Half-widths of the repeated searches, Kintas and FSS."""
 FINER_GRID = 16
 TOLERANCE = 6e-4
+"""Spacing of the last grid."""
 FSS_SPACINGS = (0.04, 0.01, TOLERANCE)
 """The same of the three searches for FSS, whose runs are the dearest."""
-"""Spacing of the last grid."""
+FDJ_SPACING = 4.5e-3
+"""The same of FDJ, whose cost is nearly a parabola."""
 LEAD_S = 0.05
 PRECISION: Mapping[str, float] = {"Kintas": 1.0, "FSS": 1.0, "FDJ": 0.2}
 """Typical errors of the three searches in proportion to each other: FDJ is known best."""
@@ -133,7 +135,7 @@ def first_approximation(inputs: FirstInputs) -> FirstApproximation:
     def fss_cost(grid: NDArray[np.float64], kintas: float) -> NDArray[np.float64]:
         return creeping(_points(inputs.unknowns, Kintas=kintas, FSS=grid))
 
-    fdj = _search(counter, fdj_cost, 0.0, 1.0, GRID)
+    fdj = _search(counter, fdj_cost, 0.0, 1.0, GRID, FDJ_SPACING)
     kintas = _search(counter, lambda grid: kintas_cost(grid, 0.0), 0.0, 1.0, GRID)
     fss = _search(counter, lambda grid: fss_cost(grid, kintas), 0.0, 1.0, GRID, FSS_SPACINGS[0])
     for (kintas_range, fss_range), spacing in zip(RANGES, FSS_SPACINGS[1:], strict=True):

@@ -18,6 +18,8 @@ __all__ = ["SOLVERS", "CompactGa", "PygadGa", "SearchResult", "Solver", "make_so
 
 Progress = Callable[[int, int], None]
 """Called with evaluations done and budget."""
+FEWEST = 3
+"""Generations of the usual size below which a search makes smaller ones."""
 PARENTS, ELITE, MUTATION = 3, 1, 0.8
 """Of pygad: parents of a generation, individuals kept, probability that a gene mutates."""
 
@@ -81,8 +83,12 @@ class CompactGa:
     name: str = field(default="cga", init=False)
 
     def with_budget(self, budget: int) -> CompactGa:
-        """Return the same solver with another number of evaluations."""
-        return replace(self, budget=budget)
+        """Return the same solver with another number of evaluations.
+
+        Of few it makes generations of half the size: how often the elite moves on counts more.
+        """
+        samples = self.samples if budget >= FEWEST * self.samples else self.samples // 2
+        return replace(self, budget=budget, samples=samples)
 
     def minimise(
         self,

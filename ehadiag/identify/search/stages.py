@@ -55,7 +55,7 @@ STAGES = (0.25, 0.5, 0.75)
 
 What comes later is for the last step of the refinement, so that all else is done before the end.
 """
-BUDGET = 1.0 / 6.0
+BUDGET = 1.0 / 12.0
 """Budgets of the solver, for all stages together."""
 DEVIATION = 0.004
 """Of the first stage about the first approximation, severities."""

@@ -63,7 +63,8 @@ RING_TIME = ROOM + 1
 REST = RING_TIME + 1
 MOVE = REST + 4
 LOOSE = MOVE + 16
-SENSING = LOOSE + 16
+IDLE = LOOSE + 16
+SENSING = IDLE + 1
 MOST_HALVINGS = 4
 """The jack takes at most 2^MOST_HALVINGS steps a tick."""
 SENSING_ROWS = 2 * len(Follow._fields) + 1
@@ -72,8 +73,8 @@ of sampling, and the number of the step that holds it."""
 COEFFICIENT_ROWS = SENSING + (MOST_HALVINGS + 1) * SENSING_ROWS
 """Rows of the coefficients: the laws' fields; flapper deflection within which a resting spool
 stays; reciprocal of the ringing's rate; transitions over a whole tick at rest (2 x 2), over a
-quarter of a tick moving (4 x 4), and the same without the feedback wire; the filter before the
-converters."""
+quarter of a tick moving (4 x 4), and the same without the feedback wire; 1 in a lane that holds no
+candidate, whose events nobody waits for; the filter before the converters."""
 
 drive_laws = lanes_of(DriveLaw, DRIVE_LAW, LANES)
 spool_laws = lanes_of(SpoolLaw, SPOOL_LAW, LANES)

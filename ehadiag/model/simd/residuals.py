@@ -45,6 +45,7 @@ from ehadiag.model.simd.layout import (
     ANCHORED,
     COEFFICIENT_ROWS,
     FLOWING,
+    IDLE,
     LANES,
     PATH_ROWS,
     POSITION,
@@ -296,7 +297,8 @@ def _block(
     position, weight, levels, start = batch.position, batch.weight, work.levels, batch.start
     located = weight.shape[0] > POSITION_ROW
     count, wanted = candidates.shape[0], out.shape[0]
-    # Lanes that hold no candidate repeat the last one; a half of none is left out.
+    # Lanes that hold no candidate repeat the last one up to its first event; a half of none is left
+    # out.
     end = WIDTH if count <= WIDTH else LANES
     backlash = creeps = shaped = senses = False
     sums[:] = 0.0
@@ -312,6 +314,8 @@ def _block(
             backlash, creeps, shaped, senses = tabulate(
                 rows, tick, coefficients, moving, loose, stuck, slides, free_slides, rings
             )
+            for i in range(LANES):
+                coefficients[IDLE * LANES + i] = 1.0 if i >= count else 0.0
         # Most candidates are read at the end of the tick, where the spool is at hand.
         read = SEEN if senses else SPOOL
         plays, since = int(plant_of(rows[0]).NPL), batch.since[index]
@@ -334,7 +338,7 @@ def _block(
             with_jack = k <= last
             if busy:
                 busy = halved_lanes(
-                    count, end, tick, backlash, with_jack, state, path, coefficients,
+                    end, tick, backlash, with_jack, state, path, coefficients,
                     slides, free_slides, rings, pieces,
                 )  # fmt: skip
             if busy:

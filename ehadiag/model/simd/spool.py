@@ -36,6 +36,7 @@ from ehadiag.model.simd.layout import (
     FLAPPER,
     FLAPPER_RATE,
     FLOWING,
+    IDLE,
     LANES,
     LOOSE,
     MOVE,
@@ -190,7 +191,7 @@ def spool_lanes(
         ra = xf - still
         rb = (wf + t.ring_damping * ra) * load(coefficients, RING_TIME * LANES + o)
         room = load(coefficients, ROOM * LANES + o) - magnitude(still)
-        free = clamped == 0.0
+        free, idle = clamped == 0.0, load(coefficients, IDLE * LANES + o)
         rests = (d == 0.0) & free & (room > 0.0) & (ra * ra + rb * rb < room * room)
         k = REST * LANES + o
         rest_xf = still + load(coefficients, k) * ra + load(coefficients, k + LANES) * wf
@@ -283,8 +284,9 @@ def spool_lanes(
         store(state, FLAPPER_RATE * LANES + o, new_wf)
         store(state, SPOOL * LANES + o, x4)
         store(state, SPOOL_RATE * LANES + o, v4)
+        fine = fine | (idle != 0.0)
         store(state, BUSY * LANES + o, where(fine, 0.0, 1.0))
-        store(state, DONE * LANES + o, 0.0)
+        store(state, DONE * LANES + o, idle)
         if anywhere(~fine):
             any_busy = True
     return any_busy

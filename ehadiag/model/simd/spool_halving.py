@@ -36,7 +36,7 @@ from ehadiag.compile.vector import (
 from ehadiag.model.laws import SpoolLaw, play, slide_base, still_flapper
 from ehadiag.model.scalar.transition import FINEST
 from ehadiag.model.simd.coefficients import HALVINGS
-from ehadiag.model.simd.jack_pieces import ALONE, PIECE, jack_over_pieces
+from ehadiag.model.simd.jack_pieces import PIECE, jack_over_pieces
 from ehadiag.model.simd.layout import (
     BUSY,
     CLAMPED,
@@ -255,7 +255,6 @@ def _cut(
 @inlined
 def _halved(
     o: int,
-    count: int,
     tick: float,
     backlash: bool,
     with_jack: bool,
@@ -348,17 +347,13 @@ def _halved(
     store_where(state, DIRECTION * LANES + o, mine, s.d)
     store(state, BUSY * LANES + o, where(mine, 0.0, busy))
     if with_jack:
-        store(pieces, ALONE, where(mine, kinks, 0.0))
-        for lane in range(max(count - o, 0), WIDTH):
-            pieces[ALONE + lane] = 0.0
-        kinks = load(pieces, ALONE)
+        kinks = where(mine, kinks, 0.0)
         if anywhere(kinks != 0.0):
             jack_over_pieces(o, kinks, cuts, tick, state, path, coefficients, pieces)
 
 
 @bare_kernel
 def halved_lanes(
-    count: int,
     end: int,
     tick: float,
     backlash: bool,
@@ -378,7 +373,6 @@ def halved_lanes(
 
     Parameters
     ----------
-    count: lanes that hold a candidate; the jacks of others are left as they were.
     with_jack: whether the jack is to go along the pieces of the spool's path that events cut.
     backlash: whether any lane has some.
     slides, free_slides, rings: transitions over 2^0 … 2^HALVINGS finest steps, see
@@ -387,7 +381,7 @@ def halved_lanes(
     """
     any_busy, tables = False, _Tables(slides, free_slides, rings)
     for o in range(0, end, WIDTH):
-        _halved(o, count, tick, backlash, with_jack, state, path, coefficients, tables, pieces)
+        _halved(o, tick, backlash, with_jack, state, path, coefficients, tables, pieces)
         if anywhere(load(state, BUSY * LANES + o) != 0.0):
             any_busy = True
     return any_busy

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from identify_cases import own_experiment
 
 from ehadiag.identify.refine.derivatives import Considered, Derivatives
+from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, Unknowns, parameter
+from ehadiag.model.simd.model import SimdModel
 
 ROWS = 2
 N = 60
@@ -107,3 +110,20 @@ def test_what_is_considered_counts_on_the_rows_that_it_is_sized_by():
     considered = model.at(np.full(len(FAULTS), 0.5))[1][0]
     np.testing.assert_allclose(considered[SPOOL_ROW], 0.15e-6 * shape[SPOOL_ROW])
     assert not considered[PRESSURE_ROW].any()
+
+
+def test_an_instant_of_sampling_acts_by_how_fast_a_signal_changes():
+    """Beside a run of the model with that lead: the same but for what bends within two ticks."""
+    experiment = own_experiment((0.3, 0.3, 0.3))
+    unknowns = unknowns_of([experiment], (*FAULTS, *OFFSETS, LEAD))
+    model = SimdModel(lay_out([experiment]), unknowns)
+    x = np.array([0.3, 0.3, 0.3, 0.0, 0.0])
+    by_run, by_rate = (
+        Derivatives(model, experiment.noise, [Considered(LEAD, 0.15e-6, (SPOOL_ROW,), by_rate)])
+        for by_rate in (False, True)
+    )
+    (expected,), (found,) = by_run.at(x / by_run.scale)[1], by_rate.at(x / by_run.scale)[1]
+    assert not found[PRESSURE_ROW].any()
+    left = np.sqrt(np.mean((found - expected)[SPOOL_ROW] ** 2))
+    assert left < 0.35 * np.sqrt(np.mean(expected[SPOOL_ROW] ** 2))
+    assert model.evaluations == 3
