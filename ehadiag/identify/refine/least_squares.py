@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.refine.derivatives import CAP, Derivatives, capped
 from ehadiag.identify.refine.linearisation import Belief, Linearised, crossed
-from ehadiag.identify.refine.posterior import FEW, nothing, sharpen
+from ehadiag.identify.refine.posterior import FEW, Pace, nothing, sharpen
 from ehadiag.model.interface import ResidualModel
 from ehadiag.model.parameters import Parameter
 
@@ -104,11 +104,12 @@ def refine(
     start: Mapping[str, float],
     spread: NDArray[np.float64] | float = SPREAD,
     between: Callable[[], None] = nothing,
+    pace: Pace = FEW,
 ) -> Refinement:
     """Sharpen a belief about a start, values by name (0 where not named).
 
     spread: of the severities about it, shape (c,), or of each of them.
-    between: see `sharpen`.
+    between, pace: see `sharpen`.
     """
     x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
     curved = model.curved
@@ -116,7 +117,7 @@ def refine(
         np.clip(x, model.lower, model.upper),
         np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
     )
-    found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, FEW, between)
+    found = sharpen(model, begin, begin, np.zeros((len(x), len(x))), crossed, pace, between)
     return by_lines(model, found.belief.x, found.linear, settled=found.settled)
 
 

@@ -4,7 +4,8 @@ The optimum of the first part stands with its information, the normal matrix of 
 Gauss-Newton step on the residuals of the last part, weighed by the information of both, leads to
 the optimum of the whole (a measurement update of the information filter). Where the last part is
 small the step is a fraction of a deviation, over which derivatives hold. From where a longer one
-leads the whole is refined; one that is none of a small part, or does not lead down, is not taken.
+leads the whole is refined, in few rounds; where it does not lead down the last round is about where
+the first part ended. One that is none of a small part is not taken.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ LONG = 1.0
 from there."""
 WORSE = 4.0
 """Cost by which the step may lead up: what break-aways make of a way down."""
+FEWER = replace(FEW, most_rounds=3, whole_rounds=3)
+"""Rounds of the whole where it is refined: the test is over by then, and the verdict awaited."""
 FREE = 1e-12
 """Information on what nothing shows."""
 
@@ -46,7 +49,7 @@ FREE = 1e-12
 def add_last_part(
     experiments: Sequence[Experiment], until: Sequence[int], first_part: FirstPart
 ) -> Refinement | None:
-    """Optimum on all of the tests, from that on their first parts; None where a step is not enough.
+    """Optimum on all of the tests, from that on their first parts; None where it is elsewhere.
 
     Parameters
     ----------
@@ -78,14 +81,15 @@ def add_last_part(
         if np.any(np.abs(moved - x)[whole.faults] > LONG * std[whole.faults]):
             names = (item.name for item in whole.estimated)
             start = dict(zip(names, (moved * whole.scale).tolist(), strict=True))
-            found = refine(whole, start, FEW.width * (std * whole.scale)[whole.curved])
+            width = FEW.width * (std * whole.scale)[whole.curved]
+            found = refine(whole, start, width, pace=FEWER)
             others, moved, normal, settled = [], found.x, found.normal, found.converged
         x = moved
     width = FEW.width * _deviations(normal)[whole.curved]
     root = np.diag(np.minimum(width, SPREAD / whole.scale[whole.curved]))
     found, (cost, *before) = last_round(whole, Belief(x, root), settled, *others)
     if before and cost > before[0] + WORSE:
-        return None
+        found, _ = last_round(whole, Belief(others[0], root), settled)
     return replace(found, evaluations=evaluations + found.evaluations)
 
 

@@ -25,7 +25,9 @@ COMMAND = (
 )
 START_S = 3.0
 """Until the emulated computer sends."""
-TESTS = ("open", "closed")
+WORN = ("--Kintas", "0.3", "--FSS", "0.6", "--FDJ", "0.3")
+CASES = (("open", WORN, ""), ("closed", WORN, ""), ("closed", (), ", healthy actuator"))
+"""Stored test, severities of the emulated unit, and what a figure's name says of it."""
 MOST_S = 60.0
 
 
@@ -41,17 +43,20 @@ def measure(sizes: Sizes) -> list[Figure]:
     for source, sink in ((left[0], right[0]), (right[0], left[0])):
         threading.Thread(target=_pump, args=(source, sink), daemon=True).start()
     out = []
-    with tempfile.TemporaryDirectory() as folder, _computer(os.ttyname(left[1])):
-        for test in TESTS:
-            delays = []
+    for test, severities, words in CASES:
+        delays = []
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            _computer(os.ttyname(left[1]), severities),
+        ):
             for _ in range(max(1, sizes.repeats // 5)):
                 found = _bit(test, os.ttyname(right[1]), folder)
                 if found is not None:
                     delays.append(found)
-            value = statistics.median(delays) * 1e3 if delays else None
-            remark = f"median of {len(delays)} tests; wall time of two processes on a serial line"
-            name = f"last frame of a live test ({test}) to verdict"
-            out.append(Figure(SECTION, name, value, "ms", remark))
+        value = statistics.median(delays) * 1e3 if delays else None
+        remark = f"median of {len(delays)} tests; wall time of two processes on a serial line"
+        name = f"last frame of a live test ({test}{words}) to verdict"
+        out.append(Figure(SECTION, name, value, "ms", remark))
     return out
 
 
@@ -74,9 +79,9 @@ def _bit(test: str, port: str, folder: str) -> float | None:
 
 
 @contextmanager
-def _computer(port: str) -> Iterator[None]:
+def _computer(port: str, severities: tuple[str, ...]) -> Iterator[None]:
     """Run the emulated flight-control computer beside."""
-    arguments = ["sim", "--serial", port, "--Kintas", "0.3", "--FSS", "0.6", "--FDJ", "0.3"]
+    arguments = ["sim", "--serial", port, *severities]
     process = subprocess.Popen(
         [*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
