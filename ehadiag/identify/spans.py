@@ -15,13 +15,22 @@ from ehadiag.model.batch import POSITION_ROW, Batch
 from ehadiag.model.parameter import sized
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, Unknowns
 
-__all__ = ["ANCHOR_LSB", "Spans", "by_experiment", "judge_noise", "lay_out", "unknowns_of"]
+__all__ = [
+    "ANCHOR_LSB",
+    "Spans",
+    "by_experiment",
+    "even_levels",
+    "judge_noise",
+    "lay_out",
+    "unknowns_of",
+]
 
 Spans = Sequence[Sequence[Window]]
 """Of each test, s."""
 ANCHOR_GAIN = 0.3
 ANCHOR_LSB = (1.3, 6.0)
 """Filtered and single innovations beyond which the model is put back on the spool, LSB."""
+EVEN_LEVEL = 2
 FOLLOW = 0.01
 """Share of the jack's innovation by which the model is moved each tick: what lasts longer than a
 tenth of a second is taken away from the residual."""
@@ -95,6 +104,14 @@ def lay_out(
         weight=np.hstack(weight),
         anchor=np.array(anchors),
     )
+
+
+def even_levels(batch: Batch) -> NDArray[np.int64]:
+    """Halvings of the jack's ticks, the same for all, for few runs of a model, shape (N,).
+
+    For few it takes longer to find how each tick is to be cut than to take four steps in each.
+    """
+    return np.full(batch.weight.shape[1], EVEN_LEVEL)
 
 
 def _origin(experiment: Experiment, first: int) -> float:

@@ -15,7 +15,14 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.refine.derivatives import CAP, Considered, Derivatives
 from ehadiag.identify.refine.least_squares import SPREAD, Refinement, median_offsets, refine
 from ehadiag.identify.refine.posterior import nothing
-from ehadiag.identify.spans import ANCHOR_LSB, Spans, judge_noise, lay_out, unknowns_of
+from ehadiag.identify.spans import (
+    ANCHOR_LSB,
+    Spans,
+    even_levels,
+    judge_noise,
+    lay_out,
+    unknowns_of,
+)
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameters import FAULTS, OFFSETS, Parameter, parameter
 from ehadiag.model.simd.model import SimdModel
@@ -36,8 +43,6 @@ __all__ = [
     "residuals_at",
 ]
 
-FREE_LEVEL = 2
-"""Halvings of the jack's ticks in a model that runs free, for noise and medians."""
 JUDGEMENTS = 3
 """How often at most the noise is judged anew."""
 NOISE_SETTLED = 0.15
@@ -149,9 +154,7 @@ def residuals_at(
 ) -> tuple[SimdModel, NDArray[np.float64]]:
     """A model that runs free, and its residuals at severities by name, no offsets taken off."""
     batch = lay_out(experiments, spans)
-    # For one point it takes longer to find the jack's steps than to take four in every tick.
-    levels = np.full(len(batch.current), FREE_LEVEL)
-    model = SimdModel(batch, unknowns_of(experiments), levels=levels)
+    model = SimdModel(batch, unknowns_of(experiments), levels=even_levels(batch))
     point = np.array([[start.get(item.name, 0.0) for item in model.unknowns.free]])
     return model, model.residuals(point)[0][0]
 

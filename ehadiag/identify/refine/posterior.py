@@ -100,7 +100,7 @@ hard (closed loop, little hysteresis) 38 came to the optimum, with 700 runs each
 0.75 19, with 480 runs; of 0.65 9, with 360; of 0.9 42, with 970."""
 LAST = replace(MANY, most_rounds=12, flat=4.0)
 """The same, of a last look, which begins beside the optimum."""
-FEW = Pace(0.3, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0)
+FEW = Pace(0.2, 1.5, settled_ratio=0.6, settled_step=0.1, most_rounds=9, whole_rounds=6, flat=0.0)
 """For few ones, which are told apart at once: until the estimate is that of any search before."""
 
 

@@ -40,7 +40,7 @@ LONG = 1.0
 from there."""
 WORSE = 4.0
 """Cost by which the step may lead up: what break-aways make of a way down."""
-FEWER = replace(FEW, most_rounds=3, whole_rounds=3)
+FEWER = replace(FEW, most_rounds=4, whole_rounds=2)
 """Rounds of the whole where it is refined: the test is over by then, and the verdict awaited."""
 FREE = 1e-12
 """Information on what nothing shows."""

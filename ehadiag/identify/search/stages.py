@@ -26,7 +26,7 @@ from ehadiag.identify.search.first_approximation import (
 )
 from ehadiag.identify.search.objective import Objective
 from ehadiag.identify.search.solvers import SearchResult, Solver
-from ehadiag.identify.spans import lay_out, unknowns_of
+from ehadiag.identify.spans import even_levels, lay_out, unknowns_of
 from ehadiag.model.parameters import FAULTS
 from ehadiag.model.simd.model import SimdModel
 
@@ -176,7 +176,7 @@ def _search_stage(
         digest(f"search {seed} {part!r}", [*batch, np.array(unknowns.base), start, spread]),
         SearchResult,
         lambda: part.minimise(
-            Objective(SimdModel(batch, unknowns)),
+            Objective(SimdModel(batch, unknowns, levels=even_levels(batch))),
             start,
             spread,
             seed + stage,
