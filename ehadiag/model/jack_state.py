@@ -65,7 +65,7 @@ class Probe(NamedTuple):
 
 
 @packed
-def place_on(p: Piece, q: float) -> Any:
+def place_on(p: Piece, q: Any) -> Any:
     """Spool at the share q of a piece, m."""
     r = 1.0 - q
     return p.x0 + q * q * (3.0 - 2.0 * q) * (p.x1 - p.x0) + q * r * (r * p.rise0 - q * p.rise1)

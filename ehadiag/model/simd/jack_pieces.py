@@ -21,10 +21,10 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.collocation import C1, C2, radau_velocity
-from ehadiag.model.jack import FINE_RATIO, FINE_TRAVEL, FRESH_DECAY
+from ehadiag.model.jack import FINE_RATIO, FINE_TRAVEL, FRESH_DECAY, MOST_STEPS
 from ehadiag.model.jack_state import Piece, Probe, place_on
 from ehadiag.model.lands import open_piece
-from ehadiag.model.laws import excess, resistance
+from ehadiag.model.laws import JackLaw, excess, resistance
 from ehadiag.model.second_stage import jack_piece
 from ehadiag.model.sensors import sensing
 from ehadiag.model.simd.jack_events import keep_lane_jack, lane_jack
@@ -66,8 +66,9 @@ def jack_over_pieces(
 ) -> None:
     """Jack over a tick, by `count` pieces, of the lanes from `o` in which `these` is not 0.
 
-    A lane in which it starts or stops within a piece goes over that alone, and one whose second
-    stage, lands or sensor are not the plain ones over all of them.
+    After a start or a stop it takes some steps a piece. A lane in which it starts or stops within a
+    piece goes over that alone, and one whose second stage, lands or sensor are not the plain ones
+    over all of them.
     """
     j, law = jack_laws(coefficients, o), sensor_laws(coefficients, o)
     place, velocity = load(state, JACK * LANES + o), load(state, JACK_VELOCITY * LANES + o)
@@ -88,15 +89,21 @@ def jack_over_pieces(
             rests = here & (d == 0.0) & (up <= 0.0) & (down >= 0.0)
             slides = here & (d != 0.0)
             if anywhere(slides):
-                near = where(x0 * x1 > 0.0, least(magnitude(x0), magnitude(x1)), 0.0)
-                slides = slides & (magnitude(x1 - x0) < most(near * FINE_RATIO, FINE_TRAVEL))
-                if anywhere(slides & (fresh != 0.0)):
-                    rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
-                    slides = slides & ((fresh == 0.0) | (span * rate < FRESH_DECAY))
                 piece = Piece(
                     span, x0, x1, load(pieces, k + 2 * WIDTH) * span,
                     load(pieces, k + 3 * WIDTH) * span,
                 )  # fmt: skip
+                near = where(x0 * x1 > 0.0, least(magnitude(x0), magnitude(x1)), 0.0)
+                fine = most(near * FINE_RATIO, FINE_TRAVEL)
+                many = slides & ((fresh != 0.0) | (magnitude(x1 - x0) >= fine))
+                slides = slides & ~many
+                if anywhere(many):
+                    rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
+                    wanted = magnitude(x1 - x0) / fine
+                    decay = where(fresh != 0.0, span * rate * (1.0 / FRESH_DECAY), 0.0)
+                    many, place, velocity = _in_steps(
+                        j, piece, many, most(wanted, decay), d, place, velocity
+                    )
                 xa, xb = place_on(piece, C1), place_on(piece, C2)
                 later = radau_velocity(
                     j, span, j.load + hold + d * j.friction, velocity, xa, xb, x1,
@@ -105,6 +112,7 @@ def jack_over_pieces(
                 moved = place + 0.5 * span * (velocity + later)
                 slides = slides & (later * d > 0.0) & (magnitude(moved) < j.stroke)
                 place, velocity = where(slides, moved, place), where(slides, later, velocity)
+                slides = slides | many
             alone = here & ~rests & ~slides
             fresh = where(rests | slides, 0.0, fresh)
             if anywhere(alone):
@@ -117,6 +125,38 @@ def jack_over_pieces(
             x0 = where(span > 0.0, x1, x0)
     _keep(o, plain, place, velocity, d, fresh, state)
     store(state, DONE * LANES + o, where(these != 0.0, 1.0, load(state, DONE * LANES + o)))
+
+
+@packed
+def _in_steps(
+    j: JackLaw, piece: Piece, these: Mask, wanted: Vector, d: Vector, place: Vector,
+    velocity: Vector,
+) -> tuple[Mask, Vector, Vector]:  # fmt: skip
+    """Sliding jack over a piece in as many steps as a lane alone would take, 1 + wanted of them.
+
+    Returns in which of the lanes it goes on sliding, and theirs moved.
+    """
+    zero = d * 0.0
+    count, most_steps = zero + 1.0, 1
+    while most_steps < MOST_STEPS and anywhere(these & (wanted >= most_steps * 1.0)):
+        count = where(wanted >= most_steps * 1.0, count + 1.0, count)
+        most_steps += 1
+    begin, at, speed, by_count = zero, place, velocity, (zero + 1.0) / count
+    for step in range(1, most_steps + 1):
+        goes = these & (count >= step * 1.0)
+        end = where(count == step * 1.0, 1.0, by_count * (step * 1.0))
+        width = end - begin
+        xa, xb = place_on(piece, begin + C1 * width), place_on(piece, begin + C2 * width)
+        xe, h = place_on(piece, end), width * piece.span
+        later = radau_velocity(
+            j, h, j.load + j.spring * at + d * j.friction, speed, xa, xb, xe,
+            resistance(j, xa), resistance(j, xb), resistance(j, xe),
+        )  # fmt: skip
+        moved = at + 0.5 * h * (speed + later)
+        these = these & (~goes | ((later * d > 0.0) & (magnitude(moved) < j.stroke)))
+        at, speed = where(goes, moved, at), where(goes, later, speed)
+        begin = end
+    return these, where(these, at, place), where(these, speed, velocity)
 
 
 @packed

@@ -188,17 +188,18 @@ def _rung(
 def _advanced(
     t: SpoolLaw, tables: _Tables, o: int, longest: int, shortest: int, rest: Vector, unit: float,
     fine: bool, backlash: bool, deflection: Vector, going: Mask, s: _Motion,
-) -> tuple[_Motion, Vector, Vector]:  # fmt: skip
+) -> tuple[_Motion, Mask, Mask]:  # fmt: skip
     """Lanes that go, after `rest` steps of `unit` seconds in one go.
 
     longest, shortest: which of their binary digits may be 1. fine: whether it is the finest step;
     backlash: whether any lane has some.
 
-    Returns the state, where an event has come or may hide, and where there is a stop; not 0 there.
+    Returns the state, in which of them an event has come or may hide, and in which there is a stop.
     """
-    zero, h = s.d * 0.0, rest * unit
+    h = rest * unit
     xf, wf, xs, vs = s.xf, s.wf, s.xs, s.vs
-    found_in, stops_in = zero, zero
+    found_in = going & ~going
+    stops_in = found_in
     moves, rests = going & (s.d != 0.0), going & (s.d == 0.0)
     if backlash:
         free = moves & (s.d * (s.xs - s.wire) < t.backlash - TOUCH)
@@ -210,24 +211,21 @@ def _advanced(
             )
             xf, wf = where(free, nxf, xf), where(free, nwf, wf)
             xs, vs = where(free, nxs, xs), where(free, nvs, vs)
-            found_in = where(free & found, 1.0, found_in)
-            stops_in = where(free & stops, 1.0, stops_in)
+            found_in, stops_in = free & found, free & stops
     if anywhere(moves):
         nxf, nwf, nxs, nvs, found, stops = _slid(
             t, tables.slides, o, longest, shortest, rest, h, fine, deflection, s
         )
         xf, wf = where(moves, nxf, xf), where(moves, nwf, wf)
         xs, vs = where(moves, nxs, xs), where(moves, nvs, vs)
-        found_in = where(moves & found, 1.0, found_in)
-        stops_in = where(moves & stops, 1.0, stops_in)
+        found_in, stops_in = found_in | (moves & found), stops_in | (moves & stops)
     if anywhere(rests):
         still = still_flapper(t.ratio, deflection, s.wire)
         nxf, nwf, found, stops = _rung(
             t, tables.rings, o, longest, shortest, rest, h, fine, still, s
         )
         xf, wf = where(rests, nxf, xf), where(rests, nwf, wf)
-        found_in = where(rests & found, 1.0, found_in)
-        stops_in = where(rests & stops, 1.0, stops_in)
+        found_in, stops_in = found_in | (rests & found), stops_in | (rests & stops)
     return _Motion(xf, wf, xs, vs, play(s.wire, xs, t.backlash), s.d), found_in, stops_in
 
 
@@ -282,56 +280,56 @@ def _halved(
     before, since, events, kinks = s.vs, zero, zero, zero
     cuts = 0
     for node in range(NODES):
-        done, limit, longest, shortest = zero, zero, HALVINGS, HALVINGS
-        going = good != 0.0
-        while anywhere(going):
-            # On to the node at once, where no event may hide before it.
-            rest = where(going, QUARTER - done, 0.0)
-            new, found, stops = _advanced(
-                t, tables, o, longest, shortest, rest, unit, False, backlash, deflection, going, s
-            )
-            good = where(stops != 0.0, 0.0, good)
-            goes = going & (found == 0.0)
-            s = _chosen(goes, new, s)
-            since = where(goes, since + rest, since)
-            done = where(goes, QUARTER, done)
-            longest, shortest = HALVINGS - 1, 0
-            hunts = where(good != 0.0, found, 0.0)
-            if anywhere(hunts != 0.0):
-                # Where it may, by shorter and shorter steps up to it, the last of them twice.
+        done, limit, hunts, begin = zero, QUARTER + zero, good, HALVINGS
+        while anywhere(hunts != 0.0):
+            # On to the node at once, where no event may hide before it (the first time); where one
+            # may, by shorter and shorter steps up to it, the last of them twice.
+            for n in range(HALVINGS - begin, HALVINGS + 2):
+                level = max(HALVINGS - n, 0)
+                units, fine = float(1 << level), n > HALVINGS
+                wants = (hunts != 0.0) & (done + units <= limit)
+                new, found, stops = _advanced(
+                    t, tables, o, level, level, zero + units, unit, fine, backlash,
+                    deflection, wants, s,
+                )  # fmt: skip
+                good, hunts = where(stops, 0.0, good), where(stops, 0.0, hunts)
+                if not fine:
+                    limit = where(found, done + units, limit)
+                    wants = wants & ~found
+                s = _chosen(wants, new, s)
+                since = where(wants, since + units, since)
+                done = where(wants, done + units, done)
+                if level == HALVINGS and not anywhere(found):
+                    break
+                if fine and anywhere(found):
+                    _cut(pieces, cuts, where(found, since * unit, 0.0), s.xs, before, s.vs)
+                    cuts += 1
+                    # A spool that stops rests, or moves back; one at rest breaks away; else it
+                    # meets the wire.
+                    turns = found & (s.vs * s.d <= 0.0)
+                    side = where(s.xf > 0.0, 1.0, zero - 1.0)
+                    side = where(magnitude(s.xf) > t.breakaway, side, 0.0)
+                    vs, d = where(turns, 0.0, s.vs), where(turns, side, s.d)
+                    s = _Motion(s.xf, s.wf, s.xs, vs, s.wire, d)
+                    kinks = where(turns & (d != 0.0), 1.0, kinks)
+                    before, since = where(found, vs, before), where(found, 0.0, since)
+                    events = where(found, events + 1.0, events)
+                    good = where(events > MOST_EVENTS * 1.0, 0.0, good)
+            going, begin = (good != 0.0) & (done < QUARTER), HALVINGS - 1
+            hunts = zero
+            if anywhere(going):
+                # Past an event on to the node at once, and so on.
+                rest = where(going, QUARTER - done, 0.0)
+                new, found, stops = _advanced(
+                    t, tables, o, HALVINGS - 1, 0, rest, unit, False, backlash, deflection, going, s
+                )
+                good = where(stops, 0.0, good)
+                goes = going & ~found
+                s = _chosen(goes, new, s)
+                since = where(goes, since + rest, since)
+                done = where(goes, QUARTER, done)
+                hunts = where(going & found & (good != 0.0), 1.0, zero)
                 limit = QUARTER + zero
-                for n in range(HALVINGS + 1):
-                    level = max(HALVINGS - 1 - n, 0)
-                    units, fine = float(1 << level), level == 0
-                    wants = (hunts != 0.0) & (done + units <= limit)
-                    new, found, stops = _advanced(
-                        t, tables, o, level, level, where(wants, units, 0.0), unit, fine, backlash,
-                        deflection, wants, s,
-                    )  # fmt: skip
-                    good = where(stops != 0.0, 0.0, good)
-                    if not fine:
-                        limit = where(found != 0.0, done + units, limit)
-                        wants = wants & (found == 0.0)
-                    s = _chosen(wants, new, s)
-                    since = where(wants, since + units, since)
-                    done = where(wants, done + units, done)
-                    comes = found != 0.0
-                    if fine and anywhere(comes):
-                        _cut(pieces, cuts, where(comes, since * unit, 0.0), s.xs, before, s.vs)
-                        cuts += 1
-                        # A spool that stops rests, or moves back; one at rest breaks away; else it
-                        # meets the wire.
-                        turns = comes & (s.vs * s.d <= 0.0)
-                        side = where(s.xf > 0.0, 1.0, zero - 1.0)
-                        side = where(magnitude(s.xf) > t.breakaway, side, 0.0)
-                        vs, d = where(turns, 0.0, s.vs), where(turns, side, s.d)
-                        s = _Motion(s.xf, s.wf, s.xs, vs, s.wire, d)
-                        kinks = where(turns & (d != 0.0), 1.0, kinks)
-                        before, since = where(comes, vs, before), where(comes, 0.0, since)
-                        hunts = where(comes, 0.0, hunts)
-                        events = where(comes, events + 1.0, events)
-                        good = where(events > MOST_EVENTS * 1.0, 0.0, good)
-            going = (good != 0.0) & (done < QUARTER)
         _cut(pieces, cuts, since * unit, s.xs, before, s.vs)
         cuts += 1
         since, before = zero, s.vs
