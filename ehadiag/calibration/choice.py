@@ -1,23 +1,38 @@
-"""Chooses the model that a unit is learned by: simple ones first, then all effects, then fewer.
+"""Chooses the model that a unit is learned by, in open loop: simple ones first, then all effects.
 
 A simple model that leaves nothing is taken. Else what a unit may have besides is freed, and what
 the recordings do not ask for is taken out again (`ehadiag.calibration.effects`). One recording of
-each test suffices to choose; all are learned from.
+each open-loop test suffices to choose: there the spool breaks away seldom, so that a search comes
+to the optimum and what it leaves is of the model. All recordings are learned from.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from ehadiag.calibration.effects import asked_for_by, with_further_effects
+from ehadiag.calibration.effects import (
+    LITTLE,
+    QUICK,
+    asked_for_by,
+    in_order,
+    with_further_effects,
+)
 from ehadiag.calibration.judging import WORTH_ANOTHER
-from ehadiag.calibration.models import ONE_START, SMOOTH, TWO_STARTS, Learned, Model, simple_models
-from ehadiag.calibration.session import Session
+from ehadiag.calibration.models import (
+    ONE_START,
+    SLOW,
+    SMOOTH,
+    TWO_STARTS,
+    Learned,
+    Model,
+    simple_models,
+)
+from ehadiag.calibration.session import Part, Session
 from ehadiag.core.actuator import Actuator
-from ehadiag.identify.nuisance.explained import is_noise
+from ehadiag.identify.nuisance.explained import excess_of_signals
 from ehadiag.identify.nuisance.knowledge import data_that_pass_for
-from ehadiag.identify.spans import by_experiment
+from ehadiag.model.batch import SPOOL_ROW
 
 __all__ = ["choose", "learned_as_new"]
 
@@ -31,6 +46,9 @@ ALIKE = 30.0
 
 def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]:
     """Learn with one model after the other until one explains the recordings; all that were tried.
+
+    The other second stage is tried where the spool is explained and the pressure is not: the spool
+    leaves as much with either.
 
     Parameters
     ----------
@@ -46,69 +64,51 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     list[Learned]
         In the order in which they were tried.
     """
-    models = simple_models(start)
-    if compare:
-        models += [replace(item, plays=SMOOTH) for item in models]
     out: list[Learned] = []
-    for model in models:
-        out.append(_searched(session, model, first=not out))
-        if _has_all_effects(out[-1]) and not compare:
-            return out
-    if any(_has_all_effects(item) for item in out):
+    simple = simple_models(start)
+    for plays in (1, SMOOTH):
+        for model in simple:
+            if model != simple[0] and not compare and not _spool_is_explained(out[-1]):
+                break
+            out.append(_simply(session, replace(model, plays=plays), out))
+            if out[-1].estimated.explained and not compare:
+                return out
+    if any(item.estimated.explained for item in out):
         return out
-    smooth = [_smooth(session, out, simple) for simple in simple_models(start)]
-    if not compare:
-        out += smooth
-    if any(item.estimated.explained for item in smooth):
-        return out
-    for item in smooth:  # what they leave does not tell the second stage
-        out.append(with_further_effects(session, item))
+    for model in simple:  # what they leave does not tell the second stage
+        out.append(with_further_effects(session, replace(model, plays=SMOOTH)))
         if out[-1].estimated.excess <= WORTH_ANOTHER:
             break
     return out
 
 
-def _has_all_effects(found: Learned) -> bool:
-    """Whether all is explained, or all of open loop: no effect is missing.
-
-    In closed loop the spool breaks away so often that a search may end with some of it at wrong
-    ticks.
-    """
-    if found.estimated.explained:
-        return True
-    parts = by_experiment(found.experiments, found.estimated.refined.residuals)
-    first = [
-        is_noise(part)
-        for item, part in zip(found.experiments, parts, strict=True)
-        if not item.test.closed_loop
-    ]
-    return bool(first) and all(first)
+def _spool_is_explained(found: Learned) -> bool:
+    return excess_of_signals(found.estimated.refined.residuals)[SPOOL_ROW] <= LITTLE
 
 
-def _smooth(session: Session, tried: Sequence[Learned], simple: Model) -> Learned:
-    """Learn a smooth hysteresis with one class of second stage, if that has not been tried."""
-    model = replace(simple, plays=SMOOTH)
-    for item in tried:
-        if item.model == model:
-            return item
-    one_play = next(item for item in tried if item.model == simple)
-    hint = one_play.estimated.refined.values
-    return session.learn(model, nearly_new=True, hint=hint, budget=ONE_START, some=True)
+def _simply(session: Session, model: Model, before: Sequence[Learned]) -> Learned:
+    """Learn with a model without further effects, a smooth hysteresis from where one play ended."""
+    if model.plays == 1:
+        return _searched(session, model, first=not before)
+    alike = [item for item in before if item.model.second_stage == model.second_stage]
+    hint = (alike or before)[-1].estimated.refined.values
+    return session.learn(model, nearly_new=True, hint=hint, budget=ONE_START, part=Part.OPEN_LOOP)
 
 
 def learned_as_new(session: Session, best: Learned) -> Learned:
-    """Learn once more, the severities taken for 0 and the frictions as new in their place.
+    """Learn from all recordings, the severities taken for 0 and the frictions as new instead.
 
-    Effects that the recordings do not ask for are left out. Residuals like noise are no proof of
-    the best optimum, and what is learned here is believed ever after: with a simple model the best
-    of several searches is taken. With many effects each search begins where the first one ended.
+    Residuals like noise are no proof of the best optimum, and what is learned here is believed ever
+    after: with a simple model the best of several searches is taken. With further effects those
+    that open loop does not ask for are freed once more, since closed loop may, and each search
+    begins where that one ended.
 
     Parameters
     ----------
     session : Session
         The recordings.
     best : Learned
-        With the severities estimated.
+        From open loop, with the severities estimated.
 
     Returns
     -------
@@ -117,18 +117,37 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     """
     values = best.estimated.refined.values
     hint = {**values, **data_that_pass_for(session.start, values)}
-    model = replace(best.model, beside=asked_for_by(best)) if best.model.rich else best.model
-    budget = ONE_START if model.rich else TWO_STARTS
-    found = [session.learn(model, new=True, hint=hint, budget=budget)]
+    if best.model.rich:
+        return _with_effects(session, best, hint)
+    found = [session.learn(best.model, new=True, hint=hint, budget=TWO_STARTS)]
     for turn in range(1, MOST_SEARCHES):
-        if _came_to(best, found[0]) or (best.model.rich and _as_good(found[0], best)):
+        if _came_to(best, found[0]):
             break
-        around = None if turn % 2 and not best.model.rich else hint
-        found.append(session.learn(model, new=True, hint=around, budget=budget, turn=turn))
+        around = None if turn % 2 else hint
+        found.append(session.learn(best.model, new=True, hint=around, budget=TWO_STARTS, turn=turn))
         found.sort(key=lambda item: item.criterion)
         if found[1].criterion - found[0].criterion < ALIKE:
             break
     return found[0]
+
+
+def _with_effects(session: Session, best: Learned, hint: Mapping[str, float]) -> Learned:
+    """Learn from all recordings with the further effects that these ask for."""
+    names = set(asked_for_by(best))
+    if not names.intersection(SLOW):
+        names.update(QUICK)
+    model = replace(best.model, beside=in_order(names))
+    whole = session.learn(model, new=True, hint=hint, budget=ONE_START, part=Part.EACH_TEST)
+    fewer = replace(model, beside=asked_for_by(whole))
+    if fewer == model and len(whole.experiments) == len(session.recordings):
+        return whole
+    hint = whole.estimated.refined.values
+    found: list[Learned] = []
+    for turn in range(MOST_SEARCHES):
+        found.append(session.learn(fewer, new=True, hint=hint, budget=ONE_START, turn=turn))
+        if _as_good(found[-1], whole):
+            break
+    return min(found, key=lambda item: item.criterion)
 
 
 def _came_to(best: Learned, found: Learned) -> bool:
@@ -145,15 +164,17 @@ def _as_good(found: Learned, best: Learned) -> bool:
 
 
 def _searched(session: Session, model: Model, *, first: bool) -> Learned:
-    """Learn with a simple model, again where the search may have stopped beside the optimum."""
-    found = session.learn(model, nearly_new=True, brief=True, some=True)
+    """Learn with one play, again where the search may have stopped beside the optimum."""
+    found = session.learn(model, nearly_new=True, brief=True, part=Part.OPEN_LOOP)
     turn = 1
     while turn < MOST_SEARCHES and _may_have_stopped_beside(found, first=first):
         # The unit may be worn, too.
-        other = session.learn(model, nearly_new=turn != 1, brief=True, some=True, turn=turn)
+        other = session.learn(
+            model, nearly_new=turn != 1, brief=True, part=Part.OPEN_LOOP, turn=turn
+        )
         found = min(found, other, key=lambda item: item.criterion)
         turn += 1
-        if found.estimated.excess > WORTH_ANOTHER or _has_all_effects(found):
+        if found.estimated.excess > WORTH_ANOTHER or found.estimated.explained:
             break
     return found
 
