@@ -119,11 +119,11 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     hint = {**values, **data_that_pass_for(session.start, values)}
     if best.model.rich:
         return _with_effects(session, best, hint)
-    found = [session.learn(best.model, new=True, hint=hint, budget=TWO_STARTS)]
+    found = [session.learn(best.model, new=True, hint=hint, hint_of_open=True, budget=TWO_STARTS)]
     for turn in range(1, MOST_SEARCHES):
         if _came_to(best, found[0]):
             break
-        around = None if turn % 2 else hint
+        around = None if turn % 2 else found[0].estimated.refined.values
         found.append(session.learn(best.model, new=True, hint=around, budget=TWO_STARTS, turn=turn))
         found.sort(key=lambda item: item.criterion)
         if found[1].criterion - found[0].criterion < ALIKE:
@@ -137,17 +137,38 @@ def _with_effects(session: Session, best: Learned, hint: Mapping[str, float]) ->
     if not names.intersection(SLOW):
         names.update(QUICK)
     model = replace(best.model, beside=in_order(names))
-    whole = session.learn(model, new=True, hint=hint, budget=ONE_START, part=Part.EACH_TEST)
+    whole = session.learn(
+        model, new=True, hint=hint, hint_of_open=True, budget=ONE_START, part=Part.EACH_TEST
+    )
     fewer = replace(model, beside=asked_for_by(whole))
     if fewer == model and len(whole.experiments) == len(session.recordings):
         return whole
-    hint = whole.estimated.refined.values
+    enough = 1 if names.intersection(SLOW) else 2
     found: list[Learned] = []
-    for turn in range(MOST_SEARCHES):
-        found.append(session.learn(fewer, new=True, hint=hint, budget=ONE_START, turn=turn))
-        if _as_good(found[-1], whole):
+    while len(found) < MOST_SEARCHES:
+        afresh = bool(len(found) % 2)
+        around = hint if afresh else min([whole, *found], key=_left).estimated.refined.values
+        found.append(
+            session.learn(
+                fewer,
+                new=True,
+                hint=around,
+                hint_of_open=afresh,
+                budget=ONE_START,
+                turn=len(found),
+            )
+        )
+        nearest = min(found, key=_left)
+        before, fewer = fewer, replace(fewer, beside=asked_for_by(found[-1]))
+        done = nearest.estimated.explained or len(found) >= enough
+        if fewer == before and done and _as_good(nearest, whole):
             break
     return min(found, key=lambda item: item.criterion)
+
+
+def _left(found: Learned) -> float:
+    """What a search leaves, over noise."""
+    return found.estimated.excess
 
 
 def _came_to(best: Learned, found: Learned) -> bool:
