@@ -18,7 +18,7 @@ from ehadiag.calibration.effects import (
     in_order,
     with_further_effects,
 )
-from ehadiag.calibration.judging import WORTH_ANOTHER
+from ehadiag.calibration.judging import WORTH_ANOTHER, is_explained
 from ehadiag.calibration.models import (
     ONE_START,
     SLOW,
@@ -99,9 +99,8 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     """Learn from all recordings, the severities taken for 0 and the frictions as new instead.
 
     Residuals like noise are no proof of the best optimum, and what is learned here is believed ever
-    after: with a simple model the best of several searches is taken. With further effects those
-    that open loop does not ask for are freed once more, since closed loop may, and each search
-    begins where that one ended.
+    after: the best of several searches is taken. Where the model leaves something in open loop the
+    further effects that this does not ask for are freed once more, since closed loop may.
 
     Parameters
     ----------
@@ -117,18 +116,21 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     """
     values = best.estimated.refined.values
     hint = {**values, **data_that_pass_for(session.start, values)}
-    if best.model.rich:
+    if best.model.rich and not best.estimated.explained:
         return _with_effects(session, best, hint)
-    found = [session.learn(best.model, new=True, hint=hint, hint_of_open=True, budget=TWO_STARTS)]
+    model = replace(best.model, beside=asked_for_by(best)) if best.model.rich else best.model
+    found = [session.learn(model, new=True, hint=hint, hint_of_open=True, budget=TWO_STARTS)]
     for turn in range(1, MOST_SEARCHES):
-        if _came_to(best, found[0]):
+        if _came_to(best, found[0]) or (model.rich and found[0].estimated.explained):
             break
         around = None if turn % 2 else found[0].estimated.refined.values
-        found.append(session.learn(best.model, new=True, hint=around, budget=TWO_STARTS, turn=turn))
+        found.append(session.learn(model, new=True, hint=around, budget=TWO_STARTS, turn=turn))
         found.sort(key=lambda item: item.criterion)
         if found[1].criterion - found[0].criterion < ALIKE:
             break
-    return found[0]
+    if model.rich and not is_explained(found[0]):
+        found.append(_with_effects(session, best, hint))
+    return min(found, key=lambda item: item.criterion)
 
 
 def _with_effects(session: Session, best: Learned, hint: Mapping[str, float]) -> Learned:

@@ -120,15 +120,27 @@ def test_a_comparison_tries_all():
     ]
 
 
-def test_effects_that_closed_loop_may_ask_for_are_freed_once_more(further):
-    session = Told(lambda _model: (0.0, 0.0))
-    best = session.learn(Model("linear", SMOOTH, (SKEW,)), part=Part.OPEN_LOOP)
+def learned_after(leaves):
+    session = Told(leaves)
+    best = session.learn(Model("linear", SMOOTH, (SKEW, "load")), part=Part.OPEN_LOOP)
     learned = learned_as_new(session, best)
-    whole, last = session.asked[-2:]
-    assert whole[0].beside == in_order(QUICK)
-    assert whole[1]["hint_of_open"]
-    assert last[0].beside == learned.model.beside == (SKEW,)
     assert all(how["new"] for _, how in session.asked[1:])
+    assert learned.model.beside == (SKEW,)
+    return [(model.beside, how.get("hint_of_open", False)) for model, how in session.asked[1:]]
+
+
+def test_what_open_loop_explains_is_learned_as_it_is(further):
+    assert learned_after(lambda _model: (0.0, 0.0)) == [((SKEW,), True)]
+
+
+def test_effects_that_closed_loop_may_ask_for_are_freed_once_more(further):
+    asked = learned_after(lambda _model: (1.0, 1.0))
+    assert asked == [(in_order(QUICK), True), ((SKEW,), False), ((SKEW,), True)]
+
+
+def test_closed_loop_that_open_loop_does_not_explain_asks_for_more(further):
+    asked = learned_after(lambda model: (9.0, 9.0) if len(model.beside) == 1 else (0.0, 0.0))
+    assert (in_order(QUICK), True) in asked
 
 
 @pytest.mark.parametrize(
