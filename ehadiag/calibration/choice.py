@@ -30,6 +30,7 @@ from ehadiag.calibration.models import (
 )
 from ehadiag.calibration.session import Part, Session
 from ehadiag.core.actuator import Actuator
+from ehadiag.identify.nuisance.estimate import HYSTERESIS
 from ehadiag.identify.nuisance.explained import excess_of_signals
 from ehadiag.identify.nuisance.knowledge import data_that_pass_for
 from ehadiag.model.batch import SPOOL_ROW
@@ -42,6 +43,8 @@ AS_MUCH = 1.1
 """Ratio of what two searches leave, over noise, up to which neither stopped beside the optimum."""
 ALIKE = 30.0
 """Cost by which searches that came to the same place differ."""
+ROUGH = 3e-3
+"""Hysteresis, full width, below which effects that closed loop asks for are break-aways."""
 
 
 def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]:
@@ -100,7 +103,8 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
 
     Residuals like noise are no proof of the best optimum, and what is learned here is believed ever
     after: the best of several searches is taken. Where the model leaves something in open loop the
-    further effects that this does not ask for are freed once more, since closed loop may.
+    further effects that this does not ask for are freed once more, since closed loop may: but not
+    where it is so rough that it would ask for any.
 
     Parameters
     ----------
@@ -116,7 +120,7 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     """
     values = best.estimated.refined.values
     hint = {**values, **data_that_pass_for(session.start, values)}
-    if best.model.rich and not best.estimated.explained:
+    if best.model.rich and not (best.estimated.explained or values[HYSTERESIS] < ROUGH):
         return _with_effects(session, best, hint)
     model = replace(best.model, beside=asked_for_by(best)) if best.model.rich else best.model
     found = [session.learn(model, new=True, hint=hint, hint_of_open=True, budget=TWO_STARTS)]

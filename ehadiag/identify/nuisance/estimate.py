@@ -28,7 +28,7 @@ from ehadiag.identify.spans import by_experiment, judge_noise
 from ehadiag.identify.uncertainty import independent
 from ehadiag.model.parameters import Parameter
 
-__all__ = ["BUDGET", "Estimated", "estimate", "spread_of_optima"]
+__all__ = ["BUDGET", "HYSTERESIS", "Estimated", "estimate", "spread_of_optima"]
 
 BUDGET = 1600
 """Runs of the model after which no further start is made."""

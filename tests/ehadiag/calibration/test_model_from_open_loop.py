@@ -42,8 +42,9 @@ def left(spool, pressure):
 class Told:
     """A session whose searches leave what the test says, by the model, and keep what was asked."""
 
-    def __init__(self, leaves):
+    def __init__(self, leaves, hysteresis=0.02):
         self.leaves = leaves
+        self.values = {"hysteresis": hysteresis}
         self.start = default_actuator()
         self.recordings = (None, None)
         self.asked = []
@@ -52,7 +53,7 @@ class Told:
         self.asked.append((model, how))
         residuals = left(*self.leaves(model))
         estimated = SimpleNamespace(
-            refined=SimpleNamespace(residuals=residuals, values={}),
+            refined=SimpleNamespace(residuals=residuals, values=self.values),
             explained=is_noise(residuals),
             excess=excess(residuals),
         )
@@ -120,8 +121,8 @@ def test_a_comparison_tries_all():
     ]
 
 
-def learned_after(leaves):
-    session = Told(leaves)
+def learned_after(leaves, hysteresis=0.02):
+    session = Told(leaves, hysteresis)
     best = session.learn(Model("linear", SMOOTH, (SKEW, "load")), part=Part.OPEN_LOOP)
     learned = learned_as_new(session, best)
     assert all(how["new"] for _, how in session.asked[1:])
@@ -136,6 +137,11 @@ def test_what_open_loop_explains_is_learned_as_it_is(further):
 def test_effects_that_closed_loop_may_ask_for_are_freed_once_more(further):
     asked = learned_after(lambda _model: (1.0, 1.0))
     assert asked == [(in_order(QUICK), True), ((SKEW,), False), ((SKEW,), True)]
+
+
+def test_with_little_hysteresis_closed_loop_asks_for_nothing(further):
+    asked = learned_after(lambda _model: (1.0, 1.0), hysteresis=0.001)
+    assert {names for names, _ in asked} == {(SKEW,)}
 
 
 def test_closed_loop_that_open_loop_does_not_explain_asks_for_more(further):
