@@ -16,6 +16,7 @@ from ehadiag.calibration.effects import (
     QUICK,
     asked_for_by,
     in_order,
+    looked_for_again,
     with_further_effects,
 )
 from ehadiag.calibration.judging import WORTH_ANOTHER, is_explained
@@ -31,7 +32,7 @@ from ehadiag.calibration.models import (
 from ehadiag.calibration.session import Part, Session
 from ehadiag.core.actuator import Actuator
 from ehadiag.identify.nuisance.estimate import HYSTERESIS
-from ehadiag.identify.nuisance.explained import excess_of_signals
+from ehadiag.identify.nuisance.explained import excess_of_signals, is_of_the_pressure
 from ehadiag.identify.nuisance.knowledge import data_that_pass_for
 from ehadiag.model.batch import SPOOL_ROW
 
@@ -78,11 +79,29 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
                 return out
     if any(item.estimated.explained for item in out):
         return out
-    for model in simple:  # what they leave does not tell the second stage
-        out.append(with_further_effects(session, replace(model, plays=SMOOTH)))
-        if out[-1].estimated.excess <= WORTH_ANOTHER:
-            break
-    return out
+    return [*out, *_with_further_effects(session, simple)]
+
+
+def _with_further_effects(session: Session, simple: Sequence[Model]) -> list[Learned]:
+    """Learn further effects with one second stage after the other, until one leaves little.
+
+    Where the spool is explained and the pressure is far from it the other one comes first, before
+    the effects are looked for again.
+    """
+    out: list[Learned] = []
+    for model in simple:
+        found = with_further_effects(session, replace(model, plays=SMOOTH))
+        if not _is_of_the_pressure(found):
+            found = looked_for_again(session, found)
+        out.append(found)
+        if found.estimated.excess <= WORTH_ANOTHER:
+            return out
+    best = min(out, key=lambda item: item.criterion)
+    return [*out, looked_for_again(session, best)] if _is_of_the_pressure(best) else out
+
+
+def _is_of_the_pressure(found: Learned) -> bool:
+    return is_of_the_pressure(found.estimated.refined.residuals)
 
 
 def _spool_is_explained(found: Learned) -> bool:

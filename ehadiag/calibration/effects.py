@@ -28,7 +28,15 @@ from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import parameter
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["LITTLE", "QUICK", "asked_for", "asked_for_by", "in_order", "with_further_effects"]
+__all__ = [
+    "LITTLE",
+    "QUICK",
+    "asked_for",
+    "asked_for_by",
+    "in_order",
+    "looked_for_again",
+    "with_further_effects",
+]
 
 QUICK = tuple(name for name in EFFECTS if name not in SLOW)
 LITTLE = 1.5
@@ -60,6 +68,11 @@ def with_further_effects(session: Session, model: Model) -> Learned:
         best = _round(session, best, QUICK, 1)
     if _promising(best, SLOW):
         best = _round(session, best, SLOW, 2)
+    return best
+
+
+def looked_for_again(session: Session, best: Learned) -> Learned:
+    """Learn further effects afresh where much is left after a search for them."""
     if best.estimated.excess > LITTLE:
         best = _round(session, best, QUICK, 3, afresh=True)
     if best.estimated.excess > WORTH_ANOTHER:

@@ -73,6 +73,12 @@ def further(monkeypatch):
     def freed(session, model):
         return session.learn(replace(model, beside=(SKEW,)), part=Part.OPEN_LOOP)
 
+    def again(session, best):
+        if best.estimated.explained:
+            return best
+        return session.learn(replace(best.model, beside=(SKEW, "load")), part=Part.OPEN_LOOP)
+
+    monkeypatch.setattr(choice, "looked_for_again", again)
     monkeypatch.setattr(choice, "with_further_effects", freed)
     monkeypatch.setattr(choice, "asked_for_by", lambda _found: (SKEW,))
 
@@ -103,7 +109,7 @@ def test_where_the_spool_is_left_no_other_stage_is_tried(further):
         return (0.0, 0.0) if model.rich else (5.0, 9.0)
 
     session, model = chosen(leaves)
-    assert model == Model("linear", SMOOTH, (SKEW,))
+    assert (model.second_stage, model.plays) == ("linear", SMOOTH)
     assert "orifice" not in {item.second_stage for item in session.models}
 
 
@@ -111,7 +117,24 @@ def test_the_other_stage_is_not_given_up_where_effects_explain_too_little(furthe
     def leaves(model):
         return (0.0, 0.0) if model.rich and model.second_stage == "orifice" else (5.0, 9.0)
 
-    assert chosen(leaves)[1] == Model("orifice", SMOOTH, (SKEW,))
+    assert chosen(leaves)[1].second_stage == "orifice"
+
+
+def test_where_only_the_pressure_is_left_the_other_stage_comes_before_another_look(further):
+    def leaves(model):
+        if not model.rich:
+            return (5.0, 9.0)
+        return (0.0, 0.0 if model.second_stage == "orifice" else 9.0)
+
+    session, _ = chosen(leaves)
+    looked = [len(item.beside) for item in session.models if item.second_stage == "linear"]
+    assert max(looked) == 1
+
+
+def test_where_neither_stage_explains_the_better_one_is_looked_for_again(further):
+    session, model = chosen(lambda model: (0.0, 9.0) if model.rich else (5.0, 9.0))
+    assert len(model.beside) == 2
+    assert {item.second_stage for item in session.models} == {"linear", "orifice"}
 
 
 def test_a_comparison_tries_all():
