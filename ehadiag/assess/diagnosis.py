@@ -209,7 +209,7 @@ class DiagnosisSession:
                 culprit = culprit_of(experiments, identification, recordings[0].environment)
             else:
                 why = (
-                    *_of_supplies(experiments, modelled, identification.fit.pressure_offset),
+                    *_of_supplies(experiments, modelled, identification),
                     *_of_positions(positions, most_gain_error(self._actuator)),
                 )
             if not why:
@@ -389,9 +389,13 @@ def _notes(
 
 
 def _of_supplies(
-    experiments: Sequence[Experiment], modelled: Sequence[Response], offset: float
+    experiments: Sequence[Experiment],
+    modelled: Sequence[Response],
+    identification: Identification,
 ) -> list[str]:
     """Why the supply pressure cannot be what its probe says, each reason once."""
+    # What the sensor reads at rest has been taken off each; this is what the search found besides.
+    offset = identification.fit.pressure_offset - experiments[0].pressure_offset
     found = (
         objections_to_supply(experiment, response, offset)
         for experiment, response in zip(experiments, modelled, strict=True)

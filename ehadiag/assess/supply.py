@@ -33,7 +33,7 @@ def objections_to_supply(experiment: Experiment, modelled: Response, offset: flo
     modelled : Response
         Of the identified actuator, over the same ticks.
     offset : float
-        Of the pressure sensor, Pa.
+        Of the pressure sensor, beyond the one that `experiment` is free of, Pa.
 
     Returns
     -------

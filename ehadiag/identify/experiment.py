@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import PRESSURE, Channels
+from ehadiag.core.channels import PRESSURE, Channel, Channels
 from ehadiag.core.conversion import conversion_of
 from ehadiag.core.recording import Environment, Samples
 from ehadiag.core.stored_test import StoredTest
@@ -23,6 +23,10 @@ __all__ = ["Experiment", "build_experiment", "noise_is_judged_early", "share_off
 DISPLACED = 0.3e6 / PRESSURE.full_scale
 """Pressure at rest, over the converter's half range, above which it is none of the sensor's
 offset: 0.3 MPa of the default range."""
+SETTLES_LSB, SETTLES_NOISE = 5.0, 8.0
+"""Pressure of a first sample beside that of the rest's second half, in steps of the converter and
+deviations of the noise, from which on nothing rested: a null bias beyond the spool's friction moves
+it from the first tick on."""
 LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 LEAST_QUIET_BLOCKS = 20
@@ -94,6 +98,8 @@ def build_experiment(
     position = np.where(samples.saturated[3], np.nan, samples.position)
     trace = commanded_current(samples, test, actuator.controller, channels)
     rest = _ticks_at_rest(trace.current)
+    if _settles(pressure[:rest], channels.pressure):
+        rest = 0
     constants = unit_constants(actuator, environment)
     spool_offset, rest_pressure = _mean(spool[:rest]), _mean(pressure[:rest])
     # What the jack's load or displaced lands ask for is no offset.
@@ -172,6 +178,18 @@ def _ticks_at_rest(current: NDArray[np.float64]) -> int:
     """
     moving = np.flatnonzero(current != 0.0)
     return int(moving[0]) if moving.size else len(current)
+
+
+def _settles(values: NDArray[np.float64], channel: Channel) -> bool:
+    """Whether a signal that should rest begins elsewhere than it stays."""
+    begin, end = values[:3], values[len(values) // 2 :]
+    begin, end = begin[np.isfinite(begin)], end[np.isfinite(end)]
+    if not begin.size or not end.size:
+        return False
+    place = np.median(end)
+    noise = 1.4826 * np.median(np.abs(end - place))
+    most = max(SETTLES_LSB * channel.lsb, SETTLES_NOISE * noise)
+    return bool(np.abs(begin - place).max() > most)
 
 
 def _mean(values: NDArray[np.float64]) -> float:

@@ -37,12 +37,17 @@ MOST_OUTLIERS = 0.01
 HOPELESS = (0.3, 0.05)
 """Share of residuals beyond three deviations after one start, and after two, from which on no more
 is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones."""
-HOPELESS_ASTRAY = (0.45, 0.3)
-"""The same in closed loop, where searches that went astray on sound units left 0.4 after a first
-start, and 0.27 after one that took its time."""
+HOPELESS_ASTRAY = (0.6, 0.42)
+"""The same in closed loop, where searches that went astray on sound units left 0.45 after a first
+start, and 0.36 after one that took its time; further ones explained each of them."""
+HOPELESS_SPOOL = 30.0
+"""Excess of the spool there after two starts: 19 at most on those units."""
+HOPELESS_PRESSURE = 0.1
+"""Share of outliers there after two starts if the pressure is explained worse than the spool, which
+shows it where a search went astray: 0.07 at most on those units, 0.16 and more on broken ones."""
 HOPELESS_EXCESS = 3.0
-"""The same of the excess, after two starts: 1.6 at most on sound units that a further start
-explained, 2.0 with a load that is not estimated."""
+"""Excess in open loop after two starts: 1.6 at most on sound units that a further start explained,
+2.0 with a load that is not estimated. In closed loop that of the pressure, for the rule above."""
 SPOOL_EXPLAINED = 1.25
 
 
@@ -90,13 +95,17 @@ def is_hopeless(residuals: NDArray[np.float64], starts: int, *, astray: bool = F
     astray: whether a search may well end beside the optimum.
     """
     most = HOPELESS_ASTRAY if astray else HOPELESS
-    if outliers_of(residuals) > most[min(starts, len(most)) - 1]:
+    outliers = outliers_of(residuals)
+    if outliers > most[min(starts, len(most)) - 1]:
         return True
-    excesses = excess_of_signals(residuals)
-    if astray and len(excesses) > 1:
-        # Where a search went astray the spool shows it more than the pressure.
-        return starts > 1 and max(excesses[1:]) > max(excesses[0], HOPELESS_EXCESS)
-    return not astray and starts > 1 and max(excesses, default=0.0) > HOPELESS_EXCESS
+    if starts < 2:
+        return False
+    spool, *others = excess_of_signals(residuals)
+    pressure = max(others, default=0.0)
+    if not astray:
+        return max(spool, pressure) > HOPELESS_EXCESS
+    pressure_is_worse = pressure > max(spool, HOPELESS_EXCESS)
+    return spool > HOPELESS_SPOOL or (pressure_is_worse and outliers > HOPELESS_PRESSURE)
 
 
 def misses_only_pressure(residuals: NDArray[np.float64]) -> bool:

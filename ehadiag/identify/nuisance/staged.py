@@ -41,6 +41,9 @@ NEARLY_EXPLAINED = 1.3
 left the search has ended beside the optimum, and believes too much."""
 CLOSER = 0.3
 """Spread of a further look about the best place, in spreads of what open loop alone leaves."""
+PATIENCE = 3
+"""Budgets of a search in closed loop alone, which may go astray several times: ten of 300 units
+were given up with one, one with two, none with three."""
 RELAXED = 100.0
 """Weight of the spool over the pressure while the spool is explained first."""
 Hopeless = Callable[[NDArray[np.float64], int], bool]
@@ -158,7 +161,7 @@ def _searched(
         again=again,
         calmly=before is not None,
         alias=ALIAS,
-        budget=settings.budget,
+        budget=settings.budget * (PATIENCE if patient and settings.give_up else 1),
         seed=settings.seed,
         tell=settings.tell,
         hopeless=_hopeless(give_up=settings.give_up, patient=patient),

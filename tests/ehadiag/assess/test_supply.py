@@ -16,6 +16,7 @@ from ehadiag.core.actuator import default_actuator
 from ehadiag.core.stored_test import bundled_tests, resolve_test
 from ehadiag_sim.faults.hardware import broken
 from ehadiag_sim.plant.conditions import Faults
+from ehadiag_sim.plant.simulator import simulate
 from firmware_iface.logs.reader import read_recording
 
 ACTUATOR = default_actuator()
@@ -24,11 +25,15 @@ TESTS = tuple(bundled_tests().values())
 
 @pytest.fixture(scope="module", params=["healthy-closed.blf", "paper-open-4.blf"])
 def sound(request):
-    """Experiment, response and offset of a sound recording."""
+    """Experiment, response and remaining offset of a sound recording."""
     found = diagnose([read_recording(LOGS / request.param)], ACTUATOR, TESTS)
     (experiment,) = found.experiments
     response = response_of(experiment, found.identification)
-    return experiment, response, found.identification.fit.pressure_offset
+    return (
+        experiment,
+        response,
+        found.identification.fit.pressure_offset - experiment.pressure_offset,
+    )
 
 
 def cut(experiment, share):
@@ -66,3 +71,13 @@ def test_a_starved_unit_in_closed_loop_is_not_healthy():
     rng = np.random.default_rng(4)
     recording = broken("starved", rng, ACTUATOR, resolve_test("closed"), Faults(0.14, 0.0, 0.12))
     assert diagnose([recording], ACTUATOR, TESTS).verdict is Verdict.NOT_TESTED
+
+
+def test_the_offset_at_rest_is_taken_off_once():
+    """A sixth of what the pressure of a clogged valve reaches."""
+    done = simulate(ACTUATOR, resolve_test("open"), Faults(0.98, 0.45, 0.02), seed=3, step=1e-6)
+    recording = done.recording("simulated", 1)
+    samples = replace(recording.samples, pressure=recording.samples.pressure + 0.25e6)
+    found = diagnose([replace(recording, samples=samples)], ACTUATOR, TESTS)
+    assert not any("supply" in reason for reason in found.reasons)
+    assert found.verdict is Verdict.FAULT
