@@ -1,23 +1,40 @@
-"""Chooses the model that a unit is learned by: simple ones first, then all effects, then fewer.
+"""Chooses the model that a unit is learned by, in open loop: simple ones first, then all effects.
 
 A simple model that leaves nothing is taken. Else what a unit may have besides is freed, and what
 the recordings do not ask for is taken out again (`ehadiag.calibration.effects`). One recording of
-each test suffices to choose; all are learned from.
+each open-loop test suffices to choose: there the spool breaks away seldom, so that a search comes
+to the optimum and what it leaves is of the model. All recordings are learned from.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from ehadiag.calibration.effects import asked_for_by, with_further_effects
-from ehadiag.calibration.judging import WORTH_ANOTHER
-from ehadiag.calibration.models import ONE_START, SMOOTH, TWO_STARTS, Learned, Model, simple_models
-from ehadiag.calibration.session import Session
+from ehadiag.calibration.effects import (
+    LITTLE,
+    QUICK,
+    asked_for_by,
+    in_order,
+    looked_for_again,
+    with_further_effects,
+)
+from ehadiag.calibration.judging import WORTH_ANOTHER, is_explained
+from ehadiag.calibration.models import (
+    ONE_START,
+    SLOW,
+    SMOOTH,
+    TWO_STARTS,
+    Learned,
+    Model,
+    simple_models,
+)
+from ehadiag.calibration.session import Part, Session
 from ehadiag.core.actuator import Actuator
-from ehadiag.identify.nuisance.explained import is_noise
+from ehadiag.identify.nuisance.estimate import HYSTERESIS
+from ehadiag.identify.nuisance.explained import excess_of_signals, is_of_the_pressure
 from ehadiag.identify.nuisance.knowledge import data_that_pass_for
-from ehadiag.identify.spans import by_experiment
+from ehadiag.model.batch import SPOOL_ROW
 
 __all__ = ["choose", "learned_as_new"]
 
@@ -27,10 +44,15 @@ AS_MUCH = 1.1
 """Ratio of what two searches leave, over noise, up to which neither stopped beside the optimum."""
 ALIKE = 30.0
 """Cost by which searches that came to the same place differ."""
+ROUGH = 3e-3
+"""Hysteresis, full width, below which effects that closed loop asks for are break-aways."""
 
 
 def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]:
     """Learn with one model after the other until one explains the recordings; all that were tried.
+
+    The other second stage is tried where the spool is explained and the pressure is not: the spool
+    leaves as much with either.
 
     Parameters
     ----------
@@ -46,69 +68,69 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     list[Learned]
         In the order in which they were tried.
     """
-    models = simple_models(start)
-    if compare:
-        models += [replace(item, plays=SMOOTH) for item in models]
     out: list[Learned] = []
-    for model in models:
-        out.append(_searched(session, model, first=not out))
-        if _has_all_effects(out[-1]) and not compare:
-            return out
-    if any(_has_all_effects(item) for item in out):
+    simple = simple_models(start)
+    for plays in (1, SMOOTH):
+        for model in simple:
+            if model != simple[0] and not compare and not _spool_is_explained(out[-1]):
+                break
+            out.append(_simply(session, replace(model, plays=plays), out))
+            if out[-1].estimated.explained and not compare:
+                return out
+    if any(item.estimated.explained for item in out):
         return out
-    smooth = [_smooth(session, out, simple) for simple in simple_models(start)]
-    if not compare:
-        out += smooth
-    if any(item.estimated.explained for item in smooth):
-        return out
-    for item in smooth:  # what they leave does not tell the second stage
-        out.append(with_further_effects(session, item))
-        if out[-1].estimated.excess <= WORTH_ANOTHER:
-            break
-    return out
+    return [*out, *_with_further_effects(session, simple)]
 
 
-def _has_all_effects(found: Learned) -> bool:
-    """Whether all is explained, or all of open loop: no effect is missing.
+def _with_further_effects(session: Session, simple: Sequence[Model]) -> list[Learned]:
+    """Learn further effects with one second stage after the other, until one leaves little.
 
-    In closed loop the spool breaks away so often that a search may end with some of it at wrong
-    ticks.
+    Where the spool is explained and the pressure is far from it the other one comes first, before
+    the effects are looked for again.
     """
-    if found.estimated.explained:
-        return True
-    parts = by_experiment(found.experiments, found.estimated.refined.residuals)
-    first = [
-        is_noise(part)
-        for item, part in zip(found.experiments, parts, strict=True)
-        if not item.test.closed_loop
-    ]
-    return bool(first) and all(first)
+    out: list[Learned] = []
+    for model in simple:
+        found = with_further_effects(session, replace(model, plays=SMOOTH))
+        if not _is_of_the_pressure(found):
+            found = looked_for_again(session, found)
+        out.append(found)
+        if found.estimated.excess <= WORTH_ANOTHER:
+            return out
+    best = min(out, key=lambda item: item.criterion)
+    return [*out, looked_for_again(session, best)] if _is_of_the_pressure(best) else out
 
 
-def _smooth(session: Session, tried: Sequence[Learned], simple: Model) -> Learned:
-    """Learn a smooth hysteresis with one class of second stage, if that has not been tried."""
-    model = replace(simple, plays=SMOOTH)
-    for item in tried:
-        if item.model == model:
-            return item
-    one_play = next(item for item in tried if item.model == simple)
-    hint = one_play.estimated.refined.values
-    return session.learn(model, nearly_new=True, hint=hint, budget=ONE_START, some=True)
+def _is_of_the_pressure(found: Learned) -> bool:
+    return is_of_the_pressure(found.estimated.refined.residuals)
+
+
+def _spool_is_explained(found: Learned) -> bool:
+    return excess_of_signals(found.estimated.refined.residuals)[SPOOL_ROW] <= LITTLE
+
+
+def _simply(session: Session, model: Model, before: Sequence[Learned]) -> Learned:
+    """Learn with a model without further effects, a smooth hysteresis from where one play ended."""
+    if model.plays == 1:
+        return _searched(session, model, first=not before)
+    alike = [item for item in before if item.model.second_stage == model.second_stage]
+    hint = (alike or before)[-1].estimated.refined.values
+    return session.learn(model, nearly_new=True, hint=hint, budget=ONE_START, part=Part.OPEN_LOOP)
 
 
 def learned_as_new(session: Session, best: Learned) -> Learned:
-    """Learn once more, the severities taken for 0 and the frictions as new in their place.
+    """Learn from all recordings, the severities taken for 0 and the frictions as new instead.
 
-    Effects that the recordings do not ask for are left out. Residuals like noise are no proof of
-    the best optimum, and what is learned here is believed ever after: with a simple model the best
-    of several searches is taken. With many effects each search begins where the first one ended.
+    Residuals like noise are no proof of the best optimum, and what is learned here is believed ever
+    after: the best of several searches is taken. Where the model leaves something in open loop the
+    further effects that this does not ask for are freed once more, since closed loop may: but not
+    where it is so rough that it would ask for any.
 
     Parameters
     ----------
     session : Session
         The recordings.
     best : Learned
-        With the severities estimated.
+        From open loop, with the severities estimated.
 
     Returns
     -------
@@ -117,18 +139,61 @@ def learned_as_new(session: Session, best: Learned) -> Learned:
     """
     values = best.estimated.refined.values
     hint = {**values, **data_that_pass_for(session.start, values)}
+    if best.model.rich and not (best.estimated.explained or values[HYSTERESIS] < ROUGH):
+        return _with_effects(session, best, hint)
     model = replace(best.model, beside=asked_for_by(best)) if best.model.rich else best.model
-    budget = ONE_START if model.rich else TWO_STARTS
-    found = [session.learn(model, new=True, hint=hint, budget=budget)]
+    found = [session.learn(model, new=True, hint=hint, hint_of_open=True, budget=TWO_STARTS)]
     for turn in range(1, MOST_SEARCHES):
-        if _came_to(best, found[0]) or (best.model.rich and _as_good(found[0], best)):
+        if _came_to(best, found[0]) or (model.rich and found[0].estimated.explained):
             break
-        around = None if turn % 2 and not best.model.rich else hint
-        found.append(session.learn(model, new=True, hint=around, budget=budget, turn=turn))
+        around = None if turn % 2 else found[0].estimated.refined.values
+        found.append(session.learn(model, new=True, hint=around, budget=TWO_STARTS, turn=turn))
         found.sort(key=lambda item: item.criterion)
         if found[1].criterion - found[0].criterion < ALIKE:
             break
-    return found[0]
+    if model.rich and not is_explained(found[0]):
+        found.append(_with_effects(session, best, hint))
+    return min(found, key=lambda item: item.criterion)
+
+
+def _with_effects(session: Session, best: Learned, hint: Mapping[str, float]) -> Learned:
+    """Learn from all recordings with the further effects that these ask for."""
+    names = set(asked_for_by(best))
+    if not names.intersection(SLOW):
+        names.update(QUICK)
+    model = replace(best.model, beside=in_order(names))
+    whole = session.learn(
+        model, new=True, hint=hint, hint_of_open=True, budget=ONE_START, part=Part.EACH_TEST
+    )
+    fewer = replace(model, beside=asked_for_by(whole))
+    if fewer == model and len(whole.experiments) == len(session.recordings):
+        return whole
+    enough = 1 if names.intersection(SLOW) else 2
+    found: list[Learned] = []
+    while len(found) < MOST_SEARCHES:
+        afresh = bool(len(found) % 2)
+        around = hint if afresh else min([whole, *found], key=_left).estimated.refined.values
+        found.append(
+            session.learn(
+                fewer,
+                new=True,
+                hint=around,
+                hint_of_open=afresh,
+                budget=ONE_START,
+                turn=len(found),
+            )
+        )
+        nearest = min(found, key=_left)
+        before, fewer = fewer, replace(fewer, beside=asked_for_by(found[-1]))
+        done = nearest.estimated.explained or len(found) >= enough
+        if fewer == before and done and _as_good(nearest, whole):
+            break
+    return min(found, key=lambda item: item.criterion)
+
+
+def _left(found: Learned) -> float:
+    """What a search leaves, over noise."""
+    return found.estimated.excess
 
 
 def _came_to(best: Learned, found: Learned) -> bool:
@@ -145,15 +210,17 @@ def _as_good(found: Learned, best: Learned) -> bool:
 
 
 def _searched(session: Session, model: Model, *, first: bool) -> Learned:
-    """Learn with a simple model, again where the search may have stopped beside the optimum."""
-    found = session.learn(model, nearly_new=True, brief=True, some=True)
+    """Learn with one play, again where the search may have stopped beside the optimum."""
+    found = session.learn(model, nearly_new=True, brief=True, part=Part.OPEN_LOOP)
     turn = 1
     while turn < MOST_SEARCHES and _may_have_stopped_beside(found, first=first):
         # The unit may be worn, too.
-        other = session.learn(model, nearly_new=turn != 1, brief=True, some=True, turn=turn)
+        other = session.learn(
+            model, nearly_new=turn != 1, brief=True, part=Part.OPEN_LOOP, turn=turn
+        )
         found = min(found, other, key=lambda item: item.criterion)
         turn += 1
-        if found.estimated.excess > WORTH_ANOTHER or _has_all_effects(found):
+        if found.estimated.excess > WORTH_ANOTHER or found.estimated.explained:
             break
     return found
 

@@ -13,7 +13,7 @@ without the effects they mostly stay.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,14 +21,22 @@ from numpy.typing import NDArray
 
 from ehadiag.calibration.judging import WORTH_ANOTHER
 from ehadiag.calibration.models import EFFECTS, ONE_START, SLOW, Learned, Model
-from ehadiag.calibration.session import Session
+from ehadiag.calibration.session import Part, Session
 from ehadiag.identify.refine.posterior import TAIL
 from ehadiag.identify.spans import lay_out, unknowns_of
 from ehadiag.identify.uncertainty import covariance
 from ehadiag.model.parameters import parameter
 from ehadiag.model.simd.model import SimdModel
 
-__all__ = ["asked_for", "asked_for_by", "with_further_effects"]
+__all__ = [
+    "LITTLE",
+    "QUICK",
+    "asked_for",
+    "asked_for_by",
+    "in_order",
+    "looked_for_again",
+    "with_further_effects",
+]
 
 QUICK = tuple(name for name in EFFECTS if name not in SLOW)
 LITTLE = 1.5
@@ -40,14 +48,14 @@ MUCH = 0.03
 TINY = 1e-300
 
 
-def with_further_effects(session: Session, smooth: Learned) -> Learned:
-    """Learn further effects beside a smooth hysteresis.
+def with_further_effects(session: Session, model: Model) -> Learned:
+    """Learn further effects beside those of a model, from open loop.
 
     Parameters
     ----------
     session : Session
         The recordings.
-    smooth : Learned
+    model : Model
         With a smooth hysteresis.
 
     Returns
@@ -55,16 +63,26 @@ def with_further_effects(session: Session, smooth: Learned) -> Learned:
     Learned
         With those that the recordings ask for, or, where that explains more, with all.
     """
-    best = _round(session, smooth, QUICK, 0, afresh=True)
+    best = _freed(session, model, QUICK, 0)
     if best.estimated.excess <= WORTH_ANOTHER:
         best = _round(session, best, QUICK, 1)
     if _promising(best, SLOW):
         best = _round(session, best, SLOW, 2)
+    return best
+
+
+def looked_for_again(session: Session, best: Learned) -> Learned:
+    """Learn further effects afresh where much is left after a search for them."""
     if best.estimated.excess > LITTLE:
         best = _round(session, best, QUICK, 3, afresh=True)
     if best.estimated.excess > WORTH_ANOTHER:
         best = _round(session, best, QUICK, 4)
     return best
+
+
+def in_order(names: Collection[str]) -> tuple[str, ...]:
+    """Return effects in the order of `EFFECTS`."""
+    return tuple(name for name in EFFECTS if name in names)
 
 
 def _promising(best: Learned, names: Sequence[str]) -> bool:
@@ -100,17 +118,27 @@ def _promising(best: Learned, names: Sequence[str]) -> bool:
 def _round(
     session: Session, best: Learned, more: Sequence[str], turn: int, *, afresh: bool = False
 ) -> Learned:
-    """Learn more effects beside those that are asked for, and then those that are, if need be."""
+    """Learn more effects beside those that are asked for, where something is left to explain."""
     if best.estimated.explained:
         return best
     names = {*more, *asked_for_by(best)}
-    begin = None if afresh else best
-    wanted = tuple(name for name in EFFECTS if name in names)
-    found = _search(session, best.model, wanted, begin, turn)
-    if found.estimated.excess > LITTLE or not names.intersection(SLOW):
-        fewer = _search(session, best.model, asked_for_by(found), found, turn)
-        found = min(found, fewer, key=_worse)
+    found = _freed(session, best.model, names, turn, None if afresh else best)
     return min(best, found, key=_worse)
+
+
+def _freed(
+    session: Session,
+    model: Model,
+    names: Collection[str],
+    turn: int,
+    begin: Learned | None = None,
+) -> Learned:
+    """Learn some effects, and then those of them that are asked for, if need be."""
+    found = _search(session, model, in_order(names), begin, turn)
+    if found.estimated.excess > LITTLE or not set(SLOW).intersection(names):
+        fewer = _search(session, model, asked_for_by(found), found, turn)
+        found = min(found, fewer, key=_worse)
+    return found
 
 
 def _search(
@@ -123,7 +151,7 @@ def _search(
         nearly_new=True,
         hint={**usual, **begin.estimated.refined.values} if begin else None,
         budget=ONE_START,
-        some=True,
+        part=Part.OPEN_LOOP,
         turn=turn,
     )
 

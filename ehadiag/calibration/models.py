@@ -174,6 +174,7 @@ def learn(
     new: bool,
     nearly_new: bool = False,
     hint: Mapping[str, float] | None = None,
+    hint_of_open: bool = False,
     budget: int = BUDGET,
     brief: bool = False,
     seed: int,
@@ -195,6 +196,8 @@ def learn(
         Look for small severities.
     hint : Mapping[str, float] | None
         Values by name beside which the optimum probably lies.
+    hint_of_open : bool
+        Whether these are of the open-loop recordings alone.
     budget : int
         Runs of the model after which no further start is made.
     brief : bool
@@ -225,6 +228,7 @@ def learn(
         known={**model.known, **small},
         considered=CONSIDERED,
         hint=hint,
+        hint_of_open=hint_of_open,
         budget=budget,
         seed=seed,
         tell=tell,

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from enum import Enum
+from functools import partial
 
 import numpy as np
 
@@ -28,10 +30,18 @@ from ehadiag.core.stored_test import StoredTest
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.model.parameters import Unknowns
 
-__all__ = ["Progress", "Session"]
+__all__ = ["Part", "Progress", "Session"]
 
 Progress = Callable[[str, float], None]
 """Called with the stage and its share done, 0 … 1."""
+
+
+class Part(Enum):
+    """Which of the recordings are learned from."""
+
+    ALL = "all"
+    EACH_TEST = "the first of each test"
+    OPEN_LOOP = "the first of each open-loop test, or of each test if none is"
 
 
 class Session:
@@ -72,21 +82,20 @@ class Session:
             *objections_to_unit(self.recordings, self.start),
         ]
 
-    def build(self, actuator: Actuator) -> list[Experiment]:
-        """Experiments of all recordings."""
-        return [
-            self._experiment(recording, test, actuator)
-            for recording, test in zip(self.recordings, self._tests, strict=True)
-            if test is not None
-        ]
-
-    def build_some(self, actuator: Actuator) -> list[Experiment]:
-        """Experiments of the first recording of each test."""
-        first = {test.name: index for index, test in reversed([*enumerate(self._tests)]) if test}
+    def build(self, actuator: Actuator, part: Part = Part.ALL) -> list[Experiment]:
+        """Experiments of a part of the recordings."""
         return [
             self._experiment(self.recordings[index], self._tests[index], actuator)
-            for index in sorted(first.values())
+            for index in self._indices(part)
         ]
+
+    def _indices(self, part: Part) -> list[int]:
+        known = [(index, test) for index, test in enumerate(self._tests) if test is not None]
+        if part is Part.ALL:
+            return [index for index, _ in known]
+        if part is Part.OPEN_LOOP:
+            known = [item for item in known if not item[1].closed_loop] or known
+        return sorted({test.name: index for index, test in reversed(known)}.values())
 
     def _experiment(
         self, recording: Recording, test: StoredTest | None, actuator: Actuator
@@ -102,22 +111,24 @@ class Session:
         new: bool = False,
         nearly_new: bool = False,
         hint: Mapping[str, float] | None = None,
+        hint_of_open: bool = False,
         budget: int = BUDGET,
         brief: bool = False,
-        some: bool = False,
+        part: Part = Part.ALL,
         turn: int = 0,
     ) -> Learned:
         """Learn with a model; see `ehadiag.calibration.models.learn`.
 
-        some: from the first recording of each test; turn: of several searches with it.
+        part: of the recordings; turn: of several searches with it.
         """
         found = learn(
             model,
-            self.build_some if some else self.build,
+            partial(self.build, part=part),
             self.start,
             new=new,
             nearly_new=nearly_new,
             hint=hint,
+            hint_of_open=hint_of_open,
             budget=budget,
             brief=brief,
             seed=self.seed + turn,

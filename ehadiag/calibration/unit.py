@@ -93,8 +93,6 @@ def calibrate(
     if not is_explained(learned):
         return session.refused(unexplained(learned, recordings), best, tried)
     lesson = lesson_of(learned.estimated, _usual_std(learned))
-    if best.model.rich:
-        tried.append(learned)
     return session.done(lesson, learned, best, tried, sources)
 
 

@@ -28,7 +28,7 @@ from ehadiag.identify.spans import by_experiment, judge_noise
 from ehadiag.identify.uncertainty import independent
 from ehadiag.model.parameters import Parameter
 
-__all__ = ["BUDGET", "Estimated", "estimate", "spread_of_optima"]
+__all__ = ["BUDGET", "HYSTERESIS", "Estimated", "estimate", "spread_of_optima"]
 
 BUDGET = 1600
 """Runs of the model after which no further start is made."""
@@ -87,6 +87,7 @@ def estimate(
     joint: Joint | None = None,
     considered: Sequence[Considered] = (),
     hint: Mapping[str, float] | None = None,
+    hint_of_open: bool = False,
     budget: int = BUDGET,
     seed: int = 0,
     tell: Callable[[float], None] | None = None,
@@ -110,6 +111,9 @@ def estimate(
         What is held, with a tolerance that counts in the interval.
     hint : mapping, optional
         Values by name (0 where not named) beside which the optimum probably lies.
+    hint_of_open : bool
+        Whether these are of the open-loop recordings alone: a search with the others then begins
+        where that with these ends.
     budget : int
         See `BUDGET`.
     seed : int
@@ -132,6 +136,7 @@ def estimate(
         known=known,
         joint=joint,
         hint=hint,
+        hint_of_open=hint_of_open,
         budget=budget,
         seed=seed,
         tell=tell,

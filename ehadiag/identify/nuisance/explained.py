@@ -37,9 +37,10 @@ MOST_OUTLIERS = 0.01
 HOPELESS = (0.3, 0.05)
 """Share of residuals beyond three deviations after one start, and after two, from which on no more
 is looked for: 0.003 at most after the first one on sound units, 0.08 and more on broken ones."""
-HOPELESS_ASTRAY = (0.6, 0.42)
+HOPELESS_ASTRAY = (0.6, 0.42, 0.42, 0.2)
 """The same in closed loop, where searches that went astray on sound units left 0.45 after a first
-start, and 0.36 after one that took its time; further ones explained each of them."""
+start, 0.38 after one or two that took their time, and 0.07 after three; further ones explained each
+of them."""
 HOPELESS_SPOOL = 30.0
 """Excess of the spool there after two starts: 19 at most on those units."""
 HOPELESS_PRESSURE = 0.1
@@ -47,7 +48,8 @@ HOPELESS_PRESSURE = 0.1
 shows it where a search went astray: 0.07 at most on those units, 0.16 and more on broken ones."""
 HOPELESS_EXCESS = 3.0
 """Excess in open loop after two starts: 1.6 at most on sound units that a further start explained,
-2.0 with a load that is not estimated. In closed loop that of the pressure, for the rule above."""
+2.0 with a load that is not estimated. In closed loop that of the pressure, for the rule above, or
+of the spool while the pressure is explained, which would show a break-away at a wrong tick, too."""
 SPOOL_EXPLAINED = 1.25
 
 
@@ -104,8 +106,9 @@ def is_hopeless(residuals: NDArray[np.float64], starts: int, *, astray: bool = F
     pressure = max(others, default=0.0)
     if not astray:
         return max(spool, pressure) > HOPELESS_EXCESS
-    pressure_is_worse = pressure > max(spool, HOPELESS_EXCESS)
-    return spool > HOPELESS_SPOOL or (pressure_is_worse and outliers > HOPELESS_PRESSURE)
+    if pressure > max(spool, HOPELESS_EXCESS):
+        return outliers > HOPELESS_PRESSURE
+    return spool > (HOPELESS_EXCESS if 0.0 < pressure <= SPOOL_EXPLAINED else HOPELESS_SPOOL)
 
 
 def misses_only_pressure(residuals: NDArray[np.float64]) -> bool:

@@ -57,6 +57,7 @@ class Settings:
     known: Mapping[str, Known]
     joint: Joint | None
     hint: Mapping[str, float] | None
+    hint_of_open: bool
     budget: int
     seed: int
     tell: Callable[[float], None] | None
@@ -133,7 +134,7 @@ def _searched(
     if before is not None:
         there = carried_over(before.model, before.found.belief, model)
         origins, again = [there], CLOSER * there.root
-        if hint is not None:
+        if hint is not None and not settings.hint_of_open:
             origins = [Belief(beside(model, first, hint).x, again), there]
     elif any(item.constants.OIL > 0.0 for item in experiments):
         guide = _spool_guide(experiments, settings.free, coarse.levels)

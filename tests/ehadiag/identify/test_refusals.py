@@ -104,10 +104,13 @@ def test_hopeless_is_much_on_many_ticks_or_very_much_on_few() -> None:
     assert not is_hopeless(bursts, 1)
     assert is_hopeless(bursts, 2)
     assert not is_hopeless(bursts, 2, astray=True)  # of a search that went astray
-    assert not is_hopeless(bursts[::-1], 2, astray=True)
+    assert is_hopeless(bursts[::-1], 2, astray=True)  # a break-away shows in the pressure, too
+    assert not is_hopeless(bursts[[1, 1]], 2, astray=True)
     bursts[1, 1000:2000] += 400.0
     assert not is_hopeless(bursts, 1, astray=True)
     assert is_hopeless(bursts, 2, astray=True)
+    assert not is_hopeless(bursts[[1, 1]], 3, astray=True)
+    assert is_hopeless(bursts[[1, 1]], 4, astray=True)
     assert not is_hopeless(waves, 1, astray=True)
     assert is_hopeless(waves, 2, astray=True)
     assert is_hopeless(waves[[1, 1]], 1, astray=True)

@@ -56,10 +56,12 @@ def _print_unit(folder: Path, name: str, count: int | None) -> None:
     )
     spent = time.process_time() - begin
     models = "; ".join(f"{item.words} {item.excess:.2f}" for item in found.tried)
-    print(f"\nUnit {name}: {spent:.0f} s of processor time, residuals over noise: {models}\n")
-    if found.actuator is None:
+    print(f"\nUnit {name}: {spent:.1f} s of processor time, residuals over noise: {models}\n")
+    calibration = found.actuator.calibration if found.actuator else None
+    if found.actuator is None or calibration is None:
         print(f"refused: {'; '.join(found.reasons)}")
         return
+    print(f"learned: {calibration.fit.excess:.2f}, {', '.join(calibration.effects)}\n")
     print("| " + " | ".join(HEADINGS) + " |\n|" + " --- |" * len(HEADINGS))
     errors, inside = [], []
     for row in rows:
