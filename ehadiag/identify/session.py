@@ -306,7 +306,7 @@ class Session:
             seed=self.seed,
             tell=lambda share: tell("nuisances", share),
             # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
-            give_up=not knowledge.doubts,
+            give_up=knowledge.explains_sound,
             explains=knowledge.explains,
             patient=patient,
             left_before=before,

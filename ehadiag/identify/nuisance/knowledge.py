@@ -143,6 +143,12 @@ class Knowledge:
         """Whether the data are not to be taken for exact."""
         return bool(self.free or self.aliases)
 
+    @property
+    def explains_sound(self) -> bool:
+        """Whether it explains each recording of a sound unit: that of one without further effects,
+        where nothing was left unexplained."""
+        return not self.doubts or (self.joint is not None and self.explains is is_noise)
+
     def beside(self, others: Sequence[Parameter]) -> tuple[Parameter, ...]:
         """Return other parameters and what is free because of this, each once."""
         mine = {item.name for item in self.free}

@@ -77,6 +77,14 @@ def test_the_constants_have_the_effects_and_deviations_are_known_about_them():
     assert np.sqrt(np.diag(covariance)) == pytest.approx(GOOD.std)
 
 
+@pytest.mark.parametrize(("excess", "sound"), [(1.1, True), (1.5, False)])
+def test_a_sound_recording_is_explained_if_the_unit_as_new_was(excess, sound):
+    fit = Goodness(excess=excess, outliers=0.01, spool_rms=1.0, pressure_rms=1.0)
+    knowledge = knowledge_of(with_calibration(fit=fit))
+    assert knowledge.doubts
+    assert knowledge.explains_sound is sound
+
+
 def test_tolerances_have_no_place_beside_a_calibration():
     with pytest.raises(ConfigurationError, match="calibrated"):
         with_tolerance(with_calibration(), 0.05)

@@ -23,6 +23,8 @@ from ehadiag.model.plant import plant_constants
 def test_the_bundled_file_has_none():
     assert default_actuator().tolerance.names == ()
     assert not knowledge_of(default_actuator()).doubts
+    assert knowledge_of(default_actuator()).explains_sound
+    assert not knowledge_of(with_tolerance(default_actuator(), 0.05)).explains_sound
 
 
 def test_all_data_of_the_model_can_have_one():
