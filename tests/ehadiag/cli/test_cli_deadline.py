@@ -39,9 +39,9 @@ class Clock:
     ("nuisances", "limit", "stage"),
     [
         (Nuisances.AUTO, 0.05, "search"),
-        (Nuisances.AUTO, 0.23, "refinement"),
+        (Nuisances.AUTO, 0.18, "refinement"),
         (Nuisances.ALL, 0.27, "nuisances"),
-        (Nuisances.ALL, 0.33, "nuisances"),
+        (Nuisances.ALL, 0.3, "nuisances"),
     ],
 )
 def test_a_search_ends_soon_after_its_time(
