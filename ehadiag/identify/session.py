@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 
 from ehadiag.identify.estimates import identification, outliers
 from ehadiag.identify.experiment import Experiment, share_offsets
-from ehadiag.identify.nuisance.estimate import Estimated, estimate
+from ehadiag.identify.nuisance.estimate import Estimated
 from ehadiag.identify.nuisance.explained import excess, is_of_the_pressure
+from ehadiag.identify.nuisance.freed import Freeing
 from ehadiag.identify.nuisance.knowledge import NOTHING, Knowledge
 from ehadiag.identify.nuisance.prior import nuisances_of
-from ehadiag.identify.nuisance.trial import would_explain
 from ehadiag.identify.refine.first_part import (
     FirstPart,
     Look,
-    considered_in,
     first_spans,
     look_at,
     refine_first_part,
@@ -58,7 +57,7 @@ from ehadiag.identify.textbook import (
     searched_whole,
 )
 from ehadiag.identify.uncertainty import covariance, independent
-from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY, Parameter, parameter
+from ehadiag.model.parameters import FAULTS, REGISTRY
 
 __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 
@@ -66,13 +65,6 @@ __all__ = ["Nuisances", "Session", "SoFar", "identify"]
 BEYOND_RESCUE = 0.05
 """Share of residuals beyond three deviations after a refinement from which on no further search is
 made: 0.04 at most on a textbook's actuator after the search before."""
-BEYOND_LOAD = 15.0
-"""Excess after all nuisances from which on a load is not tried besides."""
-NEARLY = 1.3
-"""Excess with a calibration's knowledge up to which a unit is taken not to have changed since: wear
-brings out what its model leaves, and loosened effects would stand in for that."""
-CHANGE = 0.5
-"""Share of what is left beyond noise that may remain where effects have changed since."""
 LASTING = 1.2
 """Excess of residuals over noise (`ehadiag.identify.nuisance.explained`) that asks for nuisances:
 1.15 at most in 80 recordings of units without any."""
@@ -194,7 +186,14 @@ class Session:
         if not alone and (best is None or not _leaves_nothing(best.refined)):
             hint = best.refined.values if best else named(found.best)
             alone_left = excess(best.refined.residuals) if best else np.inf
-            freed = self._freed(experiments, hint if near else None, alone_left, tell)
+            tell("nuisances", 0.0)
+            freeing = Freeing(
+                self.knowledge,
+                () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY),
+                self.seed,
+                partial(tell, "nuisances"),
+            )
+            freed = freeing.estimated(experiments, hint if near else None, alone_left)
         if best is not None and (freed is None or _is_poorer(freed, best)):
             if near and outliers(best.refined) <= BEYOND_RESCUE and not _is_elsewhere(freed, best):
                 best = rescued(
@@ -244,73 +243,6 @@ class Session:
         other = replace(other, evaluations=found.evaluations + other.evaluations)
         near = self._look(experiments, other.best).unlikeness <= HOPELESS
         return (other if near else replace(found, evaluations=other.evaluations)), near
-
-    def _freed(
-        self,
-        experiments: Sequence[Experiment],
-        hint: Mapping[str, float] | None,
-        before: float,
-        tell: Progress,
-    ) -> Estimated:
-        """Estimate with all nuisances free; before: excess that the severities alone leave."""
-        tell("nuisances", 0.0)
-        found = self._estimated(experiments, self.knowledge, hint, tell, before=before)
-        if found.explained:
-            return found
-        if not self.knowledge.doubts:
-            return self._with_load(experiments, found, tell)
-        if self.knowledge.joint is None or found.excess <= NEARLY:
-            return found
-        loose = self._estimated(experiments, self.knowledge.loosened(), hint, tell)
-        return loose if loose.excess - 1.0 < CHANGE * (found.excess - 1.0) else found
-
-    def _with_load(
-        self, experiments: Sequence[Experiment], found: Estimated, tell: Progress
-    ) -> Estimated:
-        """Estimate a constant load, too, where that explains what the others do not."""
-        load = parameter("load")
-        if found.excess > BEYOND_LOAD or is_of_the_pressure(found.refined.residuals):
-            return found
-        if not would_explain(load, found, self.seed):
-            return found
-        more = self._estimated(
-            experiments, self.knowledge, found.refined.values, tell, (load,), before=found.excess
-        )
-        best = more if more.explained or more.excess < found.excess else found
-        return replace(
-            best,
-            evaluations=found.evaluations + more.evaluations,
-            starts=found.starts + more.starts,
-        )
-
-    def _estimated(
-        self,
-        experiments: Sequence[Experiment],
-        knowledge: Knowledge,
-        hint: Mapping[str, float] | None,
-        tell: Progress,
-        further: tuple[Parameter, ...] = (),
-        before: float = np.inf,
-    ) -> Estimated:
-        effects = () if self.nuisances is Nuisances.NONE else nuisances_of(REGISTRY)
-        effects = (*effects, *further)
-        patient = any(item.test.closed_loop for item in experiments)
-        free = (*knowledge.severities, *OFFSETS, *knowledge.beside(effects))
-        return estimate(
-            experiments,
-            free,
-            known=knowledge.known,
-            joint=knowledge.joint,
-            considered=considered_in(experiments, free),
-            hint=hint,
-            seed=self.seed,
-            tell=lambda share: tell("nuisances", share),
-            # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
-            give_up=knowledge.explains_sound,
-            explains=knowledge.explains,
-            patient=patient,
-            left_before=before,
-        )
 
     def _said(
         self,
