@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from ehadiag.identify import session
+from ehadiag.identify.nuisance import freed
 from ehadiag.identify.nuisance.knowledge import Knowledge
 from ehadiag.identify.nuisance.prior import Joint
 
@@ -34,8 +34,9 @@ def test_effects_are_loosened_only_where_that_explains_what_the_calibration_does
     def answer(_experiments, _free, *, joint, **_):
         return Answer(as_known if joint is CALIBRATED.joint else loosened)
 
-    monkeypatch.setattr(session, "estimate", answer)
-    monkeypatch.setattr(session, "considered_in", lambda *_: ())
+    monkeypatch.setattr(freed, "estimate", answer)
+    monkeypatch.setattr(freed, "considered_in", lambda *_: ())
     known = replace(CALIBRATED, aliases=(object(),))
-    found = session.Session(knowledge=known)._freed([], None, 9.0, lambda _stage, _share: None)
+    freeing = freed.Freeing(known, effects=(), seed=0, tell=lambda _share: None)
+    found = freeing.estimated([], None, 9.0)
     assert found.excess == taken
