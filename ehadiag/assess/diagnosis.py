@@ -394,10 +394,10 @@ def _of_supplies(
     identification: Identification,
 ) -> list[str]:
     """Why the supply pressure cannot be what its probe says, each reason once."""
-    # What the sensor reads at rest has been taken off each; this is what the search found besides.
-    offset = identification.fit.pressure_offset - experiments[0].pressure_offset
+    # What the sensor read at rest has been taken off those that rested.
+    offset = identification.fit.pressure_offset
     found = (
-        objections_to_supply(experiment, response, offset)
+        objections_to_supply(experiment, response, offset - experiment.pressure_offset)
         for experiment, response in zip(experiments, modelled, strict=True)
     )
     return list(dict.fromkeys(why for reasons in found for why in reasons))

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ehadiag.calibration.effects import (
-    LITTLE,
     QUICK,
     asked_for_by,
     in_order,
@@ -32,12 +31,18 @@ from ehadiag.calibration.models import (
 from ehadiag.calibration.session import Part, Session
 from ehadiag.core.actuator import Actuator
 from ehadiag.identify.nuisance.estimate import HYSTERESIS
-from ehadiag.identify.nuisance.explained import excess_of_signals, is_of_the_pressure
+from ehadiag.identify.nuisance.explained import (
+    SPOOL_EXPLAINED,
+    excess_of_signals,
+    is_of_the_pressure,
+)
 from ehadiag.identify.nuisance.knowledge import data_that_pass_for
-from ehadiag.model.batch import SPOOL_ROW
+from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 
 __all__ = ["choose", "learned_as_new"]
 
+SPOOL_AT_MOST = 1.5
+"""Spool's residuals over noise up to which the other second stage may explain the pressure."""
 MOST_SEARCHES = 3
 """With one model, until two have come to the same place."""
 AS_MUCH = 1.1
@@ -72,7 +77,7 @@ def choose(session: Session, start: Actuator, *, compare: bool) -> list[Learned]
     simple = simple_models(start)
     for plays in (1, SMOOTH):
         for model in simple:
-            if model != simple[0] and not compare and not _spool_is_explained(out[-1]):
+            if model != simple[0] and not compare and not _misses_the_pressure(out[-1]):
                 break
             out.append(_simply(session, replace(model, plays=plays), out))
             if out[-1].estimated.explained and not compare:
@@ -97,15 +102,20 @@ def _with_further_effects(session: Session, simple: Sequence[Model]) -> list[Lea
         if found.estimated.excess <= WORTH_ANOTHER:
             return out
     best = min(out, key=lambda item: item.criterion)
-    return [*out, looked_for_again(session, best)] if _is_of_the_pressure(best) else out
+    if not _is_of_the_pressure(best):
+        return out
+    again = looked_for_again(session, best)
+    return out if again is best else [*out, again]
 
 
 def _is_of_the_pressure(found: Learned) -> bool:
     return is_of_the_pressure(found.estimated.refined.residuals)
 
 
-def _spool_is_explained(found: Learned) -> bool:
-    return excess_of_signals(found.estimated.refined.residuals)[SPOOL_ROW] <= LITTLE
+def _misses_the_pressure(found: Learned) -> bool:
+    """Whether the spool is explained, more or less, and the pressure is not."""
+    excesses = excess_of_signals(found.estimated.refined.residuals)
+    return excesses[SPOOL_ROW] <= SPOOL_AT_MOST and excesses[PRESSURE_ROW] > SPOOL_EXPLAINED
 
 
 def _simply(session: Session, model: Model, before: Sequence[Learned]) -> Learned:
@@ -166,7 +176,8 @@ def _with_effects(session: Session, best: Learned, hint: Mapping[str, float]) ->
         model, new=True, hint=hint, hint_of_open=True, budget=ONE_START, part=Part.EACH_TEST
     )
     fewer = replace(model, beside=asked_for_by(whole))
-    if fewer == model and len(whole.experiments) == len(session.recordings):
+    of_all = [whole] if len(whole.experiments) == len(session.recordings) else []
+    if fewer == model and of_all:
         return whole
     enough = 1 if names.intersection(SLOW) else 2
     found: list[Learned] = []
@@ -188,7 +199,7 @@ def _with_effects(session: Session, best: Learned, hint: Mapping[str, float]) ->
         done = nearest.estimated.explained or len(found) >= enough
         if fewer == before and done and _as_good(nearest, whole):
             break
-    return min(found, key=lambda item: item.criterion)
+    return min([*found, *of_all], key=lambda item: item.criterion)
 
 
 def _left(found: Learned) -> float:

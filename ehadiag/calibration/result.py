@@ -44,7 +44,7 @@ class Tried:
 
     words: str
     excess: float
-    """Cost of its residuals over that of noise alone."""
+    """Cost of its residuals, in open loop if there was one, over that of noise alone."""
     criterion: float
     """Bayesian information criterion, less the best one's."""
 

@@ -77,7 +77,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """What the recordings do not show: why it was held."""
     fit: Goodness
     evidence: dict[str, Number] = {}
-    """Bayesian information criterion of each model that was tried, less the best one's."""
+    """Bayesian information criterion of each model that was tried, less the best one's; of open
+    loop if there was one."""
     recordings: tuple[Source, ...]
 
     def objection(self) -> str:

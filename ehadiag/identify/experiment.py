@@ -24,9 +24,9 @@ DISPLACED = 0.3e6 / PRESSURE.full_scale
 """Pressure at rest, over the converter's half range, above which it is none of the sensor's
 offset: 0.3 MPa of the default range."""
 SETTLES_LSB, SETTLES_NOISE = 5.0, 8.0
-"""Pressure of a first sample beside that of the rest's second half, in steps of the converter and
-deviations of the noise, from which on nothing rested: a null bias beyond the spool's friction moves
-it from the first tick on."""
+"""Pressure of the first samples beside that of the rest's second half, in steps of the converter
+and deviations of the noise, from which on nothing rested: a null bias beyond the spool's friction
+moves it from the first tick on."""
 LEAST_REST = 20
 """Samples at rest from which an offset is taken."""
 LEAST_QUIET_BLOCKS = 20
@@ -189,7 +189,7 @@ def _settles(values: NDArray[np.float64], channel: Channel) -> bool:
     place = np.median(end)
     noise = 1.4826 * np.median(np.abs(end - place))
     most = max(SETTLES_LSB * channel.lsb, SETTLES_NOISE * noise)
-    return bool(np.abs(begin - place).max() > most)
+    return bool(np.median(np.abs(begin - place)) > most)
 
 
 def _mean(values: NDArray[np.float64]) -> float:

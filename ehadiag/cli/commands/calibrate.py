@@ -61,7 +61,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="refine the calibrated --actuator by later recordings, still healthy",
     )
     parser.add_argument(
-        "--compare", action="store_true", help="try every second stage and print the evidence"
+        "--compare",
+        action="store_true",
+        help="try each second stage and hysteresis; print the evidence",
     )
     options.add_actuator_options(parser)
     options.add_mapping_options(parser)

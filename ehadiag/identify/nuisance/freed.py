@@ -111,7 +111,7 @@ class Freeing:
             hint=hint,
             seed=self.seed,
             tell=self.tell,
-            # Of a unit whose data are in doubt the first starts may leave as much as of a stranger.
+            # Else the first starts may leave as much as of a stranger.
             give_up=knowledge.explains_sound,
             explains=knowledge.explains,
             patient=any(item.test.closed_loop for item in experiments),

@@ -113,6 +113,8 @@ class Knowledge:
         Of severities by name, beside all else.
     explains : callable
         Of residuals, shape (signals, N): whether no more is left than of the unit as new.
+    leaves_nothing : bool
+        Whether a calibration explained the unit as new to the noise.
     severities : tuple of Parameter
         The faults, with the bounds within which they are looked for.
     """
@@ -124,6 +126,7 @@ class Knowledge:
     about: Mapping[str, float] = field(default_factory=dict)
     std: Mapping[str, float] = field(default_factory=dict)
     explains: Explains = is_noise
+    leaves_nothing: bool = False
     severities: tuple[Parameter, ...] = FAULTS
 
     def loosened(self) -> Knowledge:
@@ -145,9 +148,9 @@ class Knowledge:
 
     @property
     def explains_sound(self) -> bool:
-        """Whether it explains each recording of a sound unit: that of one without further effects,
-        where nothing was left unexplained."""
-        return not self.doubts or (self.joint is not None and self.explains is is_noise)
+        """Whether it explains each recording of a sound unit: data that are not in doubt, or a
+        calibration that left nothing."""
+        return not self.doubts or self.leaves_nothing
 
     def beside(self, others: Sequence[Parameter]) -> tuple[Parameter, ...]:
         """Return other parameters and what is free because of this, each once."""
@@ -260,7 +263,15 @@ def _calibrated(calibration: Calibration, channels: Channels) -> Knowledge:
         for name, size in FURTHER_STD.items()
     }
     explains = leaves_no_more(calibration.fit)
-    return Knowledge(tuple(free), OF_THE_DAY, joint, (), calibration.effects, std, explains)
+    return Knowledge(
+        free=tuple(free),
+        known=OF_THE_DAY,
+        joint=joint,
+        about=calibration.effects,
+        std=std,
+        explains=explains,
+        leaves_nothing=calibration.fit.left == 0.0,
+    )
 
 
 def has_further_effects(calibration: Calibration) -> bool:

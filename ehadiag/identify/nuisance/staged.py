@@ -42,8 +42,8 @@ left the search has ended beside the optimum, and believes too much."""
 CLOSER = 0.3
 """Spread of a further look about the best place, in spreads of what open loop alone leaves."""
 PATIENCE = 3
-"""Budgets of a search in closed loop alone, which may go astray several times: ten of 300 units
-were given up with one, one with two, none with three."""
+"""Budgets of a search in closed loop that open loop does not lead, which may go astray several
+times: ten of 300 units were given up with one, one with two, none with three."""
 RELAXED = 100.0
 """Weight of the spool over the pressure while the spool is explained first."""
 Hopeless = Callable[[NDArray[np.float64], int], bool]

@@ -145,7 +145,7 @@ def by_lines(
         weighted=weighted,
         evaluations=model.evaluations,
         converged=settled,
-        anchored=0,
+        anchored=0,  # the last round counts, and knows what is considered
     )
 
 

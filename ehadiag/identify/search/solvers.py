@@ -83,11 +83,11 @@ class CompactGa:
     name: str = field(default="cga", init=False)
 
     def with_budget(self, budget: int) -> CompactGa:
-        """Return the same solver with another number of evaluations.
+        """Return the same kind of solver with another number of evaluations.
 
         Of few it makes generations of half the size: how often the elite moves on counts more.
         """
-        samples = self.samples if budget >= FEWEST * self.samples else self.samples // 2
+        samples = self.samples if budget >= FEWEST * self.samples else max(1, self.samples // 2)
         return replace(self, budget=budget, samples=samples)
 
     def minimise(

@@ -50,3 +50,10 @@ def test_a_spool_that_friction_holds_beside_the_middle_starts_there(pushed):
     experiment = experiment_of(held)
     assert experiment.rested
     assert experiment.origin > 0.0
+
+
+def test_a_spoilt_sample_does_not_undo_a_rest(pushed):
+    pressure = np.where(np.arange(OPEN.ticks) < 100, 1.8e6, pushed.samples.pressure)
+    pressure[1] += 0.2e6
+    spoilt = replace(pushed, samples=replace(pushed.samples, pressure=pressure))
+    assert experiment_of(spoilt).rested

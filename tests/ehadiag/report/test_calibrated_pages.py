@@ -79,7 +79,7 @@ def test_the_page_of_a_calibration_says_what_was_learned_and_how_well() -> None:
     assert "CALIBRATED" in text
     for item in found.values:
         assert item.meaning in text
-    for part in ("What was learned", "covariance", "Evidence of the second stage", "serial 41"):
+    for part in ("What was learned", "covariance", "Evidence of the models", "serial 41"):
         assert part in text
     for why in found.actuator.calibration.held.values():
         assert why in text
