@@ -29,7 +29,6 @@ from ehadiag.model.parameters import parameter
 from ehadiag.model.simd.model import SimdModel
 
 __all__ = [
-    "LITTLE",
     "QUICK",
     "asked_for",
     "asked_for_by",

@@ -11,7 +11,7 @@ directions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,25 +128,11 @@ def by_lines(
 
     Its residuals are the middle's, moved by the lines where these hold: no run of the model.
     """
-    weighted = model.model.batch.weight > 0.0
-    clear = linear.scatter < CLEAR
-    jacobian = np.where(clear, linear.jacobian, 0.0)
+    jacobian = np.where(linear.scatter < CLEAR, linear.jacobian, 0.0)
     residuals = linear.middle + np.tensordot(x - linear.at, jacobian, 1)
-    used = clear & (residuals**2 < CAP) & weighted
-    return Refinement(
-        parameters=model.estimated,
-        x=x,
-        scale=model.scale,
-        cost=capped(residuals),
-        residuals=residuals,
-        jacobian=np.where(used, jacobian, 0.0),
-        considered=np.zeros((0, *residuals.shape)),
-        used=used,
-        weighted=weighted,
-        evaluations=model.evaluations,
-        converged=settled,
-        anchored=0,  # the last round counts, and knows what is considered
-    )
+    # The last round counts how often it was re-anchored, and knows what is considered.
+    considered = np.zeros((0, *residuals.shape))
+    return _put_together(model, x, linear, residuals, considered, anchored=0, settled=settled)
 
 
 def described(
@@ -162,6 +148,23 @@ def described(
     linear: the model about it, over the width of what is known.
     """
     residuals, considered, anchored, _ = model.at(x)
+    found = _put_together(
+        model, x, linear, residuals, considered, anchored=anchored, settled=settled
+    )
+    return replace(found, information=information)
+
+
+def _put_together(
+    model: Derivatives,
+    x: NDArray[np.float64],
+    linear: Linearised,
+    residuals: NDArray[np.float64],
+    considered: NDArray[np.float64],
+    *,
+    anchored: int,
+    settled: bool,
+) -> Refinement:
+    """What residuals at an optimum and the lines about it make known."""
     weighted = model.model.batch.weight > 0.0
     used = (linear.scatter < CLEAR) & (residuals**2 < CAP) & weighted
     return Refinement(
@@ -177,7 +180,6 @@ def described(
         evaluations=model.evaluations,
         converged=settled,
         anchored=anchored,
-        information=information,
     )
 
 
