@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from ehadiag.calibration.choice import choose, learned_as_new
+from ehadiag.calibration.as_new import learned_as_new
+from ehadiag.calibration.choice import choose
 from ehadiag.calibration.judging import AS_NEW, is_explained, not_as_new, not_healthy, unexplained
 from ehadiag.calibration.models import EFFECTS, Learned, Model
 from ehadiag.calibration.packing import lesson_of

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ehadiag.calibration import choice
-from ehadiag.calibration.choice import choose, learned_as_new
+from ehadiag.calibration import as_new, choice
+from ehadiag.calibration.as_new import learned_as_new
+from ehadiag.calibration.choice import choose
 from ehadiag.calibration.effects import QUICK, in_order
 from ehadiag.calibration.models import SMOOTH, Model
 from ehadiag.calibration.session import Part, Session
@@ -80,7 +81,7 @@ def further(monkeypatch):
 
     monkeypatch.setattr(choice, "looked_for_again", again)
     monkeypatch.setattr(choice, "with_further_effects", freed)
-    monkeypatch.setattr(choice, "asked_for_by", lambda _found: (SKEW,))
+    monkeypatch.setattr(as_new, "asked_for_by", lambda _found: (SKEW,))
 
 
 def chosen(leaves, *, compare=False):
