@@ -1,10 +1,12 @@
 """Settings of the documentation site: the pages of this folder, plain Markdown, and the docstrings.
 
-`sphinx-build -W --keep-going -b html docs build/site` makes it.
+`sphinx-build -W --keep-going -b html docs build/site` makes it. `python docs/conf.py` writes the
+table of parameters into its page.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from importlib.metadata import version as installed
@@ -17,7 +19,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "sim")]
 
 project = "ehadiag"
-author = "the ehadiag maintainers"
+author = "the ehadiag developers"
 release = version = installed("ehadiag")
 language = "en"
 default_role = "code"
@@ -33,17 +35,22 @@ autodoc_typehints = "none"  # numpydoc's sections have them
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
 
-CONTENTS = "index"
+CONTENTS = ("index", "maintainers")
+"""Pages whose lists make the navigation."""
 LINK = re.compile(r"- \[.*?\]\(([\w/-]+)\.md\)")
-OUTSIDE = re.compile(r"\]\(((?:\.\./)+examples/README\.md)\)")
+OUTSIDE = re.compile(
+    r"\]\(((?:\.\./)+(?:examples/README|CONTRIBUTING|firmware_iface/c/README)\.md)\)"
+)
 SCROLLED = re.compile(r'<pre(?=>)|<div(?= class="table-wrapper)')
 HEAD = re.compile(r"^(?=[A-Z][a-z]+$)", re.MULTILINE)
 
 
 def adapt(_app: Sphinx, page: str, source: list[str]) -> None:
-    """Hand on what stands outside this folder; make the navigation from the first page's lists."""
+    """Link files outside this folder; fill the gallery; make the navigation from the lists."""
+    if page == "gallery":
+        source[0] += gallery()
     source[0] = OUTSIDE.sub(r"](path:\1)", source[0])
-    if page != CONTENTS:
+    if page not in CONTENTS:
         return
     trees = []
     for part in HEAD.split(source[0])[1:]:
@@ -51,6 +58,17 @@ def adapt(_app: Sphinx, page: str, source: list[str]) -> None:
         pages = "\n".join(LINK.findall(part))
         trees.append(f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n")
     source[0] += "".join(trees)
+
+
+EXAMPLES = HERE.parent / "examples" / "README.md"
+SCRIPT = re.compile(r"^```sh\npython (examples/\w+\.py)", re.MULTILINE)
+
+
+def gallery() -> str:
+    """Return the examples with their output, which tests compare, each below its source."""
+    text = EXAMPLES.read_text("utf-8").partition("\n\n")[2].replace("](../docs/", "](")
+    text = text.replace("](diagnose.ipynb)", "](path:../examples/diagnose.ipynb)")
+    return SCRIPT.sub(r"```{literalinclude} ../\1\n:language: python\n```\n\n\g<0>", text)
 
 
 def name_types(
@@ -72,8 +90,35 @@ def make_accessible(
         context["body"] = SCROLLED.sub(r'\g<0> tabindex="0"', context["body"])
 
 
+PARAMETERS = HERE / "reference" / "parameters.md"
+PARAMETER_TABLE = re.compile(r"^\| name \|.*?(?=\n\n)", re.MULTILINE | re.DOTALL)
+
+
+def parameter_table() -> str:
+    """Return the rows of the registry of parameters, as Markdown."""
+    from ehadiag.model.registry import REGISTRY  # noqa: PLC0415 - loads numba
+
+    lines = ["| name | symbol | unit | range | kind | meaning |", "| --- " * 6 + "|"]
+    data = [item for item in REGISTRY if item.name == f"datum_{item.symbol.removeprefix('d')}"]
+    error = "relative error of the actuator file's "
+    meanings = "; ".join(item.meaning.removeprefix(error) for item in data)
+    for item in [data[0], *(item for item in REGISTRY if item not in data)]:
+        bounded = math.isfinite(item.lower)
+        span = f"{item.lower:g} … {item.upper:g}" if bounded else "any"
+        cells = [f"`{item.name}`", item.symbol, item.unit, span, item.kind.value, item.meaning]
+        if item in data:  # one row for all, since they have the same bounds
+            cells[:2], cells[5] = ["`datum_NAME`", "dNAME"], f"{error}NAME: {meanings}"
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def setup(app: Sphinx) -> None:
     """Connect what is above."""
     app.connect("html-page-context", make_accessible, priority=900)  # after the theme
     app.connect("source-read", adapt)
     app.connect("autodoc-process-docstring", name_types, priority=400)  # before numpydoc
+
+
+if __name__ == "__main__":
+    text = PARAMETERS.read_text("utf-8")
+    PARAMETERS.write_text(PARAMETER_TABLE.sub(lambda _: parameter_table(), text), "utf-8")

@@ -9,23 +9,28 @@ The names below are loaded when they are first used: the import itself costs not
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from ehadiag.api import calibrate, diagnose, diagnose_many, read, save_actuator, simulate
     from ehadiag.assess.diagnosis import Diagnosis
     from ehadiag.assess.verdict import Levels, Verdict
-    from ehadiag.calibration.result import Calibrated
+    from ehadiag.calibration.unit_models import Calibrated
     from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
-    from ehadiag.core.errors import (
+    from ehadiag.estimate import Effect, Severity
+    from ehadiag.history.records import Usage
+    from ehadiag.history.store import History
+    from ehadiag.monitor.streaming import Monitor, Reading, Tick
+    from ehadiag.prognosis.units import Prognosis, forecast
+    from ehadiag.request import Request
+    from ehadiag.result import Result
+    from ehadiag.session.bus_calls import check_bus, record, run_simulator, run_test, watch
+    from firmware_iface.errors import (
         BusLostError,
         ConfigurationError,
         EhadiagError,
         InputOutputError,
         NotTestedError,
     )
-    from ehadiag.core.recording import CommandMode, Recording, Samples
-    from ehadiag.core.stored_test import StoredTest, bundled_tests, load_test
-    from ehadiag.facade.calls import calibrate, diagnose, read, save_actuator, simulate
-    from ehadiag.facade.result import Result
-    from ehadiag.monitor import Monitor, Reading, Tick
-    from ehadiag.report.faults import Fault
+    from firmware_iface.recording import CommandMode, Recording, Samples
+    from firmware_iface.stored_test import StoredTest, bundled_tests, load_test
 
     __version__: str
 
@@ -36,49 +41,73 @@ __all__ = [
     "CommandMode",
     "ConfigurationError",
     "Diagnosis",
+    "Effect",
     "EhadiagError",
-    "Fault",
+    "History",
     "InputOutputError",
     "Levels",
     "Monitor",
     "NotTestedError",
+    "Prognosis",
     "Reading",
     "Recording",
+    "Request",
     "Result",
     "Samples",
+    "Severity",
     "StoredTest",
     "Tick",
+    "Usage",
     "Verdict",
     "__version__",
     "bundled_tests",
     "calibrate",
+    "check_bus",
     "default_actuator",
     "diagnose",
+    "diagnose_many",
+    "forecast",
     "load_actuator",
     "load_test",
     "read",
+    "record",
+    "run_simulator",
+    "run_test",
     "save_actuator",
     "simulate",
+    "watch",
 ]
 
 _HOMES = {
     "ehadiag.assess.diagnosis": ("Diagnosis",),
     "ehadiag.assess.verdict": ("Levels", "Verdict"),
-    "ehadiag.calibration.result": ("Calibrated",),
+    "ehadiag.calibration.unit_models": ("Calibrated",),
     "ehadiag.core.actuator": ("Actuator", "default_actuator", "load_actuator"),
-    "ehadiag.core.errors": (
+    "firmware_iface.errors": (
         "BusLostError",
         "ConfigurationError",
         "EhadiagError",
         "InputOutputError",
         "NotTestedError",
     ),
-    "ehadiag.core.recording": ("CommandMode", "Recording", "Samples"),
-    "ehadiag.core.stored_test": ("StoredTest", "bundled_tests", "load_test"),
-    "ehadiag.facade.calls": ("calibrate", "diagnose", "read", "save_actuator", "simulate"),
-    "ehadiag.facade.result": ("Result",),
-    "ehadiag.monitor": ("Monitor", "Reading", "Tick"),
-    "ehadiag.report.faults": ("Fault",),
+    "firmware_iface.recording": ("CommandMode", "Recording", "Samples"),
+    "firmware_iface.stored_test": ("StoredTest", "bundled_tests", "load_test"),
+    "ehadiag.estimate": ("Effect", "Severity"),
+    "ehadiag.history.records": ("Usage",),
+    "ehadiag.history.store": ("History",),
+    "ehadiag.prognosis.units": ("Prognosis", "forecast"),
+    "ehadiag.api": (
+        "calibrate",
+        "diagnose",
+        "diagnose_many",
+        "read",
+        "save_actuator",
+        "simulate",
+    ),
+    "ehadiag.monitor.streaming": ("Monitor", "Reading", "Tick"),
+    "ehadiag.request": ("Request",),
+    "ehadiag.result": ("Result",),
+    "ehadiag.session.bus_calls": ("check_bus", "record", "run_simulator", "run_test", "watch"),
 }
 """Which module has which name; the imports above tell the same to type checkers and editors."""
 

@@ -8,13 +8,12 @@ python examples/monitor_stream.py
 """
 
 import ehadiag
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import EmulatorTransport
-from ehadiag_sim.plant.conditions import Faults
-from firmware_iface.alignment.live_ticks import LiveTicks
-from firmware_iface.codec.encode import Encoder
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.emulator import EmulatorTransport, FccCore
+from firmware_iface.codec import Encoder
+from firmware_iface.live_decode import LiveTicks
+from firmware_iface.transport.base import open_source
 from firmware_iface.transport.frames import Frame
-from firmware_iface.transport.receiver import open_source
 
 actuator = ehadiag.default_actuator()
 tests = ehadiag.bundled_tests()

@@ -1,4 +1,4 @@
-"""Settings of hypothesis for all tests."""
+"""For all tests: settings of hypothesis, time limits, a small disk."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ from hypothesis import settings
 # An example's time says nothing on a machine that other work shares.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+SLOW_LIMIT = 1800.0
+"""Time limit of a test that is marked slow, s; that of others is in pyproject.toml."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give slow tests more time."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_LIMIT))
 
 
 @pytest.fixture

@@ -7,71 +7,31 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.assess.unobservable import lost_positions
-from ehadiag.assess.wrong_units import beyond_reach
-from ehadiag.core.actuator import Actuator
-from ehadiag.core.calibration import CHANGED, Calibration
+from ehadiag.assess.lost_samples import objection_to_lost_positions
+from ehadiag.assess.plausibility import objections_to_readings
+from ehadiag.core.actuator import WEAR_EXCESS_FACTOR, Actuator, Calibration
 from ehadiag.core.conversion import conversion_of
-from ehadiag.core.recording import BitState, CommandMode, Environment, Recording, Samples
-from ehadiag.core.stored_test import SAME_RATE, StoredTest
-from ehadiag.identify.commanded_current import CONTROL_LAW_LSB, FRAME_TOLERANCE
+from ehadiag.core.criteria import FIT, RECORDING
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.nuisance.knowledge import has_further_effects
-from ehadiag.identify.result import Identification
+from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.prior import has_further_effects
+from ehadiag.identify.signals import COMMAND_FRAME_TOLERANCE
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
-
-__all__ = [
-    "LONGEST_GAP_S",
-    "MOST_LOST",
-    "most_left",
-    "nothing_is_under_way",
-    "objections_to_estimate",
-    "objections_to_experiment",
-    "objections_to_recording",
-    "objections_to_unit",
-    "out_of_range",
-    "remarks_on_recording",
-    "repetitions",
-]
-
-LATEST_S = 0.05
-"""A frame that comes later than this after its tick does not come."""
-MOST_LOST = 0.25
-"""Share of samples of a channel that may be missing."""
-MOST_LOST_BY_TIME = 0.4
-"""The same where no counter tells the ticks: of two samples a tick late one counts as lost."""
-MOST_SPACING = 2
-"""Ticks between two samples: half the control rate is enough to diagnose from."""
-LONGEST_GAP_S = 0.25
-"""Longest span without a sample."""
-LEAST_COMMANDS = 100
-"""Command frames that tell at which resolution the control law got its command."""
-LEAST_CURRENTS = 0.4
-"""Share of ticks whose measured current must bear out a stored command that was not recorded."""
-LEAST_MISSED_S = 0.01
-"""A shorter piece missing at an end of the test is a lost frame like others."""
-LEAST_SHARE = 0.5
-"""Share of the samples of a window that a search needs."""
-MOST_SATURATED = 0.02
-"""Share of samples at a converter's end."""
-TEMPERATURES = (-54.0, 135.0)
-"""degC; the range in which the oil's law is used."""
-LEAST_SUPPLY = 0.5
-"""Share of the actuator's own supply pressure."""
-NOISE_SHARE = 2.0
-"""Gap of the current, in units of noise, that noise does not make."""
-MOST_OUTLIERS = 0.015
-MOST_RMS = 1.25
-BROUGHT_OUT = 6.0
-"""By which wear may make more outliers of what effects beyond the usual ones stand in for: worn
-units with such effects had up to 8 % of them, and errors well within their intervals."""
+from firmware_iface.recording import (
+    BitState,
+    CommandMode,
+    Environment,
+    Recording,
+    Samples,
+)
+from firmware_iface.stored_test import RATE_TOLERANCE, StoredTest
 
 
-def nothing_is_under_way(recording: Recording, test: StoredTest) -> bool:
+def is_complete_recording(recording: Recording, test: StoredTest) -> bool:
     """Whether a recording has the end of a test, and no frame of it may still come.
 
-    What is missing longer than `LATEST_S` before the end is lost; a channel of which there is
-    nothing at all is not on this bus.
+    What is missing longer than `RECORDING.max_frame_delay_s` before the end is lost; a channel of
+    which there is nothing at all is not on this bus.
     """
     samples = recording.samples
     if samples is None or samples.ticks != test.ticks:
@@ -80,7 +40,7 @@ def nothing_is_under_way(recording: Recording, test: StoredTest) -> bool:
         return False
     if recording.outcome.state is not BitState.COMPLETE:
         return False
-    end = slice(-round(LATEST_S * test.rate) or None, None)
+    end = slice(-round(RECORDING.max_frame_delay_s * test.rate) or None, None)
     for values in (
         samples.current,
         samples.spool,
@@ -99,23 +59,34 @@ def objections_to_recording(
 ) -> list[str]:
     """Why a recording cannot be diagnosed; empty if it can."""
     if recording.outcome.state is BitState.REFUSED:
-        return [f"refused by the flight-control computer: {_words(recording.outcome.reason.name)}"]
+        return [
+            f"refused by the flight-control computer: {_plain_words(recording.outcome.reason.name)}"
+        ]
     if recording.outcome.state is BitState.ABORTED:
         return ["the test was aborted"]
     samples = recording.samples
     if samples is None:
         return [*recording.quality.refused, "no telemetry of a test in the recording"]
-    beyond = beyond_reach(samples, actuator)
+    beyond = objections_to_readings(samples, actuator)
     if test is None and recording.test_id is None:
-        return beyond or ["the recording does not say which test it is of: name the test by --test"]
+        return beyond or [
+            "the recording does not say which test it is of: name the test by --test; of a test in"
+            " several files join these by --merge"
+        ]
     if test is None:
         return [f"test {recording.test_id} is none of the stored tests: name its file by --test"]
     return [
         *recording.quality.refused,
         *beyond,
-        *_unlike_the_test(samples, test, actuator),
-        *_gaps(samples, test, MOST_LOST_BY_TIME if recording.by_time else MOST_LOST),
-        *out_of_range(recording.environment, samples, actuator),
+        *_test_mismatches(samples, test, actuator),
+        *_gaps(
+            samples,
+            test,
+            RECORDING.max_missing_share_without_counter
+            if recording.by_time
+            else RECORDING.max_missing_share,
+        ),
+        *objections_to_conditions(recording.environment, samples, actuator),
     ]
 
 
@@ -131,7 +102,7 @@ def objections_to_unit(recordings: Sequence[Recording], actuator: Actuator) -> l
     ]
 
 
-def repetitions(recordings: Sequence[Recording]) -> list[str]:
+def objections_to_duplicates(recordings: Sequence[Recording]) -> list[str]:
     """Say which recordings are others once more: what they show would count twice."""
     seen: dict[bytes, str] = {}
     out = []
@@ -149,12 +120,15 @@ def repetitions(recordings: Sequence[Recording]) -> list[str]:
     return out
 
 
-def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
+def _test_mismatches(samples: Samples, test: StoredTest, actuator: Actuator) -> list[str]:
     out = []
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     commands = int(np.isfinite(samples.command).sum())
-    if test.closed_loop and commands < LEAST_COMMANDS:
-        if np.isfinite(samples.current[: test.ticks]).mean() < LEAST_CURRENTS:
+    if test.closed_loop and commands < RECORDING.min_command_frames:
+        if (
+            np.isfinite(samples.current[: test.ticks]).mean()
+            < RECORDING.min_current_share_without_command
+        ):
             out.append(
                 f"{commands or 'no'} command frames in the recording, nor the servovalve current:"
                 " closed loop cannot be judged without: record the message with the command too,"
@@ -164,9 +138,9 @@ def _unlike_the_test(samples: Samples, test: StoredTest, actuator: Actuator) -> 
         out.append(
             f"the command is a {samples.mode.name.lower()}, test {test.name!r} needs another"
         )
-    if abs(samples.period_ns * 1e-9 * test.rate - 1.0) > SAME_RATE:
+    if abs(samples.period_ns * 1e-9 * test.rate - 1.0) > RATE_TOLERANCE:
         out.append(f"telemetry every {samples.period_ns / 1e6:g} ms, test at {test.rate:g} Hz")
-    elif abs(actuator.controller.rate / test.rate - 1.0) > SAME_RATE:
+    elif abs(actuator.controller.rate / test.rate - 1.0) > RATE_TOLERANCE:
         out.append(f"controller at {actuator.controller.rate:g} Hz, test at {test.rate:g} Hz")
     return out
 
@@ -180,14 +154,19 @@ def _gaps(samples: Samples, test: StoredTest, most: float) -> list[str]:
         longest = float(np.diff(edges).max() - 1) / test.rate
         if share > most:
             out.append(f"{share:.0%} of the {name} samples are missing (limit {most:.0%})")
-        elif longest > LONGEST_GAP_S:
-            out.append(f"no {name} sample for {longest:.2f} s (limit {LONGEST_GAP_S:g} s)")
+        elif longest > RECORDING.max_sample_gap_s:
+            out.append(
+                f"no {name} sample for {longest:.2f} s (limit {RECORDING.max_sample_gap_s:g} s)"
+            )
     both = np.isfinite(samples.spool[: test.ticks]) & np.isfinite(samples.pressure[: test.ticks])
     spacing = _spacing(np.flatnonzero(both))
-    for search in ("FDJ", "Kintas", "FSS", "refinement"):
+    for search in test.windows.__struct_fields__:
         for start, end in getattr(test.windows, search):
             inside = both[round(start * test.rate) : round(end * test.rate)]
-            if inside.sum() * spacing < LEAST_SHARE * (end - start) * test.rate:
+            if (
+                inside.sum() * spacing
+                < RECORDING.min_sample_share_of_window * (end - start) * test.rate
+            ):
                 out.append(f"samples are missing in {start:g} … {end:g} s, which {search} needs")
     return out
 
@@ -195,25 +174,35 @@ def _gaps(samples: Samples, test: StoredTest, most: float) -> list[str]:
 def _spacing(present: NDArray[np.int64]) -> int:
     """Ticks between two samples: of a bus or a logger that brings each second tick none is lost."""
     steps = np.diff(present)
-    return int(np.clip(np.median(steps), 1, MOST_SPACING)) if steps.size else 1
+    return (
+        int(np.clip(np.median(steps), 1, RECORDING.max_sample_spacing_ticks)) if steps.size else 1
+    )
 
 
-def out_of_range(environment: Environment, samples: Samples, actuator: Actuator) -> list[str]:
+def objections_to_conditions(
+    environment: Environment, samples: Samples, actuator: Actuator
+) -> list[str]:
     """What the model must not be run with; holds for a running test too."""
     out = []
     saturated = conversion_of(samples, actuator).saturated
     for index, name in ((1, "spool"), (2, "pressure"), (3, "position")):
         share = float(np.mean(saturated[index]))
-        if share > MOST_SATURATED:
+        if share > RECORDING.max_saturated_share:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
     temperature = environment.oil_temperature
-    if temperature is not None and not TEMPERATURES[0] <= temperature <= TEMPERATURES[1]:
+    if (
+        temperature is not None
+        and not RECORDING.oil_temperature_range_degc[0]
+        <= temperature
+        <= RECORDING.oil_temperature_range_degc[1]
+    ):
         out.append(
-            f"oil at {temperature:g} degC, outside {TEMPERATURES[0]:g} … {TEMPERATURES[1]:g}"
+            f"oil at {temperature:g} degC, outside {RECORDING.oil_temperature_range_degc[0]:g} … "
+            f"{RECORDING.oil_temperature_range_degc[1]:g}"
         )
     if environment.supply_pressure is not None and environment.return_pressure is not None:
         supply = environment.supply_pressure - environment.return_pressure
-        if supply < LEAST_SUPPLY * actuator.servovalve.PSR:
+        if supply < RECORDING.min_supply_pressure_share * actuator.servovalve.PSR:
             out.append(
                 f"supply {supply / 1e6:.1f} MPa above return, "
                 f"the actuator's data say {actuator.servovalve.PSR / 1e6:.1f} MPa"
@@ -227,8 +216,10 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
     trace, test = experiment.trace, experiment.test
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     channels = experiment.channels
-    reach = (channels.position if test.closed_loop else channels.current).full_scale
-    if trace.command_deviation > max(FRAME_TOLERANCE[mode] * reach, trace.command_step):
+    full_scale = (channels.position if test.closed_loop else channels.current).full_scale
+    if trace.command_deviation > max(
+        COMMAND_FRAME_TOLERANCE[mode] * full_scale, trace.command_step
+    ):
         unit = "mm" if test.closed_loop else "mA"
         out.append(
             f"the command differs from test {test.name!r} by up to "
@@ -236,7 +227,7 @@ def objections_to_experiment(experiment: Experiment) -> list[str]:
         )
     if current := objection_to_current(experiment):
         out.append(current)
-    if lost := lost_positions(experiment):
+    if lost := objection_to_lost_positions(experiment):
         out.append(lost)
     for name, values in (("spool", experiment.spool), ("pressure", experiment.pressure)):
         seen = values[np.isfinite(values)]
@@ -253,7 +244,9 @@ def objection_to_current(experiment: Experiment) -> str:
         experiment.spool_noise / channels.spool.grain,
         experiment.pressure_noise / channels.pressure.grain,
     )
-    limit_lsb = max(CONTROL_LAW_LSB, NOISE_SHARE * noise_lsb)
+    limit_lsb = max(
+        RECORDING.max_control_residual_lsb, RECORDING.max_current_residual_stds * noise_lsb
+    )
     if not trace.residual_lsb > limit_lsb:
         return ""
     return (
@@ -273,7 +266,7 @@ def objections_to_estimate(
     fit = identification.fit
     out = []
     rms = max(fit.spool_rms, fit.pressure_rms)
-    most_outliers, most_rms = most_left(calibration)
+    most_outliers, most_rms = residual_limits(calibration)
     if fit.outliers > most_outliers or not rms <= most_rms:
         out.append(
             f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
@@ -286,25 +279,29 @@ def objections_to_estimate(
     return out
 
 
-def most_left(calibration: Calibration | None) -> tuple[float, float]:
+def residual_limits(calibration: Calibration | None) -> tuple[float, float]:
     """Outliers (share) and rms residual that an explained recording may have.
 
     calibration: of the unit: what it could not explain is allowed, and what wear brings out of
     effects that stand in for others.
     """
     if calibration is None:
-        return MOST_OUTLIERS, MOST_RMS
+        return FIT.max_outlier_share, FIT.max_rms
     further = has_further_effects(calibration)
     if not (further or calibration.fit.left > 0.0):
-        return MOST_OUTLIERS, MOST_RMS
+        return FIT.max_outlier_share, FIT.max_rms
     fit = calibration.fit
+    outliers = (FIT.outlier_factor_further_effects if further else 1.0) * FIT.max_outlier_share
     return (
-        (BROUGHT_OUT if further else 1.0) * MOST_OUTLIERS + CHANGED * fit.outliers,
-        MOST_RMS * CHANGED * max(fit.spool_rms, fit.pressure_rms),
+        min(outliers + WEAR_EXCESS_FACTOR * fit.outliers, FIT.max_outlier_share_poor_calibration),
+        min(
+            FIT.max_rms * WEAR_EXCESS_FACTOR * max(fit.spool_rms, fit.pressure_rms),
+            FIT.max_rms_poor_calibration,
+        ),
     )
 
 
-def remarks_on_recording(
+def notes_on_recording(
     recording: Recording, test: StoredTest | None, actuator: Actuator
 ) -> tuple[str, ...]:
     """What was assumed and what is missing, where a verdict can be given all the same."""
@@ -324,14 +321,14 @@ def remarks_on_recording(
     if test is not None and len(present):
         first = float(present[0]) / test.rate
         last = max(test.ticks - 1 - float(present[-1]), 0.0) / test.rate
-        if first >= LEAST_MISSED_S:
+        if first >= RECORDING.min_missing_end_s:
             out.append(f"the first {first:.3f} s of the test are missing")
-        if last >= LEAST_MISSED_S:
+        if last >= RECORDING.min_missing_end_s:
             out.append(f"the last {last:.3f} s of the test are missing: the recording ends early")
         elif recording.outcome.state is BitState.RUNNING:
             out.append("the recording ends before the computer's word that the test is complete")
     return tuple(out)
 
 
-def _words(name: str) -> str:
+def _plain_words(name: str) -> str:
     return name.lower().replace("_", " ")

@@ -9,62 +9,72 @@ from dataclasses import dataclass
 import numpy as np
 
 from ehadiag.assess.acceptance import (
+    notes_on_recording,
     objection_to_current,
+    objections_to_conditions,
+    objections_to_duplicates,
     objections_to_estimate,
     objections_to_experiment,
     objections_to_recording,
     objections_to_unit,
-    out_of_range,
-    remarks_on_recording,
-    repetitions,
 )
-from ehadiag.assess.culprit import Culprit, culprit_of
-from ehadiag.assess.delays import in_time
-from ehadiag.assess.lost_ticks import UNEASY, can_be_told, told_by_response, widened
-from ehadiag.assess.modelled import response_of
-from ehadiag.assess.other_faults import (
-    OtherFault,
-    degraded_by,
-    notes_on_other_faults,
-    other_faults,
+from ehadiag.assess.blocks import creep_note, unexplained_block
+from ehadiag.assess.lost_samples import (
+    has_observable_severity,
+    is_reconstructible,
+    objection_to_frame_order,
+    objection_to_lost_positions,
+    reconstruct_lost_samples,
+    restrict_to_observable,
+    widen_intervals,
 )
-from ehadiag.assess.plausible import objections_to_actuator
-from ehadiag.assess.position import (
+from ehadiag.assess.other_causes import (
+    count_other_faults,
+    effects_of,
+    find_culprit,
+    notes_on_effects,
+    with_limits,
+)
+from ehadiag.assess.plausibility import objections_to_actuator, objections_to_travel
+from ehadiag.assess.response_checks import (
     PositionFit,
-    most_gain_error,
+    correct_delays,
+    fit_position,
+    identified_response,
+    max_position_gain_error,
     objections_to_position,
-    position_fit,
+    objections_to_supply,
 )
-from ehadiag.assess.supply import objections_to_supply
-from ehadiag.assess.travel import objections_to_travel
-from ehadiag.assess.unobservable import (
-    lost_order,
-    lost_positions,
-    observable,
-    what_is_left,
+from ehadiag.assess.sampling_instants import (
+    INSTANTS,
+    settle_instants,
+    why_sampled_seldom,
+    widen_by_instants,
 )
-from ehadiag.assess.verdict import Levels, Verdict, judge
+from ehadiag.assess.verdict import Levels, Verdict, chance_above, judge
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.recording import Recording
-from ehadiag.core.shown_in import told
-from ehadiag.core.stored_test import StoredTest
+from ehadiag.core.conventions import FRICTION_NAME, with_unit
+from ehadiag.core.criteria import FIT, LOSSES, RECORDING, VERDICT
+from ehadiag.estimate import Culprit, Effect
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
-from ehadiag.identify.nuisance.knowledge import OF_THE_DAY, PASS_FOR_FAULTS, knowledge_of
-from ehadiag.identify.result import Identification
-from ehadiag.identify.search.solvers import CompactGa, Solver
-from ehadiag.identify.search.stages import STAGES, Progress, first_ends_at, stage_ends_at
-from ehadiag.identify.session import Nuisances, Session, SoFar
-from ehadiag.model.parameters import parameter
-from ehadiag.model.scalar.response import Response
-
-__all__ = ["Diagnosis", "DiagnosisSession", "diagnose", "match_tests", "not_tested"]
-
-CHANGED = 6.0
-"""Deviations of a calibration beyond which an effect has changed since."""
-LEAST_CHANGE = 0.1
-"""Of an effect, in units of its scale."""
-LEAST_SHARE = 0.75
-"""Share of samples without which nothing is worked out of a running test."""
+from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.identification_session import (
+    IdentificationSession,
+    InterimEstimate,
+    NuisanceMode,
+)
+from ehadiag.identify.prior import DAILY_PRIORS, FAULT_OF_DATUM, unit_prior
+from ehadiag.identify.solvers import CompactGa, Solver
+from ehadiag.identify.staged_search import (
+    STAGE_SHARES,
+    StageProgress,
+    first_approximation_ready_at,
+    stage_ready_at,
+)
+from ehadiag.model.registry import parameter
+from ehadiag.model.residual_models import ModelResponse
+from firmware_iface.recording import Recording
+from firmware_iface.stored_test import StoredTest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,42 +92,37 @@ class Diagnosis:
     """What was identified from; empty without identification."""
     positions: tuple[PositionFit | None, ...]
     """Of each experiment the check of its position sensor; None where there are too few samples."""
-    other: tuple[OtherFault, ...]
-    """Effects of the unit that were estimated and have a limit of their own."""
+    effects: tuple[Effect, ...]
+    """Every effect of the unit and its installation that was estimated."""
     culprit: Culprit | None
     """What may keep the model from explaining the recordings; None where it explains them."""
     notes: tuple[str, ...]
     """What the recordings say of themselves, what was assumed, what is missing."""
     elapsed: float
-    """s from samples to verdict."""
+    """Time from samples to verdict, s."""
+
+    @property
+    def other(self) -> tuple[Effect, ...]:
+        """Effects that have a limit of their own, in the order of the actuator file."""
+        return with_limits(self.effects, self.actuator)
 
 
-Estimated = tuple[list[Experiment], Identification, tuple[str, ...], tuple[str, ...]]
+IdentifiedRecordings = tuple[list[Experiment], Identification, tuple[str, ...], tuple[str, ...]]
 """Experiments, what they say, notes on what was put right, and why it cannot carry a verdict."""
 
 
 class DiagnosisSession:
-    """A diagnosis that is fed a recording as it grows, and is asked to finish.
+    """A diagnosis that takes a recording while it grows, and is finished with the complete one.
 
-    A finished recording is the same path, fed once: `diagnose`. What was worked out of a test's
-    beginning is used where the finished recording has the same samples to the last bit, so that the
-    answer is that of the recording alone, only sooner. One thread at a time.
+    A finished recording takes the same path, `diagnose`. What was computed from the beginning of a
+    test is used again where the finished recording has the same samples to the last bit, so that
+    the answer is that of the recording alone, only sooner. One thread at a time.
 
-    Parameters
-    ----------
-    actuator : Actuator
-    tests : Iterable[StoredTest]
-        The tests that a recording may be of, told apart by number.
-    default : StoredTest | None
-        Test of recordings whose bus does not carry a number.
-    levels : Levels | None
-        Advisory level and limit.
-    solver : Solver | None
-        Global search; the compact genetic algorithm unless given.
-    seed : int
-        The same seed gives the same answer on the same machine.
-    nuisances : Nuisances
-        Which effects of the installation are estimated beside the faults.
+    actuator: data of the actuator; tests: tests that a recording may be of, distinguished by
+    number; default: test of recordings whose bus does not carry a number; levels: advisory level
+    and limit; solver: global search; the compact genetic algorithm unless given; seed: the same
+    seed gives the same answer on the same machine; nuisances: which effects of the installation are
+    estimated with the faults.
     """
 
     def __init__(
@@ -129,13 +134,13 @@ class DiagnosisSession:
         levels: Levels | None = None,
         solver: Solver | None = None,
         seed: int = 0,
-        nuisances: Nuisances = Nuisances.AUTO,
+        nuisances: NuisanceMode = NuisanceMode.AUTO,
     ) -> None:
         self._actuator = actuator
         self._tests = tuple(tests)
         self._default = default
         self._levels = levels or Levels()
-        self._session = Session(solver, seed, nuisances, knowledge_of(actuator))
+        self._session = IdentificationSession(solver, seed, nuisances, unit_prior(actuator))
 
     @property
     def reused(self) -> int:
@@ -143,7 +148,7 @@ class DiagnosisSession:
         return self._session.reused
 
     @property
-    def so_far(self) -> SoFar | None:
+    def so_far(self) -> InterimEstimate | None:
         """Severities as the running test shows them; another thread may look."""
         return self._session.so_far
 
@@ -154,66 +159,86 @@ class DiagnosisSession:
         """
         if not isinstance(self._session.solver, CompactGa) or not noise_is_judged_early(test):
             return ()
-        ends = {first_ends_at(test), *(stage_ends_at(test, i) for i in range(len(STAGES)))}
+        ends = {
+            first_approximation_ready_at(test),
+            *(stage_ready_at(test, i) for i in range(len(STAGE_SHARES))),
+        }
         return tuple(sorted(end for end in ends if end < test.duration))
 
     def feed(self, recording: Recording) -> None:
-        """Work out all that the samples so far allow; nothing of what cannot carry a verdict."""
-        samples, test = recording.samples, _match(recording, self._tests, self._default)
+        """Compute all that the samples so far allow, unless they cannot carry a verdict."""
+        samples, test = recording.samples, _match_test(recording, self._tests, self._default)
         if samples is None or samples.ticks == 0 or test is None or not self.due_s(test):
             return
-        if out_of_range(recording.environment, samples, self._actuator):
+        if objections_to_conditions(recording.environment, samples, self._actuator):
             return
         if objections_to_actuator(self._actuator):
             return
         experiment = build_experiment(samples, recording.environment, test, self._actuator)
         for values in (experiment.spool, experiment.pressure):
-            if np.isfinite(values).mean() < LEAST_SHARE:
+            if np.isfinite(values).mean() < RECORDING.min_sample_share_early:
                 return
         self._session.feed([experiment])
 
     def finish(
-        self, recordings: Sequence[Recording], progress: Progress | None = None
+        self, recordings: Sequence[Recording], progress: StageProgress | None = None
     ) -> Diagnosis:
         """Diagnose one actuator from one complete recording, or from several together."""
+        found = self._finished(recordings, progress)
+        if found.verdict is Verdict.NOT_TESTED and any(item.as_measured for item in recordings):
+            measured = self._finished([item.as_measured or item for item in recordings], progress)
+            return found if measured.verdict is Verdict.NOT_TESTED else measured
+        return found
+
+    def _finished(
+        self, recordings: Sequence[Recording], progress: StageProgress | None
+    ) -> Diagnosis:
         begin = time.perf_counter()
         matched = match_tests(recordings, self._tests, self._default)
-        experiments, reasons = self._experiments(recordings, matched)
-        orders = tuple(dict.fromkeys(filter(None, map(lost_order, recordings))))
-        known = (*map(lost_positions, experiments), *orders)
-        hidden = tuple(dict.fromkeys(reason for reason in reasons if reason in known))
+        experiments, reasons = examined_recordings(recordings, matched, self._actuator)
+        orders = tuple(dict.fromkeys(filter(None, map(objection_to_frame_order, recordings))))
+        loss_reasons = (*map(objection_to_lost_positions, experiments), *orders)
+        hidden = tuple(dict.fromkeys(reason for reason in reasons if reason in loss_reasons))
         closed = any(item.test.closed_loop for item in experiments)
-        lost = bool(hidden) and set(reasons) <= set(hidden) and observable(experiments)
+        lost = bool(hidden) and set(reasons) <= set(hidden) and has_observable_severity(experiments)
         identification: Identification | None = None
         positions: tuple[PositionFit | None, ...] = ()
-        others: tuple[OtherFault, ...] = ()
         culprit: Culprit | None = None
         late: tuple[str, ...] = ()
         verdict, why = Verdict.NOT_TESTED, tuple(reasons)
-        told = self._told(recordings, experiments, progress) if lost and not orders else None
-        if lost and told is None:
+        reconstructed = (
+            self._reconstructed(recordings, experiments, progress) if lost and not orders else None
+        )
+        if lost and reconstructed is None:
             found = self._session.finish(experiments, progress)
-            identification, words = what_is_left(found, closed=closed)
+            identification, words = restrict_to_observable(found, closed=closed)
             why = tuple(f"{reason}: {words}" for reason in hidden)
-        if told is not None or not reasons:
-            experiments, identification, late, why = told or self._estimated(
+        if reconstructed is not None or not reasons:
+            experiments, identification, late, why = reconstructed or self._estimated(
                 recordings, experiments, progress, ordered=not orders
             )
-            modelled = [response_of(item, identification) for item in experiments]
-            positions = tuple(map(position_fit, experiments, modelled))
-            others = other_faults(identification, self._actuator)
+            modelled = [identified_response(item, identification) for item in experiments]
+            positions = tuple(map(fit_position, experiments, modelled))
             if why and orders:
-                identification, words = what_is_left(identification, closed=closed)
+                identification, words = restrict_to_observable(identification, closed=closed)
                 why = tuple(f"{reason}: {words}" for reason in orders)
             elif why:
-                culprit = culprit_of(experiments, identification, recordings[0].environment)
+                culprit = find_culprit(experiments, identification, recordings[0].environment)
+                if self._actuator.calibration is not None:
+                    why = (*why, f"not explained: the {unexplained_block(experiments, modelled)}")
             else:
                 why = (
-                    *_of_supplies(experiments, modelled, identification),
-                    *_of_positions(positions, most_gain_error(self._actuator)),
+                    *_supply_objections(experiments, modelled, identification),
+                    *_position_objections(positions, max_position_gain_error(self._actuator)),
                 )
+            creeping = creep_note(experiments, [item.spool for item in modelled])
+            if creeping:
+                late = (*late, creeping)
+                why = why or _objections_to_creep(identification, self._levels, creeping)
             if not why:
-                verdict, why = degraded_by(others, *judge(identification, self._levels))
+                limited = with_limits(effects_of(identification, self._actuator), self._actuator)
+                verdict, why = count_other_faults(limited, *judge(identification, self._levels))
+        effects = effects_of(identification, self._actuator)
         return Diagnosis(
             recordings=tuple(recordings),
             tests=matched,
@@ -223,14 +248,14 @@ class DiagnosisSession:
             identification=identification,
             experiments=tuple(experiments) if identification else (),
             positions=positions,
-            other=others,
+            effects=effects,
             culprit=culprit,
             notes=(
                 *_notes(recordings, matched, self._actuator),
-                *_freed(identification, self._actuator),
+                *_notes_on_effects(identification, self._actuator),
                 *late,
-                *_unchecked(positions),
-                *notes_on_other_faults(others),
+                *_notes_on_unchecked_positions(positions),
+                *notes_on_effects(with_limits(effects, self._actuator)),
             ),
             elapsed=time.perf_counter() - begin,
         )
@@ -239,73 +264,111 @@ class DiagnosisSession:
         self,
         recordings: Sequence[Recording],
         experiments: list[Experiment],
-        progress: Progress | None,
+        progress: StageProgress | None,
         *,
         ordered: bool,
-    ) -> Estimated:
-        """Identify; where that does not explain the recordings, by what the response tells."""
-        found = self._session.finish(experiments, progress)
+    ) -> IdentifiedRecordings:
+        """Identify; where that does not explain the recordings, with corrected samples."""
+        acquired = any(item.acquired is not None for item in experiments)
+        if acquired:
+            experiments, found = self._with_instants(experiments, progress)
+        else:
+            found = self._session.finish(experiments, progress)
         late: tuple[str, ...] = ()
         by_time = any(item.by_time for item in recordings)
-        if by_time:
-            experiments, found, late = in_time(
+        if by_time and not acquired:
+            experiments, found, late = correct_delays(
                 experiments, found, lambda item: self._session.finish(item, progress)
             )
         why = tuple(objections_to_estimate(found, self._actuator.calibration))
+        why += why_sampled_seldom(experiments) if why else ()
         if why and ordered and not late:
-            told = self._told(recordings, experiments, progress)
-            if told is not None:
-                return told
-        if by_time and found.fit.outliers > UNEASY and can_be_told(recordings, experiments):
-            found = widened(found)
+            reconstructed = self._reconstructed(recordings, experiments, progress)
+            if reconstructed is not None:
+                return reconstructed
+        if (
+            by_time
+            and found.fit.outliers > LOSSES.min_outlier_share_misplaced
+            and is_reconstructible(recordings, experiments)
+        ):
+            found = widen_intervals(found)
         return experiments, found, late, why
 
-    def _told(
+    def _with_instants(
+        self, experiments: Sequence[Experiment], progress: StageProgress | None
+    ) -> tuple[list[Experiment], Identification]:
+        """Identify together with the instants at which an acquisition sampled."""
+        start = self._session.searched(experiments)
+        for _ in range(INSTANTS.rounds):
+            settled, variance = settle_instants(experiments, start)
+            found = widen_by_instants(self._session.finish(settled, progress), variance)
+            if not any(objections_to_estimate(found, self._actuator.calibration)):
+                break
+            # Severities beside the optimum have led to instants beside theirs.
+            start = {item.name: item.value for item in found.estimates}
+        return settled, found
+
+    def _reconstructed(
         self,
         recordings: Sequence[Recording],
         experiments: Sequence[Experiment],
-        progress: Progress | None,
-    ) -> Estimated | None:
-        """Identify with lost positions as the response tells them; None where that explains
-        nothing."""
-        if not can_be_told(recordings, experiments):
+        progress: StageProgress | None,
+    ) -> IdentifiedRecordings | None:
+        """Identify with reconstructed samples; None where that explains no more."""
+        if not is_reconstructible(recordings, experiments):
             return None
-        told = told_by_response(
+        reconstructed = reconstruct_lost_samples(
             recordings,
             experiments,
             self._actuator,
             lambda item: self._session.finish(item, progress),
         )
-        if told is None or objections_to_estimate(told[1], self._actuator.calibration):
+        if reconstructed is None or objections_to_estimate(
+            reconstructed[1], self._actuator.calibration
+        ):
             return None
-        now, found, note = told
-        return now, widened(found), (note,), ()
+        now, found, note = reconstructed
+        return now, widen_intervals(found), (note,), ()
 
-    def _experiments(
-        self, recordings: Sequence[Recording], matched: Sequence[StoredTest | None]
-    ) -> tuple[list[Experiment], list[str]]:
-        """What is identified from, and why that cannot be."""
-        reasons, experiments = objections_to_actuator(self._actuator), []
-        for recording, test in zip(recordings, matched, strict=True):
-            objections = objections_to_recording(recording, test, self._actuator)
-            if not objections and test is not None and recording.samples is not None:
-                experiment = build_experiment(
-                    recording.samples, recording.environment, test, self._actuator
-                )
-                objections = objections_to_experiment(experiment)
-                if objections == [objection_to_current(experiment)] and lost_order(recording):
-                    objections = [lost_order(recording)]
-                if test.closed_loop and not objections:
-                    # The control law works on the position: a search would take long.
-                    objections = objections_to_travel(recording.samples, self._actuator)
-                experiments.append(experiment)
-            reasons += objections
-        if len({recording.serial for recording in recordings} - {None}) > 1:
-            reasons.append("the recordings are of actuators with different serial numbers")
-        else:
-            reasons += repetitions(recordings)
-        reasons += objections_to_unit(recordings, self._actuator)
-        return experiments, reasons
+
+def examined_recordings(
+    recordings: Sequence[Recording], matched: Sequence[StoredTest | None], actuator: Actuator
+) -> tuple[list[Experiment], list[str]]:
+    """What can be identified from recordings of one actuator, and why that cannot be.
+
+    matched: stored test of each recording.
+    """
+    reasons, experiments = objections_to_actuator(actuator), []
+    for recording, test in zip(recordings, matched, strict=True):
+        objections = objections_to_recording(recording, test, actuator)
+        if not objections and test is not None and recording.samples is not None:
+            experiment = build_experiment(recording.samples, recording.environment, test, actuator)
+            objections = objections_to_experiment(experiment)
+            if objections == [objection_to_current(experiment)] and objection_to_frame_order(
+                recording
+            ):
+                objections = [objection_to_frame_order(recording)]
+            if test.closed_loop and not objections:
+                # The control law works on the position: a search would take long.
+                objections = objections_to_travel(recording.samples, actuator)
+            experiments.append(experiment)
+        reasons += objections
+    if len({recording.serial for recording in recordings} - {None}) > 1:
+        reasons.append("the recordings are of actuators with different serial numbers")
+    else:
+        reasons += objections_to_duplicates(recordings)
+    reasons += objections_to_unit(recordings, actuator)
+    return experiments, reasons
+
+
+def _objections_to_creep(
+    identification: Identification, levels: Levels, creeping: str
+) -> tuple[str, ...]:
+    """Why a spool that creeps in steps has no verdict: unless another severity decides it."""
+    others = [item for item in identification.estimates if item.name != FRICTION_NAME]
+    if any(chance_above(item, levels.limit) >= VERDICT.min_chance_fault for item in others):
+        return ()
+    return (f"FSS is not shown: {creeping}",)
 
 
 def diagnose(
@@ -317,8 +380,8 @@ def diagnose(
     levels: Levels | None = None,
     solver: Solver | None = None,
     seed: int = 0,
-    nuisances: Nuisances = Nuisances.AUTO,
-    progress: Progress | None = None,
+    nuisances: NuisanceMode = NuisanceMode.AUTO,
+    progress: StageProgress | None = None,
 ) -> Diagnosis:
     """Diagnose one actuator from complete recordings: see `DiagnosisSession`."""
     session = DiagnosisSession(
@@ -353,7 +416,7 @@ def not_tested(
         identification=None,
         experiments=(),
         positions=(),
-        other=(),
+        effects=(),
         culprit=None,
         notes=_notes(recordings, tests, actuator),
         elapsed=elapsed,
@@ -364,11 +427,11 @@ def match_tests(
     recordings: Sequence[Recording], tests: Iterable[StoredTest], default: StoredTest | None = None
 ) -> tuple[StoredTest | None, ...]:
     """Find the test that each recording is of; None where it is none of `tests`."""
-    known = tuple(tests)
-    return tuple(_match(recording, known, default) for recording in recordings)
+    candidates = tuple(tests)
+    return tuple(_match_test(recording, candidates, default) for recording in recordings)
 
 
-def _match(
+def _match_test(
     recording: Recording, tests: Sequence[StoredTest], default: StoredTest | None
 ) -> StoredTest | None:
     """Find the test that a recording is of."""
@@ -382,15 +445,15 @@ def _notes(
 ) -> tuple[str, ...]:
     """Notes on all recordings, each once."""
     each = (
-        (*recording.quality.notes, *remarks_on_recording(recording, test, actuator))
+        (*recording.quality.notes, *notes_on_recording(recording, test, actuator))
         for recording, test in zip(recordings, tests, strict=True)
     )
     return tuple(dict.fromkeys(note for notes in each for note in notes))
 
 
-def _of_supplies(
+def _supply_objections(
     experiments: Sequence[Experiment],
-    modelled: Sequence[Response],
+    modelled: Sequence[ModelResponse],
     identification: Identification,
 ) -> list[str]:
     """Why the supply pressure cannot be what its probe says, each reason once."""
@@ -403,21 +466,21 @@ def _of_supplies(
     return list(dict.fromkeys(why for reasons in found for why in reasons))
 
 
-def _of_positions(positions: Sequence[PositionFit | None], most: float) -> list[str]:
-    """Why the position sensor cannot be believed, each reason once."""
+def _position_objections(positions: Sequence[PositionFit | None], most: float) -> list[str]:
+    """Reasons why the position sensor is not trusted, each once."""
     found = (objections_to_position(fit, most) for fit in positions if fit)
     return list(dict.fromkeys(why for reasons in found for why in reasons))
 
 
-def _unchecked(positions: Sequence[PositionFit | None]) -> tuple[str, ...]:
+def _notes_on_unchecked_positions(positions: Sequence[PositionFit | None]) -> tuple[str, ...]:
     """Whether the position sensor went unchecked."""
     if None not in positions:
         return ()
     return ("too few samples of the jack position: its sensor is not checked",)
 
 
-def _freed(identification: Identification | None, actuator: Actuator) -> tuple[str, ...]:
-    """What was estimated beside the faults, if anything, and what is known of it."""
+def _notes_on_effects(identification: Identification | None, actuator: Actuator) -> tuple[str, ...]:
+    """Notes on effects that were estimated with the faults."""
     if identification is None or not identification.freed:
         return ()
     out = []
@@ -430,18 +493,22 @@ def _freed(identification: Identification | None, actuator: Actuator) -> tuple[s
             "recordings: its data and effects are refined within what is known of them"
         )
         out += [
-            f"{parameter(name).short} has changed since: {told(value, parameter(name).unit)} then, "
-            f"{told(identification.nuisances[name].value, parameter(name).unit)} now"
+            f"{parameter(name).short} has changed since: "
+            f"{with_unit(value, parameter(name).unit)} then, "
+            f"{with_unit(identification.nuisances[name].value, parameter(name).unit)} now"
             for name, value in calibration.effects.items()
             if name in identification.nuisances
             and abs(identification.nuisances[name].value - value)
-            > max(CHANGED * stds[name], LEAST_CHANGE * parameter(name).scale)
+            > max(
+                FIT.min_effect_change_stds * stds[name],
+                FIT.min_effect_change_scales * parameter(name).scale,
+            )
         ]
-    learned = (*learned, *OF_THE_DAY)
+    learned = (*learned, *DAILY_PRIORS)
     words = [parameter(name).short for name in identification.freed if name not in learned]
     if words:
         out.append(f"estimated beside the faults: {', '.join(words)}")
-    aliases = [name for name in PASS_FOR_FAULTS if actuator.tolerance.of(name) > 0.0]
+    aliases = [name for name in FAULT_OF_DATUM if actuator.tolerance.of(name) > 0.0]
     if aliases and calibration is None:
         out.append(
             f"held, with the tolerance in the intervals: {', '.join(aliases)}, which no recording "

@@ -8,12 +8,12 @@ from enum import IntEnum, StrEnum
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
+from ehadiag.core.criteria import VERDICT
+from firmware_iface.errors import ConfigurationError
 
 if TYPE_CHECKING:  # the command line needs levels and codes long before it loads the compiler
-    from ehadiag.identify.result import Estimate, Identification
-
-__all__ = ["Levels", "Rule", "Verdict", "chance_above", "judge"]
+    from ehadiag.identify.identification_result import Estimate, Identification
 
 
 class Verdict(IntEnum):
@@ -33,7 +33,7 @@ class Verdict(IntEnum):
         return format(self.name, specification)
 
 
-class Rule(StrEnum):
+class VerdictRule(StrEnum):
     """What a verdict goes by."""
 
     INTERVAL = "interval"
@@ -44,39 +44,23 @@ class Rule(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Levels of a severity, 0 … 1, and the rule by which they are held against it.
+    """Levels of a severity, 0 … 1, and the rule by which it is compared with them.
 
-    Attributes
-    ----------
-    advisory : float
-        DEGRADED at or above.
-    limit : float
-        FAULT at or above.
-    rule : Rule
-        What a verdict goes by.
-
-    Raises
-    ------
-    ConfigurationError
-        Not 0 < advisory < limit <= 1.
+    Levels that are not 0 < advisory < limit <= 1 raise ConfigurationError.
     """
 
     advisory: float = 0.25
+    """DEGRADED at or above."""
     limit: float = 0.75
-    rule: Rule = Rule.INTERVAL
+    """FAULT at or above."""
+    rule: VerdictRule = VerdictRule.INTERVAL
+    """What a verdict goes by."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.advisory < self.limit <= 1.0:
             raise ConfigurationError(
                 f"levels: need 0 < advisory < limit <= 1, not {self.advisory:g} and {self.limit:g}"
             )
-
-
-FALSE_HEALTHY = 0.025
-"""Largest chance that a severity is at or above the advisory level for HEALTHY: of the specific
-consumer's risk that JCGM 106 speaks of."""
-FAULT_CHANCE = 0.5
-"""Least chance that a severity is at or above the limit for FAULT."""
 
 
 def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tuple[str, ...]]:
@@ -86,9 +70,12 @@ def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tupl
     its interval reaches from below the advisory level to above the limit), and that before
     DEGRADED.
     """
-    if levels.rule is Rule.ESTIMATE:
+    if levels.rule is VerdictRule.ESTIMATE:
         return _by_estimate(identification.estimates, levels)
+    open_ends = _limits_within_exponents(identification, levels)
     verdict, reasons = _by_estimate(identification.estimates, levels, faults_only=True)
+    if open_ends and all(reason.startswith(f"{FRICTION_NAME} ") for reason in reasons):
+        return Verdict.NOT_TESTED, open_ends
     if reasons:
         return verdict, reasons
     blind = [
@@ -99,6 +86,18 @@ def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tupl
     if blind:
         return Verdict.NOT_TESTED, tuple(blind)
     return _by_chance(identification.estimates, levels)
+
+
+def _limits_within_exponents(identification: Identification, levels: Levels) -> tuple[str, ...]:
+    """Severities that are a fault with one exponent of clogging, and none with another."""
+    if EXPONENT_NAME not in identification.nuisances:
+        return ()
+    return tuple(
+        f"{item.name} may be anything from {item.interval95[0]:.3f} to {item.interval95[1]:.3f},"
+        " by the valve's exponent of clogging: state servovalve.clogging_exponent"
+        for item in identification.estimates
+        if item.name == FRICTION_NAME and item.interval95[0] < levels.limit <= item.interval95[1]
+    )
 
 
 def _by_estimate(
@@ -118,9 +117,9 @@ def _by_estimate(
 
 
 def _at_limit(item: Estimate, levels: Levels) -> bool:
-    if levels.rule is Rule.ESTIMATE:
+    if levels.rule is VerdictRule.ESTIMATE:
         return item.value >= levels.limit
-    return chance_above(item, levels.limit) >= FAULT_CHANCE
+    return chance_above(item, levels.limit) >= VERDICT.min_chance_fault
 
 
 def _advisory(item: Estimate, levels: Levels) -> str:
@@ -134,7 +133,7 @@ def _by_chance(estimates: Sequence[Estimate], levels: Levels) -> tuple[Verdict, 
     no greater.
     """
     chances = [chance_above(item, levels.advisory) for item in estimates]
-    if sum(chances) <= FALSE_HEALTHY:
+    if sum(chances) <= VERDICT.max_chance_false_healthy:
         return Verdict.HEALTHY, ()
     worst = max(chances)
     reasons = [
@@ -143,7 +142,9 @@ def _by_chance(estimates: Sequence[Estimate], levels: Levels) -> tuple[Verdict, 
         else f"{item.name} {item.value:.3f} may be at or above the advisory level "
         f"{levels.advisory:g}: chance {chance:.1%}"
         for item, chance in zip(estimates, chances, strict=True)
-        if item.value >= levels.advisory or chance == worst or chance > FALSE_HEALTHY
+        if item.value >= levels.advisory
+        or chance == worst
+        or chance > VERDICT.max_chance_false_healthy
     ]
     return Verdict.DEGRADED, tuple(reasons)
 

@@ -1,78 +1,118 @@
-"""Entry point of `ehadiag`: one parser, and one place where errors become exit codes."""
+"""Entry point of `ehadiag`: one parser, and one place where errors become exit codes.
+
+Also `--version` and `--verbose`.
+"""
 
 from __future__ import annotations
 
 import argparse
+import atexit
+import contextlib
 import io
 import os
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from ehadiag.cli.commands import (
-    bit,
-    calibrate,
-    completion,
-    design,
-    diagnose,
-    export,
-    history,
-    init,
-    monitor,
-    replay,
-    report,
-    rul,
-    serve,
-    sim,
-    tests,
-    warmup,
+import ehadiag
+from ehadiag.cli.command_parser import CommandParser, refuse_former_options
+from ehadiag.core.interruption import (
+    INTERRUPTED_EXIT_CODE,
+    ignore_signals,
+    interrupt_on_signals,
+    is_computing,
+    signals_restored,
 )
-from ehadiag.cli.commands import check_bus as checkbus
-from ehadiag.cli.defaults import NAME, apply_defaults
-from ehadiag.cli.exit_codes import FAILED, worst_code
-from ehadiag.cli.interrupt import ignore_signals, interrupt_on_signals, signals_restored
-from ehadiag.cli.output import abandon, say
-from ehadiag.cli.verbose import tell_all
-from ehadiag.cli.version import ShowVersions
-from ehadiag.core.errors import EhadiagError, reason_of
-from ehadiag.core.printable import printable
+from ehadiag.terminal.output import (
+    INPUT_OUTPUT_EXIT_CODE,
+    discard_stream,
+    print_status,
+    worst_exit_code,
+)
+from firmware_iface.errors import EhadiagError, reason_of
 
-__all__ = ["main", "process"]
+COMMANDS = {
+    "bit": ("bit_command", "request a built-in test on a bus, record and diagnose it"),
+    "diagnose": ("diagnose_commands", "diagnose recordings"),
+    "monitor": ("bus_commands", "watch an actuator on a bus, and raise an alarm when it changes"),
+    "serve": ("serve_command", "show the bus, tests, reports and history on a local web page"),
+    "calibrate": (
+        "calibrate_commands",
+        "learn a unit from recordings of it as new, as an actuator file",
+    ),
+    "design": ("calibrate_commands", "score a test by what it can show, propose a better one"),
+    "sim": ("bus_commands", "run the emulated flight-control computer on a bus"),
+    "tests": ("setup_commands", "list the stored tests"),
+    "check-bus": ("bus_commands", "listen to a bus and report what maps, rates, gaps, range use"),
+    "replay": ("bus_commands", "play a recording onto a bus"),
+    "history": (
+        "history_commands",
+        "health history: list, show, export, import, plot, init, event, withdraw",
+    ),
+    "rul": ("rul_command", "remaining useful life of a unit, or of all, from the health history"),
+    "report": ("diagnose_commands", "write reports (HTML) from stored results"),
+    "export": ("setup_commands", "write the kernels as a library for another computer"),
+    "warmup": ("setup_commands", "compile the kernels now"),
+    "init": (
+        "setup_commands",
+        "write a commented template of an actuator, test, mapping or defaults file",
+    ),
+    "completion": ("setup_commands", "print a shell's completion script"),
+}
+"""Commands: the module, loaded when the command is called, and the help's line."""
+
+
+class VersionAction(argparse.Action):
+    """Print one line and end: the package's version first, then those of Python and libraries."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        """Print and end; only who asks waits for the look-up."""
+        print(versions_text())
+        parser.exit()
+
+
+def versions_text() -> str:
+    """Return the versions of this package, of Python, and of the libraries that matter."""
+    import platform  # noqa: PLC0415 - only who asks
+    from importlib.metadata import version  # noqa: PLC0415 - reads a file for each library
+
+    from ehadiag.compile.libraries import compiler_versions  # noqa: PLC0415
+
+    parts = [f"Python {platform.python_version()}"]
+    parts += [
+        f"numpy {version('numpy')}",
+        f"numba {compiler_versions().get('numba', 'absent')}",
+        f"python-can {version('python-can')}",
+    ]
+    return f"ehadiag {ehadiag.__version__} ({', '.join(parts)})"
+
+
+def print_verbose(arguments: argparse.Namespace) -> None:
+    """Say versions and options, and let what libraries log reach standard error.
+
+    arguments: the parsed command line.
+    """
+    import logging  # noqa: PLC0415 - only who wants to see it
+
+    logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
+    print_status(versions_text())
+    given = {key: value for key, value in vars(arguments).items() if key not in ("run", "verbose")}
+    print_status(", ".join(f"{key}={value!r}" for key, value in sorted(given.items())))
+
 
 EPILOG = """\
 exit codes: 0 healthy, 10 degraded, 20 fault, 30 not tested (reason given),
 2 wrong usage or configuration, 3 input/output failure; several logs: the worst."""
-INTERRUPTED = 130
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, and where to read on."""
-
-    def error(self, message: str) -> NoReturn:
-        command = self.prog.partition(" ")[2]
-        where = f"{command}: " if command else ""
-        self.exit(2, f"ehadiag: {where}{printable(message)}; see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code.
 
-    Parameters
-    ----------
-    argv : Sequence[str] | None
-        Arguments after the program's name; None: those of the process.
-
-    Returns
-    -------
-    int
-        Exit code.
-
-    Raises
-    ------
-    SystemExit
-        Wrong usage (code 2), `--help` and `--version`.
+    argv: arguments after the program's name; None: those of the process. Returns exit code.
+    SystemExit: wrong usage (code 2), `--help` and `--version`.
     """
     with signals_restored():
         return _run(argv, interrupt_on_signals())
@@ -82,70 +122,92 @@ def process() -> NoReturn:
     """Run the command line as this process: a signal after the verdict does not hide its code."""
     code = _run(None, interrupt_on_signals())
     ignore_signals()
+    if is_computing():
+        # Compiled code that goes on while the interpreter is taken down may crash, and the code
+        # with it.
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
     sys.exit(code)
 
 
 def _run(argv: Sequence[str] | None, interrupted: threading.Event) -> int:
     _fill_closed_streams()
-    _print_whatever_comes()
+    _escape_unprintable()
     code = 0
     try:
-        arguments = _parsed(argv)
+        arguments = parse_arguments(argv)
         code = int(arguments.run(arguments))
         sys.stdout.flush()
     except EhadiagError as error:
-        say(str(error))
+        print_status(str(error))
         return error.exit_code
     except BrokenPipeError:
         # Whoever read our output has gone.
-        abandon(sys.stdout)
-        return worst_code((code, FAILED))
+        discard_stream(sys.stdout)
+        return worst_exit_code((code, INPUT_OUTPUT_EXIT_CODE))
     except OSError as error:
-        abandon(sys.stdout)
-        say(f"{error.filename or 'standard output'}: {reason_of(error)}")
-        return worst_code((code, FAILED))
-    except KeyboardInterrupt:
-        say("interrupted")
-        return INTERRUPTED
-    except RuntimeError:
-        if not interrupted.is_set():
-            raise
-        say("interrupted")
-        return INTERRUPTED
+        discard_stream(sys.stdout)
+        print_status(f"{error.filename or 'standard output'}: {reason_of(error)}")
+        return worst_exit_code((code, INPUT_OUTPUT_EXIT_CODE))
+    except (KeyboardInterrupt, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not interrupted.is_set():
+            raise  # else the compiler has turned an interruption into this error
+        print_status("interrupted")
+        return INTERRUPTED_EXIT_CODE
     return code
 
 
-def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the command line; more logs (results) may follow the options that follow logs."""
-    parser, commands = _parser_and_commands()
+def parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Parse a command line with its defaults; more logs (results) may follow the options.
+
+    argv: arguments after the program's name; None: those of the process. Returns with the function
+    `run` of the command. ConfigurationError: a default that no option takes; SystemExit: wrong
+    usage, `--help` and `--version`.
+    """
     given = sys.argv[1:] if argv is None else list(argv)
-    used, ignored = apply_defaults(commands, given)
-    for text in ignored:
-        say(text)
+    command = next((item for item in given if not item.startswith("-")), "")
+    parser, commands = parser_and_commands(command)
+    if not given:
+        parser.print_help()
+        parser.exit(2)
+    called = commands.get(command, parser)
+    assert isinstance(called, CommandParser)
+    refuse_former_options(called, given)
+    used: Sequence[str] = ()
+    if command in commands:
+        from ehadiag.cli import defaults  # noqa: PLC0415 - not for the help of all commands
+
+        used, ignored = defaults.apply_defaults(
+            command, called, given, lambda: parser_and_commands()[1]
+        )
+        for text in ignored:
+            print_status(text)
     arguments, rest = parser.parse_known_args(given)
     late = [item for item in rest if item == "-" or not item.startswith("-")]
-    files = _repeated(commands, given)
+    files = _repeatable_argument(called)
     if files is not None and len(late) == len(rest):
         getattr(arguments, files).extend(late)
     elif rest:
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if used and (arguments.verbose or NAME in used):
-        say(f"defaults from {', '.join(used)}")
+        called.refuse_unknown(rest)
+    if used and (arguments.verbose or defaults.DEFAULTS_FILE_NAME in used):
+        print_status(f"defaults from {', '.join(used)}")
     if arguments.verbose:
-        tell_all(arguments)
+        print_verbose(arguments)
     return arguments
 
 
-def _repeated(commands: Mapping[str, argparse.ArgumentParser], given: Sequence[str]) -> str | None:
-    """Where the arguments of the command are that may be repeated; None where it has none."""
-    command = next((item for item in given if not item.startswith("-")), "")
-    actions = commands[command]._actions if command in commands else []
+def _repeatable_argument(command: argparse.ArgumentParser) -> str | None:
+    """Where the arguments of a command are that may be repeated; None where it has none."""
     return next(
-        (item.dest for item in actions if item.nargs == "+" and not item.option_strings), None
+        (item.dest for item in command._actions if item.nargs == "+" and not item.option_strings),
+        None,
     )
 
 
-def _print_whatever_comes() -> None:
+def _escape_unprintable() -> None:
     """Let a name that the terminal's encoding lacks be printed as numbers, not end the program."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -158,12 +220,15 @@ def _fill_closed_streams() -> None:
             setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
 
 
-def _parser() -> argparse.ArgumentParser:
-    return _parser_and_commands()[0]
+def parser_and_commands(
+    command: str | None = None,
+) -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    """Make the parser, and those of the commands.
 
-
-def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
-    parser: argparse.ArgumentParser = _Parser(
+    command: the only one whose options are wanted; None: of all. Returns the whole parser, and the
+    commands by name.
+    """
+    parser: argparse.ArgumentParser = CommandParser(
         prog="ehadiag",
         description="Diagnosis of electrohydraulic actuators: clogging of the first-stage filter\n"
         "(Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (limit).",
@@ -173,19 +238,17 @@ def _parser_and_commands() -> tuple[argparse.ArgumentParser, Mapping[str, argpar
     )
     parser.add_argument(
         "--version",
-        action=ShowVersions,
+        action=VersionAction,
         nargs=0,
         help="print versions, also of libraries, and exit",
     )
     subparsers: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
         metavar="COMMAND", required=True
     )
-    for command in (
-        bit, diagnose, monitor, serve, calibrate, design, sim, tests, checkbus, replay, history,
-        rul, report, export, warmup, init,
-    ):  # fmt: skip
-        command.add_parser(subparsers)
-    completion.add_parser(subparsers, _parser)
-    for item in subparsers.choices.values():
-        item.add_argument("-v", "--verbose", action="store_true", help="tell more on the way")
+    for name, (module, text) in COMMANDS.items():
+        made = subparsers.add_parser(name, help=text, allow_abbrev=False)
+        if command in (name, None):
+            function = f"define_{name.replace('-', '_')}"
+            getattr(import_module(f"ehadiag.cli.{module}"), function)(made)
+            made.add_argument("-v", "--verbose", action="store_true", help="tell more on the way")
     return parser, subparsers.choices

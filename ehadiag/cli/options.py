@@ -1,189 +1,116 @@
-"""Command-line options that several commands share."""
+"""Command-line options that several commands share, and the numbers that they take."""
 
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Callable
+from typing import Any
 
-from ehadiag.cli.argument_types import count, instant, positive, seed, share
-from ehadiag.cli.effects import add_effect_options
+from ehadiag.request import Option, Request, request_options
+from ehadiag.setup import Setup
 
-__all__ = [
-    "TEST",
-    "add_actuator_options",
-    "add_column_options",
-    "add_diagnosis_options",
-    "add_fault_options",
-    "add_json_option",
-    "add_level_options",
-    "add_log_options",
-    "add_mapping_options",
-    "add_result_options",
-    "add_seed_option",
-    "add_when_options",
-]
-
-TEST = "open|closed|NUMBER|FILE"
-"""How every command lets a test be named."""
-TIME_LIMIT_S = 600.0
-"""Some ten thousand times what a sound recording takes."""
+MAX_HISTORY_SERIAL = (1 << 63) - 1
+"""Largest serial number that a history can hold, 1."""
 
 
-def add_actuator_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--actuator`."""
-    parser.add_argument(
-        "--actuator", metavar="FILE", help="actuator data, TOML (default: the reference actuator)"
-    )
+def positive_number(text: str) -> float:
+    """Read a number above zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a number above 0")
+    return value
 
 
-def add_tolerance_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--tolerance`."""
-    parser.add_argument(
-        "--tolerance",
-        type=share,
-        metavar="SHARE",
-        help="each datum of the actuator file may be off by this share, 0 … 0.3"
-        " (default: as the file says)",
-    )
+def positive_count(text: str) -> int:
+    """Read a whole number above zero."""
+    if not (text.isascii() and text.isdigit()) or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
+    return int(text)
 
 
-def add_mapping_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--mapping` and `--dbc`."""
-    parser.add_argument(
-        "--mapping",
-        metavar="FILE",
-        help="which signals of a DBC are which channels, TOML (default: the FCC's own bus)",
-    )
-    parser.add_argument(
-        "--dbc",
-        metavar="FILE",
-        help="DBC to use instead of the mapping's own, or one of the default names",
-    )
-
-
-def add_column_options(parser: argparse.ArgumentParser) -> None:
-    """Add the columns of decoded signals, and several files of one recording."""
-    parser.add_argument(
-        "--column",
-        action="append",
-        default=[],
-        metavar="ROLE=NAME[:UNIT]",
-        help="column of a recording of decoded signals (CSV, Parquet, MF4), as"
-        " position='Stroke':mm; repeatable (default: the mapping's, else by name)",
-    )
-    parser.add_argument(
-        "--merge",
-        action="store_true",
-        help="the logs are files of one recording: split in time, or one for each bus",
-    )
-
-
-def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add the channel of a recording, and what reading one may cost."""
-    parser.add_argument(
-        "--log-channel",
-        type=count,
-        metavar="N",
-        help="adapter channel of the recording that is the actuator's, from 1"
-        " (default: the mapping's, else the only one)",
-    )
-    parser.add_argument(
-        "--max-frames",
-        type=count,
-        default=20_000_000,
-        metavar="N",
-        help="frames that a recording may have (default 20000000, some three hours)",
-    )
-    parser.add_argument(
-        "--max-log-size",
-        type=positive,
-        default=4096.0,
-        metavar="MiB",
-        help="size of a recording, and of what it unpacks to (default 4096)",
-    )
-    parser.add_argument(
-        "--max-read-time",
-        type=positive,
-        default=900.0,
-        metavar="S",
-        help="time that reading one recording may take (default 900)",
-    )
-
-
-def add_level_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--advisory` and `--limit`."""
-    parser.add_argument(
-        "--advisory",
-        type=float,
-        default=0.25,
-        metavar="K",
-        help="DEGRADED at or above this severity (default 0.25)",
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=0.75,
-        metavar="K",
-        help="FAULT at or above this severity (default 0.75)",
-    )
-
-
-def add_seed_option(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add `--seed`; `what` says what is drawn by it."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        metavar="N",
-        help=f"{what} (default 0); the same seed, the same answer",
-    )
-
-
-def add_when_options(parser: argparse.ArgumentParser) -> None:
-    """Add where in a recording the test lies, for buses that do not say."""
-    for name, what in (("start", "begins"), ("end", "has ended")):
-        parser.add_argument(
-            f"--{name}",
-            type=instant,
-            metavar="S",
-            help=f"where the test {what}, s from the first sample of the recording, on a bus that"
-            " does not say (default: found by its command or current)",
+def unit_number(text: str) -> int:
+    """Read a serial number of a unit, as far as buses and histories carry them."""
+    if text in ("hours", "cycles"):
+        raise argparse.ArgumentTypeError(f"{text!r}: the unit of the answer is --in {text} now")
+    if not (text.isascii() and text.isdigit()) or len(text) > 19 or int(text) > MAX_HISTORY_SERIAL:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: a serial number is a whole number, 0 … {MAX_HISTORY_SERIAL}"
         )
+    return int(text)
 
 
-def add_diagnosis_options(parser: argparse.ArgumentParser) -> None:
-    """Add solver, seed, levels, time limit and output."""
-    parser.add_argument(
-        "--solver",
-        choices=("cga", "pygad"),
-        default="cga",
-        help="search: compact GA (default) or pygad",
-    )
-    parser.add_argument(
-        "--nuisances",
-        choices=("auto", "none", "all"),
-        default="auto",
-        help="estimate null bias, gain, hysteresis and backlash beside the faults: where the faults"
-        " alone do not explain a recording (auto, the default), never, or always",
-    )
-    add_tolerance_option(parser)
-    add_seed_option(parser, "seed of the search")
-    add_level_options(parser)
-    parser.add_argument(
-        "--rule",
-        choices=("interval", "estimate"),
-        default="interval",
-        help="verdict by the chance that a severity is at or above a level (default), or by the"
-        " estimates alone",
-    )
-    parser.add_argument(
-        "--time-limit",
-        type=positive,
-        default=TIME_LIMIT_S,
-        metavar="S",
-        help="NOT TESTED where the identification takes longer, wall clock"
-        f" (default {TIME_LIMIT_S:g})",
-    )
-    add_json_option(parser)
+def seed_number(text: str) -> int:
+    """Read a seed of random numbers."""
+    if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:
+        raise argparse.ArgumentTypeError(f"{text!r}: a seed is a whole number, 0 … 4294967295")
+    return int(text)
+
+
+BUS = ("mapping", "dbc", "id_offset")
+"""Fields of a request: what the frames of a bus mean."""
+READING = ("log_channel", "max_frames", "max_log_size_MiB", "max_read_time_s")
+"""Fields of a request: the channel of a recording, and what reading one may cost."""
+LEVELS = ("advisory", "limit")
+"""Fields of a request: levels of a verdict."""
+SEARCH = ("solver", "nuisances", "tolerance", "seed", *LEVELS, "rule", "time_limit_s")
+"""Fields of a request: all that decides an identification and its verdict."""
+
+
+def add_request_options(
+    parser: argparse.ArgumentParser, *names: str, help: str | None = None
+) -> None:
+    """Add the options of fields of a request.
+
+    parser: of a command; names: fields, in the order of the help; help: in place of what the fields
+    say of themselves.
+    """
+    for name in names:
+        option = request_options()[name]
+        text = help or option.help
+        settings: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
+        if option.kind is bool:
+            parser.add_argument(option.flag, action="store_true", **settings)
+            continue
+        if option.many:
+            settings |= {"action": "append", "default": []}
+        else:
+            settings |= {"default": option.default, "type": _reader(option)}
+        if option.choices:
+            settings["choices"] = option.choices
+        parser.add_argument(option.flag, metavar=option.metavar, **settings)
+
+
+def _reader(option: Option) -> Callable[[str], Any]:
+    def read(text: str) -> Any:
+        try:
+            return option.read(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return str if option.choices or option.kind is str else read
+
+
+def request_of(arguments: argparse.Namespace, **changes: Any) -> Request:
+    """Return what a command line asks for.
+
+    arguments: the parsed command line; fields that its command has no option for keep their
+    defaults; changes: fields with other values. ConfigurationError: values that contradict each
+    other.
+    """
+    given = vars(arguments)
+    fields = {name: given[name] for name in Request.__struct_fields__ if name in given}
+    for name in ("actuator", "mapping", "dbc"):
+        fields[name] = fields.get(name) or None
+    return Request(**fields | changes)
+
+
+def setup_of(arguments: argparse.Namespace, label: str = "", **changes: Any) -> Setup:
+    """Return what a command line names; `label`, `changes`: see `Setup` and `request_of`."""
+    return Setup(request_of(arguments, **changes), label=label)
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -197,70 +124,28 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 def add_result_options(parser: argparse.ArgumentParser) -> None:
     """Add how a result is written."""
-    parser.add_argument(
-        "--json-version",
-        type=int,
-        choices=(1, 2),
-        default=2,
-        help="of the JSON objects (default 2); 1: without what 2 added, none for unreadable logs",
-    )
     parser.add_argument("--no-picture", action="store_true", help="draw nothing")
 
 
-def add_fault_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the simulated actuator."""
-    group = parser.add_argument_group("simulated actuator")
-    for name, meaning in (
-        ("Kintas", "clogging of the first-stage filter"),
-        ("FSS", "spool-sleeve friction"),
-        ("FDJ", "jack-cylinder friction"),
-    ):
-        group.add_argument(
-            f"--{name}",
-            f"--{name.lower()}",
-            dest=name,
-            type=float,
-            default=0.0,
-            metavar="K",
-            help=f"{meaning}, 0 … 1 (default 0)",
-        )
-    group.add_argument(
-        "--noise",
-        type=float,
-        default=0.5,
-        metavar="LSB",
-        help="rms noise of the converters (default 0.5)",
+def add_screen_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--plain` and `--snapshots`."""
+    parser.add_argument(
+        "--plain",
+        action="store_true",
+        help="plain lines instead of the live view (so anyway where standard error is no terminal)",
     )
-    group.add_argument(
-        "--offsets",
-        type=float,
-        nargs=4,
-        default=(0.0, 0.0, 0.0, 0.0),
-        metavar="LSB",
-        help="offsets of current, spool, pressure, position",
+    parser.add_argument(
+        "--snapshots",
+        action="store_true",
+        help="write what the live view shows to standard output, four JSON lines a second; all else"
+        " goes to standard error. The session ends as by Ctrl-C when nobody reads any more",
     )
-    group.add_argument(
-        "--oil-temperature", type=float, default=40.0, metavar="degC", help="(default 40)"
+
+
+def add_report_option(parser: argparse.ArgumentParser, place: str = "to the output folder") -> None:
+    """Add `--report`; `place` says where the page goes."""
+    parser.add_argument(
+        "--report",
+        action="store_true",
+        help=f"also write a report, one HTML page that needs no network, {place}",
     )
-    group.add_argument(
-        "--supply",
-        type=float,
-        default=20.7,
-        metavar="MPa",
-        help="supply pressure (default 20.7; return 0.7)",
-    )
-    group.add_argument(
-        "--simulator-seed",
-        type=seed,
-        default=1,
-        metavar="N",
-        help="seed of the simulated noise (default 1)",
-    )
-    group.add_argument(
-        "--serial-number",
-        type=int,
-        default=1,
-        metavar="N",
-        help="of the simulated actuator (default 1)",
-    )
-    add_effect_options(parser)

@@ -1,1 +1,1 @@
-"""Compilation of numba kernels: one decorator, a cache that cannot go stale, vector types."""
+"""Compilation of kernels: decorators, vector types, libraries that Python loads."""

@@ -1,167 +1,161 @@
-"""Object files for other computers from compiled kernels, by the compiler that is in numba.
+"""Object files for other computers from compiled kernels, by the LLVM that is in numba.
 
-numba keeps with each compiled kernel its LLVM module. Of it the kernel itself is taken, with a
-C function in front that converts nothing but pointers, and code for the target is emitted: each
-product and each sum rounded by itself, so that every processor comes to the same digits. numba's
-run-time library stays behind: kernels that need it are refused. Of a C library only `RUNTIME` is
-called, which compilers too may call in any program.
+Each product and each sum is rounded by itself, so that every processor comes to the same digits.
+Kernels that need numba's run-time library are refused; of a C library only RUNTIME_FUNCTIONS are
+called. For a processor without doubles each result is rounded to single precision, on LLVM's text.
 """
 
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import llvmlite.binding as llvm
-import numba
 import numpy as np
 from numba import types
+from numba.core.registry import cpu_target
 
-from ehadiag.compile.single import single_precision
-from ehadiag.core.errors import ConfigurationError
+from ehadiag.compile.frontend import compiled, modules_of, numba_type
+from ehadiag.compile.worker import (
+    CFunction,
+    DoublesArgument,
+    ObjectFile,
+    Processor,
+    SlotArguments,
+    TableArgument,
+)
+from firmware_iface.errors import ConfigurationError
 
-__all__ = [
-    "RUNTIME",
-    "Function",
-    "Numbers",
-    "Pointer",
-    "Processor",
-    "Table",
-    "object_code",
-    "tool_versions",
-]
+LLVM_NAME = r'%(?:"[^"]+"|[\w.$-]+)'
+LLVM_KIND = r"double|<\d+ x double>"
+LLVM_ARITHMETIC = re.compile(
+    rf"^  ({LLVM_NAME}) = ((?:fadd|fsub|fmul|fdiv) ({LLVM_KIND}) |(?:sitofp|uitofp) .* to "
+    rf"({LLVM_KIND}))(.*)$",
+    re.M,
+)
+LLVM_ROOT = re.compile(
+    rf"^  ({LLVM_NAME}) = (?:tail )?call double @llvm\.sqrt\.f64\(double ([^)]+)\).*$", re.M
+)
+LLVM_CONSTANT = re.compile(r"(?<![\w.%\"-])(-?\d+\.\d+e[+-]\d+|0x[0-9A-F]{16})\b")
 
-RUNTIME = frozenset({"memcpy", "memset", "memmove"})
+
+def single_precision(text: str) -> str:
+    """Round results of arithmetic on doubles in a module's text to single precision."""
+    text = LLVM_ROOT.sub(_root, LLVM_ARITHMETIC.sub(_rounded, text))
+    if "@llvm.sqrt.f32(" in text:
+        text += "\ndeclare float @llvm.sqrt.f32(float)\n"
+    return text
+
+
+def _inner(name: str, what: str) -> str:
+    plain = name[1:].strip('"')
+    return f'%"{plain}.{what}"'
+
+
+def _rounded(found: re.Match[str]) -> str:
+    name, operation, kind, made, rest = found.groups()
+    kind = kind or made
+    narrow = kind.replace("double", "float")
+    wide, cut = _inner(name, "wide"), _inner(name, "single")
+    return (
+        f"  {wide} = {operation}{LLVM_CONSTANT.sub(_constant, rest)}\n"
+        f"  {cut} = fptrunc {kind} {wide} to {narrow}\n"
+        f"  {name} = fpext {narrow} {cut} to {kind}"
+    )
+
+
+def _root(found: re.Match[str]) -> str:
+    name, of = found.groups()
+    cut, root = _inner(name, "of"), _inner(name, "single")
+    return (
+        f"  {cut} = fptrunc double {of} to float\n"
+        f"  {root} = call float @llvm.sqrt.f32(float {cut})\n"
+        f"  {name} = fpext float {root} to double"
+    )
+
+
+def _constant(found: re.Match[str]) -> str:
+    digits = found[0]
+    number = (
+        struct.unpack(">d", bytes.fromhex(digits[2:]))[0]
+        if digits.startswith("0x")
+        else float(digits)
+    )
+    try:
+        rounded = struct.unpack(">f", struct.pack(">f", number))[0]
+    except OverflowError:  # no number of single precision
+        return digits
+    return f"0x{struct.pack('>d', rounded).hex().upper()}"
+
+
+RUNTIME_FUNCTIONS = frozenset({"memcpy", "memset", "memmove"})
 """What of a C library the code may call."""
-OPTIMISE = 2
-LEAVE = re.compile(r"\b(?:contract|nnan|nsz|ninf|arcp|afn|reassoc|fast) (?=[^\"]*$)", re.M)
+MEMORY_FUNCTIONS = """
+define hidden ptr @memset(ptr %to, i32 %byte, i64 %count) "no-builtins" {
+begin:
+  %value = trunc i32 %byte to i8
+  br label %next
+next:
+  %n = phi i64 [0, %begin], [%m, %step]
+  %more = icmp ult i64 %n, %count
+  br i1 %more, label %step, label %end
+step:
+  %place = getelementptr i8, ptr %to, i64 %n
+  store i8 %value, ptr %place
+  %m = add i64 %n, 1
+  br label %next
+end:
+  ret ptr %to
+}
+define hidden ptr @memcpy(ptr %to, ptr %from, i64 %count) "no-builtins" {
+begin:
+  br label %next
+next:
+  %n = phi i64 [0, %begin], [%m, %step]
+  %more = icmp ult i64 %n, %count
+  br i1 %more, label %step, label %end
+step:
+  %source = getelementptr i8, ptr %from, i64 %n
+  %byte = load i8, ptr %source
+  %place = getelementptr i8, ptr %to, i64 %n
+  store i8 %byte, ptr %place
+  %m = add i64 %n, 1
+  br label %next
+end:
+  ret ptr %to
+}
+"""
+"""The functions of a C library that LLVM calls for what it takes them for; for a library that has
+no other beside it."""
+OPTIMISATION_LEVEL, FAST_OPTIMISATION_LEVEL = 2, 3
+EXCEPTION = re.compile(r'store ptr @"?\.const\.picklebuf[^,]*, ptr')
+"""Where a function of numpy that a kernel uses would raise an error: its status says that, too."""
+FAST_MATH_FLAGS = re.compile(
+    r"\b(?:contract|nnan|nsz|ninf|arcp|afn|reassoc|fast) (?=[^\"]*$)", re.M
+)
 """Leave to round otherwise, to fuse a product and a sum above all: what a compiler makes of it
 depends on the processor, and with it the last digit."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pointer:
-    """Argument of a C function whose address the kernel is given."""
-
-
-@dataclass(frozen=True, slots=True)
-class Numbers:
-    """Argument of a C function that points to doubles, which the kernel is given as a tuple.
-
-    Attributes
-    ----------
-    count : int
-        How many; 1: a number, not a tuple.
-    """
-
-    count: int
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Not an argument of the C function: the kernel is given the address of constants.
-
-    Attributes
-    ----------
-    name : str
-        Of the table.
-    """
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class Function:
-    """A C function, `int name(pointer, …)`, and the kernel behind it.
-
-    Attributes
-    ----------
-    name : str
-        Of the C function.
-    kernel : Any
-        Decorated kernel that returns a whole number; it takes addresses, numbers and tuples of
-        numbers.
-    arguments : tuple[Pointer | Numbers | Table, ...]
-        In the order of the kernel's.
-    """
-
-    name: str
-    kernel: Any
-    arguments: tuple[Pointer | Numbers | Table, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Processor:
-    """What code is emitted for, in LLVM's names.
-
-    Attributes
-    ----------
-    triple : str
-        Empty: this computer.
-    cpu : str
-        Processor; "host": this one.
-    features : str
-        What it has beyond or less than its name says.
-    abi : str
-        Calling convention, empty: the triple's.
-    shared : bool
-        Whether the code may be part of a shared library.
-    rounds : bool
-        Whether it rounds to whole numbers by an instruction. Where not, a function of the C library
-        would be called, and no Arm code can hand it a number in both calling conventions.
-    doubles : bool
-        Whether it has instructions for doubles. Where not, the compiler's run-time library has
-        their arithmetic, but no square root.
-    single : bool
-        Whether results are rounded to single precision, see `ehadiag.compile.single`.
-    """
-
-    triple: str
-    cpu: str = ""
-    features: str = ""
-    abi: str = ""
-    shared: bool = False
-    rounds: bool = True
-    doubles: bool = True
-    single: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class _Machine:
-    """Of LLVM, with what a module must be marked with."""
+    """Target of LLVM, and how modules for it are marked."""
 
     triple: str
     layout: str
     target: Any = field(repr=False)
 
 
-def object_code(
-    functions: Sequence[Function],
-    tables: Mapping[str, Sequence[float]],
-    replaced: Mapping[str, Any],
-    processor: Processor,
-    *,
-    allowed: frozenset[str] = frozenset(),
-    exact: frozenset[Any] = frozenset(),
-) -> bytes:
-    """Emit an object file with these C functions.
+def emitted(wanted: ObjectFile) -> bytes:
+    """Emit an object file.
 
     Parameters
     ----------
-    functions : Sequence[Function]
-        The functions.
-    tables : Mapping[str, Sequence[float]]
-        Constants by name.
-    replaced : Mapping[str, Any]
-        Functions of one number of the C library, and the kernels that stand for them.
-    processor : Processor
-        The target.
-    allowed : frozenset[str]
-        What else of the C library the code may call.
-    exact : frozenset[Any]
-        Kernels of which no result is rounded to single precision.
+    wanted : ObjectFile
+        What is to be in it.
 
     Returns
     -------
@@ -173,20 +167,26 @@ def object_code(
     ConfigurationError
         The compiler has no such target.
     """
+    processor, replaced = wanted.processor, wanted.replaced
     machine = _machine(processor)
-    main = _parsed(_head(machine) + _front(functions, tables, replaced), machine)
-    wanted = {item.name for item in functions}
-    for kernel, kinds in _kernels(functions, replaced):
-        main.link_in(
-            _module(kernel, kinds, machine, replaced, processor.single and kernel not in exact)
-        )
-    text = _closed(str(main), wanted)
-    whole = _parsed(text, machine)
-    _optimise(whole, machine)
-    foreign = {item.name for item in whole.functions if item.is_declaration} - RUNTIME - allowed
+    main = _parsed(_head(machine) + _front(wanted.functions, wanted.tables, replaced), machine)
+    names = {item.name for item in wanted.functions}
+    kernels = list(_kernels(wanted.functions, replaced))
+    for single in (False, True):
+        some = [
+            item for item in kernels if (processor.single and item[0] not in wanted.exact) is single
+        ]
+        if some:
+            main.link_in(_module(some, machine, replaced, processor, single))
+    whole = _parsed(_closed(str(main), names), machine)
+    _optimise(whole, machine, processor)
+    if processor.fast:
+        whole.link_in(_parsed(_head(machine) + MEMORY_FUNCTIONS, machine))
+    foreign = {item.name for item in whole.functions if item.is_declaration}
+    foreign -= RUNTIME_FUNCTIONS | wanted.allowed
     foreign = {name for name in foreign if not name.startswith("llvm.")}
     if foreign:
-        raise RuntimeError(f"kernels that call {', '.join(sorted(foreign))} cannot be exported")
+        raise RuntimeError(f"kernels that call {', '.join(sorted(foreign))} cannot be compiled")
     code: bytes = machine.target.emit_object(whole)
     return code
 
@@ -202,7 +202,7 @@ def _machine(processor: Processor) -> _Machine:
         target = llvm.Target.from_triple(triple).create_target_machine(
             cpu=cpu,
             features=features,
-            opt=OPTIMISE,
+            opt=_level(processor),
             reloc="pic" if processor.shared else "static",
             codemodel="default",
             **({"abiname": processor.abi} if processor.abi else {}),
@@ -224,7 +224,7 @@ def _parsed(text: str, machine: _Machine) -> Any:
 
 
 def _kernels(
-    functions: Sequence[Function], replaced: Mapping[str, Any]
+    functions: Sequence[CFunction], replaced: Mapping[str, Any]
 ) -> Iterable[tuple[Any, tuple[Any, ...]]]:
     """Every kernel once, with the types of its arguments."""
     seen = set()
@@ -236,39 +236,38 @@ def _kernels(
         yield kernel, (types.float64,)
 
 
-def _types(item: Function) -> tuple[Any, ...]:
+def _types(item: CFunction) -> tuple[Any, ...]:
+    if isinstance(item.arguments, SlotArguments):
+        return tuple(numba_type(kind) for kind in item.kernel.kinds[0])
     return tuple(
         (types.UniTuple(types.float64, kind.count) if kind.count > 1 else types.float64)
-        if isinstance(kind, Numbers)
+        if isinstance(kind, DoublesArgument)
         else types.intp
         for kind in item.arguments
     )
 
 
-def _compiled(kernel: Any, kinds: tuple[Any, ...]) -> Any:
-    """What numba keeps of a kernel for these types."""
-    kernel.compile(kinds)
-    return kernel.overloads[kinds]
-
-
 def _module(
-    kernel: Any,
-    kinds: tuple[Any, ...],
+    kernels: Sequence[tuple[Any, tuple[Any, ...]]],
     machine: _Machine,
     replaced: Mapping[str, Any],
+    processor: Processor,
     single: bool,
 ) -> Any:
-    """Take a kernel's module, without the parts that only Python calls."""
-    result = _compiled(kernel, kinds)
-    name = result.fndesc.llvm_func_name
-    # What numba itself would link into another kernel that calls this one.
-    module = llvm.parse_bitcode(result.library._get_module_for_linking().as_bitcode())
+    """Link the modules of kernels and of all that they call."""
+    results = [compiled(kernel, kinds) for kernel, kinds in kernels]
+    names = {item.fndesc.llvm_func_name for item in results}
+    module = llvm.parse_assembly(_head(machine))
+    for item in modules_of([result.library for result in results]):
+        module.link_in(item, preserve=True)
     for item in module.functions:
         if not item.is_declaration:
-            item.linkage = "external" if item.name == name else "internal"
-    _tidy(module)
-    text = str(module)
-    text = LEAVE.sub("", text)
+            item.linkage = "external" if item.name in names else "internal"
+    if single:
+        _tidy(module)  # so that constants stand where they are used
+    text = EXCEPTION.sub("store ptr null, ptr", str(module))
+    if not processor.fast:
+        text = FAST_MATH_FLAGS.sub("", text)
     # The intrinsic is one instruction where there is one.
     text = re.sub(r"^declare double @sqrt\(.*$", "", text, flags=re.M)
     if "@sqrt(" in text:
@@ -301,7 +300,7 @@ def _stand_in(function: str) -> str:
 
 
 def _front(
-    functions: Sequence[Function],
+    functions: Sequence[CFunction],
     tables: Mapping[str, Sequence[float]],
     replaced: Mapping[str, Any],
 ) -> str:
@@ -312,7 +311,7 @@ def _front(
     ]
     parts += [_c_function(item) for item in functions]
     for function, kernel in replaced.items():
-        name = _compiled(kernel, (types.float64,)).fndesc.llvm_func_name
+        name = compiled(kernel, (types.float64,)).fndesc.llvm_func_name
         parts.append(
             f'declare i32 @"{name}"(ptr, ptr, double)\n'
             f"define double @{_stand_in(function)}(double %x) {{\n"
@@ -328,25 +327,27 @@ def _doubles(values: Sequence[float]) -> str:
     return ", ".join(f"double 0x{value:016X}" for value in bits)
 
 
-def _c_function(item: Function) -> str:
+def _c_function(item: CFunction) -> str:
     """A function of pointers that returns an int: the same in every calling convention."""
-    result = _compiled(item.kernel, _types(item))
+    result = compiled(item.kernel, _types(item))
+    if isinstance(item.arguments, SlotArguments):
+        return _slot_function(item.name, result)
     name, whole = result.fndesc.llvm_func_name, "i64"
     if types.unliteral(result.signature.return_type) != types.int64:
         raise RuntimeError(f"{item.name}: the kernel returns {result.signature.return_type}")
     parameters, lines = [], []
     passed, kinds = ["ptr %result", "ptr %error"], ["ptr", "ptr"]
     for index, kind in enumerate(item.arguments):
-        if not isinstance(kind, Table):
+        if not isinstance(kind, TableArgument):
             parameters.append(f"ptr %a{index}")
-        if isinstance(kind, Numbers):
+        if isinstance(kind, DoublesArgument):
             for n in range(kind.count):
                 lines.append(f"%g{index}_{n} = getelementptr double, ptr %a{index}, i32 {n}")
                 lines.append(f"%n{index}_{n} = load double, ptr %g{index}_{n}, align 8")
                 passed.append(f"double %n{index}_{n}")
                 kinds.append("double")
             continue
-        source = f"@{kind.name}" if isinstance(kind, Table) else f"%a{index}"
+        source = f"@{kind.name}" if isinstance(kind, TableArgument) else f"%a{index}"
         lines.append(f"%p{index} = ptrtoint ptr {source} to i64")
         passed.append(f"i64 %p{index}")
         kinds.append("i64")
@@ -361,6 +362,27 @@ def _c_function(item: Function) -> str:
     )
 
 
+def _slot_function(name: str, result: Any) -> str:
+    """A function of a pointer to arguments in slots of 8 bytes, behind that of the result."""
+    kind = cpu_target.target_context.call_conv.get_function_type(
+        result.fndesc.restype, result.fndesc.argtypes
+    )
+    lines, passed, kinds = [], ["ptr %slots", "ptr %error"], ["ptr", "ptr"]
+    for place, given in enumerate(kind.args[2:]):
+        shown = "ptr" if given.is_pointer else str(given)
+        lines.append(f"%g{place} = getelementptr i64, ptr %slots, i32 {place + 1}")
+        lines.append(f"%v{place} = load {shown}, ptr %g{place}, align 8")
+        passed.append(f"{shown} %v{place}")
+        kinds.append(shown)
+    body = "\n  ".join(lines)
+    called = result.fndesc.llvm_func_name
+    return (
+        f'declare i32 @"{called}"({", ".join(kinds)})\n'
+        f"define i32 @{name}(ptr %slots) {{\n  %error = alloca ptr\n  {body}\n"
+        f'  %status = call i32 @"{called}"({", ".join(passed)})\n  ret i32 %status\n}}'
+    )
+
+
 def _closed(text: str, wanted: set[str]) -> str:
     """Make everything but the wanted functions private, so that what is not called goes."""
     module = llvm.parse_assembly(text)
@@ -370,17 +392,13 @@ def _closed(text: str, wanted: set[str]) -> str:
     return str(module)
 
 
-def _optimise(module: Any, machine: _Machine) -> None:
-    options = llvm.create_pipeline_tuning_options(OPTIMISE)
-    options.loop_vectorization = options.slp_vectorization = False
-    options.loop_unrolling = False
+def _optimise(module: Any, machine: _Machine, processor: Processor) -> None:
+    options = llvm.create_pipeline_tuning_options(_level(processor))
+    options.loop_vectorization = options.loop_unrolling = processor.fast
+    options.slp_vectorization = False
     builder = llvm.create_pass_builder(machine.target, options)
     builder.getModulePassManager().run(module, builder)
 
 
-def tool_versions() -> dict[str, str]:
-    """Versions of what emits the code."""
-    return {
-        "numba": numba.__version__,
-        "llvm": ".".join(map(str, llvm.llvm_version_info)),
-    }
+def _level(processor: Processor) -> int:
+    return FAST_OPTIMISATION_LEVEL if processor.fast else OPTIMISATION_LEVEL

@@ -1,1 +1,1 @@
-"""Data that every layer shares: channels, actuator, stored test, recording, errors."""
+"""Data that every layer shares: actuator, converters, criteria of a verdict, conventions."""

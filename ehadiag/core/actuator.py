@@ -1,50 +1,140 @@
-"""Data of one actuator (controller, servovalve, jack), read from a TOML file and checked."""
+"""Data of one actuator (servovalve, jack, limits, calibration), and its TOML file."""
 
 from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from ehadiag.core.calibration import Calibration
-from ehadiag.core.converters import Converters
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.toml_file import decode_toml, read_toml
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.files import decode_toml, read_toml
+from firmware_iface.stored_test import Controller
 
-__all__ = [
-    "MOST_TOLERANCE",
-    "VARYING",
-    "Actuator",
-    "Controller",
-    "Jack",
-    "Limits",
-    "SecondStage",
-    "Servovalve",
-    "Tolerance",
-    "default_actuator",
-    "load_actuator",
-    "with_tolerance",
-]
 
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+class ConverterSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One converter: its range is ±full_scale."""
+
+    full_scale: Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+    """Half range, SI unit of the channel."""
+    bits: Annotated[int, msgspec.Meta(ge=6, le=24)] = 12
+    """Width."""
+
+
+class ConverterSpecs(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The four converters; of those that are left out nothing is known."""
+
+    current: ConverterSpec | msgspec.UnsetType = msgspec.UNSET
+    """Of the servovalve current, A."""
+    spool: ConverterSpec | msgspec.UnsetType = msgspec.UNSET
+    """Of the spool position, m."""
+    pressure: ConverterSpec | msgspec.UnsetType = msgspec.UNSET
+    """Of the differential pressure, Pa."""
+    position: ConverterSpec | msgspec.UnsetType = msgspec.UNSET
+    """Of the jack position, m."""
+
+
+MAX_CALIBRATED_PARAMETERS = 64
+MIN_ROOT_DIAGONAL = 1e-9
+MAX_NOISE_EXCESS = 1.16
+"""Excess up to which a model leaves nothing (`ehadiag.identify.estimates`)."""
+WEAR_EXCESS_FACTOR = 2.0
+"""By which wear may make more of what a model leaves: friction acts on more of it."""
+
+LongText = Annotated[str, msgspec.Meta(max_length=1000)]
+ShortText = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+PositiveSize = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+CalibrationNumber = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+CorrelationFactor = Annotated[float, msgspec.Meta(ge=-1.1, le=1.1)]
+NonNegativeRatio = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+
+
+class CalibrationSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A recording that was learned from."""
+
+    name: LongText
+    test: ShortText
+    sha256: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    """Of the log; empty where it was none."""
+
+
+class FitQuality(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How well the model explains the recordings with what was learned."""
+
+    excess: NonNegativeRatio
+    """Cost of the residuals over that of noise alone; about 1."""
+    outliers: NonNegativeRatio
+    """Share of residuals beyond three times the noise."""
+    spool_rms: NonNegativeRatio
+    """Residual in units of the noise."""
+    pressure_rms: NonNegativeRatio
+
+    @property
+    def left(self) -> float:
+        """What the model leaves beside noise, over what noise alone may leave; 0: nothing."""
+        return max(self.excess / MAX_NOISE_EXCESS - 1.0, 0.0)
+
+    @property
+    def most_excess(self) -> float:
+        """Excess that a later recording of the unit may have."""
+        return WEAR_EXCESS_FACTOR * self.excess
+
+
+class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What was learned beside the data, which stand in the file's own tables."""
+
+    date: ShortText
+    """UTC, ISO 8601."""
+    start: ShortText
+    """Name of the actuator that it began with."""
+    serial: Annotated[int, msgspec.Meta(ge=0, le=4294967295)] | None = None
+    """Of the unit; None where its bus does not say."""
+    plays: Annotated[int, msgspec.Meta(ge=1, le=256)] = 1
+    """Of the hysteresis (PHY-29)."""
+    effects: dict[str, CalibrationNumber]
+    """Nuisances of the unit by name, SI."""
+    parameters: Annotated[
+        tuple[ShortText, ...], msgspec.Meta(min_length=1, max_length=MAX_CALIBRATED_PARAMETERS)
+    ]
+    """What is not known exactly: effects, and data by their relative error."""
+    std: tuple[PositiveSize, ...]
+    """Standard deviations of the parameters, SI."""
+    root: tuple[tuple[CorrelationFactor, ...], ...]
+    """Lower triangle L of their correlation L Lᵀ, row by row."""
+    held: dict[str, LongText] = {}
+    """What the recordings do not show: why it was held."""
+    fit: FitQuality
+    evidence: dict[str, CalibrationNumber] = {}
+    """Bayesian information criterion of each model that was tried, less the best one's; of open
+    loop if there was one."""
+    recordings: tuple[CalibrationSource, ...]
+
+    def objection(self) -> str:
+        """Return what one key alone cannot tell; empty where all is well."""
+        count = len(self.parameters)
+        if len(set(self.parameters)) < count:
+            return "calibration.parameters: a name stands twice"
+        unknown = sorted(set(self.effects) - set(self.parameters))
+        if unknown:
+            return f"calibration.effects: {', '.join(unknown)} not among calibration.parameters"
+        if len(self.std) != count:
+            return f"calibration.std: need {count} numbers, one of each parameter"
+        if [len(row) for row in self.root] != list(range(1, count + 1)):
+            return f"calibration.root: need {count} rows of 1, 2, … numbers"
+        if any(row[-1] < MIN_ROOT_DIAGONAL for row in self.root):
+            return "calibration.root: the last number of a row must be above 0"
+        return ""
+
+
+ActuatorName = Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
 # Each range is some decades about what is built, so that no product of them leaves the numbers.
 
 
-class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Position controller of the flight-control computer (PHY-2)."""
-
-    IM: Annotated[float, msgspec.Meta(ge=1e-4, le=10)]
-    """Rated current and saturation, A."""
-    GAP: Annotated[float, msgspec.Meta(ge=0, le=1e4)]
-    """Proportional gain, A/m."""
-    GAI: Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)] = 0.0
-    """Integral gain, A/(m s)."""
-    GAD: Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)] = 0.0
-    """Derivative gain, A s/m."""
-    rate: Annotated[float, msgspec.Meta(ge=10, le=1e5)] = 1000.0
-    """Control rate, Hz."""
+ExponentOrRange = float | tuple[float, float]
+MAX_CLOGGING_EXPONENT = 2.0
+"""Largest exponent of the pressure gain behind a clogged filter, 1: that of a turbulent filter in
+series with a bridge of constant opening; a laminar one has 1, one behind the bridge's supply 0."""
 
 
 class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -66,6 +156,9 @@ class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """First-stage flow gain as new, m²/s."""
     GPF: Annotated[float, msgspec.Meta(ge=1e6, le=1e16)]
     """First-stage pressure gain, Pa/m."""
+    clogging_exponent: ExponentOrRange = 0.0
+    """Exponent m of the pressure gain behind a clogged filter, GPF k^m, 1 (PHY-45), or the range
+    in which it is: a datum of the valve's maker."""
     AS: Annotated[float, msgspec.Meta(ge=1e-8, le=0.1)]
     """Spool end area, m²."""
     MS: Annotated[float, msgspec.Meta(ge=1e-6, le=100)]
@@ -86,6 +179,12 @@ class Servovalve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Flow gain, m²/s."""
     CLK: Annotated[float, msgspec.Meta(ge=0, le=1e-6)]
     """Leakage, m³/(s Pa)."""
+
+    @property
+    def clogging_range(self) -> tuple[float, float]:
+        """Least and largest exponent of the pressure gain behind a clogged filter, 1."""
+        m = self.clogging_exponent
+        return m if isinstance(m, tuple) else (m, m)
 
 
 class Jack(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -114,14 +213,18 @@ class SecondStage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """`linear`: saturating pressure gain, stiff oil; `orifice`: two lands, compressible oil."""
     beta: Annotated[float, msgspec.Meta(ge=1e7, le=3e9)] = 7.5e8
     """Effective bulk modulus of the oil, Pa; of orifices only."""
-    volume: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1.6e-4
-    """Volume of both chambers together, m³; of orifices only."""
+    volume_of_one_chamber: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1.6e-4
+    """Volume of one chamber with its lines, the jack in the middle, m³; of orifices only."""
+    volume: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] | msgspec.UnsetType = msgspec.UNSET
+    """Former name of `volume_of_one_chamber`, still read."""
+    by_position: bool = False
+    """Whether the chambers' volumes follow the jack's travel (PHY-42); of orifices only."""
 
 
-MOST_TOLERANCE = 0.3
-Share = Annotated[float, msgspec.Meta(ge=0, le=MOST_TOLERANCE)]
+MAX_TOLERANCE = 0.3
+ToleranceShare = Annotated[float, msgspec.Meta(ge=0, le=MAX_TOLERANCE)]
 
-VARYING = ("GM", "KSF", "KF", "GQF", "CS", "FSS0", "GP", "GQ", "MJ", "CJ", "FDJ0")
+VARYING_PARAMETERS = ("GM", "KSF", "KF", "GQF", "CS", "FSS0", "GP", "GQ", "MJ", "CJ", "FDJ0")
 """Data in which units of one type differ, and of which a test shows what matters (PHY-37)."""
 
 
@@ -132,34 +235,34 @@ class Tolerance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     none.
     """
 
-    all: Share = 0.0
-    """Of each of `VARYING` that is not named."""
-    GM: Share | None = None
-    KSF: Share | None = None
-    KF: Share | None = None
-    JF: Share | None = None
-    CF: Share | None = None
-    XFM: Share | None = None
-    GQF: Share | None = None
-    GPF: Share | None = None
-    AS: Share | None = None
-    MS: Share | None = None
-    CS: Share | None = None
-    FSS0: Share | None = None
-    GP: Share | None = None
-    GQ: Share | None = None
-    CLK: Share | None = None
-    AJ: Share | None = None
-    MJ: Share | None = None
-    CJ: Share | None = None
-    FDJ0: Share | None = None
+    all: ToleranceShare = 0.0
+    """Of each of `VARYING_PARAMETERS` that is not named."""
+    GM: ToleranceShare | None = None
+    KSF: ToleranceShare | None = None
+    KF: ToleranceShare | None = None
+    JF: ToleranceShare | None = None
+    CF: ToleranceShare | None = None
+    XFM: ToleranceShare | None = None
+    GQF: ToleranceShare | None = None
+    GPF: ToleranceShare | None = None
+    AS: ToleranceShare | None = None
+    MS: ToleranceShare | None = None
+    CS: ToleranceShare | None = None
+    FSS0: ToleranceShare | None = None
+    GP: ToleranceShare | None = None
+    GQ: ToleranceShare | None = None
+    CLK: ToleranceShare | None = None
+    AJ: ToleranceShare | None = None
+    MJ: ToleranceShare | None = None
+    CJ: ToleranceShare | None = None
+    FDJ0: ToleranceShare | None = None
 
     def of(self, name: str) -> float:
         """Return the tolerance of a datum."""
         own: float | None = getattr(self, name)
         if own is not None:
             return own
-        return self.all if name in VARYING else 0.0
+        return self.all if name in VARYING_PARAMETERS else 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -167,7 +270,25 @@ class Tolerance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return tuple(name for name in self.__struct_fields__[1:] if self.of(name) > 0.0)
 
 
-class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+DiscrepancyShare = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
+
+
+class Discrepancy(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Standard deviation of each severity by a wrong law of the fault, over the severity, 1.
+
+    What a unit shows as new says nothing of it (Kennedy and O'Hagan, J. R. Stat. Soc. B 63(3),
+    2001).
+    """
+
+    Kintas: DiscrepancyShare = 0.01
+    """Of the filter's clogging."""
+    FSS: DiscrepancyShare = 0.03
+    """Of the spool's friction, whose law is that of clogging too."""
+    FDJ: DiscrepancyShare = 0.01
+    """Of the jack's friction."""
+
+
+class EffectLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Sizes, of either sign, beyond which an effect of the unit is a fault of its own."""
 
     null_bias: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.03
@@ -180,18 +301,29 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Relative change."""
 
 
+class Advice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What to do about each fault, as the end of "Plan to …"; empty: nothing is said."""
+
+    Kintas: LongText = "clean or replace the filter of the servovalve's first stage"
+    FSS: LongText = "replace the servovalve"
+    FDJ: LongText = "overhaul the jack"
+
+
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One actuator: its parts, how far their data may be off, what was learned of the unit."""
 
-    name: Name
+    name: ActuatorName
     controller: Controller
     servovalve: Servovalve
     jack: Jack
     second_stage: SecondStage = SecondStage()
-    limits: Limits = Limits()
+    limits: EffectLimits = EffectLimits()
     tolerance: Tolerance = Tolerance()
-    converters: Converters | msgspec.UnsetType = msgspec.UNSET
+    discrepancy: Discrepancy = Discrepancy()
+    converters: ConverterSpecs | msgspec.UnsetType = msgspec.UNSET
     """Behind the measured channels; unset: nothing is known of them."""
+    advice: Advice = Advice()
+    """What to do about a fault; no datum of the model."""
     calibration: Calibration | None = None
     """What was learned of this unit; None: the data are those of a type."""
 
@@ -228,22 +360,9 @@ def default_actuator() -> Actuator:
 def with_tolerance(actuator: Actuator, share: float) -> Actuator:
     """Return the same actuator, the data in which units differ with one tolerance.
 
-    Parameters
-    ----------
-    actuator : Actuator
-        Its file's own tolerances do not count.
-    share : float
-        The tolerance, 0 … `MOST_TOLERANCE`.
-
-    Returns
-    -------
-    Actuator
-        As new data.
-
-    Raises
-    ------
-    ConfigurationError
-        The actuator is calibrated: what was found takes the place of tolerances.
+    actuator: its file's own tolerances do not count; share: the tolerance, 0 … `MAX_TOLERANCE`.
+    Returns as new data. ConfigurationError: the actuator is calibrated: what was found takes the
+    place of tolerances.
     """
     if actuator.calibration is not None:
         raise ConfigurationError(
@@ -259,7 +378,44 @@ def _checked(actuator: Actuator, source: str) -> Actuator:
         raise ConfigurationError(f"{source}: servovalve.FSS1 must be greater than servovalve.FSS0")
     if actuator.jack.FDJ1 <= actuator.jack.FDJ0:
         raise ConfigurationError(f"{source}: jack.FDJ1 must be greater than jack.FDJ0")
+    stage = actuator.second_stage
+    if stage.volume is not msgspec.UNSET:
+        stage = msgspec.structs.replace(
+            stage, volume_of_one_chamber=stage.volume, volume=msgspec.UNSET
+        )
+        actuator = msgspec.structs.replace(actuator, second_stage=stage)
+    low, high = actuator.servovalve.clogging_range
+    if not 0.0 <= low <= high <= MAX_CLOGGING_EXPONENT:
+        raise ConfigurationError(
+            f"{source}: servovalve.clogging_exponent: need a number from 0 to"
+            f" {MAX_CLOGGING_EXPONENT:g}, or the two ends of a range, the smaller one first"
+        )
     objection = actuator.calibration.objection() if actuator.calibration else ""
     if objection:
         raise ConfigurationError(f"{source}: {objection}")
     return actuator
+
+
+ACTUATOR_FILE_HEAD = (
+    "# Written by `ehadiag calibrate`; SI units. Keys: docs/reference/actuator-file.md.\n"
+)
+
+
+def actuator_toml(actuator: Actuator) -> bytes:
+    """Return an actuator as TOML, every number to its last digit.
+
+    actuator: the data. Returns UTF-8.
+    """
+    tree: Any = msgspec.to_builtins(actuator)
+    import tomli_w  # noqa: PLC0415 - only where a file is written
+
+    return (ACTUATOR_FILE_HEAD + tomli_w.dumps(_without_none(tree))).encode()
+
+
+def _without_none(node: Any) -> Any:
+    """Leave out what is not there: TOML has no word for it."""
+    if isinstance(node, dict):
+        return {key: _without_none(value) for key, value in node.items() if value is not None}
+    if isinstance(node, list | tuple):
+        return [_without_none(item) for item in node]
+    return node

@@ -12,42 +12,77 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import CHANNELS, Channel, Channels, Stated, near_ends
-from ehadiag.core.converters import Converter
-from ehadiag.core.recording import Samples
-from ehadiag.core.step_seen import step_seen
+from ehadiag.core.actuator import Actuator, ConverterSpec
+from firmware_iface.recording import (
+    CHANNELS,
+    Channel,
+    Channels,
+    Samples,
+    StatedConverter,
+    end_thresholds,
+)
 
-__all__ = [
-    "Conversion",
-    "actuator_channels",
-    "conversion_of",
-    "range_is_stated",
-    "reach_of",
-    "stated_channels",
-]
 
-MARGIN = 1.25
+class StepLimits(NamedTuple):
+    """Limits by which the step of a converter shows in its values."""
+
+    levels: int = 30
+    """Least different values."""
+    single: float = 1.6
+    """Least distances: a bus that rounds codes again moves each by half its own step at most."""
+    same: float = 1e-6
+    """Share of the range within which two values are the same, in single precision."""
+    deviation: float = 0.26
+    """Steps by which values may be off whole steps: a bus that rounds to half a step."""
+    share: float = 0.99
+    """Least share of the values so near."""
+    tolerance: float = 0.005
+    """Relative distance within which a step is the expected one."""
+    ratio: float = 4.0
+    """Expected steps beyond which a step is a damaged converter's, not a coarser one's."""
+
+
+STEPS = StepLimits()
+
+
+def observed_step(values: NDArray[np.float64]) -> float | None:
+    """Return the step of which all values are whole numbers, but for a constant.
+
+    values: samples of one channel, shape (n,); what is not finite does not count. Returns in the
+    unit of the values; None where too few different values, or none of such a step, are there:
+    resampled or exact data.
+    """
+    known = values[np.isfinite(values)]
+    levels = np.unique(known)
+    if levels.size < STEPS.levels:
+        return None
+    apart = np.diff(levels)
+    apart = apart[apart > STEPS.same * (levels[-1] - levels[0]) / STEPS.levels]
+    if apart.size < STEPS.levels - 1:
+        return None
+    least = float(apart.min())
+    step = float(apart[apart < STEPS.single * least].mean())
+    # Neighbours first: an error of the step grows with the distance that it is used over.
+    for _ in range(3):
+        number = np.cumsum(np.concatenate([[0.0], np.rint(np.diff(levels) / step)]))
+        centred = number - number.mean()
+        step = float(centred @ (levels - levels.mean())) / float(centred @ centred)
+    origin = float(np.median(levels - number * step))
+    off = np.abs(levels - origin - number * step) / step
+    return step if float(np.quantile(off, STEPS.share)) <= STEPS.deviation else None
+
+
+RANGE_MARGIN = 1.25
 """Range over the actuator's own reach, of a converter of which nothing is known."""
-SAME_STEP = 0.005
-"""Relative distance within which a step that data show is the one that is expected."""
-COARSEST = 4.0
-"""Expected steps beyond which a step in the data is a damaged converter's, not a coarser one's."""
 
 
 class Conversion(NamedTuple):
-    """The converters of a recording.
-
-    Attributes
-    ----------
-    channels : Channels
-        Ranges and steps.
-    saturated : NDArray[np.bool_]
-        Shape (4, ticks): the converter stood at its end.
-    """
+    """The converters of a recording."""
 
     channels: Channels
+    """Ranges and steps."""
     saturated: NDArray[np.bool_]
+    """Shape (4, ticks): the converter stood at its end."""
 
 
 def actuator_channels(actuator: Actuator) -> Channels:
@@ -56,47 +91,32 @@ def actuator_channels(actuator: Actuator) -> Channels:
     Of one that it leaves out the range of PHY-23 is assumed, or 1.25 times the actuator's reach
     where that is beyond it, in 4096 steps.
 
-    Parameters
-    ----------
-    actuator : Actuator
-        Data of the actuator.
-
-    Returns
-    -------
-    Channels
-        Ranges and steps.
+    actuator: data of the actuator. Returns ranges and steps.
     """
     return stated_channels((), actuator)
 
 
-def stated_channels(stated: tuple[Stated | None, ...], actuator: Actuator) -> Channels:
+def stated_channels(stated: tuple[StatedConverter | None, ...], actuator: Actuator) -> Channels:
     """Converters as mapping and actuator file state them, see `actuator_channels`.
 
-    Parameters
-    ----------
-    stated : tuple[Stated | None, ...]
-        By the mapping, which comes first, of each channel; empty: nothing.
-    actuator : Actuator
-        Data of the actuator.
-
-    Returns
-    -------
-    Channels
-        Ranges and steps.
+    stated: by the mapping, which comes first, of each channel; empty: nothing; actuator: data of
+    the actuator. Returns ranges and steps.
     """
-    said = stated or (None,) * len(CHANNELS)
-    own = (_of_file(actuator, channel) for channel in CHANNELS)
-    return Channels(*(_told(item, channel) for item, channel in zip(said, own, strict=True)))
+    statements = stated or (None,) * len(CHANNELS)
+    own = (_filed_channel(actuator, channel) for channel in CHANNELS)
+    return Channels(
+        *(_with_statement(item, channel) for item, channel in zip(statements, own, strict=True))
+    )
 
 
-def range_is_stated(stated: Stated | None, actuator: Actuator, channel: Channel) -> bool:
+def range_is_stated(stated: StatedConverter | None, actuator: Actuator, channel: Channel) -> bool:
     """Tell whether mapping (`stated`) or actuator file say what range a converter has."""
-    return _converter(actuator, channel) is not None or (
+    return _filed_converter(actuator, channel) is not None or (
         stated is not None and stated.low is not None
     )
 
 
-def reach_of(actuator: Actuator, channel: Channel) -> float:
+def largest_value(actuator: Actuator, channel: Channel) -> float:
     """Return the largest value that a channel has on an actuator: current, stops, supply; SI."""
     return {
         "current": actuator.controller.IM,
@@ -113,34 +133,25 @@ def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
     which may be coarser than the bus's own, or else the assumed one. A sample is at an end if the
     bus said so, or if it lies at the end of a range that is stated.
 
-    Parameters
-    ----------
-    samples : Samples
-        One test.
-    actuator : Actuator
-        Data of the actuator.
-
-    Returns
-    -------
-    Conversion
-        Converters, and which samples stood at their ends.
+    samples: one test; actuator: data of the actuator. Returns converters, and which samples stood
+    at their ends.
     """
-    said = samples.stated or (None,) * len(CHANNELS)
+    statements = samples.stated or (None,) * len(CHANNELS)
     channels, saturated = [], samples.saturated
     for index, (item, channel) in enumerate(
-        zip(said, stated_channels(samples.stated, actuator), strict=True)
+        zip(statements, stated_channels(samples.stated, actuator), strict=True)
     ):
         values = np.asarray(getattr(samples, channel.name))
-        filed = _converter(actuator, channel) is not None
+        filed = _filed_converter(actuator, channel) is not None
         if not filed and (item is None or item.step is None):
-            channels.append(_seen(values, channel))
+            channels.append(_with_observed_step(values, channel))
         else:
             channels.append(channel)
         low, high = (None, None) if item is None else (item.low, item.high)
         if filed and low is None:
             low, high = -channel.full_scale, channel.full_scale - channel.lsb
         if low is not None and high is not None:
-            lower, upper = near_ends(low, high, channels[-1].lsb)
+            lower, upper = end_thresholds(low, high, channels[-1].lsb)
             at_end = (values <= lower) | (values >= upper)
             if (at_end & ~saturated[index]).any():
                 saturated = saturated.copy()
@@ -148,23 +159,25 @@ def conversion_of(samples: Samples, actuator: Actuator) -> Conversion:
     return Conversion(Channels(*channels), saturated)
 
 
-def _converter(actuator: Actuator, channel: Channel) -> Converter | None:
+def _filed_converter(actuator: Actuator, channel: Channel) -> ConverterSpec | None:
     """What the actuator file says of a converter, if anything."""
     if actuator.converters is msgspec.UNSET:
         return None
-    found: Converter | msgspec.UnsetType = getattr(actuator.converters, channel.name)
+    found: ConverterSpec | msgspec.UnsetType = getattr(actuator.converters, channel.name)
     return None if found is msgspec.UNSET else found
 
 
-def _of_file(actuator: Actuator, usual: Channel) -> Channel:
-    item = _converter(actuator, usual)
+def _filed_channel(actuator: Actuator, usual: Channel) -> Channel:
+    item = _filed_converter(actuator, usual)
     if item is not None:
         return replace(usual, full_scale=item.full_scale, levels=float(1 << item.bits))
-    reach = reach_of(actuator, usual)
-    return usual if reach <= usual.full_scale else replace(usual, full_scale=MARGIN * reach)
+    largest = largest_value(actuator, usual)
+    return (
+        usual if largest <= usual.full_scale else replace(usual, full_scale=RANGE_MARGIN * largest)
+    )
 
 
-def _told(stated: Stated | None, channel: Channel) -> Channel:
+def _with_statement(stated: StatedConverter | None, channel: Channel) -> Channel:
     """A converter with what the mapping says of it in the place of what was known."""
     if stated is None:
         return channel
@@ -175,11 +188,11 @@ def _told(stated: Stated | None, channel: Channel) -> Channel:
     return channel
 
 
-def _seen(values: NDArray[np.float64], channel: Channel) -> Channel:
+def _with_observed_step(values: NDArray[np.float64], channel: Channel) -> Channel:
     """A converter with the step that its values show, where that is another one."""
-    step = step_seen(values)
-    if step is None or step > COARSEST * channel.lsb:
+    step = observed_step(values)
+    if step is None or step > STEPS.ratio * channel.lsb:
         return channel
-    if abs(step / channel.lsb - 1.0) <= SAME_STEP:
+    if abs(step / channel.lsb - 1.0) <= STEPS.tolerance:
         return channel
     return replace(channel, levels=2.0 * channel.full_scale / step)

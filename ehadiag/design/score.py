@@ -1,87 +1,151 @@
-"""Scores a test: how well it shows each severity while all else of the unit is unknown."""
+"""Scores a stored test by the Cramér-Rao bounds of the severities, on a simulated run of the test.
+
+The monitoring model runs the test, with the position fed back where the test is in closed loop.
+The score is how well each severity can be estimated while everything else about the unit is
+unknown.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.stored_test import StoredTest
-from ehadiag.design.play import Played, play
-from ehadiag.identify.nuisance.knowledge import knowledge_of
-from ehadiag.identify.nuisance.prior import information_of, nuisances_of, usual
-from ehadiag.identify.refine.derivatives import Derivatives
-from ehadiag.identify.spans import lay_out, unknowns_of
-from ehadiag.model.parameters import FAULTS, OFFSETS, REGISTRY
-from ehadiag.model.simd.model import SimdModel
+from ehadiag.core.conversion import actuator_channels
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, unknowns_of
+from ehadiag.identify.linearisation import Derivatives
+from ehadiag.identify.prior import basic_nuisances_of, prior_information, unit_prior, usual_prior
+from ehadiag.model.laws import ControlState, control_current, control_law
+from ehadiag.model.registry import FAULTS, REGISTRY, SENSOR_OFFSETS
+from ehadiag.model.residual_models import SimdModel
+from ehadiag.monitor.streaming import Monitor, Tick
+from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
+from firmware_iface.stored_test import StoredTest
 
-__all__ = ["POINTS", "Bound", "Score", "bound_of", "score", "usual_effects"]
 
-POINTS = ((0.05, 0.05, 0.05), (0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
+@dataclass(frozen=True, slots=True, eq=False)
+class PlayedTest:
+    """A test as an actuator would answer it."""
+
+    experiment: Experiment
+    """Ready for identification, its noise that of PHY-22."""
+    travel: float
+    """Largest distance of the jack from its middle, m."""
+    rate: float
+    """Largest speed of the jack, m/s."""
+    pressure: float
+    """Largest differential pressure, Pa."""
+
+
+def play_stored_test(
+    test: StoredTest,
+    actuator: Actuator,
+    severities: tuple[float, ...],
+    effects: Mapping[str, float],
+) -> PlayedTest:
+    """Run a test from rest.
+
+    test: what is played; actuator: data of the actuator; severities: in the order of the registry,
+    each 0 … 1; effects: nuisances and errors of data by the registry's names, SI. Returns the
+    answer, without noise but for the fed-back position. ConfigurationError: a severity or an effect
+    out of its range.
+    """
+    # The control law runs here, so the monitor gets currents.
+    monitor = Monitor(actuator, severities, mode=CommandMode.CURRENT, effects=effects)
+    channels = actuator_channels(actuator)
+    lsb = channels.position.lsb
+    law = control_law(actuator.controller, 1.0 / test.rate)
+    commands = test.command()
+    # Noise of the fed-back position (PHY-22), the same for all tests that are compared.
+    noise = np.random.default_rng(0).normal(0.0, 0.5, len(commands))
+    answers, seen = np.empty((len(commands), 3)), np.empty(len(commands))
+    state, place = ControlState(0.0, 0.0, 0.0), 0.0
+    for k, command in enumerate(commands.tolist()):
+        current = command
+        if test.closed_loop:
+            current, state = control_current(law, state, command - place)
+        answers[k] = monitor.push(Tick(current, *[float("nan")] * 4)).predicted
+        # The next tick's control law works on the digitised position (BUS-7).
+        place = lsb * round(float(answers[k, 2]) / lsb + float(noise[k]))
+        seen[k] = place
+    experiment = build_experiment(
+        _samples(test, commands, answers, seen), Environment(), test, actuator
+    )
+    noise_of = tuple(ESTIMATION.noise_lsb * channel.grain for channel in channels[1:])
+    _, pressure, travel = np.abs(answers).max(axis=0)
+    rate = float(np.abs(np.diff(answers[:, 2])).max()) * test.rate
+    return PlayedTest(experiment.with_noise(noise_of), float(travel), rate, float(pressure))
+
+
+def _samples(
+    test: StoredTest,
+    commands: NDArray[np.float64],
+    answers: NDArray[np.float64],
+    seen: NDArray[np.float64],
+) -> Samples:
+    """Samples without noise, but for the position that the control law saw."""
+    ticks = len(commands)
+    return Samples(
+        period_ns=round(1e9 / test.rate),
+        mode=CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT,
+        current=np.full(ticks, np.nan),
+        spool=answers[:, 0],
+        pressure=answers[:, 1],
+        position=seen,
+        command=commands,
+        saturated=np.zeros((len(CHANNELS), ticks), dtype=np.bool_),
+        host_ns=np.full(ticks, -1, dtype=np.int64),
+    )
+
+
+SCORED_SEVERITIES = ((0.05, 0.05, 0.05), (0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
 """Severities at which a test is scored: nearly as new, degraded, worn."""
-ALIKE = 0.9
-"""Correlation of two estimates from which the test hardly tells the two apart."""
-HELD = 0.7
-"""Share of what was known before from which a test shows nothing of a parameter."""
+MIN_CORRELATION_CONFUSABLE = 0.9
+"""Correlation of two estimates, 1, from which on the test hardly separates them."""
+MAX_STD_RATIO_SHOWN = 0.7
+"""Deviation over the one known beforehand, 1; above it the test does not show a parameter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bound:
-    """The Cramér-Rao bound at one point, all other unknowns free.
-
-    Attributes
-    ----------
-    severities : tuple[float, ...]
-        The point.
-    std : NDArray[np.float64]
-        Smallest deviation of an unbiased estimate of each severity, shape (k,).
-    alone : NDArray[np.float64]
-        The same if the severities and the sensors' offsets were all that is unknown, shape (k,).
-    alike : tuple[tuple[str, str, float], ...]
-        A severity, what it is hardly told apart from, and the correlation of the two.
-    unseen : tuple[str, ...]
-        Parameters of which the test shows nothing.
-    """
+    """The Cramér-Rao bound at one point, all other unknowns free."""
 
     severities: tuple[float, ...]
+    """The point."""
     std: NDArray[np.float64]
+    """Smallest deviation of an unbiased estimate of each severity, shape (k,)."""
     alone: NDArray[np.float64]
+    """The same if the severities and the sensors' offsets were all that is unknown, shape (k,)."""
     alike: tuple[tuple[str, str, float], ...]
+    """A severity, what it is hardly told apart from, and the correlation of the two."""
     unseen: tuple[str, ...]
+    """Parameters of which the test shows nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """What a test shows, and what it asks of the actuator.
-
-    Attributes
-    ----------
-    bounds : tuple[Bound, ...]
-        At each point.
-    figure : float
-        Geometric mean of the bounds of all severities at all points.
-    travel : float
-        Largest distance of the jack from its middle over the points, m.
-    rate : float
-        Largest speed of the jack, m/s.
-    pressure : float
-        Largest differential pressure, Pa.
-    """
+    """What a test shows, and what it asks of the actuator."""
 
     bounds: tuple[Bound, ...]
+    """At each point."""
     figure: float
+    """Geometric mean of the bounds of all severities at all points."""
     travel: float
+    """Largest distance of the jack from its middle over the points, m."""
     rate: float
+    """Largest speed of the jack, m/s."""
     pressure: float
+    """Largest differential pressure, Pa."""
 
 
 def score(
     test: StoredTest,
     actuator: Actuator,
-    points: Sequence[tuple[float, ...]] = POINTS,
+    points: Sequence[tuple[float, ...]] = SCORED_SEVERITIES,
 ) -> Score:
     """Score a test of an actuator.
 
@@ -89,26 +153,11 @@ def score(
     tolerance in the actuator file. The unit has usual nuisances: what hysteresis hides is not
     there to be seen on one without any.
 
-    Parameters
-    ----------
-    test : StoredTest
-        What is scored.
-    actuator : Actuator
-        Data of the actuator, with their tolerances.
-    points : Sequence[tuple[float, ...]]
-        Severities in the order of the registry.
-
-    Returns
-    -------
-    Score
-        The bounds at all points.
-
-    Raises
-    ------
-    ConfigurationError
-        A severity out of its range.
+    test: what is scored; actuator: data of the actuator, with their tolerances; points: severities
+    in the order of the registry. Returns the bounds at all points. ConfigurationError: a severity
+    out of its range.
     """
-    played = [play(test, actuator, point, usual_effects()) for point in points]
+    played = [play_stored_test(test, actuator, point, typical_effects()) for point in points]
     bounds = tuple(
         bound_of(item, actuator, point) for item, point in zip(played, points, strict=True)
     )
@@ -122,34 +171,36 @@ def score(
     )
 
 
-def usual_effects() -> dict[str, float]:
+def typical_effects() -> dict[str, float]:
     """Nuisances of a usual unit, by name: the middle of what is known of any unit."""
-    return {item.name: usual(item).mean for item in nuisances_of(REGISTRY)}
+    return {item.name: usual_prior(item).mean for item in REGISTRY if item.basic}
 
 
-def bound_of(played: Played, actuator: Actuator, point: tuple[float, ...]) -> Bound:
+def bound_of(played: PlayedTest, actuator: Actuator, point: tuple[float, ...]) -> Bound:
     """Cramér-Rao bound of a test that was played at a point.
 
     The Fisher information is that of Gaussian noise. Ticks at which a break-away tips between both
     sides of a difference are left out: there the response has no derivative.
     """
-    knowledge = knowledge_of(actuator)
-    free = (*FAULTS, *OFFSETS, *knowledge.beside(nuisances_of(REGISTRY)))
+    knowledge = unit_prior(actuator)
+    basic = basic_nuisances_of(played.experiment.constants.OIL)
+    free = (*FAULTS, *SENSOR_OFFSETS, *knowledge.with_free(basic))
     experiments = [played.experiment]
     model = Derivatives(
-        SimdModel(lay_out(experiments), unknowns_of(experiments, free)), played.experiment.noise
+        SimdModel(lay_out_spans(experiments), unknowns_of(experiments, free)),
+        played.experiment.noise,
     )
     severities = {item.name: value for item, value in zip(FAULTS, point, strict=True)}
-    values = {**usual_effects(), **severities}
+    values = {**typical_effects(), **severities}
     x = np.array([values.get(item.name, 0.0) for item in free]) / model.scale
     slope = model.trusted_slope(x)
     rows = slope.jacobian[:, slope.smooth]
-    prior = information_of(model, knowledge.known, knowledge.joint)
+    prior = prior_information(model, knowledge.priors, knowledge.joint)
     count = len(FAULTS)
     prior[:count, :] = prior[:, :count] = 0.0
     shown = rows @ rows.T
     covariance = np.linalg.pinv(shown + prior, hermitian=True)
-    known = count + len(OFFSETS)
+    known = count + len(SENSOR_OFFSETS)
     alone = np.linalg.pinv(shown[:known, :known], hermitian=True)
     spread = np.sqrt(np.diag(covariance))
     names = [item.name for item in model.estimated]
@@ -158,16 +209,16 @@ def bound_of(played: Played, actuator: Actuator, point: tuple[float, ...]) -> Bo
         severities=point,
         std=(spread * model.scale)[:count],
         alone=(np.sqrt(np.diag(alone)) * model.scale[:known])[:count],
-        alike=_alike(names, covariance / np.outer(spread, spread)),
+        alike=_confusable_pairs(names, covariance / np.outer(spread, spread)),
         unseen=tuple(
             name
             for k, name in enumerate(names[known:], start=known)
-            if spread[k] > HELD * before[k]
+            if spread[k] > MAX_STD_RATIO_SHOWN * before[k]
         ),
     )
 
 
-def _alike(
+def _confusable_pairs(
     names: Sequence[str], correlation: NDArray[np.float64]
 ) -> tuple[tuple[str, str, float], ...]:
     """Pairs of a severity and something else that go together, the closest first."""
@@ -175,6 +226,6 @@ def _alike(
         (names[i], names[j], float(correlation[i, j]))
         for i in range(len(FAULTS))
         for j in range(i + 1, len(names))
-        if abs(correlation[i, j]) >= ALIKE
+        if abs(correlation[i, j]) >= MIN_CORRELATION_CONFUSABLE
     ]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))

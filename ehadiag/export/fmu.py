@@ -1,4 +1,4 @@
-"""Co-simulation units (FMI 2.0 and 3.0) of the detailed simulator and of the streaming monitor."""
+"""Exports co-simulation units (FMI 2.0 and 3.0) of the simulator and of the monitor."""
 
 from __future__ import annotations
 
@@ -6,96 +6,180 @@ import hashlib
 import io
 import platform
 import sys
+import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from typing import Any, Final
 
-from ehadiag.compile.object_code import Function, Pointer, Processor, Table, object_code
+from ehadiag.compile.elementary import C_FUNCTIONS, ROUNDING_FUNCTIONS
+from ehadiag.compile.worker import (
+    CFunction,
+    DoublesArgument,
+    ObjectFile,
+    PointerArgument,
+    TableArgument,
+    object_code,
+)
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.false_alarms import HOURS_BETWEEN
-from ehadiag.core.folder import Folder
-from ehadiag.export.description import Variable, description
-from ehadiag.export.library import MANIFEST, MONITOR, OWN_FUNCTIONS, manifest, template, write
-from ehadiag.export.linking import c_compiler, link_shared
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.export.library import (
+    MANIFEST_FILE,
+    fill_template,
+    make_manifest,
+    write_files,
+)
+from ehadiag.export.targets import HOST, c_compiler, link_shared
 from ehadiag.model.plant import plant_constants
-from ehadiag.monitor.cusum import design_cusum
-from ehadiag.monitor.layout import PREDICTED, SIZE
-from ehadiag.monitor.plan import monitor_plan
-from ehadiag.monitor.prepare import Unit
-from ehadiag_sim.plant.coefficients import Condition
-from ehadiag_sim.plant.flat import (
-    MEMORY,
-    Inputs,
-    Outputs,
-    Settings,
+from ehadiag.model.severities import FAULT_LAWS
+from ehadiag.monitor.monitor_memory import MONITOR, MONITOR_UNIT_FIELDS, prepare_monitor
+from ehadiag.monitor.plan import design_cusum, monitor_plan
+from ehadiag.monitor.push_kernel import push_tick
+from ehadiag_sim.fmu_plant import (
+    PLANT_MEMORY,
+    FmuInputs,
+    FmuOutputs,
+    FmuSettings,
     plant_plan,
     start_plant,
     tick_plant,
 )
+from ehadiag_sim.plant_laws import UnitCondition
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.files import Folder
 
-__all__ = ["VERSIONS", "actuator_variables", "export_fmus", "monitor_variables"]
 
-VERSIONS: Final = ("2.0", "3.0")
-C_LIBRARY: Final = frozenset({"log10", "pow", "exp10"})
+@dataclass(frozen=True, slots=True)
+class FmuVariable:
+    """A number that a unit shows to its master."""
+
+    name: str
+    """Its name."""
+    causality: str
+    """"parameter", "input" or "output"."""
+    start: float
+    """Before anything is set."""
+    meaning: str
+    """With the unit of measure, for people."""
+
+
+def model_description(
+    version: str,
+    model: str,
+    token: str,
+    tick: float,
+    meaning: str,
+    variables: Sequence[FmuVariable],
+) -> bytes:
+    """Describe a unit whose variables have their places as value references.
+
+    version: "2.0" or "3.0"; model: identifier, the name of the shared library; token: that a master
+    must show to make an instance; tick: s, the internal step; meaning: one line for people;
+    variables: parameters, then inputs, then outputs. Returns XML.
+    """
+    three = version == "3.0"
+    root = ET.Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": version,
+            "modelName": model,
+            "instantiationToken" if three else "guid": token,
+            "description": meaning,
+            "generationTool": f"ehadiag {metadata.version('ehadiag')}",
+            "variableNamingConvention": "flat",
+        },
+    )
+    co = {"modelIdentifier": model, "canHandleVariableCommunicationStepSize": "true"}
+    if three:
+        co["fixedInternalStepSize"] = repr(tick)
+    ET.SubElement(root, "CoSimulation", co)
+    ET.SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(tick)})
+    listed = ET.SubElement(root, "ModelVariables")
+    if three:
+        ET.SubElement(
+            listed,
+            "Float64",
+            {
+                "name": "time",
+                "valueReference": str(len(variables)),
+                "causality": "independent",
+                "variability": "continuous",
+            },
+        )
+    for place, item in enumerate(variables):
+        attributes = {
+            "name": item.name,
+            "valueReference": str(place),
+            "causality": item.causality,
+            "variability": "fixed" if item.causality == "parameter" else "discrete",
+            "description": item.meaning,
+        }
+        start = {"start": repr(float(item.start))}
+        if item.causality == "output":
+            attributes["initial"] = "exact"
+        if three:
+            ET.SubElement(listed, "Float64", {**attributes, **start})
+        else:
+            ET.SubElement(ET.SubElement(listed, "ScalarVariable", attributes), "Real", start)
+    structure = ET.SubElement(root, "ModelStructure")
+    outputs = [n for n, item in enumerate(variables) if item.causality == "output"]
+    if three:
+        for place in outputs:
+            ET.SubElement(structure, "Output", {"valueReference": str(place)})
+    else:
+        group = ET.SubElement(structure, "Outputs")
+        for place in outputs:
+            ET.SubElement(group, "Unknown", {"index": str(place + 1)})
+    ET.indent(root)
+    return ET.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+FMI_VERSIONS: Final = ("2.0", "3.0")
+C_LIBRARY_FUNCTIONS: Final = frozenset({"log10", "pow", "exp10"})
 """What the simulator's oil may call: the same library that Python's arithmetic calls here."""
-PLACES: Final = {
+FMU_BINARY_FOLDERS: Final = {
     ("linux", "x86_64"): ("linux64", "x86_64-linux"),
     ("linux", "aarch64"): ("aarch64-linux", "aarch64-linux"),
 }
 """Folder of the binary in FMI 2.0 and 3.0."""
-DATED: Final = (1980, 1, 1, 0, 0, 0)
-"""Of all files in a unit, so that the same kernels give the same unit."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Model:
-    """What is packed into a unit.
-
-    Attributes
-    ----------
-    name : str
-        Of the unit, without the version.
-    meaning : str
-        For people.
-    variables : tuple[Variable, ...]
-        Parameters, inputs, outputs.
-    functions : tuple[Function, ...]
-        Of the object code.
-    tables : Mapping[str, Sequence[float]]
-        Its constants.
-    memory : int
-        Numbers that an instance keeps.
-    hooks : str
-        `eha_start` and `eha_tick_once`, in C.
-    allowed : frozenset[str]
-        What of the C library its code may call.
-    """
+class _FmuModel:
+    """What is packed into a unit."""
 
     name: str
+    """Of the unit, without the version."""
     meaning: str
-    variables: tuple[Variable, ...]
-    functions: tuple[Function, ...]
+    """For people."""
+    variables: tuple[FmuVariable, ...]
+    """Parameters, inputs, outputs."""
+    functions: tuple[CFunction, ...]
+    """Of the object code."""
     tables: Mapping[str, Sequence[float]]
+    """Its constants."""
     memory: int
+    """Numbers that an instance keeps."""
     hooks: str
+    """`eha_start` and `eha_tick_once`, in C."""
     allowed: frozenset[str] = field(default_factory=frozenset)
+    """What of the C library its code may call."""
 
 
-def actuator_variables() -> tuple[Variable, ...]:
+def actuator_variables() -> tuple[FmuVariable, ...]:
     """Variables of the simulator's unit; a name in `E_…` is an error of the actuator's data."""
     start = {"plays": 1.0, "oil_temperature": 40.0}
     start |= {"supply_pressure": 20.7e6, "return_pressure": 0.7e6}
     return (
-        *_variables("parameter", (*Condition._fields, *Settings._fields), start),
-        *_variables("input", Inputs._fields, {}),
-        *_variables("output", Outputs._fields, {}),
+        *_variables("parameter", (*UnitCondition._fields, *FmuSettings._fields), start),
+        *_variables("input", FmuInputs._fields, {}),
+        *_variables("output", FmuOutputs._fields, {}),
     )
 
 
-def monitor_variables(supply: float) -> tuple[Variable, ...]:
-    """Variables of the monitor's unit; supply: minus return pressure, Pa."""
+def monitor_variables(supply: float) -> tuple[FmuVariable, ...]:
+    """Variables of the monitor's unit; supply: supply minus return pressure, Pa."""
     inputs = ("command", "current", "spool", "pressure", "position")
     outputs = (
         "predicted_spool", "predicted_pressure", "predicted_position",
@@ -104,7 +188,7 @@ def monitor_variables(supply: float) -> tuple[Variable, ...]:
     )  # fmt: skip
     start = {"viscosity": 1.0, "supply": supply}
     return (
-        *_variables("parameter", Unit._fields, start),
+        *_variables("parameter", MONITOR_UNIT_FIELDS, start),
         *_variables("input", inputs, {}),
         *_variables("output", outputs, {}),
     )
@@ -112,17 +196,20 @@ def monitor_variables(supply: float) -> tuple[Variable, ...]:
 
 def _variables(
     causality: str, names: Sequence[str], start: Mapping[str, float]
-) -> tuple[Variable, ...]:
+) -> tuple[FmuVariable, ...]:
     return tuple(
-        Variable(name, causality, start.get(name, 0.0), MEANINGS.get(name, name.replace("_", " ")))
+        FmuVariable(
+            name,
+            causality,
+            start.get(name, 0.0),
+            VARIABLE_MEANINGS.get(name, name.replace("_", " ")),
+        )
         for name in names
     )
 
 
-MEANINGS: Final = {
-    "Kintas": "severity of the filter's clogging, 0 … 1",
-    "FSS": "severity of the spool's friction, 0 … 1",
-    "FDJ": "severity of the jack's friction, 0 … 1",
+VARIABLE_MEANINGS: Final = {
+    **{name: f"severity, 0 … 1: {law.meaning}" for name, law in FAULT_LAWS.items()},
     "backlash": "half-width of the backlash at the feedback spring, m",
     "oil_temperature": "degC",
     "supply_pressure": "Pa",
@@ -152,101 +239,93 @@ MEANINGS: Final = {
 }
 
 
-def export_fmus(actuator: Actuator, folder: Folder, *, hours: float = HOURS_BETWEEN) -> list[str]:
+def export_fmus(
+    actuator: Actuator, folder: Folder, *, hours: float = FALSE_ALARM_INTERVAL_H
+) -> list[str]:
     """Write units of simulator and monitor, each for both versions of FMI, for this computer.
 
-    Parameters
-    ----------
-    actuator : Actuator
-        Whose data are in them as constants.
-    folder : Folder
-        Where to write; files of these names are replaced.
-    hours : float
-        Mean time between false alarms of the monitor, h.
-
-    Returns
-    -------
-    list[str]
-        Names of the files.
-
-    Raises
-    ------
-    ConfigurationError
-        No C compiler, or a computer for which FMI has no name here.
-    InputOutputError
-        The folder cannot be written, or the compiler fails.
+    actuator: whose data are in them as constants; folder: where to write; files of these names are
+    replaced; hours: mean time between false alarms of the monitor, h. Returns names of the files.
+    ConfigurationError: no C compiler, or a computer for which FMI has no name here;
+    InputOutputError: the folder cannot be written, or the compiler fails.
     """
     compiler = c_compiler()
     if compiler is None:
         raise ConfigurationError("no C compiler (cc, or what CC names): a unit cannot be linked")
-    places = PLACES.get((sys.platform, platform.machine()))
+    places = FMU_BINARY_FOLDERS.get((sys.platform, platform.machine()))
     if places is None:
         raise ConfigurationError(f"no units for {sys.platform} on {platform.machine()}")
     tick = 1.0 / actuator.controller.rate
     files: dict[str, bytes] = {}
     for model in (_simulator(actuator), _monitor(actuator, hours)):
         code = object_code(
-            model.functions,
-            model.tables,
-            OWN_FUNCTIONS,
-            Processor("", "host", shared=True),
-            allowed=model.allowed,
+            ObjectFile(
+                model.functions,
+                HOST,
+                model.tables,
+                C_FUNCTIONS | ROUNDING_FUNCTIONS,
+                allowed=model.allowed,
+            )
         )
-        for version, place in zip(VERSIONS, places, strict=True):
+        for version, place in zip(FMI_VERSIONS, places, strict=True):
             name = f"{model.name}_fmi{version[0]}"
             token = hashlib.sha256(code + name.encode()).hexdigest()
             binary = link_shared(
                 compiler,
                 f"{name}.so",
                 {
-                    "fmu.c": template("fmu.c"),
-                    "model.h": _header(model, name, token, tick),
+                    "fmu.c": fill_template("fmu.c"),
+                    "model.h": _fmu_header(model, name, token, tick),
                     "eha.o": code,
                 },
             )
-            text = description(version, name, token, tick, model.meaning, model.variables)
+            text = model_description(version, name, token, tick, model.meaning, model.variables)
             files[f"{name}.fmu"] = _packed(
                 {"modelDescription.xml": text, f"binaries/{place}/{name}.so": binary}
             )
-    files[MANIFEST] = manifest(
+    files[MANIFEST_FILE] = make_manifest(
         files, target="host", options={"actuator": actuator.name, "hours": hours}
     )
-    write(folder, files)
+    write_files(folder, files)
     return list(files)
 
 
-def _simulator(actuator: Actuator) -> _Model:
-    of_both = (Pointer(), Table("eha_plant"), Pointer())
-    return _Model(
+def _simulator(actuator: Actuator) -> _FmuModel:
+    of_both = (PointerArgument(), TableArgument("eha_plant"), PointerArgument())
+    return _FmuModel(
         "eha_actuator",
         "Electrohydraulic actuator with faults and effects: command in, sensor signals out",
         actuator_variables(),
         (
-            Function("eha_plant_start", start_plant, of_both),
-            Function("eha_plant_tick", tick_plant, of_both),
+            CFunction("eha_plant_start", start_plant, of_both),
+            CFunction("eha_plant_tick", tick_plant, of_both),
         ),
         {"eha_plant": plant_plan(actuator)},
-        MEMORY,
-        template("fmu_actuator.h").decode(),
-        C_LIBRARY,
+        PLANT_MEMORY.end,
+        fill_template("fmu_actuator.h").decode(),
+        C_LIBRARY_FUNCTIONS,
     )
 
 
-def _monitor(actuator: Actuator, hours: float) -> _Model:
+def _monitor(actuator: Actuator, hours: float) -> _FmuModel:
     constants = plant_constants(actuator)
+    of_both = (PointerArgument(), TableArgument("eha_plan"), PointerArgument())
     plan = monitor_plan(actuator, constants, design_cusum(hours, 1.0 / actuator.controller.rate))
-    return _Model(
+    return _FmuModel(
         "eha_monitor",
         "Streaming monitor of an electrohydraulic actuator: residuals and their cumulative sums",
         monitor_variables(float(constants.PSR)),
-        MONITOR,
+        (
+            CFunction("eha_monitor_init", prepare_monitor, of_both),
+            CFunction("eha_monitor_push", push_tick, (PointerArgument(), DoublesArgument(5))),
+        ),
         {"eha_plan": plan.tolist()},
-        SIZE,
-        template("fmu_monitor.h.in", predicted=str(PREDICTED)).decode(),
+        MONITOR.end,
+        fill_template("fmu_monitor.h.in", predicted=str(MONITOR.predicted)).decode(),
     )
 
 
-def _header(model: _Model, name: str, token: str, tick: float) -> bytes:
+def _fmu_header(model: _FmuModel, name: str, token: str, tick: float) -> bytes:
     counts: dict[str, int] = {}
     for item in model.variables:
         counts[item.causality] = counts.get(item.causality, 0) + 1
@@ -269,7 +348,8 @@ def _packed(files: Mapping[str, bytes]) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
-            entry = zipfile.ZipInfo(name, DATED)
+            # One date for all files (ZIP's first), so that the same kernels give the same unit.
+            entry = zipfile.ZipInfo(name)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = (0o755 if name.endswith(".so") else 0o644) << 16
             archive.writestr(entry, data)

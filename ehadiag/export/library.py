@@ -1,111 +1,116 @@
-"""A static library with its header, example, CMake file and manifest, for one target."""
+"""Exports a static library with header, C sources of the bus, example and manifest."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata, resources
 from string import Template
 from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from ehadiag.assess.acceptance import (
-    LEAST_SUPPLY,
-    LONGEST_GAP_S,
-    MOST_LOST,
-    MOST_SATURATED,
-    most_left,
+from ehadiag.compile.elementary import (
+    C_FUNCTIONS,
+    ROUNDING_FUNCTIONS,
+    square_root,
 )
-from ehadiag.assess.verdict import FALSE_HEALTHY, FAULT_CHANCE, Levels
-from ehadiag.compile.kernel_cache import source_hash
-from ehadiag.compile.object_code import (
-    Function,
-    Numbers,
-    Pointer,
+from ehadiag.compile.sources import source_hash
+from ehadiag.compile.vector import BYTES_PER_NUMBER
+from ehadiag.compile.worker import (
+    CFunction,
+    ObjectFile,
+    PointerArgument,
     Processor,
-    Table,
+    TableArgument,
     object_code,
     tool_versions,
 )
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.errors import InputOutputError, reason_of
-from ehadiag.core.false_alarms import HOURS_BETWEEN
-from ehadiag.core.folder import Folder
-from ehadiag.core.printable import plain_name
-from ehadiag.export.archive import archive
-from ehadiag.export.arm_attributes import either_convention
-from ehadiag.export.firmware import SOURCES, firmware
-from ehadiag.export.linking import c_compiler, link_shared
-from ehadiag.export.targets import Target
-from ehadiag.identify.estimates import NOT_SHOWN_STD
-from ehadiag.model.exponential import exponential, exponential_less_one
-from ehadiag.model.unit import unit_constants
-from ehadiag.monitor import layout
-from ehadiag.monitor.cusum import CusumDesign, design_cusum
-from ehadiag.monitor.kernel import push_tick
-from ehadiag.monitor.plan import monitor_plan
-from ehadiag.monitor.prepare import prepare, rest
-from ehadiag.onboard import layout as identification
-from ehadiag.onboard.elementary import (
-    cosine,
-    logarithm,
-    round_down,
-    round_even,
-    square_root,
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.export.plan import library_plan
+from ehadiag.export.targets import (
+    Target,
+    c_compiler,
+    link_shared,
+    mark_either_convention,
+    static_library,
 )
-from ehadiag.onboard.environment import set_environment
-from ehadiag.onboard.kernels import begin_identification, identify_some
-from ehadiag.onboard.rules import Rules, with_rules
+from ehadiag.model.registry import unit_constants
+from ehadiag.model.severities import FAULT_LAWS
+from ehadiag.monitor import monitor_memory
+from ehadiag.monitor.plan import CusumDesign, design_cusum
+from ehadiag.onboard import onboard_memory as identification
+from ehadiag.onboard.c_interface import (
+    c_identify_begin,
+    c_identify_run,
+    c_monitor_health,
+    c_monitor_init,
+    c_monitor_push,
+    c_monitor_reset,
+    c_unit_environment,
+)
+from ehadiag.onboard.onboard_memory import PLAN_IDENTITY, PLAN_TEST_SIZE, PLAN_TESTS
+from firmware_iface.errors import InputOutputError, plain_name, reason_of
+from firmware_iface.files import Folder
+from firmware_iface.stored_test import StoredTest
 
-__all__ = [
-    "HEADER",
-    "LIBRARY",
-    "MANIFEST",
-    "OWN_FUNCTIONS",
-    "SHARED",
-    "export_library",
-    "manifest",
-    "rules",
-    "template",
-    "write",
-]
+FIRMWARE_MODULES: Final = (
+    "check",
+    "frames",
+    "link",
+    "samples",
+    "stored_tests",
+    "node",
+    "diagnosis",
+)
+GENERATED_FIRMWARE_MODULE: Final = "eha_fcc"
+FIRMWARE_C_FILES: Final = tuple(
+    f"{name}.c" for name in (*FIRMWARE_MODULES, GENERATED_FIRMWARE_MODULE)
+)
 
-LIBRARY: Final = "libeha.a"
-HEADER: Final = "eha_monitor.h"
-SHARED: Final = "libeha.so"
-MANIFEST: Final = "manifest.json"
-SCHEMA: Final = "ehadiag.export/1"
-OWN_FUNCTIONS: Final[Mapping[str, Any]] = {
-    "exp": exponential,
-    "expm1": exponential_less_one,
-    "log": logarithm,
-    "cos": cosine,
-}
-"""What stands for functions of the C library, whose last digit differs from one to the next."""
-ROUNDING: Final[Mapping[str, Any]] = {"rint": round_even, "floor": round_down}
-"""The same for a processor without such instructions; exact, so that no digit depends on it."""
-ROOT: Final[Mapping[str, Any]] = {"sqrt": square_root}
-PLAN: Final = "eha_plan"
-NOT_MEASURED: Final = dict.fromkeys(
+
+def firmware_sources() -> dict[str, bytes]:
+    """Read C sources and headers by name, with includes as for one folder without others in it."""
+    place = resources.files("firmware_iface").joinpath("c")
+    files = {}
+    for suffix in (".c", ".h"):
+        for name in FIRMWARE_MODULES:
+            text = place.joinpath(name + suffix).read_text("utf-8")
+            files[name + suffix] = text.replace('"generated/', '"').encode()
+        files[GENERATED_FIRMWARE_MODULE + suffix] = place.joinpath(
+            "generated", GENERATED_FIRMWARE_MODULE + suffix
+        ).read_bytes()
+    return files
+
+
+STATIC_LIBRARY_FILE: Final = "libeha.a"
+HEADER_FILE: Final = "eha_monitor.h"
+SHARED_LIBRARY_FILE: Final = "libeha.so"
+MANIFEST_FILE: Final = "manifest.json"
+EXPORT_SCHEMA: Final = "ehadiag.export/1"
+ROOT_FUNCTIONS: Final[Mapping[str, Any]] = {"sqrt": square_root}
+PLAN_TABLE: Final = "eha_plan"
+UNMEASURED_FIGURES: Final = dict.fromkeys(
     ("bit_equality", "instructions_of_push", "instructions_of_identification"), "not measured"
 )
-NEEDED: Final = "in the sources of ehadiag, with the target's compiler and QEMU"
+MEASUREMENT_NEEDS: Final = "in the sources of ehadiag, with the target's compiler and QEMU"
 
-MONITOR: Final = (
-    Function("eha_monitor_init", prepare, (Pointer(), Table(PLAN), Pointer())),
-    Function("eha_monitor_reset", rest, (Pointer(), Numbers(1))),
-    Function("eha_monitor_push", push_tick, (Pointer(), Numbers(5))),
+PLAN = TableArgument(PLAN_TABLE)
+EXPORTED_FUNCTIONS: Final = (
+    CFunction("eha_unit_environment", c_unit_environment, (PointerArgument(), PointerArgument())),
+    CFunction("eha_monitor_init", c_monitor_init, (PointerArgument(), PLAN, PointerArgument())),
+    CFunction("eha_monitor_reset", c_monitor_reset, (PointerArgument(), PLAN, PointerArgument())),
+    CFunction("eha_monitor_push", c_monitor_push, (PointerArgument(), PLAN, PointerArgument())),
+    CFunction("eha_monitor_health", c_monitor_health, (PointerArgument(), PLAN)),
+    CFunction("eha_identify_begin", c_identify_begin, (PointerArgument(), PLAN, PointerArgument())),
+    CFunction(
+        "eha_identify_run",
+        c_identify_run,
+        (PointerArgument(), PLAN, PointerArgument(), PointerArgument()),
+    ),
 )
-SURROUNDINGS: Final = (Function("eha_unit_environment", set_environment, (Pointer(), Numbers(3))),)
-
-IDENTIFICATION: Final = (
-    Function("eha_identify_begin", begin_identification, (Pointer(), Table(PLAN), Pointer())),
-    Function("eha_identify_run", identify_some, (Pointer(), Table(PLAN), Pointer(), Numbers(2))),
-)
-FUNCTIONS: Final = (*MONITOR, *SURROUNDINGS, *IDENTIFICATION)
 
 
 def export_library(
@@ -113,157 +118,123 @@ def export_library(
     target: Target,
     folder: Folder,
     *,
-    hours: float = HOURS_BETWEEN,
+    hours: float = FALSE_ALARM_INTERVAL_H,
     shift: float = 1.0,
+    tests: Sequence[StoredTest] | None = None,
 ) -> list[str]:
     """Write a library of monitor and identification for a target into a folder.
 
-    Parameters
-    ----------
-    actuator : Actuator
-        Whose data are in the library as constants.
-    target : Target
-        For what computer.
-    folder : Folder
-        Where to write; files of these names are replaced.
-    hours : float
-        Mean time between false alarms, h.
-    shift : float
-        Of the mean, in units of noise, that the sums are to find soonest.
-
-    Returns
-    -------
-    list[str]
-        Names of the files.
-
-    Raises
-    ------
-    ConfigurationError
-        A number out of its range.
-    InputOutputError
-        The folder cannot be written.
+    actuator: whose data are in the library as constants; target: for what computer; folder: where
+    to write; files of these names are replaced; hours: mean time between false alarms, h; shift: of
+    the mean, in units of noise, that the sums are to find soonest; tests: of which recordings are
+    identified, one for each kind of commands, None: the bundled ones. Returns names of the files.
+    ConfigurationError: a number out of its range; InputOutputError: the folder cannot be written.
     """
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
-    plan = with_rules(monitor_plan(actuator, unit_constants(actuator), design), rules(actuator))
-    code = either_convention(
+    plan = library_plan(actuator, design, tests, single=target.processor.single)
+    code = mark_either_convention(
         object_code(
-            FUNCTIONS,
-            {PLAN: plan.tolist()},
-            _own_functions(target.processor),
-            target.processor,
-            # They add so much to a number that nothing is left of its fraction but a rounding.
-            exact=frozenset(ROUNDING.values()),
+            ObjectFile(
+                EXPORTED_FUNCTIONS,
+                target.processor,
+                {PLAN_TABLE: plan.tolist()},
+                _own_functions(target.processor),
+                # They add so much to a number that nothing is left of its fraction but a rounding.
+                exact=frozenset(ROUNDING_FUNCTIONS.values()),
+            )
         )
     )
-    library = archive("eha.o", code, [item.name for item in FUNCTIONS])
+    library = static_library("eha.o", code, [item.name for item in EXPORTED_FUNCTIONS])
     names = {"version": metadata.version("ehadiag"), "target": target.name}
     files = {
-        LIBRARY: library,
-        HEADER: _header(actuator, target, design, hours, names),
-        "eha_identify.h": template(
+        STATIC_LIBRARY_FILE: library,
+        HEADER_FILE: _library_header(actuator, target, design, hours, plan, names),
+        "eha_identify.h": fill_template(
             "eha_identify.h.in",
-            bytes=str(identification.SIZE * layout.NUMBER),
-            own=str(identification.SIZE - len(identification.Outcome._fields)),
-            lanes=str(identification.MONITORS),
+            bytes=str(identification.ONBOARD.end * BYTES_PER_NUMBER),
+            own=str(identification.ONBOARD.end - len(identification.OnboardOutcome._fields)),
+            lanes=str(identification.ONBOARD_MODELS),
+            open_ticks=f"{plan[PLAN_TESTS]:.0f}",
+            closed_ticks=f"{plan[PLAN_TESTS + PLAN_TEST_SIZE]:.0f}",
             **names,
         ),
-        "CMakeLists.txt": template(
-            "CMakeLists.txt.in", flags=";".join(target.flags), firmware=" ".join(SOURCES), **names
+        "CMakeLists.txt": fill_template(
+            "CMakeLists.txt.in",
+            flags=";".join(target.flags),
+            firmware=" ".join(FIRMWARE_C_FILES),
+            **names,
         ),
-        "example.c": template("example.c"),
-        **firmware(),
+        "example.c": fill_template("example.c"),
+        **firmware_sources(),
     }
     compiler = c_compiler() if target.processor.shared else None
     if compiler is not None:
         # Objects alone: what is exported has no C part.
-        files[SHARED] = link_shared(compiler, SHARED, {"eha.o": code}, ["-nostartfiles"])
-        files["eha.pc"] = template("eha.pc.in", **names)
-    files[MANIFEST] = manifest(
+        files[SHARED_LIBRARY_FILE] = link_shared(
+            compiler, SHARED_LIBRARY_FILE, {"eha.o": code}, ["-nostartfiles"]
+        )
+        files["eha.pc"] = fill_template("eha.pc.in", **names)
+    files[MANIFEST_FILE] = make_manifest(
         files,
         target=target.name,
         processor={
             "triple": target.processor.triple or "of this computer",
             "cpu": target.processor.cpu,
             "features": target.processor.features,
-            "doubles": target.processor.doubles,
+            "roots": target.processor.roots,
             "single": target.processor.single,
         },
         compiler_flags=list(target.flags),
         options={"actuator": actuator.name, "hours": hours, "shift": shift},
         plan=_digest(plan),
-        functions=[item.name for item in FUNCTIONS],
-        monitor_bytes=layout.SIZE * layout.NUMBER,
-        identification_bytes=identification.SIZE * layout.NUMBER,
+        functions=[item.name for item in EXPORTED_FUNCTIONS],
+        monitor_bytes=monitor_memory.MONITOR.end * BYTES_PER_NUMBER,
+        identification_bytes=identification.ONBOARD.end * BYTES_PER_NUMBER,
         object_bytes=len(code),
-        measured=NOT_MEASURED | {"command": f"tools/onboard --into FOLDER LOG, {NEEDED}"},
+        measured=UNMEASURED_FIGURES
+        | {"command": f"tools/study onboard --into FOLDER LOG, {MEASUREMENT_NEEDS}"},
     )
-    write(folder, files)
+    write_files(folder, files)
     return list(files)
-
-
-def rules(actuator: Actuator) -> Rules:
-    """What a verdict on board goes by: the rules of `ehadiag diagnose` at its default levels.
-
-    Parameters
-    ----------
-    actuator : Actuator
-        What a calibration of the unit could not explain is no reason against a verdict.
-
-    Returns
-    -------
-    Rules
-        The limits.
-    """
-    levels, (outliers, rms) = Levels(), most_left(actuator.calibration)
-    _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
-    return Rules(
-        advisory=levels.advisory,
-        limit=levels.limit,
-        false_healthy=FALSE_HEALTHY,
-        fault_chance=FAULT_CHANCE,
-        most_outliers=outliers,
-        most_rms=rms,
-        most_std=NOT_SHOWN_STD,
-        most_lost=MOST_LOST,
-        longest_gap=LONGEST_GAP_S * actuator.controller.rate,
-        most_saturated=MOST_SATURATED,
-        least_supply=LEAST_SUPPLY * actuator.servovalve.PSR,
-        spool_low=spool[0],
-        spool_high=spool[1],
-        pressure_low=pressure[0],
-        pressure_high=pressure[1],
-        position_low=position[0],
-        position_high=position[1],
-    )
 
 
 def _own_functions(processor: Processor) -> Mapping[str, Any]:
     """What stands for functions of the C library on a processor."""
-    rounding = {} if processor.rounds else ROUNDING
-    return {**OWN_FUNCTIONS, **rounding, **({} if processor.doubles else ROOT)}
+    rounding = {} if processor.rounds else ROUNDING_FUNCTIONS
+    return {**C_FUNCTIONS, **rounding, **({} if processor.roots else ROOT_FUNCTIONS)}
 
 
-def _header(
+def _library_header(
     actuator: Actuator,
     target: Target,
     design: CusumDesign,
     hours: float,
+    plan: NDArray[Any],
     names: Mapping[str, str],
 ) -> bytes:
     held = 3 + 2 + 4
-    return template(
-        f"{HEADER}.in",
+    version, digest, serial = plan[PLAN_IDENTITY : PLAN_IDENTITY + 3].tolist()
+    return fill_template(
+        f"{HEADER_FILE}.in",
         meaning=target.meaning,
         # A comment must not be ended by a name.
         actuator=plain_name(actuator.name),
+        severities="\n".join(
+            f"    double {f'{name.lower()};':16} /* severity, 0 ... 1: {law.meaning} */"
+            for name, law in FAULT_LAWS.items()
+        ),
+        zeros=", ".join("0.0" for _ in FAULT_LAWS),
         tick_us=f"{1e6 / actuator.controller.rate:g}",
         reference=f"{design.reference:g}",
         threshold=f"{design.threshold:.4g}",
         hours=f"{hours:g}",
         supply=repr(float(unit_constants(actuator).PSR)),
-        bytes=str(layout.SIZE * layout.NUMBER),
-        before=str(layout.PREDICTED),
-        behind=str(layout.SIZE - layout.PREDICTED - held),
+        library=f"{version:.1f}",
+        plan=f"{digest:.1f}",
+        serial=f"{serial:.1f}",
+        bytes=str(monitor_memory.MONITOR.end * BYTES_PER_NUMBER),
+        before=str(monitor_memory.MONITOR.predicted),
+        behind=str(monitor_memory.MONITOR.end - monitor_memory.MONITOR.predicted - held),
         **names,
     )
 
@@ -272,46 +243,20 @@ def _digest(plan: NDArray[Any]) -> str:
     return hashlib.sha256(plan.astype("<f8").tobytes()).hexdigest()
 
 
-def template(name: str, **values: str) -> bytes:
-    """Fill in a text of the package.
-
-    Parameters
-    ----------
-    name : str
-        Of its file; the names of those with places to fill end in `.in`.
-    **values : str
-        What to fill in.
-
-    Returns
-    -------
-    bytes
-        The text.
-    """
+def fill_template(name: str, **values: str) -> bytes:
+    """Fill in a text of the package; files with places to fill have names that end in `.in`."""
     text = resources.files("ehadiag").joinpath("data", "export", name).read_text("utf-8")
     if name.endswith(".in"):
         text = Template(text).substitute(values)
     return text.encode()
 
 
-def manifest(files: Mapping[str, bytes], **facts: Any) -> bytes:
-    """Say in JSON of what an export was made, and what it holds.
-
-    Parameters
-    ----------
-    files : Mapping[str, bytes]
-        By name.
-    **facts : Any
-        Further members.
-
-    Returns
-    -------
-    bytes
-        The text.
-    """
+def make_manifest(files: Mapping[str, bytes], **facts: Any) -> bytes:
+    """Describe in JSON files by name, the versions that made them, and further facts."""
     content = {
-        "schema": SCHEMA,
+        "schema": EXPORT_SCHEMA,
         "versions": {"ehadiag": metadata.version("ehadiag"), **tool_versions()},
-        "kernel_sources": source_hash(),
+        "kernel_sources": source_hash("ehadiag.onboard.c_interface"),
         **facts,
         "files": {
             name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
@@ -321,21 +266,8 @@ def manifest(files: Mapping[str, bytes], **facts: Any) -> bytes:
     return (json.dumps(content, indent=2) + "\n").encode()
 
 
-def write(folder: Folder, files: Mapping[str, bytes]) -> None:
-    """Write files into a folder.
-
-    Parameters
-    ----------
-    folder : Folder
-        The folder, open.
-    files : Mapping[str, bytes]
-        By name.
-
-    Raises
-    ------
-    InputOutputError
-        It cannot be written.
-    """
+def write_files(folder: Folder, files: Mapping[str, bytes]) -> None:
+    """Write files by name into an open folder; a failure is an InputOutputError."""
     for name, data in files.items():
         try:
             folder.write(name, data)

@@ -1,16 +1,69 @@
-"""What a health history holds: diagnoses, maintenance events, and what was withdrawn of them."""
+"""Records of the health history: diagnoses and maintenance events.
+
+A record is made from a diagnosis with hashes of its recordings. Of several diagnoses of one
+recording only the last one counts.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from dataclasses import dataclass
+import os
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ehadiag.core.errors import ConfigurationError
+import numpy as np
 
-__all__ = ["DIAGNOSIS", "EVENT", "Effect", "Entry", "Event", "Severity", "Source", "Usage"]
+from ehadiag.core.conventions import utc_text
+from ehadiag.estimate import Effect, Severity
+from firmware_iface.errors import ConfigurationError, valid_text
 
-DIAGNOSIS, EVENT = "diagnosis", "event"
+if TYPE_CHECKING:
+    from ehadiag.result import Result
+    from firmware_iface.recording import Recording
+
+__all__ = [
+    "DIAGNOSIS_TABLE",
+    "EVENT_TABLE",
+    "Entry",
+    "MaintenanceEvent",
+    "SourceRecord",
+    "Usage",
+    "counted_entries",
+    "current_utc_text",
+    "entry_object",
+    "event_object",
+    "hash_of_file",
+    "hash_of_samples",
+    "history_entry",
+    "user_history_path",
+]
+
+
+DIAGNOSIS_TABLE, EVENT_TABLE = "diagnosis", "event"
 """Kinds of what can be withdrawn, and their tables."""
+
+
+HISTORY_FILE_NAME = "history.sqlite"
+
+
+def user_history_path() -> Path | None:
+    """File of the user's own history, whether or not it exists; None where no home is known.
+
+    In `$XDG_DATA_HOME/ehadiag`, else `~/.local/share/ehadiag`; on Windows in `%LOCALAPPDATA%`.
+    """
+    if (xdg := os.environ.get("XDG_DATA_HOME")) and os.path.isabs(xdg):
+        return Path(xdg, "ehadiag", HISTORY_FILE_NAME)
+    if home := os.environ.get("HOME"):
+        return Path(os.path.abspath(home), ".local", "share", "ehadiag", HISTORY_FILE_NAME)
+    if local := os.environ.get("LOCALAPPDATA"):  # Windows
+        return Path(local, "ehadiag", HISTORY_FILE_NAME)
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +73,7 @@ class Usage:
     Attributes
     ----------
     hours : float | None
-        Operating hours since the unit was new, h; None where nobody said.
+        Operating hours since the unit was new, h; None where unknown.
     cycles : float | None
         Cycles (flights, or what the operator counts) since the unit was new.
 
@@ -38,6 +91,10 @@ class Usage:
             if value is not None and not 0.0 <= value < math.inf:
                 raise ConfigurationError(f"{name} {value:g}: need a number of at least 0")
 
+    def amount(self, unit: str) -> float | None:
+        """Hours or cycles, by the name of the unit."""
+        return self.hours if unit == "hours" else self.cycles
+
     @property
     def known(self) -> bool:
         """Whether there is any of them."""
@@ -45,7 +102,7 @@ class Usage:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class SourceRecord:
     """A recording that a diagnosis was made from."""
 
     path: str
@@ -54,31 +111,6 @@ class Source:
     """Of the file's bytes, hexadecimal; None where there is no file."""
     samples: str | None
     """Hash of the decoded samples, the same in whatever format they were kept; None without any."""
-
-
-@dataclass(frozen=True, slots=True)
-class Severity:
-    """A severity as it was estimated; what is no number is None."""
-
-    name: str
-    estimate: float | None
-    std: float | None
-    low: float | None
-    """Lower end of the 95 % interval."""
-    high: float | None
-    at_bound: bool
-    shown: bool
-    """Whether the test shows this severity at all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Effect:
-    """An effect of the installation that was estimated beside the severities; SI."""
-
-    name: str
-    value: float | None
-    std: float | None
-    at_bound: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +127,7 @@ class Entry:
     verdict: str
     reasons: tuple[str, ...]
     usage: Usage
-    sources: tuple[Source, ...]
+    sources: tuple[SourceRecord, ...]
     severities: tuple[Severity, ...]
     """Empty where nothing was identified."""
     covariance: tuple[tuple[float, ...], ...] | None
@@ -119,7 +151,7 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class MaintenanceEvent:
     """What was done to a unit."""
 
     appended: str
@@ -137,3 +169,236 @@ class Event:
     """In its history, from 1; 0: not appended yet."""
     withdrawn: str | None = None
     """Why it counts no more; None: it counts."""
+
+
+MAX_DATE_ROUNDING_S = 2.0
+"""Time, s, by which formats of logs round dates."""
+
+
+@dataclass(frozen=True, slots=True)
+class _RecordingIdentity:
+    """Identity of a recording, whatever file it is in."""
+
+    samples: str
+    date: datetime | None
+
+    def same(self, other: _RecordingIdentity) -> bool:
+        """Whether the samples are the same, and the dates may be."""
+        if self.samples != other.samples:
+            return False
+        if self.date is None or other.date is None:
+            return True
+        apart = abs((self.date - other.date).total_seconds())
+        # Time zones differ by quarters of an hour, by a day at most.
+        step, day = 900.0, 86400.0
+        off = apart % step
+        return apart < day + MAX_DATE_ROUNDING_S and min(off, step - off) < MAX_DATE_ROUNDING_S
+
+
+def counted_entries(entries: Sequence[Entry]) -> list[Entry]:
+    """Return the diagnoses that count, oldest first.
+
+    A recording that was diagnosed again counts with its last diagnosis alone, also where this took
+    several recordings together. Hours and cycles that only an earlier one has are kept.
+
+    Parameters
+    ----------
+    entries : Sequence[Entry]
+        In the order in which they were appended.
+
+    Returns
+    -------
+    list[Entry]
+        A part of them, in the same order.
+    """
+    recordings = [_recording_identities(entry) for entry in entries]
+    last: dict[str, list[tuple[_RecordingIdentity, Usage]]] = {}
+    usages: list[Usage] = []
+    for entry, named in zip(entries, recordings, strict=True):
+        usage = entry.usage
+        for item in named:
+            for before, earlier in reversed(last.get(item.samples, [])):
+                if item.same(before):
+                    usage = _merged_usage(usage, earlier)
+        usages.append(usage)
+        for item in named:
+            last.setdefault(item.samples, []).append((item, usage))
+    seen: dict[str, list[_RecordingIdentity]] = {}
+    out = []
+    for entry, named, usage in list(zip(entries, recordings, usages, strict=True))[::-1]:
+        if any(item.same(other) for item in named for other in seen.get(item.samples, [])):
+            continue
+        for item in named:
+            seen.setdefault(item.samples, []).append(item)
+        out.append(entry if usage is entry.usage else replace(entry, usage=usage))
+    return out[::-1]
+
+
+def _merged_usage(first: Usage, second: Usage) -> Usage:
+    return Usage(
+        second.hours if first.hours is None else first.hours,
+        second.cycles if first.cycles is None else first.cycles,
+    )
+
+
+def _recording_identities(entry: Entry) -> list[_RecordingIdentity]:
+    """Identities of an entry's recordings; those without samples or file have none."""
+    names = [item.samples or item.sha256 or "" for item in entry.sources]
+    # The date of an entry is that of its first recording.
+    date = None if entry.tested is None else datetime.fromisoformat(entry.tested)
+    return [
+        _RecordingIdentity(name, date if place == 0 else None)
+        for place, name in enumerate(names)
+        if name
+    ]
+
+
+def hash_of_file(path: str) -> str | None:
+    """Return the SHA-256 of a file's bytes, hexadecimal; None without such a regular file."""
+    try:
+        # Opening a FIFO must not block.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except (OSError, ValueError):
+        return None
+    with open(handle, "rb") as file:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            return None
+        try:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError:
+            return None
+
+
+def hash_of_samples(recording: Recording) -> str | None:
+    """Return the SHA-256 of the decoded samples: the same for a log, its packed copy or conversion.
+
+    Hexadecimal; None without samples. Times of arrival do not count: formats round them.
+    """
+    samples = recording.samples
+    if samples is None:
+        return None
+    out = hashlib.sha256(
+        f"{recording.test_id} {recording.serial} {samples.period_ns} {samples.mode}".encode()
+    )
+    for values in (
+        samples.command,
+        samples.current,
+        samples.spool,
+        samples.pressure,
+        samples.position,
+    ):
+        # One zero, one NaN: equal numbers have equal bits.
+        plain = np.where(np.isnan(values), np.nan, values + 0.0)
+        out.update(plain.astype("<f8").tobytes())
+    return out.hexdigest()
+
+
+def current_utc_text() -> str:
+    """Time of day: UTC, ISO 8601, to the millisecond."""
+    return utc_text(datetime.now(UTC))
+
+
+def history_entry(result: Result, usage: Usage, *, simulated: bool) -> Entry:
+    """Return what is kept of a result.
+
+    Parameters
+    ----------
+    result : Result
+        What was found.
+    usage : Usage
+        Hours and cycles of the unit when the test was made.
+    simulated : bool
+        Whether the unit is known to be a simulated one.
+
+    Returns
+    -------
+    Entry
+        Not appended yet.
+    """
+    # A name that is not UTF-8 is a file's name only where the recordings are at hand.
+    names = [item.source for item in (result.recordings if result.at_hand else result.origins)]
+    return Entry(
+        appended=current_utc_text(),
+        tested=result.origins[0].date if result.origins else None,
+        actuator=valid_text(result.actuator),
+        serial=result.serial,
+        test=result.test and valid_text(result.test),
+        verdict=result.verdict.name,
+        reasons=result.reasons,
+        usage=usage,
+        sources=tuple(
+            SourceRecord(item.source, hash_of_file(name), item.samples_sha256)
+            for item, name in zip(result.origins, names, strict=True)
+        ),
+        severities=tuple(result.severities.values()) if result.identified else (),
+        covariance=result.covariance,
+        effects=result.effects,
+        version=result.package.version,
+        simulated=simulated,
+        result=result.to_json(),
+    )
+
+
+HISTORY_OBJECT_SCHEMA = "ehadiag.history/1"
+
+
+def entry_object(entry: Entry, *, brief: bool) -> dict[str, Any]:
+    """Return the JSON object of a diagnosis; `brief` leaves out effects, recordings and result."""
+    tree: dict[str, Any] = {
+        "schema": HISTORY_OBJECT_SCHEMA,
+        "kind": "diagnosis",
+        "number": entry.number,
+        "appended": entry.appended,
+        "tested": entry.tested,
+        "actuator": entry.actuator,
+        "serial": entry.serial,
+        "test": entry.test,
+        "verdict": entry.verdict,
+        "withdrawn": entry.withdrawn,
+        "hours": entry.usage.hours,
+        "cycles": entry.usage.cycles,
+        "severities": {
+            item.name: {
+                "estimate": item.estimate,
+                "std": item.std,
+                "interval95": list(item.interval95 or (None, None)),
+                "at_bound": item.at_bound,
+                "shown": item.shown,
+            }
+            for item in entry.severities
+        },
+    }
+    if brief:
+        return tree
+    return tree | {
+        "reasons": list(entry.reasons),
+        "covariance": entry.covariance,
+        "effects": {
+            item.name: {"value": item.value, "std": item.std, "at_bound": item.at_bound}
+            for item in entry.effects
+        },
+        "recordings": [
+            {"path": item.path, "sha256": item.sha256, "samples": item.samples}
+            for item in entry.sources
+        ],
+        "version": entry.version,
+        "simulated": entry.simulated,
+        "result": json.loads(entry.result),
+    }
+
+
+def event_object(event: MaintenanceEvent) -> dict[str, Any]:
+    """Return the JSON object of a maintenance event."""
+    return {
+        "schema": HISTORY_OBJECT_SCHEMA,
+        "kind": "event",
+        "number": event.number,
+        "appended": event.appended,
+        "when": event.when,
+        "serial": event.serial,
+        "hours": event.usage.hours,
+        "cycles": event.usage.cycles,
+        "text": event.text,
+        "withdrawn": event.withdrawn,
+        "resets": list(event.resets),
+    }

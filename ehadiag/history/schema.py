@@ -7,18 +7,25 @@ and to put another in its place.
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections.abc import Mapping, Sequence
 
-from ehadiag.core.errors import ConfigurationError
+from firmware_iface.errors import ConfigurationError
 
-__all__ = ["APPLICATION_ID", "STEPS", "migrate", "version_of"]
+__all__ = [
+    "MIGRATION_STEPS",
+    "SQLITE_APPLICATION_ID",
+    "migrate",
+    "refuse_foreign_schema",
+    "schema_version",
+]
 
-APPLICATION_ID = 0x45484148
+SQLITE_APPLICATION_ID = 0x45484148
 """'EHAH' in the file's head: what tells a history from other SQLite files."""
-APPEND_ONLY = "a history is only ever appended to"
+APPEND_ONLY_TEXT = "a history is only ever appended to"
 
-FIRST = """
+SQL_FIRST_TABLES = """
 CREATE TABLE diagnosis (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
     appended TEXT NOT NULL,      -- UTC, ISO 8601
@@ -78,7 +85,7 @@ CREATE TABLE event (
 );
 """
 
-WITHDRAWALS = """
+SQL_WITHDRAWALS = """
 CREATE TABLE withdrawal (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
     appended TEXT NOT NULL,
@@ -86,6 +93,11 @@ CREATE TABLE withdrawal (
     number INTEGER NOT NULL,     -- its id there
     text TEXT NOT NULL           -- why
 );
+"""
+
+SQL_INDEX_OF_UNITS = """
+CREATE INDEX diagnosis_of_actuator ON diagnosis (actuator, simulated, serial);
+CREATE INDEX event_of_unit ON event (serial);
 """
 
 
@@ -102,50 +114,38 @@ def _guards(tables: Mapping[str, Sequence[str]]) -> str:
         ):
             out.append(
                 f"CREATE TRIGGER {table}_no_{what.lower()} BEFORE {what} ON {table} {when} "
-                f"BEGIN SELECT RAISE(ABORT, '{APPEND_ONLY}'); END;"
+                f"BEGIN SELECT RAISE(ABORT, '{APPEND_ONLY_TEXT}'); END;"
             )
     return "\n".join(out)
 
 
-_PARTS = ("diagnosis", "place")
-_KEYS = {"diagnosis": ("id",), "event": ("id",)} | dict.fromkeys(
-    ("source", "severity", "effect"), _PARTS
+_PART_KEYS = ("diagnosis", "place")
+_TABLE_KEYS = {"diagnosis": ("id",), "event": ("id",)} | dict.fromkeys(
+    ("source", "severity", "effect"), _PART_KEYS
 )
-STEPS: tuple[str, ...] = (
-    FIRST + _guards(_KEYS),
-    WITHDRAWALS + _guards({"withdrawal": ("id",)}),
+MIGRATION_STEPS: tuple[str, ...] = (
+    SQL_FIRST_TABLES + _guards(_TABLE_KEYS),
+    SQL_WITHDRAWALS + _guards({"withdrawal": ("id",)}),
+    SQL_INDEX_OF_UNITS,
 )
 """SQL of each step, in order."""
 
 
-def version_of(connection: sqlite3.Connection) -> int:
-    """Steps that a file has gone through; 0: an empty file.
+def schema_version(connection: sqlite3.Connection) -> int:
+    """Return the steps that a file has gone through, its `user_version`; 0: an empty file.
 
-    Parameters
-    ----------
-    connection : sqlite3.Connection
-        The open file.
-
-    Returns
-    -------
-    int
-        Its `user_version`.
-
-    Raises
-    ------
-    ConfigurationError
-        The file is another program's.
+    Another program's file is a ConfigurationError.
     """
     # In this order: another process that makes the tables between two of these has marked them.
     (tables,) = connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if tables and application != APPLICATION_ID:
+    if tables and application != SQLITE_APPLICATION_ID:
         raise ConfigurationError("is an SQLite file of another program: name another file")
     return int(version)
 
 
-def migrate(connection: sqlite3.Connection, steps: Sequence[str] = STEPS) -> None:
+def migrate(connection: sqlite3.Connection, steps: Sequence[str] = MIGRATION_STEPS) -> None:
     """Bring a file to today's tables, whole or not at all; the rows that it has stay as they are.
 
     Parameters
@@ -160,22 +160,52 @@ def migrate(connection: sqlite3.Connection, steps: Sequence[str] = STEPS) -> Non
     ConfigurationError
         The file is another program's, or a later version's.
     """
-    if _refuse_later(version_of(connection), steps) == len(steps):
+    if _refuse_later(schema_version(connection), steps) == len(steps):
         return
     connection.execute("BEGIN IMMEDIATE")
     try:
         # Another process may have been quicker.
-        done = _refuse_later(version_of(connection), steps)
+        done = _refuse_later(schema_version(connection), steps)
         for step in steps[done:]:
             for statement in _statements(step):
                 connection.execute(statement)
-        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {len(steps)}")
         connection.execute("COMMIT")
     except BaseException:
         if connection.in_transaction:
             connection.execute("ROLLBACK")
         raise
+
+
+def refuse_foreign_schema(connection: sqlite3.Connection, version: int) -> None:
+    """Refuse views, triggers and tables that this program has not made: none of them is run.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+        The open file.
+    version : int
+        Steps that it says it has gone through.
+
+    Raises
+    ------
+    ConfigurationError
+        Its tables are not those of its version.
+    """
+    query = "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql NOT NULL"
+    query += " AND sql NOT LIKE 'CREATE TABLE sqlite\\_%' ESCAPE '\\'"  # such as ANALYZE makes
+    with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as model:
+        for step in MIGRATION_STEPS[:version]:
+            for statement in _statements(step):
+                model.execute(statement)
+        own = {tuple(row) for row in model.execute(query)}
+    found = {tuple(map(str, row)) for row in connection.execute(query)}
+    if version <= len(MIGRATION_STEPS) and found != own:
+        name = min(str(row[1]) for row in found ^ own)
+        raise ConfigurationError(
+            f"has {name!r} otherwise than this program makes it: the file was changed by another"
+        )
 
 
 def _refuse_later(version: int, steps: Sequence[str]) -> int:

@@ -1,4 +1,7 @@
-"""The history file: SQLite in WAL mode, several writers, each row on the disk before it counts."""
+"""The history file: SQLite in WAL mode, several writers, each row on the disk before it counts.
+
+It is a named file, or the user's own in the data folder of the platform.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +9,47 @@ import contextlib
 import json
 import os
 import sqlite3
+import stat
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
+import msgspec
+
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Effect, Severity
 from ehadiag.history.records import (
-    DIAGNOSIS,
-    EVENT,
-    Effect,
+    DIAGNOSIS_TABLE,
+    EVENT_TABLE,
     Entry,
-    Event,
-    Severity,
-    Source,
+    MaintenanceEvent,
+    SourceRecord,
     Usage,
 )
-from ehadiag.history.schema import STEPS, migrate, version_of
+from ehadiag.history.schema import MIGRATION_STEPS, migrate, refuse_foreign_schema, schema_version
+from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
 
-__all__ = ["History"]
+__all__ = [
+    "History",
+]
 
-PATIENCE_S = 30.0
-"""How long one writer waits for the others."""
-POLL_S = 0.02
-WHY = {
+
+WRITER_TIMEOUT_S = 30.0
+"""Time, s, that one writer waits for the others."""
+WAL_POLL_INTERVAL_S = 0.02
+MIN_FLEET_UNITS, MAX_FLEET_UNITS = 10, 60
+"""Number of other units that a forecast reads, whatever their diagnoses: a fleet, and half as many
+again as it learns from, since some show no growth."""
+MAX_FLEET_DIAGNOSES = 2000
+"""Number of diagnoses that a forecast reads of other units, about: 0.1 s."""
+QUERY_TIMEOUT_S = 60.0
+"""Seconds of one query, at most: a damaged or hostile file must not hold anybody up."""
+QUERY_CHECK_STEPS = 100_000
+"""Steps of SQLite's machine between two looks at the clock, and at signals."""
+SIDE_FILE_SUFFIXES = ("-wal", "-shm", "-journal")
+"""Files beside a history that SQLite takes as a part of it."""
+SQLITE_ERROR_TEXTS = {
     "SQLITE_FULL": "no room left on the disk",
     "SQLITE_BUSY": "other programs have held it too long; try again",
     "SQLITE_LOCKED": "other programs have held it too long; try again",
@@ -39,14 +59,19 @@ WHY = {
     "SQLITE_READONLY": "cannot be written to",
     "SQLITE_IOERR": "the disk is full or failing",
     "SQLITE_CONSTRAINT": "only ever appended to",
+    "SQLITE_INTERRUPT": f"not read within {QUERY_TIMEOUT_S:g} s, or interrupted",
 }
 """By the first two words of SQLite's own name of an error."""
-DIAGNOSIS_ROW = (
+DIAGNOSIS_COLUMNS = (
     "appended", "tested", "actuator", "serial", "test", "verdict", "reasons", "hours", "cycles",
     "covariance", "version", "simulated", "result",
 )  # fmt: skip
-EVENT_ROW = ("appended", "done", "serial", "actuator", "hours", "cycles", "text", "resets")
-WITHDRAWAL = ("appended", "kind", "number", "text")
+LONG_COLUMNS = ("covariance", "result")
+EVENT_COLUMNS = ("appended", "done", "serial", "actuator", "hours", "cycles", "text", "resets")
+WITHDRAWAL_COLUMNS = ("appended", "kind", "number", "text")
+
+
+T = TypeVar("T")
 
 
 class History:
@@ -64,7 +89,8 @@ class History:
     ConfigurationError
         There is no file, or it is another program's or a later version's.
     InputOutputError
-        It cannot be opened, or is a link: SQLite would follow it.
+        It cannot be opened, or is a link: SQLite would follow it; another user could put files
+        beside it that SQLite takes as a part of it, or has done so; it is damaged.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
@@ -85,7 +111,9 @@ class History:
             raise ConfigurationError(
                 f"no history {path}: name one by --history, or begin one by ehadiag history init"
             )
-        with self._told():
+        _refuse_planted(path, full)
+        self._deadline = 0.0
+        with self._one_line_errors():
             self._connection = self._connect(create)
             try:
                 self._prepare()
@@ -111,6 +139,31 @@ class History:
         InputOutputError
             It could not be written: nothing of it was.
         """
+        (number,) = self.append_all([entry])
+        return number
+
+    def append_all(self, entries: Sequence[Entry]) -> list[int]:
+        """Append diagnoses, all or none; they are on the disk when this returns.
+
+        Parameters
+        ----------
+        entries : Sequence[Entry]
+            What is kept of them.
+
+        Returns
+        -------
+        list[int]
+            Their numbers in this history.
+
+        Raises
+        ------
+        InputOutputError
+            They could not be written: nothing of them was.
+        """
+        with self._one_line_errors(), self._transaction():
+            return [self._append(entry) for entry in entries]
+
+    def _append(self, entry: Entry) -> int:
         usage, covariance = entry.usage, entry.covariance
         row = (
             entry.appended, entry.tested, entry.actuator, entry.serial, entry.test, entry.verdict,
@@ -121,27 +174,26 @@ class History:
         parts: dict[str, list[tuple[Any, ...]]] = {
             "source": [(item.path, item.sha256, item.samples) for item in entry.sources],
             "severity": [
-                (s.name, s.estimate, s.std, s.low, s.high, s.at_bound, s.shown)
+                (s.name, s.estimate, s.std, *(s.interval95 or (None, None)), s.at_bound, s.shown)
                 for s in entry.severities
             ],
             "effect": [(e.name, e.value, e.std, e.at_bound) for e in entry.effects],
         }
-        with self._told(), self._transaction():
-            number = self._insert("diagnosis", DIAGNOSIS_ROW, row)
-            for table, rows in parts.items():
-                for place, cells in enumerate(rows):
-                    marks = ", ".join("?" * (len(cells) + 2))
-                    self._connection.execute(
-                        f"INSERT INTO {table} VALUES ({marks})", (number, place, *cells)
-                    )
+        number = self._insert("diagnosis", DIAGNOSIS_COLUMNS, row)
+        for table, rows in parts.items():
+            for place, cells in enumerate(rows):
+                marks = ", ".join("?" * (len(cells) + 2))
+                self._connection.execute(
+                    f"INSERT INTO {table} VALUES ({marks})", (number, place, *cells)
+                )
         return number
 
-    def append_event(self, event: Event) -> int:
+    def append_event(self, event: MaintenanceEvent) -> int:
         """Append a maintenance event; it is on the disk when this returns.
 
         Parameters
         ----------
-        event : Event
+        event : MaintenanceEvent
             What was done.
 
         Returns
@@ -158,8 +210,8 @@ class History:
             event.appended, event.when, event.serial, event.actuator, event.usage.hours,
             event.usage.cycles, event.text, _json(event.resets),
         )  # fmt: skip
-        with self._told(), self._transaction():
-            return self._insert("event", EVENT_ROW, row)
+        with self._one_line_errors(), self._transaction():
+            return self._insert("event", EVENT_COLUMNS, row)
 
     def withdraw(self, kind: str, number: int, when: str, text: str) -> None:
         """Append that a diagnosis or an event counts no more; it stays where it is.
@@ -167,7 +219,7 @@ class History:
         Parameters
         ----------
         kind : str
-            `DIAGNOSIS` or `EVENT` of `ehadiag.history.records`.
+            `DIAGNOSIS_TABLE` or `EVENT_TABLE` of `ehadiag.history.records`.
         number : int
             Of the diagnosis or event.
         when : str
@@ -182,72 +234,106 @@ class History:
         InputOutputError
             It could not be written.
         """
-        with self._told(), self._transaction():
+        with self._one_line_errors(), self._transaction():
             if not self._rows(f"SELECT 1 FROM {kind} WHERE id = ?", (number,)):
                 raise ConfigurationError(f"has no {kind} {number}; see ehadiag history list")
             if number in self._withdrawn(kind):
                 raise ConfigurationError(f"has {kind} {number} withdrawn already")
-            self._insert("withdrawal", WITHDRAWAL, (when, kind, number, text))
+            self._insert("withdrawal", WITHDRAWAL_COLUMNS, (when, kind, number, text))
 
-    def entries(self, serial: int | None = None, *, withdrawn: bool = False) -> list[Entry]:
+    def entries(
+        self,
+        serial: int | Collection[int] | None = None,
+        *,
+        withdrawn: bool = False,
+        brief: bool = False,
+    ) -> list[Entry]:
         """Return the diagnoses, in the order in which they were appended.
 
         Parameters
         ----------
-        serial : int | None
-            Of one unit only; None: all.
+        serial : int | Collection[int] | None
+            Of one unit, or some; None: all.
         withdrawn : bool
             Also those that were withdrawn.
+        brief : bool
+            Without effects, covariance and result, which are most of the file.
 
         Returns
         -------
         list[Entry]
-            Also those of recordings that were diagnosed again, see `counted`.
+            Also those of recordings that were diagnosed again, see `counted_entries`.
         """
-        with self._told():
-            where, values = _of(serial)
-            rows = self._rows(f"SELECT * FROM diagnosis {where} ORDER BY id", values)
-            parts = {name: self._parts(name) for name in ("source", "severity", "effect")}
-            why = self._withdrawn(DIAGNOSIS)
-        return [
-            Entry(
-                number=row["id"],
-                appended=row["appended"],
-                tested=row["tested"],
-                actuator=row["actuator"],
-                serial=row["serial"],
-                test=row["test"],
-                verdict=row["verdict"],
-                reasons=tuple(json.loads(row["reasons"])),
-                usage=Usage(row["hours"], row["cycles"]),
-                sources=tuple(
-                    Source(item["path"], item["sha256"], item["samples"])
-                    for item in parts["source"].get(row["id"], ())
-                ),
-                severities=tuple(
-                    Severity(
-                        item["name"],
-                        item["estimate"],
-                        item["std"],
-                        item["low"],
-                        item["high"],
-                        bool(item["at_bound"]),
-                        bool(item["shown"]),
-                    )
-                    for item in parts["severity"].get(row["id"], ())
-                ),
-                covariance=None
-                if row["covariance"] is None
-                else tuple(tuple(line) for line in json.loads(row["covariance"])),
-                effects=tuple(
-                    Effect(item["name"], item["value"], item["std"], bool(item["at_bound"]))
-                    for item in parts["effect"].get(row["id"], ())
-                ),
-                version=row["version"],
-                simulated=bool(row["simulated"]),
-                result=row["result"],
-                withdrawn=why.get(row["id"]),
+        return self._entries(*_where_serial(serial), withdrawn, brief)
+
+    def entry(self, number: int) -> Entry:
+        """Return one diagnosis, also a withdrawn one; ConfigurationError where there is none."""
+        found = self._entries("WHERE id = ?", (number,), True, False)
+        if not found:
+            raise ConfigurationError(
+                f"history {self.path}: has no diagnosis {number}; see ehadiag history list"
             )
+        return found[0]
+
+    def units(self) -> list[tuple[str, int]]:
+        """Return actuator and serial number of each unit."""
+        with self._one_line_errors():
+            rows = self._rows(
+                "SELECT DISTINCT actuator, serial FROM diagnosis WHERE serial NOT NULL"
+                " ORDER BY actuator, serial"
+            )
+        return [(str(row["actuator"]), int(row["serial"])) for row in rows]
+
+    def alike(
+        self, serial: int, actuator: str | None = None
+    ) -> tuple[list[Entry], list[MaintenanceEvent]]:
+        """Return diagnoses, in brief, and events of a unit and some units of its actuator.
+
+        Parameters
+        ----------
+        serial : int
+            Of the unit.
+        actuator : str | None
+            Its actuator; None: that of its last diagnosis.
+
+        Returns
+        -------
+        tuple[list[Entry], list[MaintenanceEvent]]
+            Of the unit all; of the others as many, evenly by serial number, as a forecast uses.
+        """
+        own = self.entries(serial, brief=True)
+        kinds = [(item.actuator, item.simulated) for item in own]
+        kinds = [kind for kind in kinds if actuator in (None, kind[0])]
+        if not kinds:
+            return own, self.events(serial)
+        with self._one_line_errors():
+            rows = self._rows(
+                "SELECT serial, COUNT(*) AS number FROM diagnosis WHERE actuator = ? AND"
+                " simulated = ? AND serial NOT NULL AND serial <> ? GROUP BY serial",
+                (*kinds[-1], serial),
+            )
+        counts = sorted((int(row["serial"]), int(row["number"])) for row in rows)
+        mean = sum(number for _, number in counts) / max(len(counts), 1)
+        most = max(MIN_FLEET_UNITS, min(MAX_FLEET_UNITS, int(MAX_FLEET_DIAGNOSES / max(mean, 1))))
+        step = max(len(counts) / most, 1.0)
+        picked = [counts[int(at * step)][0] for at in range(min(most, len(counts)))]
+        serials = {serial, *picked}
+        return self.entries(serials, brief=True), self.events(serials)
+
+    def _entries(
+        self, where: str, values: tuple[Any, ...], withdrawn: bool, brief: bool
+    ) -> list[Entry]:
+        columns = [name for name in DIAGNOSIS_COLUMNS if not (brief and name in LONG_COLUMNS)]
+        tables = ("source", "severity") if brief else ("source", "severity", "effect")
+        with self._one_line_errors():
+            rows = self._rows(
+                f"SELECT id, {', '.join(columns)} FROM diagnosis {where} ORDER BY id", values
+            )
+            only = f"WHERE diagnosis IN (SELECT id FROM diagnosis {where})" if where else ""
+            parts = {name: self._parts(name, only, values) for name in tables}
+            why = self._withdrawn(DIAGNOSIS_TABLE)
+        return [
+            self._sound(Entry, partial(_entry, row, parts, why.get(row["id"]), brief=brief))
             for row in rows
             if withdrawn or row["id"] not in why
         ]
@@ -260,48 +346,42 @@ class History:
         str
             One line, without its end.
         """
-        with self._told():
+        with self._one_line_errors():
             for row in self._connection.execute("SELECT result FROM diagnosis ORDER BY id"):
+                self._sound(dict[str, Any], partial(msgspec.json.decode, row["result"]))
                 yield row["result"]
+                self._deadline = time.monotonic() + QUERY_TIMEOUT_S
 
-    def events(self, serial: int | None = None, *, withdrawn: bool = False) -> list[Event]:
+    def events(
+        self, serial: int | Collection[int] | None = None, *, withdrawn: bool = False
+    ) -> list[MaintenanceEvent]:
         """Return the maintenance events, in the order in which they were appended.
 
         Parameters
         ----------
-        serial : int | None
-            Of one unit only; None: all.
+        serial : int | Collection[int] | None
+            Of one unit, or some; None: all.
         withdrawn : bool
             Also those that were withdrawn.
 
         Returns
         -------
-        list[Event]
+        list[MaintenanceEvent]
             The events.
         """
-        with self._told():
-            where, values = _of(serial)
+        with self._one_line_errors():
+            where, values = _where_serial(serial)
             rows = self._rows(f"SELECT * FROM event {where} ORDER BY id", values)
-            why = self._withdrawn(EVENT)
+            why = self._withdrawn(EVENT_TABLE)
         return [
-            Event(
-                number=row["id"],
-                appended=row["appended"],
-                when=row["done"],
-                serial=row["serial"],
-                actuator=row["actuator"],
-                usage=Usage(row["hours"], row["cycles"]),
-                text=row["text"],
-                resets=tuple(json.loads(row["resets"])),
-                withdrawn=why.get(row["id"]),
-            )
+            self._sound(MaintenanceEvent, partial(_event, row, why.get(row["id"])))
             for row in rows
             if withdrawn or row["id"] not in why
         ]
 
     def close(self) -> None:
         """Close the file."""
-        with self._told():
+        with self._one_line_errors():
             self._connection.close()
 
     def __enter__(self) -> Self:
@@ -316,34 +396,45 @@ class History:
         if not self._writable and not Path(f"{path}-wal").exists():
             query = "ro&immutable=1"  # no writer is there
         return sqlite3.connect(
-            f"{path.as_uri()}?mode={query}", uri=True, timeout=PATIENCE_S, isolation_level=None
+            f"{path.as_uri()}?mode={query}",
+            uri=True,
+            timeout=WRITER_TIMEOUT_S,
+            isolation_level=None,
         )
 
     def _prepare(self) -> None:
         self._connection.row_factory = sqlite3.Row
-        version = version_of(self._connection)
+        self._connection.set_progress_handler(self._is_late, QUERY_CHECK_STEPS)
+        self._connection.execute("PRAGMA trusted_schema = OFF")
+        # In one transaction: another process may make the tables meanwhile.
+        self._connection.execute("BEGIN")
+        try:
+            version = schema_version(self._connection)
+            refuse_foreign_schema(self._connection, version)
+        finally:
+            self._connection.execute("ROLLBACK")
         if self._writable:
             self._enter_wal()
             self._connection.execute("PRAGMA synchronous = FULL")
             self._connection.execute("PRAGMA foreign_keys = ON")
             migrate(self._connection)
-        elif version != len(STEPS):
+        elif version != len(MIGRATION_STEPS):
             raise ConfigurationError(
-                f"has version {version} of the tables, this program has {len(STEPS)}:"
+                f"has version {version} of the tables, this program has {len(MIGRATION_STEPS)}:"
                 " open it once where it can be written to"
             )
 
     def _enter_wal(self) -> None:
         """Switch a new file to WAL; SQLite does not wait for others here."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + WRITER_TIMEOUT_S
         while True:
             try:
                 (mode,) = self._connection.execute("PRAGMA journal_mode = WAL").fetchone()
                 break
             except sqlite3.OperationalError as error:
-                if _name(error) != "SQLITE_BUSY" or time.monotonic() > end:
+                if _error_name(error) != "SQLITE_BUSY" or time.monotonic() > end:
                     raise
-                time.sleep(POLL_S)
+                time.sleep(0.02)
         if mode != "wal":
             raise InputOutputError(f"history {self.path}: its file system cannot do WAL")
 
@@ -375,19 +466,23 @@ class History:
         rows = self._rows("SELECT number, text FROM withdrawal WHERE kind = ?", (kind,))
         return {row["number"]: row["text"] for row in rows}
 
-    def _parts(self, table: str) -> dict[int, list[sqlite3.Row]]:
+    def _parts(
+        self, table: str, where: str, values: tuple[Any, ...]
+    ) -> dict[int, list[sqlite3.Row]]:
         out: dict[int, list[sqlite3.Row]] = {}
-        for row in self._rows(f"SELECT * FROM {table} ORDER BY diagnosis, place"):
+        query = f"SELECT * FROM {table} {where} ORDER BY diagnosis, place"
+        for row in self._rows(query, values):
             out.setdefault(row["diagnosis"], []).append(row)
         return out
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
-        """Turn what SQLite says into one line."""
+    def _one_line_errors(self) -> Iterator[None]:
+        """Raise errors of SQLite as one line; each query ends in time."""
+        self._deadline = time.monotonic() + QUERY_TIMEOUT_S
         try:
             yield
         except sqlite3.Error as error:
-            why = WHY.get(_name(error), str(error))
+            why = SQLITE_ERROR_TEXTS.get(_error_name(error), str(error))
             raise InputOutputError(f"history {self.path}: {why}") from None
         except OverflowError:
             raise InputOutputError(
@@ -396,16 +491,146 @@ class History:
         except ConfigurationError as error:
             raise ConfigurationError(f"history {self.path} {error}") from None
 
+    def _is_late(self) -> bool:
+        """Whether a query takes too long; SQLite asks, and ends it."""
+        return time.monotonic() > self._deadline
 
-def _name(error: sqlite3.Error) -> str:
+    def _sound(self, kind: type[T], make: Callable[[], T]) -> T:
+        """Return what a row holds; any other program may have written it."""
+        try:
+            made = make()
+            msgspec.convert(msgspec.to_builtins(made, builtin_types=(bytes,)), kind)
+        except (ValueError, TypeError, RecursionError, ConfigurationError):
+            why = SQLITE_ERROR_TEXTS["SQLITE_CORRUPT"]
+            raise InputOutputError(f"history {self.path}: {why}") from None
+        return made
+
+
+def _severity(row: sqlite3.Row) -> Severity:
+    """Severity as its row keeps it; the result beside it has the rest."""
+    low, high = row["low"], row["high"]
+    return Severity(
+        name=row["name"],
+        estimate=row["estimate"],
+        std=row["std"],
+        interval95=None if low is None or high is None else (low, high),
+        flags=(AT_BOUND,) * row["at_bound"] + (NOT_SHOWN,) * (not row["shown"]),
+    )
+
+
+def _refuse_planted(path: Path, full: Path) -> None:
+    """Raise InputOutputError where another user could put a file beside a history, or has.
+
+    Owners that are trusted with it: the caller, root, and the owner of the history itself.
+    """
+    if not hasattr(os, "getuid"):
+        return
+    trusted = {os.getuid(), 0}
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            trusted.add(full.stat().st_uid)
+        folder = full.parent.stat()
+        shared = folder.st_mode & stat.S_IWOTH or (
+            folder.st_mode & stat.S_IWGRP and not _is_private_group(folder)
+        )
+        if folder.st_uid not in trusted or shared:
+            raise InputOutputError(
+                f"history {path}: others may write to its folder, and put files beside it that"
+                " change it; move it to a folder of your own (chmod go-w)"
+            )
+        for suffix in SIDE_FILE_SUFFIXES:
+            with contextlib.suppress(FileNotFoundError):
+                state = os.lstat(f"{full}{suffix}")
+                if state.st_uid not in trusted or not stat.S_ISREG(state.st_mode):
+                    raise InputOutputError(
+                        f"history {path}: {full.name}{suffix} beside it is of another user, or a"
+                        " link; nobody knows what it changes"
+                    )
+    except OSError as error:
+        raise InputOutputError(f"history {path}: {reason_of(error)}") from None
+
+
+def _is_private_group(folder: os.stat_result) -> bool:
+    """Whether the group of a folder is that of its owner alone, as many systems make one."""
+    import grp  # noqa: PLC0415 - not on Windows
+    import pwd  # noqa: PLC0415
+
+    try:
+        owner, group = pwd.getpwuid(folder.st_uid).pw_name, grp.getgrgid(folder.st_gid)
+    except KeyError:
+        return False
+    return group.gr_name == owner and set(group.gr_mem) <= {owner}
+
+
+def _error_name(error: sqlite3.Error) -> str:
     """SQLite's name of an error without its details, such as SQLITE_IOERR."""
     full = getattr(error, "sqlite_errorname", "")
     return "_".join(full.split("_")[:2])
 
 
-def _of(serial: int | None) -> tuple[str, tuple[Any, ...]]:
-    return ("", ()) if serial is None else ("WHERE serial = ?", (serial,))
+def _where_serial(serial: int | Collection[int] | None) -> tuple[str, tuple[Any, ...]]:
+    if serial is None:
+        return "", ()
+    serials = (serial,) if isinstance(serial, int) else tuple(sorted(serial))
+    return f"WHERE serial IN ({', '.join('?' * len(serials))})", serials
 
 
 def _json(value: Any) -> str:
     return json.dumps(value, allow_nan=False)
+
+
+def _entry(
+    row: sqlite3.Row,
+    parts: Mapping[str, Mapping[int, Sequence[sqlite3.Row]]],
+    withdrawn: str | None,
+    *,
+    brief: bool,
+) -> Entry:
+    if not brief:
+        msgspec.json.decode(row["result"], type=dict)
+    return Entry(
+        number=row["id"],
+        appended=row["appended"],
+        tested=row["tested"],
+        actuator=row["actuator"],
+        serial=row["serial"],
+        test=row["test"],
+        verdict=row["verdict"],
+        reasons=tuple(json.loads(row["reasons"])),
+        usage=Usage(row["hours"], row["cycles"]),
+        sources=tuple(
+            SourceRecord(item["path"], item["sha256"], item["samples"])
+            for item in parts["source"].get(row["id"], ())
+        ),
+        severities=tuple(map(_severity, parts["severity"].get(row["id"], ()))),
+        covariance=None
+        if brief or row["covariance"] is None
+        else tuple(tuple(line) for line in json.loads(row["covariance"])),
+        effects=tuple(
+            Effect(
+                name=item["name"],
+                value=item["value"],
+                std=item["std"],
+                at_bound=bool(item["at_bound"]),
+            )
+            for item in parts.get("effect", {}).get(row["id"], ())
+        ),
+        version=row["version"],
+        simulated=bool(row["simulated"]),
+        result="" if brief else row["result"],
+        withdrawn=withdrawn,
+    )
+
+
+def _event(row: sqlite3.Row, withdrawn: str | None) -> MaintenanceEvent:
+    return MaintenanceEvent(
+        number=row["id"],
+        appended=row["appended"],
+        when=row["done"],
+        serial=row["serial"],
+        actuator=row["actuator"],
+        usage=Usage(row["hours"], row["cycles"]),
+        text=row["text"],
+        resets=tuple(json.loads(row["resets"])),
+        withdrawn=withdrawn,
+    )

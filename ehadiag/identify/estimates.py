@@ -1,40 +1,220 @@
-"""Turns the refined optimum into severities with confidence intervals and a measure of fit."""
+"""Judgement of an optimum: standard deviations, intervals, quality of fit, noise test.
+
+The covariance is the larger of the inverse curvature and a sandwich estimate with correlated
+residuals (Newey and West, Econometrica 55(3), 1987).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import MAX_NOISE_EXCESS, WEAR_EXCESS_FACTOR, FitQuality
+from ehadiag.core.criteria import FIT, GIVE_UP
+from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.refine.derivatives import CAP
-from ehadiag.identify.refine.least_squares import Refinement
-from ehadiag.identify.result import Estimate, Fit, Identification, Nuisance, Timing
-from ehadiag.identify.search.first_approximation import FirstApproximation
-from ehadiag.identify.search.solvers import SearchResult
-from ehadiag.identify.uncertainty import interval95
+from ehadiag.identify.identification_result import (
+    Estimate,
+    Fit,
+    Identification,
+    IdentificationTiming,
+    Nuisance,
+)
+from ehadiag.identify.least_squares import Refinement
+from ehadiag.identify.signals import relative_noise
+from ehadiag.identify.solvers import SearchResult
+from ehadiag.identify.staged_search import FirstApproximation
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
-from ehadiag.model.parameters import FAULTS, Kind, Parameter
+from ehadiag.model.parameter import Parameter, ParameterKind
+from ehadiag.model.registry import FAULTS
 
-__all__ = ["NOT_SHOWN_STD", "estimates_of", "fit_of", "identification", "of_faults", "outliers"]
-
-NOT_SHOWN_STD = 0.1
-BOUND = 1e-6
+STANDARD_NORMAL = NormalDist()
 
 
-def identification(
+def estimate_covariance(refinement: Refinement) -> Array:
+    """Covariance of the estimates, SI, shape (k, k), in the order of the refinement's parameters.
+
+    The larger of two, parameter by parameter: the inverse curvature times the reduced sum of
+    squares (never below 1), and the sandwich estimate with residuals correlated over some ticks
+    (Newey and West, Econometrica 55(3), 1987), which grows with what the model does not explain.
+    A severity that the test does not show has the variance of a uniform density, or of what was
+    known beforehand. Oil and supply of the day are unknowns, too, with a density of unit width. On
+    top comes what the considered parameters do: where one of them is off by a deviation the
+    estimate moves in proportion (Schmidt, Advances in Control Systems 3, 1966); and
+    `ESTIMATION.discrepancy_std`, for what either side's integration is off.
+    """
+    count, used = len(refinement.x), refinement.used
+    information = refinement.information
+    known = information is not None
+    if information is None:
+        # A weak prior keeps a severity that nothing shows finite: uniform on its range.
+        severities = np.array([item.kind is ParameterKind.FAULT for item in refinement.parameters])
+        information = np.diag(np.where(severities, 1.0 / ESTIMATION.uniform_std**2, 0.0))
+    slopes = refinement.jacobian
+    if len(refinement.daily):
+        slopes = np.concatenate([slopes, np.where(used, refinement.daily, 0.0)])
+    rows = slopes.reshape(len(slopes), -1)
+    prior = np.eye(len(slopes))
+    prior[:count, :count] = information
+    inverse = np.linalg.pinv(rows @ rows.T + prior, hermitian=True)
+    squares = float((refinement.residuals[used] ** 2).sum())
+    reduced = squares / max(int(used.sum()) - count, 1)
+    curved = inverse * max(reduced / ESTIMATION.capped_variance, 1.0)
+    # What was known is like one more sample of each parameter.
+    prior[:count, :count] *= float(known)
+    meat = _meat(slopes, np.where(used, refinement.residuals, 0.0))
+    sandwich = inverse @ (meat + prior) @ inverse
+    factor = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(curved), 1e-300), 1.0))
+    out = curved * np.outer(factor, factor)
+    for change in refinement.considered:
+        shift = inverse @ (rows @ np.where(used, change, 0.0).ravel())
+        out += np.outer(shift, shift)
+    out = out[:count, :count]
+    out += ESTIMATION.discrepancy_std**2 * np.eye(count)
+    return np.asarray(out * np.outer(refinement.scale, refinement.scale))
+
+
+def _meat(slopes: Array, residuals: Array) -> Array:
+    """Covariance of the gradient, residuals of all signals taken together at each tick.
+
+    slopes: shape (k, signals, N); residuals: 0 in rows left out, shape (signals, N).
+    """
+    score = (slopes * residuals).sum(axis=1)
+    total = score @ score.T
+    for lag in range(1, ESTIMATION.correlation_lags + 1):
+        weight = 1.0 - lag / (ESTIMATION.correlation_lags + 1.0)
+        cross = score[:, lag:] @ score[:, :-lag].T
+        total = total + weight * (cross + cross.T)
+    return np.asarray(total)
+
+
+def independent_covariance(parameters: Sequence[Parameter], std: Mapping[str, float]) -> Array:
+    """Covariance of independent deviations by name, shape (k, k).
+
+    std: in the parameters' units; 0 of those that are not named.
+    """
+    return np.diag([std.get(item.name, 0.0) ** 2 for item in parameters])
+
+
+def interval95(value: float, std: float) -> tuple[float, float]:
+    """Central 95 % interval of a normal density, cut at the bounds 0 and 1.
+
+    For an estimate at a bound the interval begins there: the density beyond it does not count.
+    """
+    half = STANDARD_NORMAL.inv_cdf(0.975) * std
+    return max(0.0, value - half), min(1.0, value + half)
+
+
+ExplanationTest = Callable[[Array], bool]
+"""Of weighted residuals, shape (signals, N): whether no better optimum is to be searched for."""
+
+
+def excess_cost(residuals: Array) -> float:
+    """Cost of residuals over that of noise alone, of the signal where the ratio is the larger.
+
+    The noise is that of second differences, which do not contain what a model leaves out.
+    residuals: weighted, 0 where no sample counts, shape (signals, N).
+    """
+    return max(signal_excess_costs(residuals), default=0.0)
+
+
+def signal_excess_costs(residuals: Array) -> list[float]:
+    """Return the excess cost of each signal, see `excess_cost`; 0 of one without samples."""
+    out = []
+    for row in residuals:
+        present = row != 0.0
+        share = (
+            row[present] / (ESTIMATION.cauchy_scale * relative_noise(row))
+            if present.any()
+            else np.zeros(1)
+        )
+        out.append(
+            float(ESTIMATION.cauchy_scale**2 * np.log1p(share**2).mean() / FIT.expected_cauchy_cost)
+        )
+    return out
+
+
+def is_noise(residuals: Array) -> bool:
+    """Whether the residuals are those of noise."""
+    return (
+        residual_outlier_share(residuals) <= FIT.max_outliers_of_noise
+        and excess_cost(residuals) <= MAX_NOISE_EXCESS
+    )
+
+
+def calibrated_explanation_test(fit: FitQuality) -> ExplanationTest:
+    """Test whether residuals are no larger than those of a unit's calibration."""
+    if not fit.left:
+        return is_noise
+    most_outliers = FIT.max_outliers_of_noise + WEAR_EXCESS_FACTOR * fit.outliers
+    return lambda residuals: (
+        residual_outlier_share(residuals) <= most_outliers
+        and excess_cost(residuals) <= fit.most_excess
+    )
+
+
+def is_unexplainable(residuals: Array, starts: int, *, astray: bool = False) -> bool:
+    """Whether so much is left after so many starts that further ones will not explain it.
+
+    astray: whether a search may well end away from the optimum.
+    """
+    most = GIVE_UP.outliers_closed_loop if astray else GIVE_UP.outliers
+    outliers = residual_outlier_share(residuals)
+    if outliers > most[min(starts, len(most)) - 1]:
+        return True
+    if starts < 2:
+        return False
+    spool, *others = signal_excess_costs(residuals)
+    pressure = max(others, default=0.0)
+    if not astray:
+        return max(spool, pressure) > GIVE_UP.excess
+    if pressure > max(spool, GIVE_UP.excess):
+        return outliers > GIVE_UP.pressure_outliers
+    return spool > (
+        GIVE_UP.excess if 0.0 < pressure <= FIT.max_explained_excess else GIVE_UP.spool_excess
+    )
+
+
+def misses_only_pressure(residuals: Array) -> bool:
+    """Whether the spool is explained, so that break-aways come at the right ticks."""
+    excesses = signal_excess_costs(residuals)
+    return (
+        excesses[0] <= FIT.max_explained_excess
+        and max(excesses[1:], default=0.0) > FIT.max_explained_excess
+    )
+
+
+def is_pressure_misfit(residuals: Array) -> bool:
+    """Whether the spool, where break-aways happen, is explained and the pressure is far from it."""
+    spool, pressure = signal_excess_costs(residuals)[:2]
+    return spool <= FIT.max_explained_excess and pressure > GIVE_UP.excess
+
+
+def residual_outlier_share(residuals: Array) -> float:
+    """Share of residuals beyond three deviations."""
+    present = residuals != 0.0
+    return (
+        float(np.mean(residuals[present] ** 2 >= ESTIMATION.cauchy_scale**2))
+        if present.any()
+        else 1.0
+    )
+
+
+def identification_result(
     first: FirstApproximation,
     found: SearchResult,
     refined: Refinement,
-    spread: NDArray[np.float64],
+    spread: Array,
     experiments: Sequence[Experiment],
     *,
     solver: str,
     seed: int,
     evaluations: int,
     attempts: int,
-    timing: Timing,
+    timing: IdentificationTiming,
     about: Mapping[str, float],
 ) -> Identification:
     """Put together what an identification says.
@@ -49,14 +229,14 @@ def identification(
             at_bound=not item.lower < refined.values[item.name] < item.upper,
         )
         for item, std in zip(refined.parameters, deviations, strict=True)
-        if item.kind is not Kind.FAULT
+        if item.kind is not ParameterKind.FAULT
     }
     return Identification(
-        estimates=estimates_of(first, found, refined, spread),
+        estimates=severity_estimates(first, found, refined, spread),
         nuisances=nuisances,
         about=about,
-        covariance=of_faults(refined, spread),
-        fit=fit_of(refined, experiments),
+        covariance=fault_covariance(refined, spread),
+        fit=fit_quality(refined, experiments),
         solver=solver,
         seed=seed,
         evaluations=evaluations,
@@ -68,55 +248,53 @@ def identification(
     )
 
 
-def of_faults(refined: Refinement, spread: NDArray[np.float64]) -> NDArray[np.float64]:
+def fault_covariance(refined: Refinement, spread: Array) -> Array:
     """Part of a covariance that is of the severities, in the order of `FAULTS`."""
     names = [item.name for item in refined.parameters]
     places = [names.index(item.name) for item in FAULTS]
     return spread[np.ix_(places, places)]
 
 
-def estimates_of(
-    first: FirstApproximation,
-    found: SearchResult,
-    refined: Refinement,
-    spread: NDArray[np.float64],
+def severity_estimates(
+    first: FirstApproximation, found: SearchResult, refined: Refinement, spread: Array
 ) -> tuple[Estimate, ...]:
     """Severities as each stage left them.
 
     spread: covariance of all that was refined, SI.
     """
     values = refined.values
-    deviations = np.sqrt(np.diag(of_faults(refined, spread)))
+    deviations = np.sqrt(np.diag(fault_covariance(refined, spread)))
     out = []
     for item, searched, std in zip(FAULTS, found.best, deviations.tolist(), strict=True):
-        value = _within(item, values[item.name])
+        value = _bounded_severity(item, values[item.name])
         out.append(
             Estimate(
                 name=item.name,
                 first=float(first.values[item.name]),
-                search=_within(item, float(searched)),
+                search=_bounded_severity(item, float(searched)),
                 value=value,
                 std=std,
                 interval95=interval95(value, std),
-                at_bound=value <= item.lower + BOUND or value >= item.upper - BOUND,
-                shown=std < NOT_SHOWN_STD,
+                at_bound=value <= item.lower + FIT.bound_tolerance
+                or value >= item.upper - FIT.bound_tolerance,
+                shown=std < FIT.max_shown_std,
             )
         )
     return tuple(out)
 
 
-def _within(item: Parameter, value: float) -> float:
-    """Severity as it is told: it is looked for beyond where data that pass for it may be off."""
+def _bounded_severity(item: Parameter, value: float) -> float:
+    """Severity within its bounds: the search goes beyond them where data are inexact."""
     return min(max(value, item.lower), item.upper)
 
 
-def fit_of(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
+def fit_quality(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
     """How well the optimum explains the recordings; noise and offsets are of the first one."""
     first, values = experiments[0], refined.values
     return Fit(
         spool_rms=_rms(refined, SPOOL_ROW),
         pressure_rms=_rms(refined, PRESSURE_ROW),
-        outliers=outliers(refined),
+        outliers=refinement_outlier_share(refined),
         spool_noise=first.spool_noise,
         pressure_noise=first.pressure_noise,
         spool_offset=first.spool_offset + values["spool_offset"],
@@ -127,13 +305,17 @@ def fit_of(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
     )
 
 
-def outliers(refined: Refinement) -> float:
+def refinement_outlier_share(refined: Refinement) -> float:
     """Share of residuals beyond three deviations."""
     present = refined.weighted
-    return float(np.mean(refined.residuals[present] ** 2 >= CAP)) if present.any() else 1.0
+    return (
+        float(np.mean(refined.residuals[present] ** 2 >= ESTIMATION.residual_cap))
+        if present.any()
+        else 1.0
+    )
 
 
-def _rms(refined: Refinement, row: int, cap: float = CAP) -> float:
+def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) -> float:
     """Rms residual of a signal, squares capped; NaN without a sample."""
     residuals = refined.residuals[row, refined.weighted[row]]
     return float(np.sqrt(np.mean(np.minimum(residuals**2, cap)))) if residuals.size else np.nan

@@ -1,37 +1,72 @@
-"""A recorded test prepared for identification: current, spool, pressure, and their noise."""
+"""A recorded test prepared for identification, and its time spans laid out for the kernels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.channels import PRESSURE, Channel, Channels
-from ehadiag.core.conversion import conversion_of
-from ehadiag.core.recording import Environment, Samples
-from ehadiag.core.stored_test import StoredTest
-from ehadiag.identify.commanded_current import CurrentTrace, commanded_current
-from ehadiag.identify.noise import QUIET_BLOCK, noise_of_signal
+from ehadiag.core.conversion import actuator_channels, conversion_of
+from ehadiag.core.criteria import RECORDING
+from ehadiag.core.estimation_rules import ANCHORING, ESTIMATION
+from ehadiag.identify.acquired_current import acquired_current
+from ehadiag.identify.signals import (
+    QUIET_BLOCK_TICKS,
+    CurrentTrace,
+    commanded_current,
+    noise_of_signal,
+    relative_noise,
+    rounding_noise,
+)
+from ehadiag.model.batch import NO_ANCHOR, POSITION_ROW, Anchor, Batch
+from ehadiag.model.parameter import Parameter, scaled_to_channels
 from ehadiag.model.plant import PlantConstants, relative_viscosity
-from ehadiag.model.unit import unit_constants
+from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, unit_constants
+from firmware_iface.recording import (
+    PRESSURE_CHANNEL,
+    Acquisition,
+    Channel,
+    Channels,
+    Environment,
+    Samples,
+)
+from firmware_iface.stored_test import StoredTest, TimeWindow
 
-__all__ = ["Experiment", "build_experiment", "noise_is_judged_early", "share_offsets"]
 
-DISPLACED = 0.3e6 / PRESSURE.full_scale
-"""Pressure at rest, over the converter's half range, above which it is none of the sensor's
-offset: 0.3 MPa of the default range."""
-SETTLES_LSB, SETTLES_NOISE = 5.0, 8.0
-"""Pressure of the first samples beside that of the rest's second half, in steps of the converter
-and deviations of the noise, from which on nothing rested: a null bias beyond the spool's friction
-moves it from the first tick on."""
-LEAST_REST = 20
-"""Samples at rest from which an offset is taken."""
-LEAST_QUIET_BLOCKS = 20
-FIRST = 10
-"""Ticks in which the jack has not yet moved from its middle."""
+class RestRules(NamedTuple):
+    """Rest of an actuator before its test."""
+
+    displaced_share: float = 0.3e6 / PRESSURE_CHANNEL.full_scale
+    """Pressure at rest from which it is no offset of the sensor, over the converter's half range,
+    1: 0.3 MPa of the default range."""
+    settling_lsb: float = 5.0
+    """Distance of the first samples from the second half of the rest that is no rest, LSB: a null
+    bias beyond the spool's friction moves it from the first tick on."""
+    settling_noise: float = 8.0
+    """The same distance, in deviations of the noise."""
+    unsettled_ratio: float = 1.5
+    """Ticks for which the pressure of oil that has not settled is left out, over those at rest, 1:
+    it fills the chambers of a jack that sticks within 50 ms of a rest of 0.2 s, and the spool
+    sticks on."""
+    min_blocks: int = 20
+    """Least number of blocks from which noise is judged, 1."""
+    breakaway_s: float = 0.25
+    """Longest time, s, from the command's first change to the pressure's: a spool at its limit of
+    friction takes 0.1 s on a ramp of the closed test."""
+    motionless_ticks: int = 10
+    """Ticks in which the jack has not yet left its middle, 1."""
+    min_held_ticks: int = 100
+    """Least number of ticks of a hold, 1: a null bias lets the spool settle for 71 (a unit of
+    `test_few_effects` with data 5 % off); a pressure that rings on its oil at 80 Hz turns within
+    a quarter of that."""
+
+
+REST = RestRules()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,11 +79,11 @@ class Experiment:
     tick: float
     """s."""
     trace: CurrentTrace
-    spool: NDArray[np.float64]
+    spool: Array
     """Measured less its offset, m; NaN where missing or at the converter's end."""
-    pressure: NDArray[np.float64]
+    pressure: Array
     """Measured less its offset, Pa; NaN where missing or at the converter's end."""
-    position: NDArray[np.float64]
+    position: Array
     """Measured less its first samples, m; NaN where missing or at the converter's end."""
     spool_noise: float
     """Standard deviation, m."""
@@ -65,11 +100,17 @@ class Experiment:
     rested: bool
     """Whether the actuator rested long enough before the test to show them."""
     origin: float
-    """Spool position before the test, m, as the pressure at rest tells."""
+    """Spool position before the test by the pressure at rest, m."""
     channels: Channels
     """Converters that the samples went through."""
     viscosity_std: float = 0.0
-    """Relative standard deviation of the oil's viscosity that the bus's rounding leaves."""
+    """Relative standard deviation of the oil's viscosity by the bus's steps of temperature."""
+    supply_std: float = 0.0
+    """Standard deviation of supply less return pressure by the bus's steps, Pa."""
+    acquired: Acquisition | None = None
+    """How the samples were measured separately; None: they are the computer's own."""
+    sampled: Array = field(default_factory=lambda: np.empty(0))
+    """When the channels of `acquired` were sampled, s on its clock; empty without it."""
 
     @property
     def ticks(self) -> int:
@@ -80,6 +121,11 @@ class Experiment:
     def noise(self) -> tuple[float, ...]:
         """Standard deviations of spool, pressure and position (m, Pa, m), as rows of residuals."""
         return self.spool_noise, self.pressure_noise, self.position_noise
+
+    def anchor(self, thresholds_lsb: tuple[float, float]) -> Anchor:
+        """Return how a model of it is re-anchored, by the thresholds of `Anchor`, LSB."""
+        small, large = (value * self.spool_noise / ESTIMATION.noise_lsb for value in thresholds_lsb)
+        return Anchor(ANCHORING.gain, small, large, JACK_ANCHOR_SHARE)
 
     def with_noise(self, noise: tuple[float, ...]) -> Experiment:
         """Return the same with other standard deviations, see `noise`."""
@@ -96,25 +142,59 @@ def build_experiment(
     spool = np.where(samples.saturated[1], np.nan, samples.spool)
     pressure = np.where(samples.saturated[2], np.nan, samples.pressure)
     position = np.where(samples.saturated[3], np.nan, samples.position)
-    trace = commanded_current(samples, test, actuator.controller, channels)
+    acquired = samples.acquired
+    if acquired is not None and test.closed_loop:
+        trace = acquired_current(
+            samples, acquired, test, actuator.controller, channels, actuator_channels(actuator)
+        )
+    else:
+        trace = commanded_current(samples, test, actuator.controller, channels)
     rest = _ticks_at_rest(trace.current)
+    unsettled = 0
     if _settles(pressure[:rest], channels.pressure):
-        rest = 0
+        rest, unsettled = 0, round(REST.unsettled_ratio * rest)
     constants = unit_constants(actuator, environment)
+    if acquired is not None:
+        constants = constants._replace(DLY=constants.DLY + acquired.lead)
     spool_offset, rest_pressure = _mean(spool[:rest]), _mean(pressure[:rest])
     # What the jack's load or displaced lands ask for is no offset.
-    least, most = _pressures_asked_for(constants)
+    least, most = _rest_pressure_bounds(constants)
     pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
     origin = 0.0
-    if abs(pressure_offset) > DISPLACED * channels.pressure.full_scale:
-        # So much pressure is that of a spool that friction holds beside the middle.
+    if abs(pressure_offset) > REST.displaced_share * channels.pressure.full_scale:
+        # So much pressure is that of a spool that friction holds off the middle.
         origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
         origin = min(max(origin, -constants.XSM), constants.XSM)
         spool_offset, pressure_offset = spool_offset - origin, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
-    position_offset = _first(position)
+    rested = rest >= ESTIMATION.min_rest_samples
+    # A motion to and fro leaves the sensor's offset.
+    centred = pressure - _mean_of_motion(pressure, test)
+    slips, held = (0, 0) if rested else _held_ticks(centred, test, channels.pressure)
+    if held:
+        # Friction keeps spool and jack where they came to rest, and the pressure with them.
+        place = float(np.nanmedian(centred[slips:held]))
+        origin = place / _rise_with_spool(constants) + constants.XLD
+        seen, far = _mean(spool[slips:held]), REST.settling_lsb * channels.spool.lsb
+        slides = _slides(position[slips:held], channels.position)
+        if slides and abs(seen - origin) > far:
+            # A spool that still slips began a tick's way before its first sample.
+            start = float(2.0 * spool[0] - spool[1])
+            origin = start if abs(start - seen) > far else seen
+        # 0.1 MPa are an offset of the sensor, or 0.07 µm of the spool; where the jack slides the
+        # offset of the spool's sensor is in its origin: unknown until it moves.
+        ticks = np.arange(len(pressure))
+        pressure = np.where(ticks < held, np.nan, pressure)
+        spool = np.where(ticks < (held if slides else slips), np.nan, spool)
+    elif constants.OIL > 0.0 and test.closed_loop:
+        unsettled = _ticks_before_motion(test)
+    if constants.OIL > 0.0:
+        # The model begins at rest; oil that has begun to ring or to fill a chamber has not.
+        pressure = np.where(np.arange(len(pressure)) < unsettled, np.nan, pressure)
+    origin = min(max(origin, -constants.XSM), constants.XSM)
+    position_offset = _mean_at_start(position)
     # Before the sines only, where that suffices: the same while the test still runs.
-    quiet = _first_part(test) if noise_is_judged_early(test) else len(spool)
+    quiet = _ticks_before_search(test) if noise_is_judged_early(test) else len(spool)
     return Experiment(
         test=test,
         constants=constants,
@@ -129,11 +209,22 @@ def build_experiment(
         spool_offset=spool_offset,
         pressure_offset=pressure_offset,
         position_offset=position_offset,
-        rested=rest >= LEAST_REST,
+        rested=rested,
         origin=origin,
         channels=channels,
         viscosity_std=_viscosity_std(environment),
+        supply_std=environment.supply_std,
+        acquired=acquired,
+        sampled=np.empty(0) if acquired is None else _sampling_instants(samples, acquired),
     )
+
+
+def _sampling_instants(samples: Samples, acquired: Acquisition) -> Array:
+    """When the channels were sampled, s on the acquisition's clock, which runs evenly."""
+    ticks = np.arange(len(samples.host_ns))
+    seen = samples.host_ns >= 0
+    length, first = np.polyfit(ticks[seen], samples.host_ns[seen] * 1e-9, 1)
+    return np.asarray(first + length * (ticks + 1.0) - acquired.lead)
 
 
 def _rise_with_spool(constants: PlantConstants) -> float:
@@ -141,10 +232,10 @@ def _rise_with_spool(constants: PlantConstants) -> float:
     return constants.GP / (1.0 + constants.GP / constants.GQ * constants.CLK)
 
 
-def _pressures_asked_for(constants: PlantConstants) -> tuple[float, float]:
+def _rest_pressure_bounds(constants: PlantConstants) -> tuple[float, float]:
     """Least and largest pressure at rest, Pa, that a spool in its middle may leave.
 
-    That which displaced lands ask for falls to nothing where the jack gives way; it is bounded by
+    That of displaced lands vanishes where the jack moves; it is bounded by
     what lands of their shape open at most.
     """
     lap = abs(constants.LAP) * constants.GP / constants.PSR
@@ -161,17 +252,17 @@ def _viscosity_std(environment: Environment) -> float:
     return std * abs(relative_viscosity(degc + 1.0) / relative_viscosity(degc) - 1.0)
 
 
-def _first_part(test: StoredTest) -> int:
+def _ticks_before_search(test: StoredTest) -> int:
     """Ticks of a test before its genetic search's window."""
     return round(min(begin for begin, _ in test.windows.refinement) * test.rate)
 
 
 def noise_is_judged_early(test: StoredTest) -> bool:
     """Whether the test's first part is long enough to judge the noise by."""
-    return _first_part(test) >= LEAST_QUIET_BLOCKS * QUIET_BLOCK
+    return _ticks_before_search(test) >= REST.min_blocks * QUIET_BLOCK_TICKS
 
 
-def _ticks_at_rest(current: NDArray[np.float64]) -> int:
+def _ticks_at_rest(current: Array) -> int:
     """How long the current is zero before the test moves the actuator.
 
     In closed loop the noise of the jack's sensor keeps the spool moving: no rest, no offset yet.
@@ -180,7 +271,59 @@ def _ticks_at_rest(current: NDArray[np.float64]) -> int:
     return int(moving[0]) if moving.size else len(current)
 
 
-def _settles(values: NDArray[np.float64], channel: Channel) -> bool:
+def _ticks_before_motion(test: StoredTest) -> int:
+    """Ticks of a test before its command changes."""
+    command = test.command()
+    moving = np.flatnonzero(command != command[0])
+    return int(moving[0]) if moving.size else 0
+
+
+def _held_ticks(pressure: Array, test: StoredTest, channel: Channel) -> tuple[int, int]:
+    """First and last tick (one past it) of a hold off the middle, before a closed loop's motion.
+
+    Before the first one a spool may still slip. Two zeros where there is no such hold.
+    """
+    if not test.closed_loop:
+        return 0, 0
+    quiet = _ticks_before_motion(test)
+    most = REST.settling_lsb * channel.lsb
+    for begin in range(0, quiet - REST.motionless_ticks, REST.motionless_ticks):
+        some = pressure[begin : begin + REST.motionless_ticks]
+        if not np.isfinite(some).any() or np.nanmax(some) - np.nanmin(some) > 2.0 * most:
+            continue
+        place = float(np.nanmedian(some))
+        if begin == 0 and abs(place) <= most:
+            return 0, 0  # it rests
+        moved = np.flatnonzero(np.abs(pressure[begin:] - place) > most)
+        end = begin + int(moved[0]) if moved.size else len(pressure)
+        if end - begin < REST.min_held_ticks:
+            continue  # it comes by, nothing holds it
+        stands = end > quiet + round(REST.breakaway_s * test.rate)  # a sensor, not an actuator
+        return (0, 0) if stands else (begin, end)
+    return 0, 0
+
+
+def _mean_of_motion(pressure: Array, test: StoredTest) -> float:
+    """Mean pressure over the windows of the genetic search, Pa; 0 before most of them is there."""
+    time = (np.arange(len(pressure)) + 1.0) / test.rate
+    inside = np.zeros(len(pressure), dtype=np.bool_)
+    for begin, end in test.windows.refinement:
+        inside |= (begin < time) & (time <= end)
+    seen = pressure[inside & np.isfinite(pressure)]
+    needed = sum(end - begin for begin, end in test.windows.refinement) * test.rate
+    return float(seen.mean()) if seen.size > RECORDING.min_sample_share_early * needed else 0.0
+
+
+def _slides(position: Array, channel: Channel) -> bool:
+    """Whether the jack travels during a hold."""
+    ends = position[: REST.motionless_ticks], position[-REST.motionless_ticks :]
+    if not all(np.isfinite(end).any() for end in ends):
+        return False
+    begin, end = (float(np.nanmean(end)) for end in ends)
+    return abs(end - begin) > REST.settling_lsb * channel.lsb
+
+
+def _settles(values: Array, channel: Channel) -> bool:
     """Whether a signal that should rest begins elsewhere than it stays."""
     begin, end = values[:3], values[len(values) // 2 :]
     begin, end = begin[np.isfinite(begin)], end[np.isfinite(end)]
@@ -188,19 +331,19 @@ def _settles(values: NDArray[np.float64], channel: Channel) -> bool:
         return False
     place = np.median(end)
     noise = 1.4826 * np.median(np.abs(end - place))
-    most = max(SETTLES_LSB * channel.lsb, SETTLES_NOISE * noise)
+    most = max(REST.settling_lsb * channel.lsb, REST.settling_noise * noise)
     return bool(np.median(np.abs(begin - place)) > most)
 
 
-def _mean(values: NDArray[np.float64]) -> float:
+def _mean(values: Array) -> float:
     """Mean of what is there; 0 of too little."""
     seen = values[np.isfinite(values)]
-    return float(seen.mean()) if seen.size >= LEAST_REST else 0.0
+    return float(seen.mean()) if seen.size >= ESTIMATION.min_rest_samples else 0.0
 
 
-def _first(values: NDArray[np.float64]) -> float:
+def _mean_at_start(values: Array) -> float:
     """Mean of the first samples, before anything has moved."""
-    seen = values[:FIRST][np.isfinite(values[:FIRST])]
+    seen = values[: REST.motionless_ticks][np.isfinite(values[: REST.motionless_ticks])]
     return float(seen.mean()) if seen.size else 0.0
 
 
@@ -223,3 +366,133 @@ def share_offsets(experiments: Sequence[Experiment]) -> list[Experiment]:
         )
         for item in experiments
     ]
+
+
+WindowSpans = Sequence[Sequence[TimeWindow]]
+"""Of each test, s."""
+ANCHOR_THRESHOLDS_LSB = (ANCHORING.small_lsb, ANCHORING.large_lsb)
+EVEN_JACK_LEVEL = 2
+JACK_ANCHOR_SHARE = 0.01
+"""Share of the jack's innovation by which the model is moved each tick: what lasts longer than a
+tenth of a second is taken away from the residual."""
+
+
+def lay_out_spans(
+    experiments: Sequence[Experiment],
+    windows: Sequence[Sequence[TimeWindow]] | None = None,
+    *,
+    lead: float = 0.0,
+    channels: tuple[bool, ...] = (True, True),
+    anchor_lsb: tuple[float, float] | None = None,
+) -> Batch:
+    """Lay spans of experiments one behind the other.
+
+    windows: spans of each experiment to explain, s; None: all of every test. lead: run-in before
+    each span, s, without weight. channels: whether spool, pressure and, where it is named, position
+    count. anchor_lsb: re-anchoring thresholds (small, large) in units of LSB-sized noise; None:
+    free run.
+    """
+    parts: list[tuple[int, int, int, int]] = []
+    for index, experiment in enumerate(experiments):
+        spans = [(0.0, experiment.ticks * experiment.tick)] if windows is None else windows[index]
+        for start, end in spans:
+            a = round(start / experiment.tick)
+            b = min(round(end / experiment.tick), experiment.ticks)
+            first = max(0, a - round(lead / experiment.tick))
+            if b - a > 1:
+                parts.append((index, first, a, b))
+    if not parts:
+        raise ValueError("no span of any experiment is inside its recording")
+    weight, anchors, origins, places = [], [], [], []
+    for index, first, a, b in parts:
+        experiment = experiments[index]
+        inside = np.arange(first, b) >= a
+        on_spool = inside & np.isfinite(experiment.spool[first:b]) & channels[0]
+        on_pressure = inside & np.isfinite(experiment.pressure[first:b]) & channels[1]
+        rows = [on_spool / experiment.spool_noise, on_pressure / experiment.pressure_noise]
+        if len(channels) > POSITION_ROW:
+            on_position = (
+                inside & np.isfinite(experiment.position[first:b]) & channels[POSITION_ROW]
+            )
+            rows.append(on_position / experiment.position_noise)
+        weight.append(np.vstack(rows))
+        anchor = NO_ANCHOR if anchor_lsb is None else experiment.anchor(anchor_lsb)
+        anchors.append(anchor.as_array())
+        origins.append(_origin(experiment, first))
+        places.append(_place(experiment, first))
+    # Nothing after the spans: a stage's inputs must not change while the test goes on.
+    ends = [max((b for i, _, _, b in parts if i == k), default=0) for k in range(len(experiments))]
+    begins = np.cumsum([0, *ends])
+    return Batch(
+        test=np.array([index for index, _, _, _ in parts]),
+        tick=np.array([experiments[i].tick for i, _, _, _ in parts]),
+        start=np.concatenate([[0], np.cumsum([b - first for _, first, _, b in parts])]),
+        origin=np.array(origins),
+        place=np.array(places),
+        history=np.array([first for _, first, _, _ in parts]),
+        since=np.array([begins[i] + first for i, first, _, _ in parts]),
+        current=np.concatenate(
+            [item.trace.current[:end] for item, end in zip(experiments, ends, strict=True)]
+        ),
+        spool=np.concatenate([experiments[i].spool[first:b] for i, first, _, b in parts]),
+        pressure=np.concatenate([experiments[i].pressure[first:b] for i, first, _, b in parts]),
+        position=np.concatenate([experiments[i].position[first:b] for i, first, _, b in parts]),
+        weight=np.hstack(weight),
+        anchor=np.array(anchors),
+    )
+
+
+def even_jack_levels(batch: Batch) -> NDArray[np.int64]:
+    """Halvings of the jack's ticks, the same for all, for few runs of a model, shape (N,).
+
+    For few it takes longer to find how each tick is to be cut than to take four steps in each.
+    """
+    return np.full(batch.weight.shape[1], EVEN_JACK_LEVEL)
+
+
+def _origin(experiment: Experiment, first: int) -> float:
+    """Spool position before tick `first`, m: where it rests before the test, else measured."""
+    if first == 0:
+        return experiment.origin
+    before = experiment.spool[max(0, first - 5) : first]
+    seen = before[np.isfinite(before)]
+    return float(seen[-1]) if seen.size else 0.0
+
+
+def _place(experiment: Experiment, first: int) -> float:
+    """Jack position before tick `first`, m: in the middle before the test, else measured."""
+    if first == 0:
+        return 0.0
+    before = experiment.position[max(0, first - 5) : first]
+    seen = before[np.isfinite(before)]
+    return float(seen.mean()) if seen.size else 0.0
+
+
+def residuals_by_experiment(experiments: Sequence[Experiment], residuals: Array) -> list[Array]:
+    """Residuals of each of several experiments, all its ticks, shape (signals, ticks) each.
+
+    residuals: of all, one behind the other, shape (signals, N).
+    """
+    return np.split(residuals, np.cumsum([item.ticks for item in experiments])[:-1], axis=1)
+
+
+def with_residual_noise(experiment: Experiment, residuals: Array) -> Experiment:
+    """Weight an experiment by the noise of its residuals, shape (signals, n).
+
+    A signal without residuals keeps the noise that it has.
+    """
+    shown = [
+        max(noise * relative_noise(row), rounding_noise(channel))
+        for noise, row, channel in zip(
+            experiment.noise, residuals, experiment.channels[1:], strict=False
+        )
+    ]
+    return experiment.with_noise((*shown, *experiment.noise[len(shown) :]))
+
+
+def unknowns_of(
+    experiments: Sequence[Experiment], free: Sequence[Parameter] = (*FAULTS, *SENSOR_OFFSETS)
+) -> Unknowns:
+    """Space of the unknowns of experiments with one actuator, on the scales of its converters."""
+    mine = tuple(scaled_to_channels(item, experiments[0].channels) for item in free)
+    return Unknowns(mine, tuple(item.constants for item in experiments), {})

@@ -1,16 +1,70 @@
-"""The flat arrays of recorded data, by time span, that candidate models are compared with."""
+"""Spans of recorded tests to compare candidates with, and re-anchoring of models on them.
+
+A candidate is one set of physical constants that may be those of the unit.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["POSITION_ROW", "PRESSURE_ROW", "SIGNALS", "SPOOL_ROW", "Batch", "longest_span"]
+from ehadiag.compile.jit import Array, Array2, inlined
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """Re-anchoring of the modelled spool and jack on the measured ones, once a tick.
+
+    The innovation is filtered, f += gain (e - f); a sample further off than `large` moves the model
+    onto it, a filtered innovation above `small` moves it by that. It undoes a break-away that went
+    the other way, and leaves a model that runs true alone.
+
+    The jack integrates what the valve lets pass, and with it every small error. It is moved by a
+    share of its innovation each tick: what is left of that is its fast part.
+    """
+
+    gain: float
+    """Gain of the filter, 1."""
+    small: float
+    """Filtered innovation that moves the model, m."""
+    large: float
+    """Innovation of one sample that moves it, m."""
+    follow: float = 0.0
+    """Share of the jack's innovation by which it is moved, 0 … 1; where its position counts."""
+
+    def as_array(self) -> Array:
+        """The form that kernels take."""
+        return np.array([self.gain, self.small, self.large, self.follow])
+
+
+NO_ANCHOR = Anchor(0.0, np.inf, np.inf)
+
+
+@inlined
+def anchored_spool(
+    error: float, gain: float, small: float, large: float, xs: float, filtered: float, bound: float
+) -> tuple[float, float, bool]:
+    """Spool position and filtered innovation after a tick, m, and whether the spool was moved.
+
+    error: innovation, measured less modelled position, m, NaN where the sample is missing; gain,
+    small, large: see `Anchor`; xs, filtered: before, m; bound: the spool's stroke either way, m.
+    """
+    if not math.isfinite(error):
+        return xs, filtered, False
+    filtered += gain * (error - filtered)
+    if abs(error) > large:
+        return min(max(xs + error, -bound), bound), 0.0, True
+    if abs(filtered) > small:
+        return min(max(xs + filtered, -bound), bound), 0.0, True
+    return xs, filtered, False
+
 
 SPOOL_ROW, PRESSURE_ROW, POSITION_ROW = 0, 1, 2
-SIGNALS = 3
+SIGNAL_ROWS = 3
 """Rows of weights and residuals: the signals that a candidate has to explain. Weights without the
 last row leave the jack's position out, and residuals are then without it too."""
 
@@ -20,47 +74,34 @@ class Batch(NamedTuple):
 
     Spans stand one behind the other in flat arrays, so that one compiled function serves any
     number of them.
-
-    Attributes
-    ----------
-    test : shape (m,)
-        Which test a span is of: the candidate's constants for that test hold in it.
-    tick : shape (m,)
-        Length of a tick, s.
-    start : shape (m + 1,)
-        First tick of each span in the flat arrays, then N.
-    origin : shape (m,)
-        Spool position before the first tick of each span, m.
-    place : shape (m,)
-        Jack position before the first tick of each span, m.
-    history : shape (m,)
-        Ticks of its test before the first one of each span.
-    since : shape (m,)
-        Place of each span's first tick in `current`.
-    current : shape (M,)
-        Of the tests from their beginning, each once, A: what comes before a span has loaded the
-        hysteresis.
-    spool, pressure, position : shape (N,)
-        Measured, m, Pa, m; NaN where missing.
-    weight : shape (signals, N)
-        Reciprocal noise of spool and pressure, and of the position if it counts; 0 where not used.
-    anchor : shape (m, 4)
-        Re-anchoring in each span, see `ehadiag.model.anchor.Anchor`.
     """
 
     test: NDArray[np.int64]
-    tick: NDArray[np.float64]
+    """Which test a span is of: the candidate's constants for that test hold in it; shape (m,)."""
+    tick: Array
+    """Length of a tick, s; shape (m,)."""
     start: NDArray[np.int64]
-    origin: NDArray[np.float64]
-    place: NDArray[np.float64]
+    """First tick of each span in the flat arrays, then N; shape (m + 1,)."""
+    origin: Array
+    """Spool position before the first tick of each span, m; shape (m,)."""
+    place: Array
+    """Jack position before the first tick of each span, m; shape (m,)."""
     history: NDArray[np.int64]
+    """Ticks of its test before the first one of each span; shape (m,)."""
     since: NDArray[np.int64]
-    current: NDArray[np.float64]
-    spool: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    position: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    anchor: NDArray[np.float64]
+    """Place of each span's first tick in `current`; shape (m,)."""
+    current: Array
+    """Of the tests from their beginning, each once, A: what comes before a span has loaded the
+    hysteresis; shape (M,)."""
+    spool: Array
+    pressure: Array
+    position: Array
+    """Measured, m, Pa, m; NaN where missing; shape (N,)."""
+    weight: Array2
+    """Reciprocal noise of spool and pressure, and of the position if it counts; 0 where not used;
+    shape (signals, N)."""
+    anchor: Array2
+    """Re-anchoring in each span, see `ehadiag.model.batch.Anchor`; shape (m, 4)."""
 
 
 def longest_span(batch: Batch) -> int:

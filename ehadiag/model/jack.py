@@ -1,44 +1,64 @@
 """Jack with a linear second stage over a piece of the spool's path: one algorithm for all kernels.
 
-A piece is cut into steps of the collocation (`ehadiag.model.collocation`). Stops and starts are
+A piece is cut into steps of the collocation (`ehadiag.model.sensors`). Stops and starts are
 located inside of it.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-from ehadiag.compile.kernels import bare_kernel, inlined
+from ehadiag.compile.jit import bare_kernel, inlined
 from ehadiag.compile.vector import packed
-from ehadiag.model.collocation import C1, C2, creeping_pressures, radau_pressures, radau_velocity
-from ehadiag.model.jack_state import JackState, Piece, Probe, place_on, sense
-from ehadiag.model.laws import JackLaw, excess, pressure, resistance
-from ehadiag.model.sensors import through_stages
+from ehadiag.model.laws import JackLaw, excess_force, stage_pressure, stage_resistance
+from ehadiag.model.sensors import (
+    RADAU,
+    JackState,
+    PathPiece,
+    PressureProbe,
+    cubic_through_stages,
+    position_on_piece,
+    radau_creep_pressures,
+    radau_pressures,
+    radau_velocity,
+    sample_pressure,
+)
 
-__all__ = ["limited", "linear_piece", "sensed_linear_piece", "still_pressure"]
 
-FINE_TRAVEL = 3.0e-6
-FINE_RATIO = 0.3
-"""Spool travel within a step (m, or share of the distance from the middle)."""
-FRESH_DECAY = 3.0
-"""Decay (power of e) of the jack's velocity within a step, where it starts or stops."""
-CREEPING, FINE_FADE = 10.0, 0.5
-"""Velocity at which a jack no longer creeps, and its change within a step before; shares of the
-Stribeck velocity."""
-MOST_STEPS = 32
-ITERATIONS = 30
-SHORTEST = 1e-6
-"""Share of a piece that counts as nothing."""
-BALANCED = 1e-9
-"""Share of the holding force that counts as no excess."""
-SLOWEST = 1e-12
-"""Velocity that counts as none, m/s."""
+class JackSteps(NamedTuple):
+    """Steps of a jack with a linear second stage over a piece."""
+
+    travel: float = 3.0e-6
+    """Spool travel within a step, m."""
+    travel_share: float = 0.3
+    """Spool travel within a step, as a share of its distance from the middle, 1."""
+    decay: float = 3.0
+    """Decay of the jack's velocity within a step where it starts or stops, as a power of e, 1."""
+    creep_limit: float = 10.0
+    """Velocity at which a jack no longer creeps, in Stribeck velocities."""
+    fade: float = 0.5
+    """Change of a creeping velocity within a step, in Stribeck velocities."""
+    most: int = 32
+    """Largest number of steps of a piece, 1."""
+    iterations: int = 30
+    """Largest number of iterations for a stop or a start, 1."""
+    least_share: float = 1e-6
+    """Share of a piece that is neglected, 1."""
+    force_tolerance: float = 1e-9
+    """Share of the holding force that is no excess, 1."""
+    least_rate: float = 1e-30
+    """Rate that is none, 1/m: not to divide by 0, nor beyond numbers of single precision."""
+    least_velocity: float = 1e-12
+    """Velocity that counts as none, m/s."""
+
+
+JACK_STEPS = JackSteps()
 
 
 @packed
 def _velocity(
-    creeps: bool, j: JackLaw, p: Piece, load: float, d: float, velocity: float,
+    creeps: bool, j: JackLaw, p: PathPiece, load: float, d: float, velocity: float,
     begin: float, end: float,
 ) -> float:  # fmt: skip
     """Velocity of the moving jack at the share `end` of a piece, `velocity` at `begin`, m/s.
@@ -46,9 +66,12 @@ def _velocity(
     creeps: whether friction may have Stribeck's part; a constant where this is compiled.
     """
     h = (end - begin) * p.span
-    x1, x2 = place_on(p, begin + C1 * (end - begin)), place_on(p, begin + C2 * (end - begin))
-    x3 = place_on(p, end)
-    e1, e2, e3 = resistance(j, x1), resistance(j, x2), resistance(j, x3)
+    x1, x2 = (
+        position_on_piece(p, begin + RADAU.c1 * (end - begin)),
+        position_on_piece(p, begin + RADAU.c2 * (end - begin)),
+    )
+    x3 = position_on_piece(p, end)
+    e1, e2, e3 = stage_resistance(j, x1), stage_resistance(j, x2), stage_resistance(j, x3)
     if creeps and j.extra > 0.0:
         return _creeping_velocity(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
     return radau_velocity(j, h, load, velocity, x1, x2, x3, e1, e2, e3)
@@ -60,13 +83,13 @@ def _creeping_velocity(
     x1: float, x2: float, x3: float, e1: float, e2: float, e3: float,
 ) -> float:  # fmt: skip
     """With Stribeck's friction; apart, so that the plain one stays small."""
-    p3 = creeping_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)[2]
+    p3 = radau_creep_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)[2]
     return j.flow * x3 - e3 * p3
 
 
 @packed
 def _stop(
-    creeps: bool, j: JackLaw, p: Piece, load: float, velocity: float, d: float, later: float,
+    creeps: bool, j: JackLaw, p: PathPiece, load: float, velocity: float, d: float, later: float,
     begin: float, end: float,
 ) -> float:  # fmt: skip
     """Share of a piece at which the jack stops, `velocity` at `begin`, `later` at `end`.
@@ -76,7 +99,7 @@ def _stop(
     """
     newest, other, at_newest, at_other = end, begin, later * d, velocity * d
     share = at_newest / (at_newest - at_other)
-    for _ in range(ITERATIONS):
+    for _ in range(JACK_STEPS.iterations):
         q = newest + share * (other - newest)
         value = _velocity(creeps, j, p, load, d, velocity, begin, q) * d
         if (value > 0.0) == (at_newest > 0.0):
@@ -85,8 +108,8 @@ def _stop(
             oldest, at_oldest = other, at_other
             other, at_other = newest, at_newest
         newest, at_newest = q, value
-        least = SHORTEST / abs(other - newest)
-        if least > 0.5 or abs(value) < SLOWEST:
+        least = JACK_STEPS.least_share / abs(other - newest)
+        if least > 0.5 or abs(value) < JACK_STEPS.least_velocity:
             return newest
         x = (newest - other) / (oldest - other)
         y = (at_newest - at_other) / (at_oldest - at_other)
@@ -102,67 +125,73 @@ def _stop(
 
 
 @packed
-def _break_away(j: JackLaw, p: Piece, hold: float, d: float, begin: float, end: float) -> float:
+def _break_away(j: JackLaw, p: PathPiece, hold: float, d: float, begin: float, end: float) -> float:
     """Share of a piece at which the force on the resting jack exceeds `hold` in direction d.
 
     It does so at `end`; regula falsi of the Illinois kind.
     """
     low, high = begin, end
-    at_low = excess(j, place_on(p, low), hold) * d
-    at_high = excess(j, place_on(p, high), hold) * d
+    at_low = excess_force(j, position_on_piece(p, low), hold) * d
+    at_high = excess_force(j, position_on_piece(p, high), hold) * d
     if at_low >= 0.0:
         return low
-    for _ in range(ITERATIONS):
+    for _ in range(JACK_STEPS.iterations):
         q = low + (high - low) * at_low / (at_low - at_high)
-        x = place_on(p, q)
-        value = excess(j, x, hold) * d
+        x = position_on_piece(p, q)
+        value = excess_force(j, x, hold) * d
         if value < 0.0:
             low, at_low = q, value
             at_high *= 0.5
         else:
             high, at_high = q, value
             at_low *= 0.5
-        if abs(value) < BALANCED * abs(hold) * resistance(j, x):
+        if abs(value) < JACK_STEPS.force_tolerance * abs(hold) * stage_resistance(j, x):
             # Not `high`: where the path is straight the first q is the root, from either side.
             return q
-        if high - low < SHORTEST:
+        if high - low < JACK_STEPS.least_share:
             break
     return high
 
 
 @packed
-def _steps(creeps: bool, j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> int:
+def _steps(
+    creeps: bool, j: JackLaw, p: PathPiece, begin: float, stop: float, state: JackState
+) -> int:
     """Into how many steps a piece is cut."""
     near = min(abs(p.x0), abs(p.x1)) if p.x0 * p.x1 > 0.0 else 0.0
-    travel, fine = (stop - begin) * abs(p.x1 - p.x0), max(FINE_TRAVEL, FINE_RATIO * near)
-    if creeps and j.by_stribeck > 0.0 and near * j.flow * j.by_stribeck < CREEPING:
-        fine = min(fine, FINE_FADE / (j.flow * j.by_stribeck))
+    travel, fine = (
+        (stop - begin) * abs(p.x1 - p.x0),
+        max(JACK_STEPS.travel, JACK_STEPS.travel_share * near),
+    )
+    if creeps and j.by_stribeck > 0.0 and near * j.flow * j.by_stribeck < JACK_STEPS.creep_limit:
+        # A compiler may divide before it looks whether it has to.
+        fine = min(fine, JACK_STEPS.fade / max(j.flow * j.by_stribeck, JACK_STEPS.least_rate))
     slides = state.direction != 0.0 and state.fresh == 0.0
     if slides and travel < fine:
         return 1  # most pieces: no division
     wanted = travel / fine
     if not slides:
         # The collocation is slow to forget what a start or a stop leaves.
-        rate = (j.area / resistance(j, near) + j.viscosity) * j.by_mass
-        wanted = max(wanted, (stop - begin) * p.span * rate / FRESH_DECAY)
-    return min(MOST_STEPS, 1 + int(wanted))
+        rate = (j.area / stage_resistance(j, near) + j.viscosity) * j.by_mass
+        wanted = max(wanted, (stop - begin) * p.span * rate / JACK_STEPS.decay)
+    return min(JACK_STEPS.most, 1 + int(wanted))
 
 
 @packed
-def limited(j: JackLaw, p12: float) -> float:
+def limited_pressure(j: JackLaw, p12: float) -> float:
     """Pressure within what the supply allows, Pa."""
     return min(max(p12, -j.supply), j.supply)
 
 
 @packed
-def still_pressure(j: JackLaw, x: float) -> float:
-    """Pressure beside a resting jack, Pa."""
-    return limited(j, pressure(j, x, 0.0))
+def pressure_at_rest(j: JackLaw, x: float) -> float:
+    """Pressure at a resting jack, Pa."""
+    return limited_pressure(j, stage_pressure(j, x, 0.0))
 
 
 @bare_kernel
 def _sensed(
-    j: JackLaw, probe: Probe, p: Piece, load: float, d: float, velocity: float,
+    j: JackLaw, probe: PressureProbe, p: PathPiece, load: float, d: float, velocity: float,
     begin: float, end: float, lagged: float, seen: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Pressure behind the filter at the share `end` of a piece, and when it was sampled, Pa.
@@ -170,24 +199,29 @@ def _sensed(
     lagged, seen: before; velocity: of the jack at `begin`, m/s.
     """
     step = end - begin
-    x0, x1 = place_on(p, begin), place_on(p, begin + C1 * step)
-    x2, x3 = place_on(p, begin + C2 * step), place_on(p, end)
+    x0, x1 = position_on_piece(p, begin), position_on_piece(p, begin + RADAU.c1 * step)
+    x2, x3 = position_on_piece(p, begin + RADAU.c2 * step), position_on_piece(p, end)
     if d != 0.0:
-        h, e1, e2, e3 = step * p.span, resistance(j, x1), resistance(j, x2), resistance(j, x3)
+        h, e1, e2, e3 = (
+            step * p.span,
+            stage_resistance(j, x1),
+            stage_resistance(j, x2),
+            stage_resistance(j, x3),
+        )
         if j.extra > 0.0:
-            p1, p2, p3 = creeping_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
+            p1, p2, p3 = radau_creep_pressures(j, h, load, d, velocity, x1, x2, x3, e1, e2, e3)
         else:
             p1, p2, p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)
-        cubic = through_stages(
-            limited(j, pressure(j, x0, velocity)),
-            limited(j, p1), limited(j, p2), limited(j, p3),
+        cubic = cubic_through_stages(
+            limited_pressure(j, stage_pressure(j, x0, velocity)),
+            limited_pressure(j, p1), limited_pressure(j, p2), limited_pressure(j, p3),
         )  # fmt: skip
     else:
-        cubic = through_stages(
-            still_pressure(j, x0), still_pressure(j, x1),
-            still_pressure(j, x2), still_pressure(j, x3),
+        cubic = cubic_through_stages(
+            pressure_at_rest(j, x0), pressure_at_rest(j, x1),
+            pressure_at_rest(j, x2), pressure_at_rest(j, x3),
         )  # fmt: skip
-    return sense(probe, cubic, begin * p.span, step * p.span, lagged, seen)
+    return sample_pressure(probe, cubic, begin * p.span, step * p.span, lagged, seen)
 
 
 def _pieces(senses: bool) -> Any:
@@ -195,12 +229,12 @@ def _pieces(senses: bool) -> Any:
 
     @(bare_kernel if senses else inlined)
     def piece(
-        j: JackLaw, probe: Probe, p: Piece, begin: float, stop: float, state: JackState
+        j: JackLaw, probe: PressureProbe, p: PathPiece, begin: float, stop: float, state: JackState
     ) -> JackState:
         place, velocity, d, fresh, p12, lagged, seen = state
         if d == 0.0:
-            x, load = place_on(p, stop), j.spring * place
-            if excess(j, x, load + j.static) <= 0.0 <= excess(j, x, load - j.static):
+            x, load = position_on_piece(p, stop), j.spring * place
+            if excess_force(j, x, load + j.static) <= 0.0 <= excess_force(j, x, load - j.static):
                 if senses:
                     lagged, seen = _sensed(j, probe, p, 0.0, 0.0, 0.0, begin, stop, lagged, seen)
                 return JackState(place, velocity, 0.0, 0.0, p12, lagged, seen)
@@ -210,8 +244,11 @@ def _pieces(senses: bool) -> Any:
             end = stop if step == steps else begin + (stop - begin) * step / steps
             spring = j.spring * place
             if d == 0.0:
-                x = place_on(p, end)
-                up, down = excess(j, x, spring + j.static), excess(j, x, spring - j.static)
+                x = position_on_piece(p, end)
+                up, down = (
+                    excess_force(j, x, spring + j.static),
+                    excess_force(j, x, spring - j.static),
+                )
                 if (up <= 0.0 and down >= 0.0) or (
                     abs(place) >= j.stroke and place * (up + down) > 0.0
                 ):
@@ -254,7 +291,7 @@ def _pieces(senses: bool) -> Any:
                 )
             place += 0.5 * (stopped - q) * p.span * velocity
             q, velocity, d, fresh = stopped, 0.0, 0.0, 1.0
-            if end - q < SHORTEST:
+            if end - q < JACK_STEPS.least_share:
                 q, step = end, step + 1
         return JackState(place, velocity, d, fresh, p12, lagged, seen)
 
@@ -264,10 +301,12 @@ def _pieces(senses: bool) -> Any:
 sensed_linear_piece = _pieces(True)
 """Compiled: jack over the shares begin … stop of a piece, with what the plain one leaves out."""
 _bare_piece = _pieces(False)
-NO_PROBE = Probe(0.0, 0.0)
+NO_PROBE = PressureProbe(0.0, 0.0)
 
 
 @inlined
-def linear_piece(j: JackLaw, p: Piece, begin: float, stop: float, state: JackState) -> JackState:
+def linear_piece(
+    j: JackLaw, p: PathPiece, begin: float, stop: float, state: JackState
+) -> JackState:
     """Jack over the shares begin … stop of a piece, its pressure as it is at the end."""
     return _bare_piece(j, NO_PROBE, p, begin, stop, state)

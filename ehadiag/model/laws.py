@@ -1,82 +1,73 @@
-"""The actuator's physical equations, each written once for the scalar and the vector kernels.
+"""Physical equations of the actuator and its controller, for scalar and vector kernels.
 
-Named tuples hold what a law needs of a candidate, precombined; the functions take plain numbers or
+Named tuples hold what a law needs of a candidate, precombined; the functions take numbers or
 vectors of lanes. Symbols and requirement numbers are those of docs/reference/physics.md.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ehadiag.compile.kernels import inlined
-from ehadiag.compile.vector import least, magnitude, most, packed
-from ehadiag.model.exponential import exponential
+import numpy as np
+
+from ehadiag.compile.elementary import exponential
+from ehadiag.compile.jit import Array, inlined, inlined_exact, kernel
+from ehadiag.compile.vector import absolute, maximum, minimum, packed, unpacker
 from ehadiag.model.plant import PlantConstants
 
-__all__ = [
-    "BEND",
-    "ESTIMATED_BEND",
-    "DriveLaw",
-    "JackLaw",
-    "SpoolLaw",
-    "creeping",
-    "drive_law",
-    "driven",
-    "excess",
-    "faded",
-    "flapper_held",
-    "jack_law",
-    "lagged",
-    "opening",
-    "play",
-    "pressure",
-    "resistance",
-    "slide_base",
-    "spool_law",
-    "steady_rate",
-    "still_flapper",
-]
+if TYPE_CHECKING:  # what a kernel imports is part of its cache key
+    from firmware_iface.stored_test import Controller
 
-STATIC_SHARE_SPOOL = 0.5
+SPOOL_DYNAMIC_FRICTION_SHARE = 0.5
 """Dynamic over static dry friction of the spool (PHY-14)."""
-STATIC_RATIO_JACK = 2.0
+JACK_STATIC_FRICTION_RATIO = 2.0
 """Static over dynamic dry friction of the jack (PHY-15)."""
-SLOWEST_STRIBECK = 1e-5
+MIN_STRIBECK_VELOCITY = 1e-5
 """Stribeck velocity below which it is not felt, m/s."""
-MOST_FADED = 40.0
-BEND, FINE_BEND = 0.05e-6, 0.5e-9
-"""Bend of the spool's path (m) that the jack does not feel: with a linear second stage, which
-follows the spool at once, and with one that stores what flows."""
-ESTIMATED_BEND = 0.02e-6
-"""The same where severities are estimated, m: with a monitor's 0.05e-6 jack friction would be up to
-0.2 deviations off."""
+MAX_DECAY_EXPONENT = 40.0
+BRIDGE_ROUNDS = 12
+"""Rounds of the iteration for the first stage's pressures, 1: to 1e-4 of a severity."""
+
+
+class PathBends(NamedTuple):
+    """Bends of the spool's path that the jack does not feel."""
+
+    monitor: float = 5e-08
+    """Bend in the monitor, whose second stage follows the spool at once, m."""
+    orifice: float = 5e-10
+    """Bend with orifices, which store the flow, m."""
+    estimation: float = 0.02e-6
+    """Bend where severities are estimated, m: with the monitor's jack friction would be up to 0.2
+    deviations off."""
+
+
+PATH_BENDS = PathBends()
+
+plant_of = unpacker(PlantConstants)
+"""Compiled: the constants that a row of `PLANT_FIELDS` numbers holds."""
 
 
 class DriveLaw(NamedTuple):
-    """What the torque motor of one candidate makes of the current.
-
-    Attributes
-    ----------
-    gain: flapper deflection per current, GM / KF, m/A.
-    bias: current that the motor adds to the commanded one, A.
-    spacing: of the half-widths of the plays, A: they are spacing (i + 1/2).
-    share: of the narrowest play in the current that acts.
-    fade: share of each play over that of the next narrower one.
-    even, odd: relative gain of the torque per current (1/A) and per its square (1/A²).
-    left: share of a change of the current that its driver's lag leaves after a tick.
-    late: the same in the mean over the tick.
-    """
+    """What the torque motor of one candidate makes of the current."""
 
     gain: Any
+    """Flapper deflection per current, GM / KF, m/A."""
     bias: Any
+    """Current that the motor adds to the commanded one, A."""
     spacing: Any
+    """Of the half-widths of the plays, A: they are spacing (i + 1/2)."""
     share: Any
+    """Of the narrowest play in the current that acts."""
     fade: Any
+    """Share of each play over that of the next narrower one."""
     even: Any
     odd: Any
+    """Relative gain of the torque per current (1/A) and per its square (1/A²)."""
     left: Any
+    """Share of a change of the current that its driver's lag leaves after a tick."""
     late: Any
+    """The same in the mean over the tick."""
 
 
 @inlined
@@ -97,116 +88,198 @@ def drive_law(c: PlantConstants, tick: float) -> DriveLaw:
 
 
 @packed
-def lagged(share: Any, before: Any, current: Any) -> Any:
+def lagged_current(share: Any, before: Any, current: Any) -> Any:
     """Current (A) of which a driver's lag leaves a share of its change from that of before."""
     return current + share * (before - current)
 
 
 @packed
-def driven(law: DriveLaw, total: Any) -> Any:
+def motor_deflection(law: DriveLaw, total: Any) -> Any:
     """Flapper deflection (m) by the sum of what the plays hold, each with its weight (A)."""
     acting = law.share * total
     return law.gain * acting * (1.0 + acting * (law.even + law.odd * acting))
 
 
 @packed
-def play(held: Any, value: Any, half_width: Any) -> Any:
+def play_output(held: Any, value: Any, half_width: Any) -> Any:
     """What a play of a half-width holds after its input has gone to a value (PHY-30)."""
-    return least(most(held, value - half_width), value + half_width)
+    return minimum(maximum(held, value - half_width), value + half_width)
 
 
-class SpoolLaw(NamedTuple):
-    """Torque motor, flapper and spool of one candidate.
-
-    Attributes
-    ----------
-    ratio: flapper deflection that the feedback wire takes back per spool travel, KSF / KF.
-    reach: its inverse, spool travel per flapper deflection.
-    force: on the spool per flapper deflection, AS GPF, N/m.
-    mass: of the spool, kg.
-    damping: viscous coefficient of the moving spool, (GPF/GQF) AS² + CS, N s/m.
-    dynamic: dry friction of the moving spool, N.
-    dry: flapper deflection that balances it, m.
-    breakaway: flapper deflection that overcomes the static friction, m.
-    extra: that which balances the friction that a creeping spool has and a fast one has not, m; 0
-        without Stribeck's effect.
-    by_stribeck: reciprocal of the velocity over which that fades, s/m.
-    flapper_stop, stroke: of flapper and spool, m.
-    backlash: half-width of the play between spool and feedback wire, m.
-    bend: of the spool's path that the second stage does not feel, m.
-    ring_damping, ring_rate: decay and angular frequency (1/s) of the flapper beside a resting
-        spool; rate 0 where it does not ring.
-    """
-
-    ratio: float
-    reach: float
-    force: float
-    mass: float
-    damping: float
-    dynamic: float
-    dry: float
-    breakaway: float
-    extra: float
-    by_stribeck: float
-    flapper_stop: float
-    stroke: float
-    backlash: float
-    bend: float
-    ring_damping: float
-    ring_rate: float
+MAX_STALL_DEFLECTION = 1.2
+"""Deflection, 1 over the nozzle's gap, taken for that of a spool that no flapper would move: a
+closed nozzle gives 0.8 of the supply, and the filter's loss less."""
 
 
 @inlined
-def spool_law(c: PlantConstants, bend: float = BEND) -> SpoolLaw:
-    """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14).
+def bridge_supply(part: float, flow: float) -> float:
+    """Pressure behind the filter over that at no load, 1 (PHY-43).
 
-    bend: of the spool's path that a linear second stage does not feel, m.
+    part: the latter over the valve's supply, 1; flow: square of the bridge's, over its supply and
+    over that at no load.
+    """
+    return 1.0 / (part + (1.0 - part) * flow)
+
+
+@inlined
+def bridge_stall(part: float, load: float) -> float:
+    """Deflection at which a resting spool's ends carry a load, 1 over the nozzle's gap (PHY-43).
+
+    part: see `bridge_supply`; load: pressure over that behind the filter at no load, 1.
+    """
+    x, supply = 0.0, 1.0
+    for _ in range(BRIDGE_ROUNDS):
+        x = min(0.25 * load / supply * (4.0 + x * x * x * x), MAX_STALL_DEFLECTION)
+        near, far = max(1.0 - x, 0.0), 1.0 + x
+        total = near / math.sqrt(1.0 + near * near) + far / math.sqrt(1.0 + far * far)
+        supply = bridge_supply(part, 0.5 * total * total)
+    return x
+
+
+@inlined
+def bridge_speed(part: float, load: float, x: float) -> float:
+    """Speed of a spool by a deflection, over that without a load at a deflection of 1 (PHY-43).
+
+    part, load: see `bridge_stall`; x: over the nozzle's gap, 1. Of the pressures at the spool's
+    ends u² and w², over the supply at no load, the one end's inlet feeds the nearer nozzle and the
+    spool, the other's with the spool the further nozzle.
+    """
+    near, far, half = max(1.0 - x, 0.0), 1.0 + x, math.sqrt(0.5)
+    flow, supply = max(x - load, 0.0) * half, 1.0
+    for _ in range(BRIDGE_ROUNDS):
+        by_near, by_far = 1.0 / (1.0 + near * near), 1.0 / (1.0 + far * far)
+        root_u = math.sqrt(max(supply / by_near - flow * flow, 0.0))
+        root_w = math.sqrt(max(supply / by_far - flow * flow, 0.0))
+        u, w = (root_u - near * flow) * by_near, (root_w + far * flow) * by_far
+        slope_u = -(flow / max(root_u, 0.1) + near) * by_near
+        slope_w = (far - flow / max(root_w, 0.1)) * by_far
+        flow -= (u * u - w * w - load) / (2.0 * (u * slope_u - w * slope_w))
+        total = near * u + far * w
+        supply = 0.5 * (supply + bridge_supply(part, 0.5 * total * total / supply))
+    return flow / half
+
+
+class SpoolLaw(NamedTuple):
+    """Torque motor, flapper and spool of one candidate."""
+
+    ratio: float
+    """Flapper deflection that the feedback wire takes back per spool travel, KSF / KF."""
+    reach: float
+    """Its inverse, spool travel per flapper deflection."""
+    force: float
+    """On the spool per flapper deflection, AS GPF, N/m."""
+    mass: float
+    """Of the spool, kg."""
+    damping: float
+    """Viscous coefficient of the moving spool, (GPF/GQF) AS² + CS of a linear stage, N s/m."""
+    dynamic: float
+    """Dry friction of the moving spool, N."""
+    eased: float
+    """What of it slows the spool while the flapper is on its stop, N (PHY-43)."""
+    null: float
+    """Middle between the flapper's stops to the first stage's null, m."""
+    dry: float
+    """Flapper deflection that balances it, m."""
+    breakaway: float
+    """Flapper deflection that overcomes the static friction, m."""
+    extra: float
+    """That which balances the friction that a creeping spool has and a fast one has not, m; 0
+    without Stribeck's effect."""
+    by_stribeck: float
+    """Reciprocal of the velocity over which that fades, s/m."""
+    flapper_stop: float
+    stroke: float
+    """Of flapper and spool, m."""
+    backlash: float
+    """Half-width of the play between spool and feedback wire, m."""
+    bend: float
+    """Of the spool's path that the second stage does not feel, m."""
+    ring_damping: float
+    ring_rate: float
+    """Decay and angular frequency (1/s) of the flapper at a resting spool; rate 0 where it does
+    not ring."""
+
+
+@inlined
+def spool_law(c: PlantConstants, bend: float = PATH_BENDS.monitor) -> SpoolLaw:
+    """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14, PHY-43).
+
+    bend: of the spool's path that a linear second stage does not feel, m. The speed by a bridge's
+    deflection bends little: while the flapper is free a line takes its place, through the
+    deflection that balances the friction and by least squares up to the flapper's stop.
     """
     force = c.AS * c.GPF
     ring_damping = 0.5 * c.CF / c.JF
     square = c.KF / c.JF - ring_damping * ring_damping
+    breakaway = c.FSS / force
+    dry = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS / force
+    dynamic = eased = SPOOL_DYNAMIC_FRICTION_SHARE * c.FSS
+    damping = c.GPF / c.GQF * c.AS * c.AS + c.CS
+    if c.BRG > 0.0:
+        gap = c.XFM / c.BRG
+        part = min(c.GPF * gap / c.PSR, 1.0)
+        load = breakaway / gap
+        breakaway = gap * bridge_stall(part, load)
+        dry = gap * bridge_stall(part, SPOOL_DYNAMIC_FRICTION_SHARE * load)
+        dynamic = eased = force * dry
+        speed = bridge_speed(part, SPOOL_DYNAMIC_FRICTION_SHARE * load, c.BRG)
+        if dry < c.XFM and speed > 0.0:
+            middle = 0.5 * (c.BRG + dry / gap)
+            half = bridge_speed(part, SPOOL_DYNAMIC_FRICTION_SHARE * load, middle)
+            unit = c.GQF * gap / c.AS
+            damping = force * (c.XFM - dry) / (unit * (0.5 * speed + half)) + c.CS
+            clamped = force * c.XFM / (force * c.XFM / (unit * speed) + c.CS)
+            eased = force * c.XFM - damping * clamped
     return SpoolLaw(
         c.KSF / c.KF,
         c.KF / c.KSF,
         force,
         c.MS,
-        c.GPF / c.GQF * c.AS * c.AS + c.CS,
-        STATIC_SHARE_SPOOL * c.FSS,
-        STATIC_SHARE_SPOOL * c.FSS / force,
-        c.FSS / force,
-        (1.0 - STATIC_SHARE_SPOOL) * c.FSS / force if c.VSS > 0.0 else 0.0,
-        1.0 / max(c.VSS, SLOWEST_STRIBECK) if c.VSS > 0.0 else 0.0,
+        damping,
+        dynamic,
+        eased,
+        c.XFN,
+        dry,
+        breakaway,
+        (1.0 - SPOOL_DYNAMIC_FRICTION_SHARE) * c.FSS / force if c.VSS > 0.0 else 0.0,
+        1.0 / max(c.VSS, MIN_STRIBECK_VELOCITY) if c.VSS > 0.0 else 0.0,
         c.XFM,
         c.XSM,
         c.BKL,
-        FINE_BEND if c.OIL > 0.0 else bend,
+        PATH_BENDS.orifice if c.OIL > 0.0 else bend,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
 
 
 @packed
-def still_flapper(ratio: Any, deflection: Any, wire: Any) -> Any:
+def flapper_rest(ratio: Any, deflection: Any, wire: Any) -> Any:
     """Deflection at which the flapper rests while the feedback wire is held at `wire`, m."""
     return deflection - ratio * wire
 
 
 @packed
-def slide_base(t: SpoolLaw, deflection: Any, direction: Any) -> Any:
+def spool_rest_position(t: SpoolLaw, deflection: Any, direction: Any) -> Any:
     """Spool position towards which it slides while the current lasts, m."""
     return (deflection - t.dry * direction) * t.reach + t.backlash * direction
 
 
 @inlined
-def steady_rate(t: SpoolLaw, xf: float, direction: float) -> float:
+def steady_spool_velocity(t: SpoolLaw, xf: float, direction: float) -> float:
     """Velocity that the spool approaches with the flapper held at `xf`, m/s."""
     return (t.force * xf - t.dynamic * direction) / t.damping
 
 
 @inlined
-def flapper_held(t: SpoolLaw, deflection: float, wire: float) -> float:
-    """Deflection of a flapper in equilibrium beside a spool that friction holds, m."""
-    xf = still_flapper(t.ratio, deflection, wire)
+def clamped_spool_velocity(t: SpoolLaw, xf: float, direction: float) -> float:
+    """Velocity that the spool approaches with the flapper on its stop, m/s (PHY-43)."""
+    return (t.force * (xf - t.null) - t.eased * direction) / t.damping
+
+
+@inlined
+def held_flapper(t: SpoolLaw, deflection: float, wire: float) -> float:
+    """Deflection of a flapper in equilibrium while friction holds the spool, m."""
+    xf = flapper_rest(t.ratio, deflection, wire)
     return min(max(xf, -t.breakaway), t.breakaway)
 
 
@@ -215,54 +288,53 @@ class JackLaw(NamedTuple):
 
     The second stage's equation, solved for the pressure, reads P12 = (flow x - v) / e with
     e = slope max(abs(x), corner) + leak, whether its pressure gain saturates or not (PHY-6).
-
-    Attributes
-    ----------
-    flow: no-load velocity of the jack per spool travel, GQ / AJ, 1/s.
-    slope: velocity that a pressure takes, per opening, GQ / (PSR AJ), 1/(s Pa).
-    leak: the same by leakage, CLK / AJ, m/(s Pa).
-    corner: opening at which the pressure gain saturates, PSR / GP, m.
-    area, viscosity: of the jack, m² and N s/m.
-    by_mass: reciprocal of its mass, 1/kg.
-    supply: supply minus return pressure, Pa.
-    by_supply: its reciprocal, 1/Pa.
-    oil: rise of the pressure by the jack's travel where the oil yields, 2 β AJ / V, Pa/m; 0: it
-        does not, and the second stage is linear.
-    stroke: m.
-    load: external with the jack in its middle, N, and what friction is more one way than the other.
-    spring: what it gains by the jack's travel, N/m.
-    friction: dry friction of the moving jack, N.
-    static: of the resting one, N.
-    extra: friction that a creeping jack has and a fast one has not, N; 0 without Stribeck's effect.
-    by_stribeck: reciprocal of the velocity over which that fades, s/m.
-    shaped: whether the lands open otherwise than by the spool's travel, 1 or 0.
-    closed: spool position at which they are closed, m.
-    even, odd: what they open more by the travel from there, to both sides, and by its cube, 1/m².
-    lap: travel that their overlap takes, m.
     """
 
     flow: Any
+    """No-load velocity of the jack per spool travel, GQ / AJ, 1/s."""
     slope: Any
+    """Velocity that a pressure takes, per opening, GQ / (PSR AJ), 1/(s Pa)."""
     leak: Any
+    """The same by leakage, CLK / AJ, m/(s Pa)."""
     corner: Any
+    """Opening at which the pressure gain saturates, PSR / GP, m."""
     area: Any
     viscosity: Any
+    """Of the jack, m² and N s/m."""
     by_mass: Any
+    """Reciprocal of its mass, 1/kg."""
     supply: Any
+    """Supply minus return pressure, Pa."""
     by_supply: Any
+    """Its reciprocal, 1/Pa."""
     oil: Any
+    """Rise of the pressure by the jack's travel where the oil yields, 2 β AJ / V, Pa/m; 0: it does
+    not, and the second stage is linear."""
+    bulge: Any
+    """Share of a chamber's volume that the jack's travel displaces, AJ / V, 1/m."""
     stroke: Any
+    """m."""
     load: Any
+    """External with the jack in its middle, N, and what friction is more one way than the other."""
     spring: Any
+    """What it gains by the jack's travel, N/m."""
     friction: Any
+    """Dry friction of the moving jack, N."""
     static: Any
+    """Of the resting one, N."""
     extra: Any
+    """Friction that a creeping jack has and a fast one has not, N; 0 without Stribeck's effect."""
     by_stribeck: Any
+    """Reciprocal of the velocity over which that fades, s/m."""
     shaped: Any
+    """Whether the lands open otherwise than by the spool's travel, 1 or 0."""
     closed: Any
+    """Spool position at which they are closed, m."""
     even: Any
     odd: Any
+    """What they open more by the travel from there, to both sides, and by its cube, 1/m²."""
     lap: Any
+    """Travel that their overlap takes, m."""
 
 
 @inlined
@@ -279,13 +351,14 @@ def jack_law(c: PlantConstants) -> JackLaw:
         c.PSR,
         1.0 / c.PSR,
         c.OIL * c.AJ,
+        c.CHB,
         c.XJM,
         c.FR + c.WAY * c.FDJ,
         c.KA,
         c.FDJ,
-        STATIC_RATIO_JACK * c.FDJ,
-        (STATIC_RATIO_JACK - 1.0) * c.FDJ if c.VSJ > 0.0 else 0.0,
-        1.0 / max(c.VSJ, SLOWEST_STRIBECK) if c.VSJ > 0.0 else 0.0,
+        JACK_STATIC_FRICTION_RATIO * c.FDJ,
+        (JACK_STATIC_FRICTION_RATIO - 1.0) * c.FDJ if c.VSJ > 0.0 else 0.0,
+        1.0 / max(c.VSJ, MIN_STRIBECK_VELOCITY) if c.VSJ > 0.0 else 0.0,
         1.0 if c.XLD != 0.0 or c.LD2 != 0.0 or c.LD3 != 0.0 or c.LAP != 0.0 else 0.0,
         c.XLD,
         c.LD2,
@@ -295,9 +368,9 @@ def jack_law(c: PlantConstants) -> JackLaw:
 
 
 @packed
-def faded(z: Any) -> Any:
+def exp_minus(z: Any) -> Any:
     """exp(-z) of z from 0 on, of numbers or vectors, to 1e-9: series and squarings."""
-    y = least(z, MOST_FADED) * (1.0 / 64.0)
+    y = minimum(z, MAX_DECAY_EXPONENT) * (1.0 / 64.0)
     out = 1.0 - y * (1.0 - y / 2.0 * (1.0 - y / 3.0 * (1.0 - y / 4.0 * (1.0 - y / 5.0))))
     for _ in range(6):
         out = out * out
@@ -305,30 +378,95 @@ def faded(z: Any) -> Any:
 
 
 @packed
-def creeping(j: JackLaw, speed: Any) -> Any:
-    """Friction that a jack at a speed (m/s) has beside that of a fast one, N (PHY-31)."""
-    return j.extra * faded(speed * j.by_stribeck)
+def stribeck_friction(j: JackLaw, speed: Any) -> Any:
+    """Friction of a jack at a speed (m/s) beyond that of a fast one, N (PHY-31)."""
+    return j.extra * exp_minus(speed * j.by_stribeck)
 
 
 @packed
-def opening(j: JackLaw, x: Any) -> Any:
+def effective_opening(j: JackLaw, x: Any) -> Any:
     """Opening of the second stage with the spool at `x`, no less than its corner, m."""
-    return most(magnitude(x), j.corner)
+    return maximum(absolute(x), j.corner)
 
 
 @packed
-def resistance(j: JackLaw, x: Any) -> Any:
+def stage_resistance(j: JackLaw, x: Any) -> Any:
     """Velocity that a pressure takes from the jack with the spool at `x`, e, m/(s Pa)."""
-    return j.slope * opening(j, x) + j.leak
+    return j.slope * effective_opening(j, x) + j.leak
 
 
 @packed
-def pressure(j: JackLaw, x: Any, velocity: Any) -> Any:
+def stage_pressure(j: JackLaw, x: Any, velocity: Any) -> Any:
     """Differential pressure with the spool at `x` and the jack at a velocity, unlimited, Pa."""
-    return (j.flow * x - velocity) / resistance(j, x)
+    return (j.flow * x - velocity) / stage_resistance(j, x)
 
 
 @packed
-def excess(j: JackLaw, x: Any, hold: Any) -> Any:
+def excess_force(j: JackLaw, x: Any, hold: Any) -> Any:
     """Force on the resting jack beyond `hold` (N, signed), times e, which is positive."""
-    return j.area * j.flow * x - (j.load + hold) * resistance(j, x)
+    return j.area * j.flow * x - (j.load + hold) * stage_resistance(j, x)
+
+
+class ControlLaw(NamedTuple):
+    """Gains of the controller (PHY-2), see `ehadiag.core.actuator.Controller`."""
+
+    IM: float
+    """Saturation, A."""
+    GAP: float
+    GAI: float
+    GAD: float
+    """A/m, A/(m s), A s/m."""
+    tick: float
+    """s."""
+
+
+class ControlState(NamedTuple):
+    """State of the controller between two ticks."""
+
+    integral: float
+    """m s."""
+    before: float
+    """m; of no meaning until started."""
+    started: float
+    """0 before the first tick, then 1."""
+
+
+def control_law(controller: Controller, tick: float) -> ControlLaw:
+    """Gains of an actuator's controller, run once each `tick` (s)."""
+    return ControlLaw(controller.IM, controller.GAP, controller.GAI, controller.GAD, tick)
+
+
+@inlined_exact
+def control_current(
+    law: ControlLaw, state: ControlState, error: float
+) -> tuple[float, ControlState]:
+    """Demanded current (A) for a position error (m).
+
+    Cor = sat(GAP Err + GAI ∫Err + GAD dErr/dt) (PHY-2).
+    """
+    wanted = law.GAP * error
+    if state.started != 0.0:
+        wanted += law.GAD * (error - state.before) / law.tick
+    trial = state.integral + error * law.tick
+    wanted += law.GAI * trial
+    out = min(max(wanted, -law.IM), law.IM)
+    integral = state.integral
+    # Conditional integration: the integral rests while it would push further into saturation.
+    if wanted == out or (wanted - out) * error < 0.0:
+        integral = trial
+    return out, ControlState(integral, error, 1.0)
+
+
+def control_currents(law: ControlLaw, errors: Array) -> Array:
+    """Demanded current of each tick (A) from its position error (m), both of shape (n,)."""
+    out = np.empty_like(errors)
+    fill_control_currents(law, np.ascontiguousarray(errors), out)
+    return out
+
+
+@kernel
+def fill_control_currents(law: ControlLaw, errors: Array, out: Array) -> None:
+    """Write what `control_currents` returns."""
+    state = ControlState(0.0, 0.0, 0.0)
+    for k in range(errors.shape[0]):
+        out[k], state = control_current(law, state, errors[k])

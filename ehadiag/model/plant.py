@@ -1,34 +1,23 @@
-"""Physical constants of an actuator: what every kernel of the monitoring model is given.
+"""Physical constants of an actuator, an input of every kernel, and how severities change them.
 
 A candidate of the identification is one `PlantConstants`: severities and nuisance parameters have
-been turned into physical constants before (`ehadiag.model.parameters`), so no kernel knows what a
-fault is.
+been turned into physical constants before, so kernels are independent of faults.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ehadiag.compile.rows import unpacker
-from ehadiag.core.actuator import Actuator
-from ehadiag.core.recording import Environment
+from ehadiag.compile.jit import Array
 
-__all__ = [
-    "FIELDS",
-    "REFERENCE_TEMPERATURE",
-    "PlantConstants",
-    "Value",
-    "plant_constants",
-    "plant_of",
-    "plant_row",
-    "relative_viscosity",
-]
+if TYPE_CHECKING:  # what a kernel imports is part of its cache key
+    from ehadiag.core.actuator import Actuator
+    from firmware_iface.recording import Environment
 
-Value = Any
+ConstantValue = Any
 """A number, or an array with one of each candidate, shape (n,)."""
 REFERENCE_TEMPERATURE = 40.0
 """degC at which an actuator's viscous coefficients are given (PHY-19)."""
@@ -44,128 +33,135 @@ class PlantConstants(NamedTuple):
     scales of severity use.
     """
 
-    IM: Value
+    IM: ConstantValue
     """Rated current, A."""
-    IB: Value
+    IB: ConstantValue
     """Null bias of the torque motor, A."""
-    HYS: Value
+    HYS: ConstantValue
     """Hysteresis of the torque motor: width of the loop over rated current."""
-    NPL: Value
+    NPL: ConstantValue
     """Number of plays whose mean the hysteresis is."""
-    SKW: Value
+    SKW: ConstantValue
     """How much less a wide play counts in that mean: by exp(-SKW (i + 1/2) / NPL), i = 0, 1 …"""
-    TQ2: Value
+    TQ2: ConstantValue
     """Even part of the torque's curve: at rated current the torque is GM IM (1 + TQ2 + TQ3)."""
-    TQ3: Value
+    TQ3: ConstantValue
     """Odd part of it, by the square of the current."""
-    LAG: Value
+    LAG: ConstantValue
     """Time constant of the current's driver and the coil, s."""
-    GM: Value
+    GM: ConstantValue
     """Torque-motor gain, N m/A."""
-    JF: Value
+    JF: ConstantValue
     """Flapper inertia, N m/(m/s²)."""
-    CF: Value
+    CF: ConstantValue
     """Flapper damping, N m/(m/s)."""
-    KF: Value
+    KF: ConstantValue
     """Net flapper stiffness, N m/m."""
-    KSF: Value
+    KSF: ConstantValue
     """Feedback-wire stiffness, N m/m."""
-    XFM: Value
+    XFM: ConstantValue
     """Flapper stop, m."""
-    GQF: Value
+    XFN: ConstantValue
+    """First stage's null from the middle between the flapper's stops, m."""
+    GQF: ConstantValue
     """First-stage flow gain, m²/s."""
-    GPF: Value
+    GPF: ConstantValue
     """First-stage pressure gain, Pa/m."""
-    AS: Value
+    CLE: ConstantValue
+    """Exponent of the first stage's pressure gain behind a clogged filter, 1."""
+    BRG: ConstantValue
+    """Flapper's stop over the gap of a nozzle, of a bridge of turbulent orifices behind the filter,
+    1 (PHY-43); 0: a linear first stage."""
+    AS: ConstantValue
     """Spool end area, m²."""
-    MS: Value
+    MS: ConstantValue
     """Spool mass, kg."""
-    CS: Value
+    CS: ConstantValue
     """Spool viscous coefficient, N s/m."""
-    XSM: Value
+    XSM: ConstantValue
     """Spool stop, m."""
-    BKL: Value
+    BKL: ConstantValue
     """Half-width of the backlash between spool and feedback spring, m."""
-    FSS: Value
+    FSS: ConstantValue
     """Static dry friction of the spool, N."""
-    FSS1: Value
+    FSS1: ConstantValue
     """Static dry friction of the spool at the limit of damage, N."""
-    VSS: Value
+    VSS: ConstantValue
     """Stribeck velocity of the spool's friction, m/s; 0: moving, it is the dynamic one."""
-    PSR: Value
+    PSR: ConstantValue
     """Supply minus return pressure, Pa."""
-    GP: Value
+    GP: ConstantValue
     """Pressure gain, Pa/m."""
-    GQ: Value
+    GQ: ConstantValue
     """Flow gain, m²/s."""
-    XLD: Value
+    XLD: ConstantValue
     """Spool position at which the metering lands are closed, m."""
-    LD2: Value
+    LD2: ConstantValue
     """Opening of the lands to the plus side over the mean of both, less 1."""
-    LD3: Value
+    LD3: ConstantValue
     """Odd part of their opening: at the spool's stop it is 1 + LD3 of the travel."""
-    LAP: Value
+    LAP: ConstantValue
     """Travel about the middle that the lands' overlap takes, m; below 0: an underlap."""
-    CLK: Value
+    CLK: ConstantValue
     """Leakage, m³/(s Pa)."""
-    OIL: Value
+    OIL: ConstantValue
     """Rise of the differential pressure by a flow into the chambers, 2 β / V, Pa/m³; 0: of a linear
     second stage, whose oil does not yield."""
-    AJ: Value
+    CHB: ConstantValue
+    """Share of a chamber's volume that the jack displaces by its travel, AJ / V, 1/m; 0: chambers
+    of the same volume everywhere."""
+    AJ: ConstantValue
     """Active area of the jack, m²."""
-    MJ: Value
+    MJ: ConstantValue
     """Equivalent mass of jack and surface, kg."""
-    CJ: Value
+    CJ: ConstantValue
     """Viscous coefficient of the jack, N s/m."""
-    XJM: Value
+    XJM: ConstantValue
     """Jack stop, m."""
-    FDJ: Value
+    FDJ: ConstantValue
     """Dynamic dry friction of the jack, N."""
-    FDJ1: Value
+    FDJ1: ConstantValue
     """Dynamic dry friction of the jack at the limit of damage, N."""
-    VSJ: Value
+    VSJ: ConstantValue
     """Stribeck velocity of the jack's friction, m/s; 0: moving, it is the dynamic one."""
-    WAY: Value
+    WAY: ConstantValue
     """Friction of a jack that moves out over the mean of both ways, less 1."""
-    FR: Value
+    FR: ConstantValue
     """External load, N."""
-    KA: Value
+    KA: ConstantValue
     """Load spring that draws the jack to its middle, N/m."""
-    OXS: Value
+    OXS: ConstantValue
     """Constant error of the spool's sensor, m."""
-    OPD: Value
+    OPD: ConstantValue
     """Constant error of the sensor of differential pressure, Pa."""
-    OXJ: Value
+    OXJ: ConstantValue
     """Constant error of the jack's sensor, m."""
-    GXS: Value
+    GXS: ConstantValue
     """Relative error of the gain of the spool's sensor."""
-    BX2: Value
+    BX2: ConstantValue
     """Even part of the curve of the spool's sensor: at its stop the spool reads 1 + BX2 + BX3."""
-    BX3: Value
+    BX3: ConstantValue
     """Odd part of it, by the square of the position."""
-    GPD: Value
+    GPD: ConstantValue
     """The same of the sensor of differential pressure."""
-    BP2: Value
+    BP2: ConstantValue
     """Even part of that sensor's curve: at the supply pressure it reads 1 + BP2 + BP3."""
-    BP3: Value
+    BP3: ConstantValue
     """Odd part of it, by the square of the pressure."""
-    GXJ: Value
+    GXJ: ConstantValue
     """The same of the jack's sensor."""
-    TAU: Value
+    TAU: ConstantValue
     """Time constant of the analogue filter before the converters of spool and pressure, s."""
-    DLY: Value
+    DLY: ConstantValue
     """Time before the end of the tick at which the channels are sampled, s."""
 
 
-FIELDS = len(PlantConstants._fields)
+PLANT_FIELDS = len(PlantConstants._fields)
 """Numbers of a candidate as kernels are given it, a row of an array."""
 
-plant_of = unpacker(PlantConstants)
-"""Compiled: the constants that a row of `FIELDS` numbers holds."""
 
-
-def plant_row(constants: PlantConstants) -> NDArray[np.float64]:
-    """One candidate as a row that kernels take, shape (FIELDS,)."""
+def plant_row(constants: PlantConstants) -> Array:
+    """One candidate as a row that kernels take, shape (PLANT_FIELDS,)."""
     return np.array(constants, dtype=np.float64)
 
 
@@ -196,15 +192,11 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
             viscosity = relative_viscosity(environment.oil_temperature)
         if environment.supply_pressure is not None and environment.return_pressure is not None:
             supply = environment.supply_pressure - environment.return_pressure
-    return PlantConstants(
+    orifices = stage.kind == "orifice"
+    none = PlantConstants(*(0.0 for _ in PlantConstants._fields))
+    return none._replace(
         IM=actuator.controller.IM,
-        IB=0.0,
-        HYS=0.0,
         NPL=1.0,
-        SKW=0.0,
-        TQ2=0.0,
-        TQ3=0.0,
-        LAG=0.0,
         GM=valve.GM,
         JF=valve.JF,
         CF=valve.CF,
@@ -213,43 +205,25 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         XFM=valve.XFM,
         GQF=valve.GQF,
         GPF=valve.GPF,
+        CLE=sum(valve.clogging_range) / 2.0,
+        BRG=valve.GPF * valve.XFM / valve.PSR if valve.clogging_range[1] > 0.0 else 0.0,
         AS=valve.AS,
         MS=valve.MS,
         CS=valve.CS * viscosity,
         XSM=valve.XSM,
-        BKL=0.0,
         FSS=valve.FSS0,
         FSS1=valve.FSS1,
-        VSS=0.0,
         PSR=supply,
         GP=valve.GP,
         GQ=valve.GQ,
-        XLD=0.0,
-        LD2=0.0,
-        LD3=0.0,
-        LAP=0.0,
         CLK=valve.CLK / viscosity,
-        OIL=2.0 * stage.beta / stage.volume if stage.kind == "orifice" else 0.0,
+        OIL=2.0 * stage.beta / stage.volume_of_one_chamber if orifices else 0.0,
+        CHB=jack.AJ / stage.volume_of_one_chamber if orifices and stage.by_position else 0.0,
         AJ=jack.AJ,
         MJ=jack.MJ,
         CJ=jack.CJ * viscosity,
         XJM=jack.XJM,
         FDJ=jack.FDJ0,
         FDJ1=jack.FDJ1,
-        VSJ=0.0,
-        WAY=0.0,
         FR=jack.FR,
-        KA=0.0,
-        OXS=0.0,
-        OPD=0.0,
-        OXJ=0.0,
-        GXS=0.0,
-        BX2=0.0,
-        BX3=0.0,
-        GPD=0.0,
-        BP2=0.0,
-        BP3=0.0,
-        GXJ=0.0,
-        TAU=0.0,
-        DLY=0.0,
     )

@@ -1,8 +1,9 @@
-"""Model of the sensors' effect on the signals: gain, offset, filter lag and sampling instant.
+"""Collocation step of the sliding jack, and its sensors: gain, offset, filter, sampling.
 
-Before its converter a signal passes a first-order filter, and it is sampled some time before the
-end of the tick. The path of a signal is a chain of cubics in u = 0 … 1, and over a cubic the filter
-is integrated exactly.
+The jack's step is Radau's collocation of order 5 (IIA, three stages; Hairer, Wanner, Solving
+Ordinary Differential Equations II, section IV.5). Before its converter a signal passes a first-
+order filter and is sampled some time before the end of the tick; over a cubic the filter is
+integrated exactly.
 """
 
 from __future__ import annotations
@@ -12,57 +13,169 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ehadiag.compile.kernels import inlined
-from ehadiag.compile.vector import packed
-from ehadiag.model.collocation import C1, C2
+from ehadiag.compile.jit import inlined
+from ehadiag.compile.vector import maximum, packed
+from ehadiag.model.laws import JackLaw, stribeck_friction
 from ehadiag.model.plant import PlantConstants
 
-__all__ = [
-    "LATE",
-    "Follow",
-    "SensorLaw",
-    "followed",
-    "following",
-    "read_pressure",
-    "read_spool",
-    "sensing",
-    "sensor_law",
-    "through_ends",
-    "through_stages",
-]
+CREEP_ITERATIONS = 3
+"""Iterations for the friction of a creeping jack, 1."""
 
-LATE = 1.0 + 1e-6
+
+class RadauTable(NamedTuple):
+    """Radau's collocation of order 5: places of the stages in a step, and their weights."""
+
+    c1: float
+    """Place of the first stage, as a share of the step, 1."""
+    c2: float
+    """Place of the second stage, 1; the third is at the end."""
+    a11: float
+    a12: float
+    a13: float
+    a21: float
+    a22: float
+    a23: float
+    a31: float
+    a32: float
+    a33: float
+    """Weights of the stages, 1."""
+
+
+def _radau_table() -> RadauTable:
+    root = math.sqrt(6.0)
+    return RadauTable(
+        (4.0 - root) / 10.0, (4.0 + root) / 10.0,
+        (88.0 - 7.0 * root) / 360.0, (296.0 - 169.0 * root) / 1800.0, (3.0 * root - 2.0) / 225.0,
+        (296.0 + 169.0 * root) / 1800.0, (88.0 + 7.0 * root) / 360.0, -(3.0 * root + 2.0) / 225.0,
+        (16.0 - root) / 36.0, (16.0 + root) / 36.0, 1.0 / 9.0,
+    )  # fmt: skip
+
+
+RADAU = _radau_table()
+
+
+@packed
+def _stage_pressures(
+    j: JackLaw, h: Any, load: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any, g1: Any, g2: Any, g3: Any,
+) -> Any:  # fmt: skip
+    """Pressures (Pa) at the three stages of a step of `h` seconds of the moving jack.
+
+    load: external and friction force at its start, N; x1, x2, x3: spool at the three stages, m;
+    e1, e2, e3: `stage_resistance` there; g1, g2, g3: more force there, N. Numbers or vectors of
+    them.
+    """
+    k = h * j.by_mass
+    thrust, drag = k * j.area, k * j.viscosity
+    y1, y2, y3 = j.flow * x1, j.flow * x2, j.flow * x3
+    f1, f2, f3 = thrust + drag * e1, thrust + drag * e2, thrust + drag * e3
+    # The load spring's force grows with the travel.
+    pull, more = k * load, 0.5 * h * k * j.spring * velocity
+    z1 = (
+        y1
+        + drag * (RADAU.a11 * y1 + RADAU.a12 * y2 + RADAU.a13 * y3)
+        + RADAU.c1 * pull
+        + RADAU.c1 * RADAU.c1 * more
+        - velocity
+    )
+    z2 = (
+        y2
+        + drag * (RADAU.a21 * y1 + RADAU.a22 * y2 + RADAU.a23 * y3)
+        + RADAU.c2 * pull
+        + RADAU.c2 * RADAU.c2 * more
+        - velocity
+    )
+    z3 = y3 + drag * (RADAU.a31 * y1 + RADAU.a32 * y2 + RADAU.a33 * y3) + pull + more - velocity
+    m11, m12, m13 = e1 + RADAU.a11 * f1, RADAU.a12 * f2, RADAU.a13 * f3
+    m21, m22, m23 = RADAU.a21 * f1, e2 + RADAU.a22 * f2, RADAU.a23 * f3
+    m31, m32, m33 = RADAU.a31 * f1, RADAU.a32 * f2, e3 + RADAU.a33 * f3
+    if g1 is not None:
+        z1 = z1 + k * (RADAU.a11 * g1 + RADAU.a12 * g2 + RADAU.a13 * g3)
+        z2 = z2 + k * (RADAU.a21 * g1 + RADAU.a22 * g2 + RADAU.a23 * g3)
+        z3 = z3 + k * (RADAU.a31 * g1 + RADAU.a32 * g2 + RADAU.a33 * g3)
+    # Cramer's rule, the unknowns one by one.
+    minor = m11 * m22 - m12 * m21
+    below = m31 * (m12 * m23 - m13 * m22) - m32 * (m11 * m23 - m13 * m21) + m33 * minor
+    first = (
+        z1 * (m22 * m33 - m23 * m32) - z2 * (m12 * m33 - m13 * m32) + z3 * (m12 * m23 - m13 * m22)
+    )
+    second = (
+        z2 * (m11 * m33 - m13 * m31) - z1 * (m21 * m33 - m23 * m31) - z3 * (m11 * m23 - m13 * m21)
+    )
+    third = m31 * (m12 * z2 - z1 * m22) - m32 * (m11 * z2 - z1 * m21) + z3 * minor
+    return first / below, second / below, third / below
+
+
+@packed
+def radau_pressures(
+    j: JackLaw, h: Any, load: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+) -> Any:  # fmt: skip
+    """Pressures (Pa) at the three stages, Stribeck's friction left out: see `radau_velocity`."""
+    return _stage_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3, None, None, None)
+
+
+@packed
+def radau_creep_pressures(
+    j: JackLaw, h: Any, load: Any, d: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+) -> Any:  # fmt: skip
+    """Pressures (Pa) at the three stages, Stribeck's friction included.
+
+    Arguments as of `radau_velocity`; d: direction of the motion. What the oil resists is far more
+    than what friction gains by velocity, so that a few repetitions find it.
+    """
+    g = d * stribeck_friction(j, velocity * d)
+    p1, p2, p3 = _stage_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3, g, g, g)
+    for _ in range(CREEP_ITERATIONS):
+        g1 = d * stribeck_friction(j, maximum((j.flow * x1 - e1 * p1) * d, x1 * 0.0))
+        g2 = d * stribeck_friction(j, maximum((j.flow * x2 - e2 * p2) * d, x1 * 0.0))
+        g3 = d * stribeck_friction(j, maximum((j.flow * x3 - e3 * p3) * d, x1 * 0.0))
+        p1, p2, p3 = _stage_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3, g1, g2, g3)
+    return p1, p2, p3
+
+
+@packed
+def radau_velocity(
+    j: JackLaw, h: Any, load: Any, velocity: Any,
+    x1: Any, x2: Any, x3: Any, e1: Any, e2: Any, e3: Any,
+) -> Any:  # fmt: skip
+    """Velocity (m/s) of the moving jack after a step of `h` seconds, Stribeck's friction left out.
+
+    load: external and dynamic friction force at its start, N; x1, x2, x3: spool at the three
+    stages, m; e1, e2, e3: `stage_resistance` there. Numbers or vectors of them.
+    """
+    p3 = radau_pressures(j, h, load, velocity, x1, x2, x3, e1, e2, e3)[2]
+    return j.flow * x3 - e3 * p3
+
+
+MAX_INSTANT_SHARE = 1.0 + 1e-6
 """Share of a piece up to which an instant counts as within it: what rounding may add."""
-SHORT = 1e-3
+MIN_FILTER_SHARE = 1e-3
 """Share of the filter's time constant in which all that a signal does is its mean."""
 
 
 class SensorLaw(NamedTuple):
-    """How the sensors of one candidate show spool, pressure and jack.
-
-    Attributes
-    ----------
-    spool_offset, pressure_offset, position_offset: constant errors, m, Pa, m.
-    spool_gain, pressure_gain, position_gain: what is shown over what is there; of the spool about
-        the middle, and
-    spool_even, spool_odd: what its gain grows by with the position (1/m) and its square (1/m²).
-    pressure_even, pressure_odd: the same of the pressure, 1/Pa and 1/Pa².
-    lead: all are sampled so long before the end of the tick, s.
-    lag: time constant of the filter before the converters of spool and pressure, s; 0: none.
-    """
+    """How the sensors of one candidate show spool, pressure and jack."""
 
     spool_offset: Any
     pressure_offset: Any
     position_offset: Any
+    """Constant errors, m, Pa, m."""
     spool_gain: Any
     pressure_gain: Any
     position_gain: Any
+    """What is shown over what is there; of the spool about the middle, and."""
     lead: Any
+    """All are sampled so long before the end of the tick, s."""
     lag: Any
+    """Time constant of the filter before the converters of spool and pressure, s; 0: none."""
     spool_even: Any
     spool_odd: Any
+    """What its gain grows by with the position (1/m) and its square (1/m²)."""
     pressure_even: Any
     pressure_odd: Any
+    """The same of the pressure, 1/Pa and 1/Pa²."""
 
 
 @inlined
@@ -99,52 +212,48 @@ def read_pressure(law: SensorLaw, p12: Any) -> Any:
 
 
 @inlined
-def sensing(law: SensorLaw) -> bool:
+def has_sensor_dynamics(law: SensorLaw) -> bool:
     """Whether spool and pressure are seen otherwise than at the end of the tick."""
     return law.lag > 0.0 or law.lead > 0.0
 
 
-class Follow(NamedTuple):
-    """How the filter's output hangs on a cubic a0 + a1 u + a2 u² + a3 u³ and on itself before.
-
-    Attributes
-    ----------
-    keep: share of the output before that is left.
-    m0, m1, m2, m3: weights of the cubic's coefficients.
-    """
+class FilterStep(NamedTuple):
+    """How the filter's output hangs on a cubic a0 + a1 u + a2 u² + a3 u³ and on itself before."""
 
     keep: Any
+    """Share of the output before that is left."""
     m0: Any
     m1: Any
     m2: Any
     m3: Any
+    """Weights of the cubic's coefficients."""
 
 
 @inlined
-def following(lag: float, span: float, upto: float) -> Follow:
+def filter_step(lag: float, span: float, upto: float) -> FilterStep:
     """Follow a cubic of a duration `span` from its start for `upto` seconds; lag 0: the cubic."""
     u = upto / span
     if lag <= 0.0:
-        return Follow(0.0, 1.0, u, u * u, u * u * u)
+        return FilterStep(0.0, 1.0, u, u * u, u * u * u)
     keep = math.exp(-upto / lag)
     m0 = -math.expm1(-upto / lag)
-    if upto < SHORT * lag:
-        return Follow(keep, m0, m0 * u / 2.0, m0 * u * u / 3.0, m0 * u * u * u / 4.0)
+    if upto < MIN_FILTER_SHARE * lag:
+        return FilterStep(keep, m0, m0 * u / 2.0, m0 * u * u / 3.0, m0 * u * u * u / 4.0)
     # By parts: the moments of exp((s - upto) / lag) / lag.
     r = lag / span
     m1 = u - r * m0
     m2 = u * u - 2.0 * r * m1
-    return Follow(keep, m0, m1, m2, u * u * u - 3.0 * r * m2)
+    return FilterStep(keep, m0, m1, m2, u * u * u - 3.0 * r * m2)
 
 
 @packed
-def followed(f: Follow, before: Any, cubic: Any) -> Any:
+def filter_output(f: FilterStep, before: Any, cubic: Any) -> Any:
     """Output of the filter after a cubic, its four coefficients; `before`: output at its start."""
     return f.keep * before + f.m0 * cubic[0] + f.m1 * cubic[1] + f.m2 * cubic[2] + f.m3 * cubic[3]
 
 
 @packed
-def through_ends(x0: Any, x1: Any, rise0: Any, rise1: Any) -> Any:
+def cubic_through_ends(x0: Any, x1: Any, rise0: Any, rise1: Any) -> Any:
     """Coefficients of the cubic with these ends and slopes (by du) there."""
     gain = x1 - x0
     return x0, rise0, 3.0 * gain - 2.0 * rise0 - rise1, rise0 + rise1 - 2.0 * gain
@@ -153,7 +262,7 @@ def through_ends(x0: Any, x1: Any, rise0: Any, rise1: Any) -> Any:
 def _inverse() -> list[list[float]]:
     """Coefficients of u, u², u³, a row each, of the cubics that are 1 at C1, C2 or 1 and else 0."""
     table: list[list[float]] = np.linalg.inv(
-        np.vander([C1, C2, 1.0], 4, increasing=True)[:, 1:]
+        np.vander([RADAU.c1, RADAU.c2, 1.0], 4, increasing=True)[:, 1:]
     ).tolist()
     return table
 
@@ -162,7 +271,7 @@ def _inverse() -> list[list[float]]:
 
 
 @packed
-def through_stages(p0: Any, p1: Any, p2: Any, p3: Any) -> Any:
+def cubic_through_stages(p0: Any, p1: Any, p2: Any, p3: Any) -> Any:
     """Coefficients of the cubic with these values at 0, C1, C2 and 1."""
     d1, d2, d3 = p1 - p0, p2 - p0, p3 - p0
     return (
@@ -171,3 +280,67 @@ def through_stages(p0: Any, p1: Any, p2: Any, p3: Any) -> Any:
         B21 * d1 + B22 * d2 + B23 * d3,
         B31 * d1 + B32 * d2 + B33 * d3,
     )
+
+
+class JackState(NamedTuple):
+    """Jack between two pieces."""
+
+    place: float
+    """m."""
+    velocity: float
+    """m/s."""
+    direction: float
+    """Of its motion, +1 or -1; 0 at rest."""
+    fresh: float
+    """Not 0 if it has just started or stopped."""
+    pressure: float
+    """Differential pressure, Pa; of an orifice stage, where it is stored in the oil."""
+    lagged: float
+    """Differential pressure behind the filter, Pa."""
+    seen: float
+    """The same when it was sampled last, Pa."""
+
+
+class PathPiece(NamedTuple):
+    """Piece of the spool's path, a cubic; numbers, or vectors of as many lanes."""
+
+    span: Any
+    """Duration, s."""
+    x0: Any
+    x1: Any
+    """Spool at its ends, m."""
+    rise0: Any
+    rise1: Any
+    """Slopes there times `span`, m."""
+
+
+class PressureProbe(NamedTuple):
+    """Sampling of the pressure within a piece."""
+
+    lag: float
+    """Of the filter before its converter, s."""
+    due: float
+    """From the start of the piece to the instant of sampling, s; none of this piece if negative or
+    beyond it."""
+
+
+@packed
+def position_on_piece(p: PathPiece, q: Any) -> Any:
+    """Spool at the share q of a piece, m."""
+    r = 1.0 - q
+    return p.x0 + q * q * (3.0 - 2.0 * q) * (p.x1 - p.x0) + q * r * (r * p.rise0 - q * p.rise1)
+
+
+@packed
+def sample_pressure(
+    probe: PressureProbe, cubic: Any, begin: float, span: float, lagged: float, seen: float
+) -> tuple[float, float]:
+    """Pressure behind the filter after a step, and when it was sampled, Pa.
+
+    cubic: coefficients of the pressure over the step; begin: its start, s from that of the piece;
+    span: s; lagged, seen: before, Pa.
+    """
+    upto = probe.due - begin
+    if 0.0 < upto <= MAX_INSTANT_SHARE * span:
+        seen = filter_output(filter_step(probe.lag, span, upto), lagged, cubic)
+    return filter_output(filter_step(probe.lag, span, span), lagged, cubic), seen

@@ -1,96 +1,98 @@
-"""Events of flapper and spool: which one ends a step, and the state after it."""
+"""Events of flapper and spool, and steps of a spool whose friction falls with its velocity.
+
+Shared by the scalar and the vector kernels. With Stribeck's friction the part that fades with the
+velocity is held over a step at the mean of its start and end; steps that are too long for that are
+halved.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ehadiag.compile.kernels import inlined
-from ehadiag.model.laws import SpoolLaw, play, still_flapper
+from ehadiag.compile.jit import inlined
+from ehadiag.compile.vector import absolute, maximum, minimum, packed
+from ehadiag.model.laws import (
+    SpoolLaw,
+    clamped_spool_velocity,
+    exp_minus,
+    flapper_rest,
+    play_output,
+    spool_rest_position,
+    steady_spool_velocity,
+)
 
-__all__ = [
-    "BREAKAWAY",
-    "ENGAGE",
-    "FLAPPER_STOP",
-    "NOTHING",
-    "RELEASE",
-    "REVERSAL",
-    "SPOOL_STOP",
-    "UNSURE",
-    "SpoolState",
-    "carried",
-    "clamped_event",
-    "held",
-    "moving_event",
-    "stuck_event",
-    "switch",
-]
 
-NOTHING = 0
-UNSURE = -1
-"""An event may hide inside the step: halve it, but it is none if it is still unsure at the end."""
-REVERSAL = 1
-SPOOL_STOP = 2
-BREAKAWAY = 3
-FLAPPER_STOP = 4
-RELEASE = 5
-ENGAGE = 6
-"""The feedback wire meets the other side of its backlash."""
-TOUCH = 1e-12
-"""m; what rounding may make of a wire that the spool carries along."""
+class SpoolEvents(NamedTuple):
+    """Codes of what may end a step of flapper and spool."""
+
+    possible: int = -1
+    """An event may hide inside the step: halve it; none if it is still uncertain at the finest
+    step."""
+    none: int = 0
+    """The step has no event."""
+    reversal: int = 1
+    """The spool reverses or comes to rest."""
+    stop: int = 2
+    """The spool meets its stop."""
+    breakaway: int = 3
+    """The spool breaks away."""
+    flapper_stop: int = 4
+    """The flapper meets its stop."""
+    flapper_release: int = 5
+    """The flapper leaves its stop."""
+    wire_engagement: int = 6
+    """The feedback wire meets the other side of its backlash."""
+
+
+EVENTS = SpoolEvents()
+
+
+WIRE_TOLERANCE = 1e-12
+"""Rounding of a wire that the spool carries along, m."""
 
 
 class SpoolState(NamedTuple):
-    """Flapper and spool at an instant.
-
-    Attributes
-    ----------
-    xf, wf: flapper deflection and its rate, m and m/s.
-    xs, vs: spool position and velocity, m and m/s.
-    wire: end of the feedback wire, which is the spool's but for the backlash, m.
-    direction: of the spool's motion, +1 or -1; 0 at rest.
-    clamped: whether the flapper is on its stop.
-    """
+    """Flapper and spool at an instant."""
 
     xf: float
     wf: float
+    """Flapper deflection and its rate, m and m/s."""
     xs: float
     vs: float
+    """Spool position and velocity, m and m/s."""
     wire: float
+    """End of the feedback wire, which is the spool's but for the backlash, m."""
     direction: int
+    """Of the spool's motion, +1 or -1; 0 at rest."""
     clamped: bool
+    """Whether the flapper is on its stop."""
 
 
 @inlined
-def held(t: SpoolLaw, xf: float, xs: float) -> bool:
+def is_spool_held(t: SpoolLaw, xf: float, xs: float) -> bool:
     """Whether a spool at rest stays: friction holds it, or its stop does."""
     return abs(xf) <= t.breakaway or (abs(xs) >= t.stroke and xs * xf > 0.0)
 
 
 @inlined
-def carried(t: SpoolLaw, direction: int, xs: float, wire: float) -> bool:
+def is_wire_carried(t: SpoolLaw, direction: int, xs: float, wire: float) -> bool:
     """Whether a spool that moves carries the feedback wire along."""
-    return direction * (xs - wire) >= t.backlash - TOUCH
+    return direction * (xs - wire) >= t.backlash - WIRE_TOLERANCE
 
 
 @inlined
 def clamped_event(
-    t: SpoolLaw,
-    deflection: float,
-    xf: float,
-    xs: float,
-    vs: float,
-    wire: float,
-    direction: int,
+    t: SpoolLaw, deflection: float, xf: float, xs: float, vs: float, wire: float, direction: int
 ) -> int:
     """What ends a step with the flapper on its stop, which it leaves when the torque turns."""
-    if (still_flapper(t.ratio, deflection, wire) - xf) * xf < 0.0:
-        return RELEASE
+    if (flapper_rest(t.ratio, deflection, wire) - xf) * xf < 0.0:
+        return EVENTS.flapper_release
     if direction == 0:
-        return NOTHING if held(t, xf, xs) else BREAKAWAY
+        return EVENTS.none if is_spool_held(t, xf, xs) else EVENTS.breakaway
     if vs * direction <= 0.0:
-        return REVERSAL
-    return SPOOL_STOP if abs(xs) >= t.stroke and xs * direction > 0.0 else NOTHING
+        return EVENTS.reversal
+    return EVENTS.stop if abs(xs) >= t.stroke and xs * direction > 0.0 else EVENTS.none
 
 
 @inlined
@@ -109,58 +111,182 @@ def moving_event(
 ) -> int:
     """What ends a step with flapper free and spool moving; loose: without the feedback wire."""
     if vs * direction <= 0.0:
-        return REVERSAL
-    if loose and carried(t, direction, xs, wire):
-        return ENGAGE
+        return EVENTS.reversal
+    if loose and is_wire_carried(t, direction, xs, wire):
+        return EVENTS.wire_engagement
     if abs(xs) >= t.stroke and xs * direction > 0.0:
-        return SPOOL_STOP
+        return EVENTS.stop
     if abs(xf) >= t.flapper_stop:
-        return FLAPPER_STOP
+        return EVENTS.flapper_stop
     if before_wf * wf < 0.0:
         # An extreme of the flapper lies inside: the spool may stop there, or the flapper touch.
         swing = 0.25 * h * max(abs(before_wf), abs(wf))
         lowest = min(before_xf * direction, xf * direction) - t.dry - swing
         if lowest <= 0.0 or max(abs(before_xf), abs(xf)) + swing >= t.flapper_stop:
-            return UNSURE
-    return NOTHING
+            return EVENTS.possible
+    return EVENTS.none
 
 
 @inlined
 def stuck_event(
-    t: SpoolLaw,
-    h: float,
-    before_xf: float,
-    before_wf: float,
-    xf: float,
-    wf: float,
-    xs: float,
+    t: SpoolLaw, h: float, before_xf: float, before_wf: float, xf: float, wf: float, xs: float
 ) -> int:
     """What ends a step with flapper free and spool at rest."""
-    if not held(t, xf, xs):
-        return BREAKAWAY
+    if not is_spool_held(t, xf, xs):
+        return EVENTS.breakaway
     if abs(xf) >= t.flapper_stop:
-        return FLAPPER_STOP
+        return EVENTS.flapper_stop
     if before_wf * wf < 0.0:
         swing = 0.25 * h * max(abs(before_wf), abs(wf))
         if max(abs(before_xf), abs(xf)) + swing > min(t.breakaway, t.flapper_stop):
-            return UNSURE
-    return NOTHING
+            return EVENTS.possible
+    return EVENTS.none
 
 
 @inlined
-def switch(t: SpoolLaw, event: int, s: SpoolState) -> SpoolState:
+def state_after_event(t: SpoolLaw, event: int, s: SpoolState) -> SpoolState:
     """State after a step that an event ends, or none."""
     xf, wf, xs, vs, wire, direction, clamped = s
-    if event == REVERSAL:
+    if event == EVENTS.reversal:
         vs, direction = 0.0, 0
         if abs(xf) > t.breakaway:
             direction = 1 if xf > 0.0 else -1
-    elif event == SPOOL_STOP:
+    elif event == EVENTS.stop:
         xs, vs, direction = math.copysign(t.stroke, xs), 0.0, 0
-    elif event == BREAKAWAY:
+    elif event == EVENTS.breakaway:
         direction = 1 if xf > 0.0 else -1
-    elif event == FLAPPER_STOP:
+    elif event == EVENTS.flapper_stop:
         xf, wf, clamped = math.copysign(t.flapper_stop, xf), 0.0, True
-    elif event == RELEASE:
+    elif event == EVENTS.flapper_release:
         clamped = False
-    return SpoolState(xf, wf, xs, vs, play(wire, xs, t.backlash), direction, clamped)
+    return SpoolState(xf, wf, xs, vs, play_output(wire, xs, t.backlash), direction, clamped)
+
+
+MAX_CREEP_ERROR = 2e-9
+"""Largest error of a creeping step, m: a hundredth of a converter's step."""
+CREEP_NEWTON_ROUNDS = 3
+"""Rounds of Newton's method, 1."""
+MIN_FRICTION_SLOPE = 0.2
+"""Least slope of the equation of the end's friction, 1; below, the velocity diverges."""
+
+
+class StepTransition(NamedTuple):
+    """What a step without friction makes of flapper and spool, by rows XF, DXF, XS, DXS."""
+
+    m00: Any
+    m01: Any
+    m02: Any
+    m03: Any
+    m10: Any
+    m11: Any
+    m12: Any
+    m13: Any
+    m20: Any
+    m21: Any
+    m22: Any
+    m23: Any
+    m30: Any
+    m31: Any
+    m32: Any
+    m33: Any
+
+
+@packed
+def creep_friction(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any, swing: Any) -> Any:
+    """Friction of a step beyond the dynamic one, as the flapper deflection (m) that balances it.
+
+    span: of the step, s; before: velocity at its start along the motion, m/s; free: velocity at its
+    end without this friction, m/s; pull: its decrease by the friction, 1/s; swing: growth of the
+    flapper's rate along the motion over the step, m/s. Returns the mean; the larger of start and
+    end; velocity (m/s) by which the end is slower than with the mean; error bound of the step, m,
+    beyond `MAX_CREEP_ERROR` where it is unknown.
+    """
+    first = t.extra * exp_minus(maximum(before, 0.0) * t.by_stribeck)
+    # The velocity follows what acts within microseconds: the end's goes by the end's friction.
+    length = span * t.damping / t.mass
+    kept = exp_minus(length)
+    weight = (1.0 - (1.0 - kept) / length) / (1.0 - kept)
+    last, slope, move = first, first * 0.0 + 1.0, first * 0.0
+    for _ in range(CREEP_NEWTON_ROUNDS):
+        after = free - pull * (first + weight * (last - first))
+        there = t.extra * exp_minus(maximum(after, 0.0) * t.by_stribeck)
+        slope = 1.0 - weight * t.by_stribeck * pull * there
+        move = (there - last) / maximum(slope, MIN_FRICTION_SLOPE)
+        last = maximum(minimum(last + move, t.extra), 0.0)
+    after = free - pull * (first + weight * (last - first))
+    change = minimum(absolute(after - before) * t.by_stribeck, 1.0)
+    largest = maximum(first, last)
+    # The last move is far more than what is left after it.
+    miss = largest * change * change * (1.0 / 12.0) + 0.1 * absolute(move)
+    # The flapper rings within the step: what the derivatives at its ends say of the mean (Euler
+    # and Maclaurin), the velocity following the flapper at once.
+    fall = t.by_stribeck * 0.5 * (first + last) * t.force / t.damping
+    ringing = span * (1.0 / 12.0) * fall * swing / maximum(1.0 - fall, MIN_FRICTION_SLOPE)
+    miss = miss + 0.05 * absolute(ringing)
+    unsure = maximum((MIN_FRICTION_SLOPE - slope) * 1e9, 0.0) * MAX_CREEP_ERROR
+    # What friction does early in the step the feedback wire has partly undone at its end.
+    undone = minimum(span * t.ratio * t.force / t.damping, first * 0.0 + 1.0) * (1.0 / 12.0)
+    miss = miss + undone * absolute(last - first)
+    doubt = span * t.force / t.damping * miss + unsure
+    mean = maximum(minimum(0.5 * (first + last) + ringing, t.extra), 0.0)
+    return mean, largest, pull * (weight - 0.5) * (last - first), doubt
+
+
+@inlined
+def creep_step(
+    t: SpoolLaw, m: StepTransition, h: float, fade: float, deflection: float, loose: bool,
+    s: SpoolState,
+) -> tuple[SpoolState, bool]:  # fmt: skip
+    """Flapper and moving spool after a step of `h` seconds, and whether it was short enough.
+
+    m: with the feedback wire, or without it where `loose`; fade: of the spool's velocity with the
+    flapper on its stop, over the step.
+    """
+    d = float(s.direction)
+    if s.clamped:
+        rest = clamped_spool_velocity(t, s.xf, d)
+        pull = t.force / t.damping * (1.0 - fade)
+        free = rest + (s.vs - rest) * fade
+        mean, _, less, doubt = creep_friction(t, h, s.vs * d, free * d, pull, 0.0)
+        steady = clamped_spool_velocity(t, s.xf - mean * d, d)
+        xs = s.xs + steady * h + (s.vs - steady) * (1.0 - fade) * t.mass / t.damping
+        vs = steady + (s.vs - steady) * fade - less * d
+        after = SpoolState(s.xf, s.wf, xs, vs, s.wire, s.direction, s.clamped)
+    elif loose:
+        still = flapper_rest(t.ratio, deflection, s.wire)
+        rest = steady_spool_velocity(t, still, d)
+        a, w = s.xf - still, s.wf
+        pull = t.force / t.damping * (1.0 - m.m33)
+        free = rest + m.m30 * a + m.m31 * w + m.m33 * (s.vs - rest)
+        swing = (m.m10 * a + m.m11 * w - w) * d
+        mean, _, less, doubt = creep_friction(t, h, s.vs * d, free * d, pull, swing)
+        steady = steady_spool_velocity(t, still - mean * d, d)
+        v = s.vs - steady
+        after = SpoolState(
+            still + m.m00 * a + m.m01 * w,
+            m.m10 * a + m.m11 * w,
+            s.xs + steady * h + m.m20 * a + m.m21 * w + m.m23 * v,
+            steady + m.m30 * a + m.m31 * w + m.m33 * v - less * d,
+            s.wire,
+            s.direction,
+            s.clamped,
+        )
+    else:
+        base = spool_rest_position(t, deflection, d)
+        a, w, b, v = s.xf - t.dry * d, s.wf, s.xs - base, s.vs
+        free = m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v
+        pull = m.m30 - m.m32 * t.reach
+        swing = (m.m10 * a + m.m11 * w + m.m12 * b + m.m13 * v - w) * d
+        mean, _, less, doubt = creep_friction(t, h, s.vs * d, free * d, pull, swing)
+        rest_xf, rest_xs = (t.dry + mean) * d, base - mean * t.reach * d
+        a, b = s.xf - rest_xf, s.xs - rest_xs
+        after = SpoolState(
+            rest_xf + m.m00 * a + m.m01 * w + m.m02 * b + m.m03 * v,
+            m.m10 * a + m.m11 * w + m.m12 * b + m.m13 * v,
+            rest_xs + m.m20 * a + m.m21 * w + m.m22 * b + m.m23 * v,
+            m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v - less * d,
+            s.wire,
+            s.direction,
+            s.clamped,
+        )
+    return after, doubt <= MAX_CREEP_ERROR

@@ -1,213 +1,333 @@
-"""Stochastic processes of wear: likelihood of increments, and first passage of a level.
+"""Laws of wear as one state-space model, many parameter sets at once.
 
-Both run on a clock of their own, `(age / scale)**power` (Whitmore and Schenkelberg, Modelling
-accelerated degradation data using Wiener diffusion with a time scale transformation, Lifetime Data
-Analysis 3, 1997), so that wear may speed up or slow down with age; and on a scale of their own,
-`log(1 + feedback*severity) / feedback`, so that it may grow with what is worn already (Park and
-Padgett, Accelerated degradation models for failure based on geometric Brownian motion and gamma
-processes, Lifetime Data Analysis 11, 2005). In both each life has a rate of its own, drawn from the
-fleet's.
-
-- Wiener process with drift: increments over a step h of the clock are normal, mean `rate*h`,
-  variance `(spread*mean rate)**2*h`; rates are normal. First passage of a level is inverse
-  Gaussian. Whitmore, Estimating degradation by a Wiener diffusion process subject to measurement
-  error, Lifetime Data Analysis 1, 1995; Peng and Tseng, Mis-specification analysis of linear
-  degradation models, IEEE Transactions on Reliability 58, 2009.
-- Gamma process: increments have a gamma density with shape `h/spread**2`, so that they never are
-  negative; its inverse scale has a gamma density over lives. Lawless and Crowder, Covariates and
-  random effects in a gamma process model with application to degradation and failure, Lifetime
-  Data Analysis 10, 2004; van Noortwijk, A survey of the application of gamma processes in
-  maintenance, Reliability Engineering and System Safety 94, 2009.
+Each law makes growth steady: on a clock of its own, and on a severity scale of its own. Severity
+on that scale and its rate are the state of a Kalman filter; first passages of a level are drawn
+from the filtered state. Equations and literature: docs/explanation/remaining-life.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc, gammaln, gdtrib, ndtr
+from scipy.special import gammainc, ndtr
 
-from ehadiag.prognosis.lives import Increments
+from ehadiag.prognosis.lives import Life
 
-__all__ = ["PROCESSES", "Gamma", "Law", "Process", "Wiener"]
+__all__ = ["LAW_NAMES", "Filtered", "Laws", "draw_laws", "draw_passages", "filter_lives"]
 
 Array = NDArray[np.float64]
-LEAST = 1e-300
-NEAR = 1e-9
+SETS_PER_LAW = 48
+"""Number of parameter sets of a law: the study's score changes by less than 1 % beyond it."""
+SEVERITY_GRID = np.linspace(-0.05, 1.05, 441)
+"""Severities, 1, at which a scale is tabulated; noise goes a little beyond 0 and 1."""
+GRID_STEP = float(SEVERITY_GRID[1] - SEVERITY_GRID[0])
+MIN_SLOWING = 0.02
+"""Rate at a ceiling over that without one, 1: so that each level has a finite scale."""
+MAX_CLOCK = 1e6
+"""Clock, scales of age, beyond which a passage counts as none."""
+WALK_STEPS = 48
+"""Number of steps of a simulated path with a walking rate."""
+BISECTIONS = 15
+"""Number of halvings of the logarithm for a passage: to 1e-3 or better."""
+
+LAW_NAMES = (
+    "Wiener", "gamma", "inverse Gaussian", "power", "Paris", "logistic", "two phases",
+    "walking rate",
+)  # fmt: skip
 
 
-class Law(NamedTuple):
-    """Parameters that all lives of a severity share."""
+class Laws(NamedTuple):
+    """Parameter sets of all laws; shape (sets,) each."""
 
-    power: float
-    """Of the clock: above 1 wear speeds up."""
-    rate: float
-    """Growth over one unit of the clock, the mean over lives."""
-    variety: float
-    """Standard deviation of the lives' rates, over their mean."""
-    spread: float
-    """Standard deviation of the growth over one unit of the clock, over the mean rate."""
-    feedback: float
-    """How much faster a part wears at severity 1 than as new, less 1."""
-
-
-class Process(Protocol):
-    """A process of wear."""
-
-    name: str
-
-    def log_likelihood(self, increments: Increments, law: Law, scale: float) -> float:
-        """Log density of the increments, the lives' own rates integrated out."""
-
-    def chances(
-        self, own: Increments, tried: Increments, law: Law, scale: float
-    ) -> tuple[float, float]:
-        """Chance of a growth of at most, and of at least, the tried one, knowing the own."""
-
-    def passage(
-        self,
-        own: Increments,
-        law: Law,
-        scale: float,
-        now: Array,
-        level: float,
-        rng: np.random.Generator,
-    ) -> Array:
-        """Draw how long on the clock from each severity to a level; infinite: never."""
+    law: NDArray[np.int64]
+    """Place in `LAW_NAMES`."""
+    power: Array
+    """Of the clock, `(age / scale)**power`."""
+    knee: Array
+    """Clock at which the second phase begins."""
+    gain: Array
+    """Rate of the second phase over the first."""
+    exponent: Array
+    """Of the feedback: the rate is `(1 + severity / begin)**exponent` times that as new."""
+    begin: Array
+    ceiling: Array
+    """Severity at which growth ends."""
+    spread: Array
+    """Deviation of the growth over one unit of the clock, over the mean rate."""
+    walk: Array
+    """Deviation of the rate's change over one unit of the clock, over the mean rate."""
+    table: Array
+    """Scale at `SEVERITY_GRID`, shape (grid, sets)."""
 
 
-class Wiener:
-    """Wiener process with drift, variance and a normal spread of the lives' drifts."""
+def draw_laws() -> Laws:
+    """Return the parameter sets: an even cover of what each law may be, always the same."""
+    count = SETS_PER_LAW
+    number = np.arange(1, count + 1)
+    # Additive recurrence with the generalised golden ratio (Roberts 2018): evenly spread.
+    cover = np.mod(0.5 + number * 1.2207440846057596 ** -np.arange(1.0, 5.0)[:, None], 1.0)
 
-    name = "Wiener"
+    def log_range(low: float, high: float, which: int) -> Array:
+        return np.asarray(low * (high / low) ** cover[which])
 
-    def log_likelihood(self, increments: Increments, law: Law, scale: float) -> float:
-        """Log density of the increments, the lives' own rates integrated out."""
-        step, growth, variance = self._columns(increments, law, scale)
-        jacobian = float(np.sum(np.log1p(law.feedback * np.maximum(increments.high, 0.0))))
-        life, lives = increments.life, increments.lives
-        information = np.bincount(life, step**2 / variance, lives)
-        about = np.bincount(life, step * (growth - law.rate * step) / variance, lives)
-        before = 1.0 / (law.variety * law.rate) ** 2
-        loss = float(np.sum((growth - law.rate * step) ** 2 / variance + np.log(variance)))
-        loss += float(np.sum(np.log1p(information / before) - about**2 / (before + information)))
-        return -0.5 * (loss + len(step) * float(np.log(2.0 * np.pi))) - jacobian
+    one, none = np.ones(count), np.zeros(count)
+    plain = {
+        "power": one, "knee": one, "gain": one, "exponent": none, "begin": one,
+        "ceiling": np.full(count, np.inf), "spread": log_range(0.02, 0.6, 0), "walk": none,
+    }  # fmt: skip
+    curved = {"power": log_range(0.5, 2.0, 1), "exponent": cover[2], "begin": 0.3 * one}
+    drawn: dict[str, dict[str, Array]] = {
+        "Wiener": {},
+        "gamma": curved,
+        "inverse Gaussian": curved,
+        "power": {"power": log_range(0.4, 3.5, 1)},
+        "Paris": {"exponent": 3.0 * cover[1], "begin": log_range(0.01, 0.5, 2)},
+        "logistic": {"exponent": one, "begin": log_range(0.005, 0.3, 1),
+                     "ceiling": log_range(0.78, 1.6, 2)},
+        "two phases": {"knee": log_range(0.15, 1.5, 1), "gain": log_range(0.2, 8.0, 2)},
+        "walking rate": {"walk": log_range(0.2, 3.0, 1), "spread": log_range(0.01, 0.3, 0)},
+    }  # fmt: skip
+    columns = [plain | drawn[name] for name in LAW_NAMES]
+    joined = {key: np.concatenate([item[key] for item in columns]) for key in plain}
+    severity = np.maximum(SEVERITY_GRID[:, None], 0.0)
+    rate = (1.0 + severity / joined["begin"]) ** joined["exponent"]
+    slowness = 1.0 / (rate * np.maximum(1.0 - severity / joined["ceiling"], MIN_SLOWING))
+    steps = 0.5 * GRID_STEP * (slowness[1:] + slowness[:-1])
+    table = np.concatenate([np.zeros((1, len(joined["power"]))), np.cumsum(steps, axis=0)])
+    law = np.repeat(np.arange(len(LAW_NAMES)), count)
+    return Laws(law=law, table=table, **joined)
 
-    def chances(
-        self, own: Increments, tried: Increments, law: Law, scale: float
-    ) -> tuple[float, float]:
-        """Chance of a growth of at most, and of at least, the tried one, knowing the own."""
-        mean, variance = self._rate(own, law, scale)
-        step, growth, noise = self._columns(tried, law, scale)
-        z = float((growth[0] - mean * step[0]) / np.sqrt(noise[0] + variance * step[0] ** 2))
-        return float(ndtr(z)), float(ndtr(-z))
 
-    def passage(
-        self, own: Increments, law: Law, scale: float, now: Array, level: float,
-        rng: np.random.Generator,
-    ) -> Array:  # fmt: skip
-        """Draw how long on the clock from each severity to a level; infinite: never."""
-        distance = np.maximum(_scaled(level, law) - _scaled(now, law), NEAR)
-        mean, variance = self._rate(own, law, scale)
-        rate = rng.normal(mean, np.sqrt(variance), distance.shape)
-        diffusion = (law.spread * law.rate) ** 2
-        out = np.full(distance.shape, np.inf)
-        ever = (rate > 0.0) | (
-            rng.random(distance.shape) < np.exp(np.minimum(2.0 * rate * distance / diffusion, 0.0))
+def _on_scale(laws: Laws, severity: Array, sets: NDArray[np.int64] | slice) -> tuple[Array, Array]:
+    """Severity on the scale of parameter sets, and the scale's slope there."""
+    place = np.clip((severity - SEVERITY_GRID[0]) / GRID_STEP, 0.0, len(SEVERITY_GRID) - 1.000001)
+    below = place.astype(np.int64)
+    if isinstance(sets, slice):
+        low, high = laws.table[below], laws.table[below + 1]
+        share = (place - below)[..., None]
+    else:
+        low, high = laws.table[below, sets], laws.table[below + 1, sets]
+        share = place - below
+    return low + share * (high - low), (high - low) / GRID_STEP
+
+
+def _clock(laws: Laws, age: Array) -> Array:
+    """Clock of every parameter set at ages over the scale; shape (..., sets)."""
+    at = np.maximum(age, 1e-9)[..., None] ** laws.power
+    return np.asarray(at + (laws.gain - 1.0) * np.maximum(at - laws.knee, 0.0))
+
+
+def _age(laws: Laws, clock: Array, sets: NDArray[np.int64]) -> Array:
+    """Age over the scale at a clock of some parameter sets."""
+    knee, gain = laws.knee[sets], laws.gain[sets]
+    at = np.where(clock > knee, knee + (clock - knee) / gain, clock)
+    return np.asarray(np.minimum(at, MAX_CLOCK) ** (1.0 / laws.power[sets]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Filtered:
+    """What the filter knows after each diagnosis; shape (diagnoses, lives, sets) each."""
+
+    level: NDArray[np.float32]
+    """Severity on the scale of the set."""
+    rate: NDArray[np.float32]
+    level_variance: NDArray[np.float32]
+    covariance: NDArray[np.float32]
+    rate_variance: NDArray[np.float32]
+    score: NDArray[np.float32]
+    """Log density of the diagnoses so far."""
+    surprise: NDArray[np.float32]
+    """Of the diagnosis, in deviations of what was predicted."""
+    usual_rate: Array
+    """Mean rate of other lives, shape (lives, sets)."""
+
+
+def mean_rates(laws: Laws, life: Life, until: int, scale: float) -> Array:
+    """Return the rate of a life on the clock and scale of each set, up to a diagnosis."""
+    ends = [0, until]
+    value, _ = _on_scale(laws, life.value[ends], slice(None))
+    clock = _clock(laws, life.age[ends] / scale)
+    return np.asarray((value[1] - value[0]) / np.maximum(clock[1] - clock[0], 1e-9))
+
+
+def filter_lives(
+    laws: Laws, lives: Sequence[Life], scale: float, usual: Array, deviation: Array
+) -> Filtered:
+    """Filter severity and rate of lives by every parameter set.
+
+    Parameters
+    ----------
+    laws : Laws
+        Parameter sets.
+    lives : Sequence[Life]
+        Each of at least one diagnosis.
+    scale : float
+        Age at which the clock stands at 1, hours or cycles.
+    usual : Array
+        Mean rate of lives, shape (lives, sets).
+    deviation : Array
+        Standard deviation of the rate over lives, shape (lives, sets).
+
+    Returns
+    -------
+    Filtered
+        A life's rows after its last diagnosis repeat it.
+    """
+    count = np.array([len(life.age) for life in lives])
+    longest = int(count.max())
+
+    def padded(name: str) -> Array:
+        rows = [getattr(life, name) for life in lives]
+        return np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
+
+    value, slope = _on_scale(laws, padded("value"), slice(None))
+    noise = (padded("std")[..., None] * slope) ** 2
+    clock = _clock(laws, padded("age") / scale)
+    diffusion, walk = (laws.spread * usual) ** 2, (laws.walk * usual) ** 2
+    level, rate = value[:, 0], usual.copy()
+    pzz, pza, paa = noise[:, 0].copy(), np.zeros_like(rate), deviation**2
+    score, surprise = np.zeros_like(rate), np.zeros_like(rate)
+    kept = [[item.astype(np.float32)] for item in (level, rate, pzz, pza, paa, score, surprise)]
+    for at in range(1, longest):
+        h = np.maximum(clock[:, at] - clock[:, at - 1], 1e-12)
+        ahead = level + rate * h
+        a = pzz + h * (2.0 * pza + h * paa + diffusion + walk * h * h / 3.0)
+        b = pza + h * (paa + 0.5 * walk * h)
+        c = paa + walk * h
+        total = a + noise[:, at]
+        off = value[:, at] - ahead
+        there = (count > at)[:, None]
+        density = -0.5 * (off * off / total + np.log(2.0 * np.pi * total)) + np.log(slope[:, at])
+        news = [
+            ahead + a / total * off, rate + b / total * off, a - a * a / total, b - a * b / total,
+            c - b * b / total, score + density, off / np.sqrt(total),
+        ]  # fmt: skip
+        olds = [level, rate, pzz, pza, paa, score, surprise]
+        level, rate, pzz, pza, paa, score, surprise = (
+            np.where(there, new, old) for new, old in zip(news, olds, strict=True)
         )
-        size = np.maximum(np.abs(rate[ever]), LEAST)
-        out[ever] = rng.wald(distance[ever] / size, distance[ever] ** 2 / diffusion)
-        return out
-
-    def _rate(self, own: Increments, law: Law, scale: float) -> tuple[float, float]:
-        """Mean and variance of one life's rate, from its own growth and the fleet's rates."""
-        step, growth, variance = self._columns(own, law, scale)
-        before = 1.0 / (law.variety * law.rate) ** 2
-        information = before + float(np.sum(step**2 / variance))
-        mean = (before * law.rate + float(np.sum(step * growth / variance))) / information
-        return mean, 1.0 / information
-
-    @staticmethod
-    def _columns(item: Increments, law: Law, scale: float) -> tuple[Array, Array, Array]:
-        step = _steps(item, law, scale)
-        growth, noise = _growth(item, law)
-        return step, growth, (law.spread * law.rate) ** 2 * step + noise
+        for column, item in zip(kept, (level, rate, pzz, pza, paa, score, surprise), strict=True):
+            column.append(item.astype(np.float32))
+    rows = [np.array(column) for column in kept]
+    return Filtered(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], usual)
 
 
-class Gamma:
-    """Gamma process whose inverse scale differs from life to life, by a gamma density."""
+def draw_passages(
+    laws: Laws,
+    sets: NDArray[np.int64],
+    state: tuple[Array, ...],
+    ages: Array,
+    levels: Array,
+    scale: float,
+    rng: np.random.Generator,
+) -> Array:
+    """Draw the time from each state to a level.
 
-    name = "gamma"
+    Parameters
+    ----------
+    laws : Laws
+        Parameter sets.
+    sets : NDArray[np.int64]
+        Set of each draw, shape (draws,).
+    state : tuple[Array, ...]
+        Severity on the scale, rate, their variances and covariance in the order of `Filtered`, and
+        the usual rate; shape (draws,) each.
+    ages : Array
+        Age of each draw, hours or cycles.
+    levels : Array
+        Severity that is to be reached.
+    scale : float
+        Age at which the clock stands at 1.
+    rng : np.random.Generator
+        Of the draws.
 
-    def log_likelihood(self, increments: Increments, law: Law, scale: float) -> float:
-        """Log density of the increments, the lives' own rates integrated out."""
-        (growth, _), lives = _growth(increments, law), increments.lives
-        if np.any(growth <= 0.0):
-            return -np.inf
-        jacobian = float(np.sum(np.log1p(law.feedback * np.maximum(increments.high, 0.0))))
-        shape, alpha, beta = self._columns(increments, law, scale)
-        whole = np.bincount(increments.life, shape, lives)
-        grown = np.bincount(increments.life, growth, lives)
-        out = float(np.sum((shape - 1.0) * np.log(growth) - gammaln(shape)))
-        out += float(np.sum(gammaln(whole + alpha) - (whole + alpha) * np.log(beta + grown)))
-        return out + lives * float(alpha * np.log(beta) - gammaln(alpha)) - jacobian
-
-    def chances(
-        self, own: Increments, tried: Increments, law: Law, scale: float
-    ) -> tuple[float, float]:
-        """Chance of a growth of at most, and of at least, the tried one, knowing the own."""
-        alpha, beta = self._inverse_scale(own, law, scale)
-        shape, _, _ = self._columns(tried, law, scale)
-        growth, noise = _growth(tried, law)
-        slack = 3.0 * float(np.sqrt(noise[0]))
-        # A gamma variable over an independent one is a beta-prime variable.
-        most, least = (max(float(growth[0]) + side, 0.0) for side in (slack, -slack))
-        low = float(betainc(shape[0], alpha, most / (most + beta)))
-        high = float(betainc(alpha, shape[0], beta / (least + beta)))
-        return low, high
-
-    def passage(
-        self, own: Increments, law: Law, scale: float, now: Array, level: float,
-        rng: np.random.Generator,
-    ) -> Array:  # fmt: skip
-        """Draw how long on the clock from each severity to a level; infinite: never."""
-        distance = np.maximum(_scaled(level, law) - _scaled(now, law), NEAR)
-        alpha, beta = self._inverse_scale(own, law, scale)
-        inverse = rng.gamma(alpha, 1.0 / beta, distance.shape)
-        # The process never falls: it has passed a level by then where it stands above it.
-        shape = gdtrib(inverse, rng.random(distance.shape), distance)
-        return np.asarray(shape * law.spread**2)
-
-    def _inverse_scale(self, own: Increments, law: Law, scale: float) -> tuple[float, float]:
-        """Shape and inverse scale of the density of one life's own inverse scale."""
-        shape, alpha, beta = self._columns(own, law, scale)
-        return alpha + float(np.sum(shape)), beta + float(np.sum(_growth(own, law)[0]))
-
-    @staticmethod
-    def _columns(item: Increments, law: Law, scale: float) -> tuple[Array, float, float]:
-        alpha = law.variety**-2
-        return _steps(item, law, scale) / law.spread**2, alpha, alpha * law.rate * law.spread**2
-
-
-def _steps(item: Increments, law: Law, scale: float) -> Array:
-    """Length of each increment on the clock."""
-    return np.maximum((item.end / scale) ** law.power - (item.start / scale) ** law.power, LEAST)
-
-
-def _growth(item: Increments, law: Law) -> tuple[Array, Array]:
-    """Growth on the law's scale, and its variance by the diagnoses' noise."""
-    low, high = (1.0 + law.feedback * np.maximum(at, 0.0) for at in (item.low, item.high))
-    noise = (item.low_std / low) ** 2 + (item.high_std / high) ** 2
-    return _scaled(item.high, law) - _scaled(item.low, law), noise
+    Returns
+    -------
+    Array
+        Hours or cycles; infinite for never.
+    """
+    level, rate, pzz, pza, paa, usual = state
+    pzz, paa = np.maximum(pzz, 0.0), np.maximum(paa, 0.0)
+    first = rng.standard_normal(len(sets))
+    now = level + np.sqrt(pzz) * first
+    slant = pza / np.sqrt(np.maximum(pzz, 1e-30))
+    left = np.sqrt(np.maximum(paa - slant**2, 0.0))
+    speed = rate + slant * first + left * rng.standard_normal(len(sets))
+    far = np.maximum(_on_scale(laws, levels, sets)[0] - now, 1e-9)
+    diffusion = np.maximum((laws.spread[sets] * usual) ** 2, 1e-18)
+    walk, law = laws.walk[sets] * np.abs(usual), laws.law[sets]
+    passed = np.full(len(sets), np.inf)
+    name = np.array(LAW_NAMES)[law]
+    walking = walk > 0.0
+    monotone = ((name == "gamma") | (name == "inverse Gaussian")) & (speed > 0.0)
+    plain = ~walking & ~monotone
+    passed[plain] = _wiener_passage(far[plain], speed[plain], diffusion[plain], rng)
+    for kind in ("gamma", "inverse Gaussian"):
+        mine = monotone & (name == kind)
+        passed[mine] = _monotone_passage(kind, far[mine], speed[mine], diffusion[mine], rng)
+    passed[walking] = _walking_passage(
+        far[walking], speed[walking], diffusion[walking], walk[walking], usual[walking], rng
+    )
+    at = np.maximum(ages / scale, 1e-9) ** laws.power[sets]
+    clock = at + (laws.gain[sets] - 1.0) * np.maximum(at - laws.knee[sets], 0.0)
+    end = scale * _age(laws, np.minimum(clock + passed, MAX_CLOCK), sets)
+    return np.where(clock + passed >= MAX_CLOCK, np.inf, np.maximum(end - ages, 0.0))
 
 
-def _scaled(severity: Array | float, law: Law) -> Array:
-    """Severity on the law's scale, equal to it near 0."""
-    return np.asarray(np.log1p(law.feedback * np.maximum(severity, 0.0)) / law.feedback)
+def _wiener_passage(
+    far: Array, speed: Array, diffusion: Array, rng: np.random.Generator
+) -> Array:  # fmt: skip
+    """First passage of a Wiener process with drift: inverse Gaussian, or never."""
+    out = np.full(far.shape, np.inf)
+    chance = np.exp(np.minimum(2.0 * speed * far / diffusion, 0.0))
+    ever = (speed > 0.0) | (rng.random(far.shape) < chance)
+    size = np.maximum(np.abs(speed[ever]), 1e-12)
+    out[ever] = rng.wald(far[ever] / size, np.maximum(far[ever] ** 2 / diffusion[ever], 1e-12))
+    return out
 
 
-PROCESSES: Mapping[str, Process] = MappingProxyType({p.name: p for p in (Wiener(), Gamma())})
-"""By name."""
+def _monotone_passage(
+    kind: str, far: Array, speed: Array, diffusion: Array, rng: np.random.Generator
+) -> Array:
+    """Passage of a process that never falls: where its distribution at an instant says so."""
+    chance = rng.random(far.shape)
+    usual = far / speed
+    low, high = np.log(1e-3 * usual), np.log(60.0 * (usual + diffusion / speed**2))
+    with np.errstate(all="ignore"):
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            clock = np.exp(middle)
+            if kind == "gamma":
+                beyond = 1.0 - gammainc(clock * speed**2 / diffusion, far * speed / diffusion)
+            else:
+                shape = clock**2 * speed**3 / diffusion
+                root, mean = np.sqrt(shape / far), speed * clock
+                tail = ndtr(-root * (far / mean + 1.0))
+                second = np.exp(np.minimum(2.0 * shape / mean, 600.0)) * tail
+                beyond = 1.0 - ndtr(root * (far / mean - 1.0)) - second
+            below = beyond < chance
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.exp(0.5 * (low + high))
+
+
+def _walking_passage(
+    far: Array, speed: Array, diffusion: Array, walk: Array, usual: Array,
+    rng: np.random.Generator,
+) -> Array:  # fmt: skip
+    """First passage of simulated paths whose rate is a random walk, held between 0 and a bound."""
+    pace = np.maximum(np.maximum(speed, 0.2 * np.abs(usual)), 1e-12)
+    step, at = far / pace / 16.0, np.zeros_like(far)
+    grown, out = np.zeros_like(far), np.full(far.shape, np.inf)
+    for _ in range(WALK_STEPS):
+        noise = rng.standard_normal((2, len(far)))
+        speed = np.abs(speed + walk * np.sqrt(step) * noise[0])
+        growth = speed * step + np.sqrt(diffusion * step) * noise[1]
+        over = np.isinf(out) & (grown + growth >= far)
+        share = (far - grown) / np.where(growth > 0.0, growth, 1.0)
+        out = np.where(over, at + np.clip(share, 0.0, 1.0) * step, out)
+        grown, at, step = grown + growth, at + step, step * 1.07
+    return out

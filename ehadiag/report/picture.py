@@ -1,197 +1,262 @@
-"""Draws a diagnosis: measured and modelled response, and their residuals."""
+"""Descriptions of pictures, whatever draws them: panels with curves in engineering units.
+
+`matplotlib_figures` draws a picture into a file, `bokeh_plots` draws one column into a page.
+"""
 
 from __future__ import annotations
 
-import io
-import math
-import textwrap
-import warnings
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ehadiag.assess.diagnosis import Diagnosis
-from ehadiag.assess.verdict import Levels
-from ehadiag.core.dates import date_text
-from ehadiag.core.printable import printable
-from ehadiag.identify.experiment import Experiment
-from ehadiag.model.plant import PlantConstants
-from ehadiag.report.faults import faults_of
-from ehadiag.report.modelled import sensed
-from ehadiag.report.picture_untested import draw_untested
+__all__ = [
+    "BAND_COLOURS",
+    "STYLES",
+    "Area",
+    "Band",
+    "Curve",
+    "CurveStyle",
+    "CurveValues",
+    "Panel",
+    "Picture",
+    "PictureColumn",
+    "ReferenceLine",
+    "marked_spans",
+    "thin_to_extremes",
+]
 
-__all__ = ["Picture", "can_be_drawn", "diagnosis_figure", "draw_column", "draw_diagnosis"]
-
-MEASURED, MODELLED, GAP = "#9aa5b1", "#c2410c", "#1d4ed8"
-DPI = 110
-LETTERS = 110
-"""Of a line of the title, for each column."""
-MOST_REASONS = 3
-
-
-class Picture(Figure):
-    """A figure that a notebook shows by itself, whether or not pyplot is loaded."""
-
-    def png(self) -> bytes:
-        """Return it as a PNG."""
-        out = io.BytesIO()
-        self.savefig(out, format="png", dpi=DPI)
-        return out.getvalue()
-
-    _repr_png_ = png
+CurveValues = NDArray[np.float64]
 
 
-def can_be_drawn(diagnosis: Diagnosis) -> bool:
-    """Whether there is anything to draw: samples, be there an estimate or not."""
-    return any(item.samples is not None and item.samples.ticks for item in diagnosis.recordings)
+class CurveStyle(NamedTuple):
+    """How a curve looks, in the words of bokeh."""
+
+    colour: str
+    line: str = ""
+    """`solid`, `dashed`, `dotted` or `dotdash`; empty: none."""
+    width: float = 1.0
+    """Points."""
+    marker: str = ""
+    """`circle`, `square`, `triangle` or `x`; empty: none."""
+    size: float = 5.0
+    """Diameter of the marker, points."""
+    hollow: bool = False
 
 
-def draw_diagnosis(diagnosis: Diagnosis, levels: Levels | None = None) -> bytes:
-    """Return the picture of a diagnosis as a PNG; see `diagnosis_figure`."""
-    with matplotlib.rc_context(matplotlib.rcParamsDefault), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # in names of others
-        return diagnosis_figure(diagnosis, levels).png()
+# Darkened from Okabe and Ito's: colour-blind people tell them apart, and from white.
+STYLES = {
+    "measured": CurveStyle("#7b8794", marker="circle", size=2.0),
+    "modelled": CurveStyle("#c2410c", "solid", 1.1),
+    "residual": CurveStyle("#1d4ed8", "solid", 0.6),
+    "signal": CurveStyle("#0072b2", "solid"),
+    "command": CurveStyle("#333333", "dashed"),
+    "saturated": CurveStyle("#b3001b", marker="x"),
+    "break-away": CurveStyle("#00664d", marker="triangle", hollow=True),
+    "reversal": CurveStyle("#005a91", marker="circle", hollow=True),
+    "end stop": CurveStyle("#8a004f", marker="square", hollow=True),
+    "forecast 0": CurveStyle("#0072b2", "dotted", 1.4),
+    "forecast 1": CurveStyle("#b34e00", "dotted", 1.4),
+    "forecast 2": CurveStyle("#007a5a", "dotted", 1.4),
+    "severity 0": CurveStyle("#0072b2", "solid", 1.2, "circle"),
+    "severity 1": CurveStyle("#b34e00", "dashed", 1.2, "square"),
+    "severity 2": CurveStyle("#007a5a", "dotdash", 1.2, "triangle"),
+    "advisory": CurveStyle("#8a5a00", "dashed"),
+    "limit": CurveStyle("#b3001b", "solid"),
+    "event": CurveStyle("#333333", "dotted"),
+}
+"""Look of a curve or line by its role."""
+BAND_COLOURS = {
+    "part 0": "#fdf2c3",
+    "part 1": "#dfeafd",
+    "part 2": "#edf8d8",
+    "missing": "#e5e7eb",
+    "deviation": "#fecaca",
+}
+"""Colour of a band by its role."""
 
 
-def diagnosis_figure(diagnosis: Diagnosis, levels: Levels | None = None) -> Picture:
-    """Draw one column for each recording: current, spool, pressure, and their residuals.
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """One curve of a panel."""
 
-    Without an estimate: what was measured, beside it what was expected (`draw_untested`).
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        What was found.
-    levels : Levels | None
-        By which it was judged; None: not told.
-
-    Returns
-    -------
-    Picture
-        The figure.
-
-    Raises
-    ------
-    ValueError
-        There are no samples to draw.
-    """
-    if not can_be_drawn(diagnosis):
-        raise ValueError("no samples, so there is nothing to draw")
-    found = diagnosis.identification
-    columns = len(diagnosis.recordings)
-    figure = Picture(figsize=(9.5 * columns, 9.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    if found is None or not all(math.isfinite(item.value) for item in found.estimates):
-        draw_untested(figure, diagnosis)
-    else:
-        grid = figure.subplots(
-            5, columns, sharex="col", squeeze=False,
-            gridspec_kw={"height_ratios": [2, 3, 1.2, 3, 1.2]},
-        )  # fmt: skip
-        for column, experiment in enumerate(diagnosis.experiments):
-            constants = found.constants(experiment.constants)
-            draw_column([axes[column] for axes in grid], experiment, constants)
-    title = "\n".join(_title(diagnosis, levels))
-    figure.suptitle(title, fontsize=11, parse_math=False)  # names of others are no formulae
-    return figure
+    label: str
+    role: str
+    """See `STYLES`."""
+    y: CurveValues
+    """In the panel's unit; NaN where missing."""
+    x: CurveValues | None = None
+    """The curve's own abscissae; None: the panel's."""
+    low: CurveValues | None = None
+    """Lower end of the interval about each value; None: no intervals."""
+    high: CurveValues | None = None
 
 
-def _title(diagnosis: Diagnosis, levels: Levels | None) -> list[str]:
-    """Verdict, estimates, reasons; of which unit, when, by which levels."""
-    names = " + ".join(printable(Path(recording.source).name) for recording in diagnosis.recordings)
-    lines = [f"{diagnosis.verdict.name.replace('_', ' ')}: {names}"]
-    if diagnosis.identification is not None:
-        lines.append(
-            ",  ".join(
-                f"{item.name} {item.value:.5f} ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
-                for item in faults_of(diagnosis).values()
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A span of the horizontal axis with a colour of its own."""
+
+    start: float
+    end: float
+    role: str
+    """See `BAND_COLOURS`."""
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceLine:
+    """A line across a panel."""
+
+    at: float
+    role: str
+    """See `STYLES`."""
+    label: str = ""
+    upright: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Area:
+    """A filled polygon, such as what a forecast spans."""
+
+    role: str
+    """See `STYLES`."""
+    x: CurveValues
+    y: CurveValues
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """Curves over one vertical axis."""
+
+    name: str
+    """Of the signal."""
+    unit: str
+    x: CurveValues
+    curves: tuple[Curve, ...]
+    bands: tuple[Band, ...] = ()
+    lines: tuple[ReferenceLine, ...] = ()
+    areas: tuple[Area, ...] = ()
+    small_unit: str = ""
+    """A thousandth of the unit, for the residual; empty: no residual is drawn."""
+    full_scale: float | None = None
+    """Half the converter's range, in the unit, for a second axis in percent."""
+    y_range: tuple[float, float] | None = None
+    """Ends of the vertical axis; None: as the curves need."""
+
+    @property
+    def y_label(self) -> str:
+        """Name and unit."""
+        return f"{self.name}, {self.unit}".removesuffix(", ")
+
+    @property
+    def empty(self) -> bool:
+        """Whether no curve has a value."""
+        return not any(np.isfinite(curve.y).any() for curve in self.curves)
+
+    def strips(self, most: int) -> list[Panel]:
+        """Return the panel and, below it, its residual if any; of more values the extremes."""
+        out = [self]
+        if (residual := self.residual) is not None:
+            present = np.abs(residual[np.isfinite(residual)])
+            # Outliers, such as a few late samples, are cut off.
+            top = 2.0 * float(np.percentile(present, 99.5)) or 1.0
+            curve = Curve("residual", "residual", residual)
+            out.append(
+                replace(
+                    self,
+                    name="residual",
+                    unit=self.small_unit,
+                    curves=(curve,),
+                    y_range=(-top, top),
+                )
             )
-        )
-    if diagnosis.other:
-        lines.append(
-            ",  ".join(
-                f"{item.meaning} {item.shown(item.value):.3g} {item.shown_unit}"
-                + (" beyond its limit" if item.beyond else "")
-                for item in diagnosis.other
+        shared = [curve for panel in out for curve in panel.curves if curve.x is None]
+        kept = thin_to_extremes([curve.y for curve in shared], most)
+        if len(kept) == len(self.x):
+            return out
+        return [
+            replace(
+                panel,
+                x=panel.x[kept],
+                curves=tuple(
+                    replace(curve, y=curve.y[kept]) if curve.x is None else curve
+                    for curve in panel.curves
+                ),
             )
-        )
-    width = LETTERS * len(diagnosis.recordings)
-    for reason in diagnosis.reasons[:MOST_REASONS]:
-        lines += textwrap.wrap(printable(reason), width)[:MOST_REASONS]
-    about = [f"actuator {printable(diagnosis.actuator.name)}"]
-    about += [f"serial {item.serial}" for item in diagnosis.recordings if item.serial is not None][
-        :1
-    ]
-    dates = [date_text(item.start_ns) for item in diagnosis.recordings]
-    about += [date for date in dates if date is not None][:1]
-    if levels is not None:
-        about.append(f"DEGRADED from {levels.advisory:g}, FAULT from {levels.limit:g}")
-    return [*lines, ",  ".join(about)]
+            for panel in out
+        ]
+
+    @property
+    def residual(self) -> CurveValues | None:
+        """The first curve less the second, in the small unit; None where there is no such value."""
+        if not self.small_unit or len(self.curves) < 2:
+            return None
+        gap = 1e3 * (self.curves[0].y - self.curves[1].y)
+        return gap if np.isfinite(gap).any() else None
 
 
-def draw_column(axes: list[Axes], experiment: Experiment, constants: PlantConstants) -> None:
-    """Draw what was measured and what the model with these constants does, with the residuals.
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureColumn:
+    """Panels one below the other over one horizontal axis: the response of one recording."""
 
-    Parameters
-    ----------
-    axes : list[Axes]
-        Five: current, spool, its residual, pressure, its residual.
-    experiment : Experiment
-        The recording.
-    constants : PlantConstants
-        Of the actuator as it was found.
+    title: str
+    panels: tuple[Panel, ...]
+    x_label: str
+    details: str = ""
+    """Test, and what the colours of the bands mean."""
+    x_range: tuple[float, float] | None = None
+    """Ends of the horizontal axis; None: as the curves need."""
+    parts: tuple[Band, ...] = ()
+    """Named spans of all panels."""
+    dates: bool = False
+    """Whether the abscissae are times of day, s since 1970."""
+    source: str = ""
+    """Of the recording."""
+
+    @property
+    def events(self) -> bool:
+        """Whether events are marked on a curve."""
+        return any(len(panel.curves) > 2 for panel in self.panels)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """Columns side by side under one title."""
+
+    title: str
+    columns: tuple[PictureColumn, ...]
+
+
+def thin_to_extremes(curves: Sequence[CurveValues], most: int) -> NDArray[np.intp]:
+    """Return ascending indices of the values to draw of curves, shape (n,) each.
+
+    All, where they are not more than `most`; else of equal parts those of the least and greatest
+    value of each curve. Nothing is averaged: what is drawn was there, and no extreme is lost.
     """
-    time = np.arange(experiment.ticks, dtype=np.float64) * experiment.tick
-    spool, pressure, _ = sensed(experiment, constants)
-    axes[0].plot(time, experiment.trace.current * 1e3, color=MODELLED, lw=0.8)
-    axes[0].set_ylabel("current, mA")
-    axes[0].set_title(f"test {printable(experiment.test.name)!r}", fontsize=10, parse_math=False)
-    _pair(axes[1], axes[2], time, experiment.spool * 1e3, spool * 1e3, "spool, mm", "µm", 1e3)
-    _pair(
-        axes[3],
-        axes[4],
-        time,
-        experiment.pressure * 1e-6,
-        pressure * 1e-6,
-        "differential pressure, MPa",
-        "kPa",
-        1e3,
-    )
-    axes[1].legend(loc="lower left", fontsize=8, framealpha=1.0, borderaxespad=0.2, markerscale=3)
-    for start, end in experiment.test.windows.refinement:
-        for item in axes:
-            item.axvspan(start, end, color="#fef3c7", zorder=0)
-    axes[0].text(
-        experiment.test.windows.refinement[0][0],
-        0.97,
-        " part for the search",
-        transform=axes[0].get_xaxis_transform(),
-        va="top",
-        fontsize=8,
-    )
-    axes[4].set_xlabel("time, s")
-    axes[4].set_xlim(0.0, time[-1])
+    count = len(curves[0]) if curves else 0
+    if count <= most:
+        return np.arange(count)
+    width = -(-count // max(1, most // (2 * len(curves))))
+    begin = np.arange(0, count, width)
+    kept = []
+    for values in curves:
+        table = np.full(len(begin) * width, np.nan)
+        table[:count] = values
+        for extreme, beyond in ((np.argmin, np.inf), (np.argmax, -np.inf)):
+            # The first of a part where all is missing.
+            filled = np.where(np.isnan(table), beyond, table).reshape(-1, width)
+            kept.append(begin + extreme(filled, axis=1))
+    return np.unique(np.concatenate(kept).astype(np.intp))
 
 
-def _pair(
-    upper: Axes,
-    lower: Axes,
-    time: NDArray[np.float64],
-    measured: NDArray[np.float64],
-    modelled: NDArray[np.float64],
-    label: str,
-    gap_unit: str,
-    gap_scale: float,
-) -> None:
-    upper.plot(time, measured, ".", color=MEASURED, ms=2.5, label="measured")
-    upper.plot(time, modelled, color=MODELLED, lw=0.8, label="modelled")
-    upper.set_ylabel(label)
-    lower.plot(time, (measured - modelled) * gap_scale, color=GAP, lw=0.5)
-    lower.set_ylabel(f"residual, {gap_unit}")
-    spread = np.nanpercentile(np.abs(measured - modelled), 99.5) * gap_scale
-    lower.set_ylim(-2.0 * spread, 2.0 * spread)
+def marked_spans(marked: NDArray[np.bool_], tick: float) -> Iterator[tuple[float, float]]:
+    """Give begin and end (s) of marked spans; shorter ones and gaps than 20 ms do not count."""
+    least = max(round(0.02 / tick), 1)
+    places = np.flatnonzero(marked)
+    if not places.size:
+        return
+    for part in np.split(places, np.flatnonzero(np.diff(places) > least) + 1):
+        if part[-1] - part[0] + 1 >= least:
+            yield float(part[0] * tick), float((part[-1] + 1) * tick)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
@@ -13,38 +12,37 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from ehadiag.core.dates import utc_text
-from ehadiag.core.printable import printable
-from ehadiag.core.small_file import read_small_file
-from ehadiag.history.counted import counted
+from ehadiag.core.conventions import MAX_RESULT_BYTES, utc_text
+from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
-from ehadiag.prognosis.unit import prognosis_of
-from ehadiag.report.html import script_sources, templates_of
-from ehadiag.report.live_plots import plot_signals
-from ehadiag.report.plots import embedded, plot_trend
-from ehadiag.report.prognosis_table import levels_named, remaining_text
+from ehadiag.model.registry import FAULT_NAMES
+from ehadiag.prognosis.units import prognosis_of
+from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
+from ehadiag.report.fleet_table import FLEET_HEAD, Cell, FleetUnit, fleet_rows
+from ehadiag.report.head import percent, plain_name, verdict_word
+from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
+from ehadiag.report.prognosis_tables import named_levels, remaining_text
+from ehadiag.report.trend_bus_pictures import trend_column
+from ehadiag.result import Result
 from ehadiag.serve.server import Page
+from firmware_iface.errors import EhadiagError, printable
+from firmware_iface.files import read_small_file
 
 if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
-    from ehadiag.history.records import Entry, Event
+    from ehadiag.history.records import Entry, MaintenanceEvent
 
 __all__ = ["Pages"]
 
-MOST_ROWS = 500
+MAX_PAGE_ROWS = 500
 """Of a list, newest first."""
-LARGEST_REPORT = 16 << 20
-REPORT_POLICY = "sandbox allow-scripts"
+MAX_REPORT_BYTES = 16 << 20
+REPORT_CONTENT_POLICY = "sandbox allow-scripts"
 """A report may be anybody's file: its scripts run, but not in the name of this server."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One cell of a list."""
-
-    text: str
-    link: str = ""
-    kind: str = ""
+MAX_FORECASTS = 20
+"""Number of units whose remaining life the front page shows; a forecast takes some 0.3 s."""
 
 
 class Pages:
@@ -60,15 +58,25 @@ class Pages:
         Advisory level and limit.
     tests : Sequence[str]
         That the page offers to start.
+    simulated : bool
+        Whether tests run on a simulated unit.
     """
 
     def __init__(
-        self, folder: Path, history: Path | None, levels: Levels, tests: Sequence[str]
+        self,
+        folder: Path,
+        history: Path | None,
+        levels: Levels,
+        tests: Sequence[str],
+        *,
+        simulated: bool = False,
     ) -> None:
         self._folder = folder
         self._history = history
         self._levels = levels
         self._tests = tuple(tests)
+        self._simulated = simulated
+        self._fleet: tuple[object, list[list[Cell]]] = (None, [])
         self._live: Page | None = None
 
     def __call__(self, path: str) -> Page | None:
@@ -89,12 +97,12 @@ class Pages:
         EhadiagError
             The history or a file cannot be read.
         """
-        if path == "/":
+        if path == "/session":
             # Made once: a plotting library of a megabyte is in it.
             self._live = self._live or self._live_page()
             return self._live
         whole: dict[str, Callable[[], Page]] = {
-            "/history": self._units_page,
+            "/": self._fleet_page,
             "/reports": self._reports_page,
         }
         if path in whole:
@@ -105,65 +113,83 @@ class Pages:
         return self._report(rest) if start == "reports" else None
 
     def _live_page(self) -> Page:
-        scripts, elements = embedded({"signals": plot_signals()})
+        scripts, elements = embed_plots({"signals": plot_live_signals()})
         own = files("ehadiag.serve").joinpath("templates/live.js").read_text(encoding="utf-8")
         return _page(
             "live.html.j2",
             [*scripts, own],
-            title="Live",
-            here="/",
+            title="Test",
+            here="/session",
             tests=self._tests,
+            simulated=self._simulated,
+            faults=[(name, plain_name(name)) for name in FAULT_NAMES],
             plots=[Markup(item) for item in elements.values()],
         )
 
-    def _units_page(self) -> Page:
-        """Return the list of the units, with the last diagnosis of each."""
-        entries, _ = self._kept()
-        last: dict[int | None, Entry] = {}
+    def _fleet_page(self) -> Page:
+        """Return the units, worst first, with trend and time left."""
+        place, none = self._history, "No diagnosis is kept yet: run a test."
+        stamp = place.stat().st_mtime_ns if place is not None and place.exists() else None
+        if stamp != self._fleet[0] or stamp is None:
+            try:
+                self._fleet = stamp, fleet_rows(self._units(), self._levels)[:MAX_PAGE_ROWS]
+            except EhadiagError as error:  # the other pages do without it
+                self._fleet, none = (None, []), str(error)
+        if place is None:
+            none = "No history is kept: --history."
+        return self._list("Fleet", "/", FLEET_HEAD, self._fleet[1], none=none)
+
+    def _units(self) -> list[FleetUnit]:
+        entries, events = self._kept()
+        by_unit: dict[int | None, list[Entry]] = {}
         for entry in entries:
-            last[entry.serial] = entry
-        rows = [
-            [
-                Cell("unknown") if serial is None else Cell(str(serial), f"/history/{serial}"),
-                Cell(printable(entry.actuator)),
-                *_diagnosed(entry),
-            ]
-            for serial, entry in sorted(
-                last.items(), key=lambda item: (item[1].tested or item[1].appended), reverse=True
-            )[:MOST_ROWS]
-        ]  # fmt: skip
-        return self._list(
-            "Health history",
-            "/history",
-            ["serial", "actuator", "last test", "verdict", "severities"],
-            rows,
-            none="No diagnosis is kept yet." if self._history else "No history is kept: --history.",
-        )
+            by_unit.setdefault(entry.serial, []).append(entry)
+        newest = {serial: counted_entries(mine)[-1] for serial, mine in by_unit.items()}
+        known = [serial for serial in newest if serial is not None]
+        known.sort(key=lambda serial: -_worst_value(newest[serial]))
+        levels = (self._levels.advisory, self._levels.limit)
+        futures = {
+            serial: prognosis_of(serial, entries, events, levels)
+            for serial in known[:MAX_FORECASTS]
+        }
+        return [
+            FleetUnit(
+                serial=serial,
+                actuator=last.actuator,
+                verdict=last.verdict,
+                word=last.verdict.replace("_", " "),
+                severities=last.severities,
+                past=[_worst_value(entry) for entry in by_unit[serial] if entry.severities],
+                tested=last.tested or last.appended,
+                link="" if serial is None else f"/history/{serial}",
+                prognosis=futures.get(serial) if serial is not None else None,
+            )
+            for serial, last in newest.items()
+        ]
 
     def _unit_page(self, serial: int) -> Page:
         """Return one unit's diagnoses, trend and remaining life."""
-        entries, events = self._kept()
+        entries, events = self._kept(serial)
         mine = [entry for entry in entries if entry.serial == serial]
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
         lines = [
             f"{item.name}: {future.unit} to {name} {level:g}: {remaining_text(left)}"
             for item in future.forecasts
-            for (name, level), left in zip(levels_named(future), item.remaining, strict=True)
+            for (name, level), left in zip(named_levels(future), item.remaining, strict=True)
         ]
         lines += [f"{item.name} {item.alarm}" for item in future.forecasts if item.alarm]
         own = [item for item in events if item.serial == serial]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
-        used = counted(mine)
+        used = counted_entries(mine)
         plots = {}
         if any(entry.severities for entry in used):
-            unit = future.unit if future.used else None
-            plots["trend"] = plot_trend(used, own, unit, levels)
+            plots["trend"] = plot_column(trend_column(used, own, future))
         return self._list(
             f"Unit {serial}",
             "",
             ["test", "verdict", "severities"],
-            [_diagnosed(entry) for entry in mine[::-1][:MOST_ROWS]],
+            [_diagnosed(entry) for entry in mine[::-1][:MAX_PAGE_ROWS]],
             none="No diagnosis of this unit is kept.",
             lines=lines,
             plots=plots,
@@ -174,14 +200,15 @@ class Pages:
         rows = [
             [
                 Cell(printable(path.name), "/reports/" + quote(os.fsencode(path.name))),
-                Cell(utc_text(datetime.fromtimestamp(path.stat().st_mtime, UTC))),
+                *_reported(path),
+                Cell(utc_text(datetime.fromtimestamp(path.stat().st_mtime, UTC))[:16]),
             ]
-            for path in self._reports()[:MOST_ROWS]
+            for path in self._reports()[:MAX_PAGE_ROWS]
         ]  # fmt: skip
         return self._list(
             "Reports",
             "/reports",
-            ["report", "written"],
+            ["report", "unit", "verdict", "worst", "written"],
             rows,
             none="No report is in the folder yet: each test that ends writes one.",
         )
@@ -191,7 +218,9 @@ class Pages:
         found = next((path for path in self._reports() if path.name == name), None)
         if found is None:
             return None
-        return Page(read_small_file(found, LARGEST_REPORT, "report"), policy=REPORT_POLICY)
+        return Page(
+            read_small_file(found, MAX_REPORT_BYTES, "report"), policy=REPORT_CONTENT_POLICY
+        )
 
     def _reports(self) -> list[Path]:
         """Reports of the folder, newest first; no links."""
@@ -200,11 +229,16 @@ class Pages:
         ]
         return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
 
-    def _kept(self) -> tuple[Sequence[Entry], Sequence[Event]]:
+    def _kept(
+        self, serial: int | None = None
+    ) -> tuple[Sequence[Entry], Sequence[MaintenanceEvent]]:
+        """Diagnoses and events of all units; of one unit and its fleet."""
         if self._history is None or not self._history.exists():
             return (), ()
         with History(self._history) as history:
-            return history.entries(), history.events()
+            if serial is not None:
+                return history.alike(serial)
+            return history.entries(brief=True), history.events()
 
     def _list(
         self,
@@ -217,7 +251,7 @@ class Pages:
         lines: Sequence[str] = (),
         plots: dict[str, Any] | None = None,
     ) -> Page:
-        scripts, elements = embedded(plots or {})
+        scripts, elements = embed_plots(plots or {})
         return _page(
             "list.html.j2",
             scripts,
@@ -225,8 +259,9 @@ class Pages:
             here=here,
             head=head,
             rows=rows,
-            none=none,
+            empty_text=none,
             lines=lines,
+            simulated=self._simulated,
             plot=next((Markup(item) for item in elements.values()), None),
         )
 
@@ -243,7 +278,29 @@ def _diagnosed(entry: Entry) -> list[Cell]:
     ]
 
 
+def _worst_value(entry: Entry) -> float:
+    return max((item.estimate or 0.0 for item in entry.severities), default=0.0)
+
+
+def _reported(path: Path) -> list[Cell]:
+    """Return unit, verdict and worst severity of the result beside a report; empty without one."""
+    try:
+        line = read_small_file(path.with_suffix(".json"), MAX_RESULT_BYTES, "result")
+        result = Result.from_json(line)
+    except (EhadiagError, ValueError):
+        return [Cell(""), Cell(""), Cell("")]
+    known = [item for item in result.severities.values() if item.estimate is not None]
+    worst = max(known, key=lambda item: item.value, default=None)
+    return [
+        Cell("unknown" if result.serial is None else str(result.serial)),
+        Cell(verdict_word(result), kind=result.verdict.name),
+        Cell("" if worst is None else f"{plain_name(worst.name)} {percent(worst.value)}"),
+    ]
+
+
 def _page(template: str, scripts: Sequence[str], **values: Any) -> Page:
+    nav = files("ehadiag.serve").joinpath("templates/nav.js").read_text(encoding="utf-8")
+    scripts = [*scripts, nav]
     policy = (
         f"default-src 'none'; script-src {script_sources(scripts)}; style-src 'unsafe-inline'; "
         "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "

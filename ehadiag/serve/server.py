@@ -1,4 +1,7 @@
-"""The server of the local page: loopback only, server-sent events, a token for what moves."""
+"""Serves the local web page: loopback only, a token for starting and aborting tests.
+
+Snapshots are server-sent events; the sessions run in processes of their own (`sessions`).
+"""
 
 from __future__ import annotations
 
@@ -14,23 +17,29 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from ehadiag.core.errors import ConfigurationError, EhadiagError, reason_of
-from ehadiag.serve.sessions import BusyError, Sessions
+from ehadiag.serve.sessions import NO_SNAPSHOT, BusyError, SessionRunner
+from firmware_iface.errors import ConfigurationError, EhadiagError, reason_of
 
-__all__ = ["HOST", "Page", "Site", "serve"]
+__all__ = [
+    "LOOPBACK_ADDRESS",
+    "Page",
+    "Site",
+    "serve",
+]
 
-HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")
-MOST_STREAMS = 16
-"""Readers of the live view at a time."""
-MOST_BODY = 1024
-"""Bytes of a request to start or abort a test."""
-SILENCE_S = 10.0
-"""After which a comment keeps a stream open."""
-PATIENCE_S = 30.0
-"""For a request."""
-HTML = "text/html; charset=utf-8"
-JSON = "application/json"
+
+LOOPBACK_ADDRESS = "127.0.0.1"
+LOOPBACK_NAMES = (LOOPBACK_ADDRESS, "localhost")
+MAX_LIVE_STREAMS = 16
+"""Number of readers of the live view at a time."""
+MAX_REQUEST_BYTES = 1024
+"""Size of the largest request to start or abort a test, bytes."""
+KEEP_ALIVE_INTERVAL_S = 10.0
+"""Time after which a comment keeps a stream open, s."""
+REQUEST_TIMEOUT_S = 30.0
+"""Longest time for a request, s."""
+HTML_CONTENT_TYPE = "text/html; charset=utf-8"
+JSON_CONTENT_TYPE = "application/json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +47,7 @@ class Page:
     """What a request gets."""
 
     body: bytes
-    kind: str = HTML
+    kind: str = HTML_CONTENT_TYPE
     policy: str = "default-src 'none'"
     """Its Content-Security-Policy."""
 
@@ -51,14 +60,14 @@ class Site:
     ----------
     pages : Callable[[str], Page | None]
         Gives the page of a path such as `/history/7`; None: there is none.
-    sessions : Sessions
+    sessions : SessionRunner
         Whose snapshots are shown.
     token : str | None
         That a request to start or abort a test must carry; None: no test is ever started here.
     """
 
     pages: Callable[[str], Page | None]
-    sessions: Sessions
+    sessions: SessionRunner
     token: str | None
 
 
@@ -87,12 +96,12 @@ def serve(site: Site, port: int) -> ThreadingHTTPServer:
         pass
 
     Handler.site = site
-    Handler.streams = threading.BoundedSemaphore(MOST_STREAMS)
+    Handler.streams = threading.BoundedSemaphore(MAX_LIVE_STREAMS)
     try:
-        server = _Server((HOST, port), Handler)
+        server = _Server((LOOPBACK_ADDRESS, port), Handler)
     except OSError as error:
         raise ConfigurationError(
-            f"--port {port}: {reason_of(error)}: name another, or 0 for any"
+            f"--http-port {port}: {reason_of(error)}: name another, or 0 for any"
         ) from None
     Handler.port = server.server_port
     return server
@@ -102,14 +111,14 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader that went away is no news."""
+        """Ignore a reader that went away."""
 
 
 class _Handler(BaseHTTPRequestHandler):
     site: Site
     streams: threading.BoundedSemaphore
     port: int
-    timeout = PATIENCE_S
+    timeout = REQUEST_TIMEOUT_S
     server_version = "ehadiag"
     sys_version = ""
 
@@ -135,7 +144,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Start or abort a test, where that is allowed and the token is right."""
         if not self._is_ours():
             return
-        asked = self._body()
+        try:
+            request = self._body()
+        except ValueError as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            self._act(request)
+
+    def _act(self, request: Any) -> None:
         if self.site.token is None:
             self._refuse(HTTPStatus.FORBIDDEN, "tests are not allowed here: see --allow-tests")
             return
@@ -144,37 +160,44 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.FORBIDDEN, "wrong token: use the address that serve printed")
             return
         try:
-            if self.path == "/start" and isinstance(asked, dict):
-                self.site.sessions.start(str(asked.get("test")))
+            if self.path == "/start" and isinstance(request, dict):
+                severities = _severities_in(request)
+                self.site.sessions.start(str(request.get("test")), severities)
             elif self.path == "/abort":
                 self.site.sessions.abort()
             else:
                 self._refuse(HTTPStatus.NOT_FOUND, "no such action")
                 return
+        except ValueError as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            return
         except KeyError:
             self._refuse(HTTPStatus.NOT_FOUND, "no such test here: see --test")
             return
         except BusyError as error:
             self._refuse(HTTPStatus.CONFLICT, str(error))
             return
-        self._send(HTTPStatus.ACCEPTED, Page(b"{}", JSON))
+        self._send(HTTPStatus.ACCEPTED, Page(b"{}", JSON_CONTENT_TYPE))
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the terminal is for the sessions."""
+        """Print nothing: the terminal is for the sessions."""
 
     def _body(self) -> Any:
+        """Return the request's JSON; ValueError where it is none, or larger than any request."""
         length = self.headers.get("Content-Length", "0")
-        size = int(length) if length.isdecimal() else MOST_BODY + 1
-        if size > MOST_BODY:
+        # Python refuses to convert thousands of digits.
+        sound = length.isdecimal() and len(length) <= len(str(MAX_REQUEST_BYTES))
+        if not sound or int(length) > MAX_REQUEST_BYTES:
             self.close_connection = True
-            return None
-        with contextlib.suppress(ValueError):
-            return json.loads(self.rfile.read(size) or b"null")
-        return None
+            raise ValueError(f"the request has more than {MAX_REQUEST_BYTES} bytes")
+        try:
+            return json.loads(self.rfile.read(int(length)) or b"null")
+        except (ValueError, RecursionError):
+            raise ValueError("the request is not JSON") from None
 
     def _is_ours(self) -> bool:
         """Refuse what another site's page sends by this browser, under whatever name."""
-        hosts = [f"{name}:{self.port}" for name in NAMES]
+        hosts = [f"{name}:{self.port}" for name in LOOPBACK_NAMES]
         origin = self.headers.get("Origin")
         good = self.headers.get("Host") in hosts
         if good and (origin is None or origin in [f"http://{host}" for host in hosts]):
@@ -184,35 +207,39 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _stream(self) -> None:
         if not self.streams.acquire(blocking=False):
-            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_STREAMS} readers are there")
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_LIVE_STREAMS} readers are there")
             return
         try:
             self.send_response(HTTPStatus.OK)
             self._head("text/event-stream", "default-src 'none'")
             self.end_headers()
             self.close_connection = True
-            self._tell_all()
+            self._send_news()
         finally:
             self.streams.release()
 
-    def _tell_all(self) -> None:
+    def _send_news(self) -> None:
         seen, sessions = 0, self.site.sessions
         with contextlib.suppress(OSError):
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             while not sessions.ended:
-                news = sessions.wait(seen, SILENCE_S)
+                news = sessions.wait(seen, KEEP_ALIVE_INTERVAL_S)
                 if news is None:
                     self.wfile.write(b": still here\n\n")
                 else:
                     seen = news.number
-                    state = {"running": news.running, "said": news.said}
+                    state = {
+                        "running": news.running,
+                        "said": news.lines,
+                        "starting": news.snapshot == NO_SNAPSHOT,
+                    }
                     self.wfile.write(
                         b"event: snapshot\ndata: " + news.snapshot + b"\n\nevent: state\ndata: "
                         + json.dumps(state).encode() + b"\n\n"
                     )  # fmt: skip
 
     def _refuse(self, status: HTTPStatus, why: str) -> None:
-        self._send(status, Page(json.dumps({"error": why}).encode(), JSON))
+        self._send(status, Page(json.dumps({"error": why}).encode(), JSON_CONTENT_TYPE))
 
     def _send(self, status: HTTPStatus, page: Page) -> None:
         self.send_response(status)
@@ -231,3 +258,14 @@ class _Handler(BaseHTTPRequestHandler):
             ("Cache-Control", "no-store"),
         ):
             self.send_header(name, value)
+
+
+def _severities_in(request: dict[str, Any]) -> dict[str, float]:
+    """Return the severities that the simulated unit is to have; ValueError where they are none."""
+    found = request.get("severities", {})
+    good = isinstance(found, dict) and all(
+        isinstance(value, int | float) and 0.0 <= value <= 1.0 for value in found.values()
+    )
+    if not good:
+        raise ValueError("severities: need numbers from 0 to 1 by the names of the faults")
+    return {str(name): float(value) for name, value in found.items()}

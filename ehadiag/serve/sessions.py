@@ -1,44 +1,76 @@
-"""Runs one session at a time, watching or testing, and hands its snapshots on.
+"""Sessions of the local page: a watch of the bus while no test runs, a test when it is started.
 
-Each is a process of its own: neither a page nor its readers can cost the bus a frame."""
+One session at a time runs, as a function of the package in a process of its own: neither a page nor
+its readers, nor the compiler, can then cost the bus a frame, and a session that hangs can be ended.
+The process is spawned by `multiprocessing`; snapshots and lines come back through a pipe, and what
+goes the other way, or the end of this process, acts as Ctrl-C does.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import multiprocessing
+import os
 import signal
-import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import IO
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple
 
-from ehadiag.core.errors import EhadiagError
-from ehadiag.core.printable import printable
-from ehadiag.live.snapshot import Snapshot
+from ehadiag.core.interruption import (
+    INTERRUPTED_EXIT_CODE,
+    children_with_safe_path,
+    interrupt_on_signals,
+)
+from ehadiag.live import Snapshot
+from firmware_iface.errors import EhadiagError, printable
 
-__all__ = ["BusyError", "News", "Sessions"]
-
-LONGEST_LINE = 1 << 20
-"""Bytes of one snapshot; a longer line is none."""
-SAID = 20
-"""Lines of a session that are kept to be shown."""
-PAUSE_S = 3.0
-"""Before a watch that ended by itself begins again."""
-ABORT_S = 15.0
-"""In which a test that is told to stop has asked for the abort and written what it has."""
+__all__ = [
+    "BusyError",
+    "Session",
+    "SessionRunner",
+    "SessionsStatus",
+]
 
 
-PROGRAM = (sys.executable, "-m", "ehadiag")
+MAX_OUTPUT_LINES_KEPT = 20
+"""Number of a session's printed lines that the page shows."""
+WATCH_RESTART_PAUSE_S = 3.0
+"""Time before a watch that ended by itself begins again, s."""
+ABORT_TIMEOUT_S = 15.0
+"""Longest time in which a stopped test aborts and writes its result, s."""
+
+
+NO_SNAPSHOT = b"null"
+"""In place of a snapshot before a session's first."""
 
 
 class BusyError(EhadiagError):
     """A test is running already, or none is."""
 
 
+class Session(NamedTuple):
+    """What runs in a process of its own."""
+
+    title: str
+    """Name for the page."""
+    function: Callable[..., int]
+    """Called with the arguments and with what takes snapshots; a module's function. Returns the
+    exit code."""
+    arguments: tuple[Any, ...]
+    """Arguments that can be sent to another process."""
+    with_severities: Callable[[Mapping[str, float]], tuple[Any, ...]] | None = None
+    """Gives the arguments for a simulated unit with other severities; None: it is a real one."""
+
+
 @dataclass(frozen=True, slots=True)
-class News:
-    """How the sessions are.
+class SessionsStatus:
+    """State of the sessions.
 
     Attributes
     ----------
@@ -48,49 +80,43 @@ class News:
         The newest one, a line of JSON; `null` before the first.
     running : str | None
         Name of the test that runs.
-    said : tuple[str, ...]
-        What the sessions said last, fit for a page.
+    lines : tuple[str, ...]
+        Latest lines that sessions printed, fit for a page.
     """
 
     number: int
     snapshot: bytes
     running: str | None
-    said: tuple[str, ...]
+    lines: tuple[str, ...]
 
 
-class Sessions:
-    """Watches the bus while no test runs, and runs a test when asked.
+class SessionRunner:
+    """Watches the bus while no test runs, and runs a test when it is started.
 
     Parameters
     ----------
-    watch : Sequence[str] | None
-        Command line of the session that only listens; None: nothing is watched between tests.
-    tests : Mapping[str, Sequence[str]]
-        Command line for each test that may be started, by name.
-    program : Sequence[str]
-        What the command lines are handed to.
+    watch : Session | None
+        Session that only listens; None: nothing is watched between tests.
+    tests : Mapping[str, Session]
+        Session for each test that may be started, by name.
     """
 
-    def __init__(
-        self,
-        watch: Sequence[str] | None,
-        tests: Mapping[str, Sequence[str]],
-        program: Sequence[str] = PROGRAM,
-    ) -> None:
-        self._program = program
+    def __init__(self, watch: Session | None, tests: Mapping[str, Session]) -> None:
         self._watch = watch
         self.tests = dict(tests)
         self._changed = threading.Condition()
-        self._asked: str | None = None
+        self._requested: str | None = None
+        self._severities: Mapping[str, float] = {}
         self._ending = False
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: BaseProcess | None = None
+        self._pipe: Connection | None = None
         self._running: str | None = None
         self._number = 1
-        self._snapshot = b"null"
-        self._said: deque[str] = deque(maxlen=SAID)
+        self._snapshot = NO_SNAPSHOT
+        self._lines: deque[str] = deque(maxlen=MAX_OUTPUT_LINES_KEPT)
         self._thread = threading.Thread(target=self._run, name="ehadiag-sessions", daemon=True)
 
-    def __enter__(self) -> Sessions:
+    def __enter__(self) -> SessionRunner:
         self._thread.start()
         return self
 
@@ -107,37 +133,41 @@ class Sessions:
         """Whether no more snapshots come."""
         return self._ending
 
-    def wait(self, after: int, timeout_s: float) -> News | None:
-        """Wait for news.
+    def wait(self, after: int, timeout_s: float) -> SessionsStatus | None:
+        """Wait for a change.
 
         Parameters
         ----------
         after : int
-            Number of the last news; 0: none yet.
+            Number of the last change; 0: none yet.
         timeout_s : float
             Longest wait.
 
         Returns
         -------
-        News | None
-            The newest; None where none came.
+        SessionsStatus | None
+            The newest; None where there was no change.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._number > after or self._ending, timeout_s)
             if self._number <= after:
                 return None
-            return News(self._number, self._snapshot, self._running, tuple(self._said))
+            return SessionsStatus(self._number, self._snapshot, self._running, tuple(self._lines))
 
-    def start(self, test: str) -> None:
-        """Ask for a test; it begins once the watch has let go of the bus.
+    def start(self, test: str, severities: Mapping[str, float] | None = None) -> None:
+        """Start a test once the watch has left the bus.
 
         Parameters
         ----------
         test : str
             Name among `tests`.
+        severities : Mapping[str, float] | None
+            Of the simulated unit, by the names of the faults; None: as it is.
 
         Raises
         ------
+        ValueError
+            The unit is a real one, or has no such fault.
         KeyError
             It may not be started.
         BusyError
@@ -145,15 +175,20 @@ class Sessions:
         """
         if test not in self.tests:
             raise KeyError(test)
+        adjust = self.tests[test].with_severities
+        if severities and adjust is None:
+            raise ValueError("severities: only a simulated unit takes them")
+        if severities and adjust is not None:
+            adjust(severities)
         with self._changed:
-            if self._running is not None or self._asked is not None:
+            if self._running is not None or self._requested is not None:
                 raise BusyError("a test is under way: wait for its end, or abort it")
-            self._asked = test
-            self._stop_process()
-            self._tell()
+            self._requested, self._severities = test, severities or {}
+            self._interrupt()
+            self._notify()
 
     def abort(self) -> None:
-        """Tell the running test to ask for its abort.
+        """Abort the running test.
 
         Raises
         ------
@@ -161,92 +196,145 @@ class Sessions:
             No test is under way.
         """
         with self._changed:
-            if self._asked is not None:
-                self._asked = None
+            if self._requested is not None:
+                self._requested = None
                 return
             if self._running is None:
                 raise BusyError("no test is under way")
-            self._stop_process()
+            self._interrupt()
 
     def close(self) -> None:
-        """End all; a running test asks for its abort first."""
+        """End all; a running test is aborted first."""
         with self._changed:
             self._ending = True
-            self._asked = None
-            self._stop_process()
-            self._tell()
-        self._thread.join(ABORT_S)
+            self._requested = None
+            self._interrupt()
+            self._notify()
+        self._thread.join(ABORT_TIMEOUT_S)
         process = self._process
-        if process is not None and process.poll() is None:
+        if process is not None and process.is_alive():
             process.kill()
 
     def _run(self) -> None:
         while not self._ending:
             with self._changed:
-                test, self._asked = self._asked, None
+                test, self._requested = self._requested, None
                 self._running = test
-                command = self.tests[test] if test is not None else self._watch
-                process = None if command is None else self._begun(command)
-                if process is None:
-                    self._changed.wait_for(lambda: self._asked is not None or self._ending)
+                session = self.tests[test] if test is not None else self._watch
+                if session is None:
+                    self._changed.wait_for(lambda: self._requested is not None or self._ending)
                     continue
-            self._follow(process)
+                pipe, process = self._begin(session)
+            self._follow(pipe, process)
             with self._changed:
-                self._process, self._running = None, None
-                self._tell()
+                self._process = self._pipe = self._running = None
+                self._notify()
                 if test is None:
-                    self._changed.wait_for(lambda: self._asked is not None or self._ending, PAUSE_S)
+                    self._changed.wait_for(
+                        lambda: self._requested is not None or self._ending, WATCH_RESTART_PAUSE_S
+                    )
 
-    def _begun(self, command: Sequence[str]) -> subprocess.Popen[bytes] | None:
-        self._said.append(printable(f"$ ehadiag {' '.join(command)}"))
-        # On Windows only a group of its own can be sent Ctrl-Break.
-        flags = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-        self._process = subprocess.Popen(
-            [*self._program, *command],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            creationflags=flags,
-            start_new_session=sys.platform != "win32",
-        )
-        self._tell()
-        return self._process
+    def _begin(self, session: Session) -> tuple[Connection, BaseProcess]:
+        if self._running is not None:
+            self._snapshot = NO_SNAPSHOT
+            self._lines.clear()
+        if self._running is not None and self._severities and session.with_severities is not None:
+            session = session._replace(arguments=session.with_severities(self._severities))
+        session = session._replace(with_severities=None)  # it need not be sent
+        self._lines.append(printable(session.title))
+        context = multiprocessing.get_context("spawn")
+        pipe, theirs = context.Pipe()
+        process = context.Process(target=_run_session, args=(session, theirs), daemon=True)
+        with children_with_safe_path():
+            process.start()
+        theirs.close()
+        self._pipe, self._process = pipe, process
+        self._notify()
+        return pipe, process
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self._number += 1
         self._changed.notify_all()
 
-    def _follow(self, process: subprocess.Popen[bytes]) -> None:
-        """Read what a session says until it ends."""
-        assert process.stdout is not None
-        assert process.stderr is not None
-        words = threading.Thread(target=self._listen, args=(process.stderr,), daemon=True)
-        with process:
-            words.start()
-            while line := process.stdout.readline(LONGEST_LINE):
-                try:
-                    snapshot = Snapshot.from_json(line)
-                except ValueError:
-                    continue
+    def _follow(self, pipe: Connection, process: BaseProcess) -> None:
+        """Take what a session sends until it ends."""
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                content: bytes | str = pipe.recv()
                 with self._changed:
-                    self._snapshot = snapshot.to_json()
-                    self._tell()
-            code = process.wait()
-            words.join()
+                    if isinstance(content, bytes):
+                        self._snapshot = content
+                    else:
+                        self._lines.append(printable(content))
+                    self._notify()
+        process.join()
         with self._changed:
-            self._said.append(f"ended with exit code {code}")
-            self._tell()
+            pipe.close()
+            self._lines.append(f"ended with exit code {process.exitcode}")
+            self._notify()
 
-    def _listen(self, stream: IO[bytes]) -> None:
-        while line := stream.readline(LONGEST_LINE):
-            text = printable(line.decode("utf-8", errors="backslashreplace").rstrip())
-            with self._changed:
-                self._said.append(text)
-                self._tell()
+    def _interrupt(self) -> None:
+        """Do what Ctrl-C does: the session aborts its test, writes what it has, ends."""
+        if self._pipe is not None and not self._pipe.closed:
+            with contextlib.suppress(OSError):
+                self._pipe.send(None)
 
-    def _stop_process(self) -> None:
-        """Send what Ctrl-C sends: the session asks for an abort, writes what it has, ends."""
-        process = self._process
-        if process is not None and process.poll() is None:
-            kind = getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT)
-            process.send_signal(kind)
+
+def _run_session(session: Session, pipe: Connection) -> None:
+    """Run a session in this process, and exit with its code."""
+    if hasattr(os, "setsid"):
+        os.setsid()  # Ctrl-C on the terminal is for the parent, which then ends the session
+    sending = threading.Lock()
+    ended = threading.Event()
+
+    def send(content: bytes | str) -> None:
+        # Where the parent has gone the pipe's other thread ends the session.
+        with contextlib.suppress(OSError), sending:
+            pipe.send(content)
+
+    def interrupt_on_message() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                pipe.recv()
+                signal.raise_signal(signal.SIGINT)
+        if not ended.is_set():  # nobody watches any more: nothing moves unwatched
+            signal.raise_signal(signal.SIGINT)
+
+    sys.stdout = sys.stderr = _LineSender(send)
+    interrupted = interrupt_on_signals()
+    threading.Thread(target=interrupt_on_message, name="ehadiag-parent", daemon=True).start()
+
+    def snapshots(item: Snapshot) -> None:
+        send(item.to_json())
+
+    try:
+        code = session.function(*session.arguments, snapshots)
+    except EhadiagError as error:
+        send(f"ehadiag: {error}")
+        code = error.exit_code
+    except KeyboardInterrupt:
+        send("ehadiag: interrupted")
+        code = INTERRUPTED_EXIT_CODE
+    except RuntimeError:
+        if not interrupted.is_set():  # the compiler turns an interruption into this error
+            raise
+        code = INTERRUPTED_EXIT_CODE
+    ended.set()
+    sys.exit(code)
+
+
+class _LineSender(io.TextIOBase):
+    """Standard output and error of a session: each line goes to the page."""
+
+    def __init__(self, send: Callable[[str], None]) -> None:
+        self._send = send
+        self._rest = ""
+
+    def write(self, text: str) -> int:
+        *lines, self._rest = (self._rest + text).split("\n")
+        for line in lines:
+            self._send(line.rstrip())
+        return len(text)
+
+    def isatty(self) -> bool:
+        return False

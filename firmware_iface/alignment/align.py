@@ -1,52 +1,58 @@
-"""Builds recordings of tests from frames: samples at their ticks, losses as NaN and counted."""
+"""Builds recordings of tests from frames: samples at their ticks, losses as NaN and counted.
+
+A long stream is cut into windows that split no test, so that memory stays constant.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from ehadiag.core.find_test import Sought, found_tests, rows_of_samples
-from ehadiag.core.recording import (
+from firmware_iface.alignment.episodes import Episode, find_episodes
+from firmware_iface.alignment.frame_faults import (
+    Conflicts,
+    count_frames,
+    count_within,
+    crowding_reason,
+    drop_conflicts,
+    judge_frames,
+    second_sender_reasons,
+    slow_values,
+)
+from firmware_iface.alignment.grid import (
+    RowBounds,
+    TickGrid,
+    command_modes,
+    samples_of,
+)
+from firmware_iface.alignment.status import onboard_results, read_status, resolve_turns
+from firmware_iface.alignment.ticks import TickAxis, place_frames
+from firmware_iface.bus_map import BusMap
+from firmware_iface.codec import DecodedTable, channels_in, choose_channel, decode
+from firmware_iface.find_test import CandidateTests, extract_tests, rows_of_samples
+from firmware_iface.protection import rows_of
+from firmware_iface.recording import (
+    ACTIVE_BIT_STATES,
+    CHANNEL_NAMES,
+    BitOutcome,
     CommandMode,
     Environment,
+    IntArray,
     OnboardResult,
-    Outcome,
     Quality,
     Recording,
     Samples,
 )
-from firmware_iface.alignment.bounds import Bounds
-from firmware_iface.alignment.counts import count_frames, within
-from firmware_iface.alignment.episodes import Episode, find_episodes
-from firmware_iface.alignment.grid import CHANNEL_KEYS, Grid, modes_told, samples_of
-from firmware_iface.alignment.policy import judge_frames
-from firmware_iface.alignment.senders import (
-    Conflicts,
-    crowded,
-    drop_conflicts,
-    second_senders,
-)
-from firmware_iface.alignment.ticks import TickAxis, place
-from firmware_iface.codec.channel import channels_in, choose_channel
-from firmware_iface.codec.decode import DecodedTable, decode
-from firmware_iface.codec.onboard import onboard_results
-from firmware_iface.codec.status import read_status, resolve_turns
-from firmware_iface.mapping.bus_map import BusMap
-from firmware_iface.transport.frames import FrameTable
+from firmware_iface.transport.frames import FrameTable, concatenate
 
-__all__ = ["assemble"]
-
-STUCK_FRAMES = 20
-OWN_STEP_K = 0.1
-"""Resolution in which the computer says the oil temperature in degC (`Environment` of the DBC)."""
-SAME = 1e-6
-"""Distance, in such steps, within which two scales are the same."""
-SEVERAL = 2
-LOOKED_BESIDE = 100
+MIN_STUCK_FRAMES = 20
+MIN_MODES = 2
+SEARCH_MARGIN_TICKS = 100
 """Ticks around a test, as the status tells it, in which its command is looked for."""
-MARGIN = 1000
+LATE_FRAME_MARGIN_ROWS = 1000
 """Rows around a test in which late frames of messages without a counter are looked for."""
 
 
@@ -57,33 +63,17 @@ def assemble(
     notes: tuple[str, ...] = (),
     *,
     channels: frozenset[int] | None = None,
-    unsaid_is_test: bool = True,
-    sought: Sought | None = None,
+    no_status_is_test: bool = True,
+    candidates: CandidateTests | None = None,
 ) -> tuple[Recording, ...]:
     """All tests in a frame table, at least one recording (without samples if none ran).
 
-    Parameters
-    ----------
-    table : FrameTable
-        Frames in order of arrival.
-    bus_map : BusMap
-        What they mean.
-    source : str
-        File or bus, for reports.
-    notes : tuple[str, ...]
-        Facts known before decoding.
-    channels : frozenset[int] | None
-        Adapter channels on which the actuator's frames came so far; None: in this table.
-    unsaid_is_test : bool
-        Take frames without command and status for one test.
-    sought : Sought | None
-        What to look for where the bus does not say when which test ran; None: nothing, all that
-        is recorded is then one test.
-
-    Returns
-    -------
-    tuple[Recording, ...]
-        The tests in order of time; one recording without samples if there is none.
+    table: frames in order of arrival; bus_map: what they mean; source: file or bus, for reports;
+    notes: facts known before decoding; channels: adapter channels on which the actuator's frames
+    came so far; None: in this table; no_status_is_test: take frames without command and status for
+    one test; candidates: what to look for where the bus does not say when which test ran; None: all
+    that is recorded is one test. Returns the tests in order of time; one recording without
+    samples if there is none.
     """
     present = channels_in(table, bus_map) if channels is None else channels
     channel, ambiguous = choose_channel(bus_map.channel, present)
@@ -91,7 +81,7 @@ def assemble(
         return (_undecoded(source, notes, ambiguous),)
     bus_map = replace(bus_map, channel=channel)
     decoded = decode(table, bus_map)
-    axis = place(decoded, bus_map.tick_ns)
+    axis = place_frames(decoded, bus_map.tick_ns)
     decoded, axis, conflicts = drop_conflicts(decoded, axis)
     status = read_status(decoded, axis, bus_map)
     if axis is not None and (mended := resolve_turns(axis, status)) is not axis:
@@ -101,27 +91,29 @@ def assemble(
         notes += ("no telemetry in the recording",)
     else:
         notes += axis.notes
-    episodes = find_episodes(decoded, axis, status, bus_map, unsaid_is_test=unsaid_is_test)
-    bounds = Bounds.of(axis) if axis is not None else None
-    looked_for = sought if axis is not None and not _says_when(decoded, axis, bus_map) else None
-    margin = LOOKED_BESIDE if looked_for is not None else 0
+    episodes = find_episodes(decoded, axis, status, bus_map, no_status_is_test=no_status_is_test)
+    bounds = RowBounds.of(axis) if axis is not None else None
+    looked_for = (
+        candidates if axis is not None and not _has_test_timing(decoded, axis, bus_map) else None
+    )
+    margin = SEARCH_MARGIN_TICKS if looked_for is not None else 0
     found: list[Recording] = []
     own = onboard_results(table, bus_map)
     for item, after in zip(episodes, (*episodes[1:], None), strict=True):
 
-        def told(mode: CommandMode | None, item: Episode = item) -> Recording:
+        def cut(mode: CommandMode | None, item: Episode = item) -> Recording:
             return _recording(
                 item, decoded, conflicts, bounds, bus_map, source, notes, len(table), margin, mode
             )
 
         if looked_for is None or bounds is None:
-            these = [told(None)]
+            these = [cut(None)]
         else:
-            modes = modes_told(_grid(item, decoded, bounds, bus_map, len(table), margin))
-            these = _in_each_mode(told, modes, item, looked_for, margin)
+            modes = command_modes(_grid(item, decoded, bounds, bus_map, len(table), margin))
+            these = _in_each_mode(cut, modes, item, looked_for, margin)
         if own:
-            said = _onboard_of(item, after, own, bounds, len(table))
-            these = [replace(one, onboard=said) for one in these]
+            onboard = _onboard_of(item, after, own, bounds, len(table))
+            these = [replace(one, onboard=onboard) for one in these]
         found += these
     return tuple(found)
 
@@ -130,7 +122,7 @@ def _onboard_of(
     episode: Episode,
     after: Episode | None,
     found: list[tuple[int, OnboardResult]],
-    bounds: Bounds | None,
+    bounds: RowBounds | None,
     rows: int,
 ) -> OnboardResult | None:
     """What the computer found between a test and the one after it, of that test."""
@@ -143,31 +135,31 @@ def _onboard_of(
 
 
 def _in_each_mode(
-    told: Callable[[CommandMode | None], Recording],
+    cut: Callable[[CommandMode | None], Recording],
     modes: tuple[CommandMode, ...],
     episode: Episode,
-    sought: Sought,
+    candidates: CandidateTests,
     margin: int,
 ) -> list[Recording]:
     """The tests in a stretch, each among the commands of its own mode."""
-    if len(modes) < SEVERAL:
-        return list(_looked_for(told(None), episode, sought, margin))
+    if len(modes) < MIN_MODES:
+        return list(_matched_in(cut(None), episode, candidates, margin))
     found: list[Recording] = []
     for mode in modes:
         own = (
             CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-            for test in sought.tests
+            for test in candidates.tests
         )
-        tests = tuple(test for test, its in zip(sought.tests, own, strict=True) if its is mode)
-        others = len(tests) < len(sought.tests)
-        part = replace(sought, tests=tests)
-        found += _looked_for(told(mode), episode, part, margin, others=others)
+        tests = tuple(test for test, its in zip(candidates.tests, own, strict=True) if its is mode)
+        others = len(tests) < len(candidates.tests)
+        part = replace(candidates, tests=tests)
+        found += _matched_in(cut(mode), episode, part, margin, others=others)
     named = [item for item in found if item.test_id is not None]
     named.sort(key=lambda item: item.start_ns or 0)
     return named or found[:1]
 
 
-def _says_when(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> bool:
+def _has_test_timing(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> bool:
     """Whether commands carry the test's number, or counters tell to which tick a status belongs."""
     command = bus_map.find("command.test_id")
     if command is not None and len(decoded.messages[command[0].name].row):
@@ -176,16 +168,21 @@ def _says_when(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> bool:
     return bool(axis.turn) and status is not None and len(decoded.messages[status[0].name].row) > 0
 
 
-def _looked_for(
-    one: Recording, episode: Episode, sought: Sought, margin: int, *, others: bool = False
+def _matched_in(
+    one: Recording,
+    episode: Episode,
+    candidates: CandidateTests,
+    margin: int,
+    *,
+    others: bool = False,
 ) -> tuple[Recording, ...]:
     """The tests in a stretch of samples that is wider by a margin than what the status said."""
     if one.samples is None:
         return (one,)
-    known = tuple(test for test in sought.tests if one.test_id in (None, test.id))
-    found = found_tests(
+    known = tuple(test for test in candidates.tests if one.test_id in (None, test.id))
+    found = extract_tests(
         one,
-        replace(sought, tests=known),
+        replace(candidates, tests=known),
         within=one.test_id is not None,
         before=margin,
         others=others,
@@ -198,7 +195,7 @@ def _looked_for(
 
 def _undecoded(source: str, notes: tuple[str, ...], why: str) -> Recording:
     quality = Quality(notes=notes, refused=(why,))
-    return Recording(source, None, None, None, Outcome(), Environment(), quality)
+    return Recording(source, None, None, None, BitOutcome(), Environment(), quality)
 
 
 def _protection_notes(bus_map: BusMap) -> tuple[str, ...]:
@@ -213,7 +210,7 @@ def _recording(
     episode: Episode,
     decoded: DecodedTable,
     conflicts: Mapping[str, Conflicts],
-    bounds: Bounds | None,
+    bounds: RowBounds | None,
     bus_map: BusMap,
     source: str,
     notes: tuple[str, ...],
@@ -243,9 +240,13 @@ def _recording(
         for name, item in decoded.messages.items()
     }
     refused, used = judge_frames(bus_map.policy, counts)
-    crowds = (crowded(item, bus_map.tick_ns, begin, end) for item in decoded.messages.values())
+    crowds = (
+        crowding_reason(item, bus_map.tick_ns, begin, end) for item in decoded.messages.values()
+    )
+    environment, mixed = _environment(decoded, begin, end, episode.ticks * bus_map.tick_ns)
     refused = (
-        *second_senders(counts, conflicts, bus_map, begin, end),
+        *second_sender_reasons(counts, conflicts, bus_map, begin, end),
+        *mixed,
         *filter(None, crowds),
         *episode.refused,
         *refused,
@@ -253,8 +254,8 @@ def _recording(
     quality = Quality(
         messages=counts,
         saturated=_saturated(samples),
-        foreign=within(decoded.foreign, begin, end),
-        error_frames=within(decoded.errors, begin, end),
+        foreign=count_within(decoded.foreign, begin, end),
+        error_frames=count_within(decoded.errors, begin, end),
         notes=(*notes, *episode.notes, *extra, *used),
         refused=refused,
     )
@@ -264,7 +265,11 @@ def _recording(
         test_id=episode.test_id,
         serial=episode.serial,
         outcome=episode.outcome,
-        environment=replace(_environment(decoded, begin, end), temperature_std=_rounding(bus_map)),
+        environment=replace(
+            environment,
+            temperature_std=_rounding_std(bus_map, "oil_temperature"),
+            supply_std=_rounding_std(bus_map, "supply_pressure", "return_pressure"),
+        ),
         quality=quality,
         channel=bus_map.channel,
         start_ns=_start_ns(samples),
@@ -275,15 +280,22 @@ def _recording(
 def _grid(
     episode: Episode,
     decoded: DecodedTable,
-    bounds: Bounds,
+    bounds: RowBounds,
     bus_map: BusMap,
     rows: int,
     beside: int,
-) -> Grid:
+) -> TickGrid:
     """Grid of a test, wider by some ticks on either side."""
     begin, end = bounds.rows(episode, rows)
     wide = replace(episode, first=episode.first - beside, ticks=episode.ticks + 2 * beside)
-    return Grid(wide, decoded, bounds.axis, bus_map, max(begin - MARGIN, 0), end + MARGIN)
+    return TickGrid(
+        wide,
+        decoded,
+        bounds.axis,
+        bus_map,
+        max(begin - LATE_FRAME_MARGIN_ROWS, 0),
+        end + LATE_FRAME_MARGIN_ROWS,
+    )
 
 
 def _start_ns(samples: Samples | None) -> int | None:
@@ -303,7 +315,7 @@ def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int
             continue
         still = np.diff(item.counter[inside]) == 0
         still &= np.diff(item.time_ns[inside]) > bus_map.tick_ns // 2
-        if still.sum() >= STUCK_FRAMES:
+        if still.sum() >= MIN_STUCK_FRAMES:
             notes.append(f"{name}: the counter stands still in {int(still.sum())} frames")
     return notes
 
@@ -311,34 +323,161 @@ def _stuck_counters(decoded: DecodedTable, bus_map: BusMap, begin: int, end: int
 def _saturated(samples: Samples | None) -> dict[str, int]:
     if samples is None:
         return {}
-    return {key: int(samples.saturated[index].sum()) for index, key in enumerate(CHANNEL_KEYS)}
+    return {key: int(samples.saturated[index].sum()) for index, key in enumerate(CHANNEL_NAMES)}
 
 
-def _environment(decoded: DecodedTable, begin: int, end: int) -> Environment:
-    def median(key: str) -> float | None:
-        role = f"environment.{key}"
+def _environment(
+    decoded: DecodedTable, begin: int, end: int, span_ns: int
+) -> tuple[Environment, tuple[str, ...]]:
+    """Oil and supply of a test, and why they are not of one sender."""
+    medians: dict[str, float] = {}
+    reasons: list[str] = []
+    for item in decoded.messages.values():
+        values, mixed = slow_values(item, begin, end, span_ns)
+        reasons += mixed
+        for role, value in values.items():
+            sound = value[np.isfinite(value)]
+            if len(sound):
+                medians[role.removeprefix("environment.")] = float(np.median(sound))
+    return Environment(**medians), tuple(reasons)
+
+
+def _rounding_std(bus_map: BusMap, *quantities: str) -> float:
+    """Standard deviation of the sum of quantities of the environment by their steps on the bus.
+
+    SI, or K; each is off evenly by half a step at most.
+    """
+    found = (bus_map.find(f"environment.{name}") for name in quantities)
+    roles = [item[1] for item in found if item is not None and not item[1].signal.is_float]
+    return math.hypot(*(role.signal.scale * role.gain for role in roles)) / math.sqrt(12.0)
+
+
+MIN_WINDOW_FRAMES = 200_000
+"""Frames from which on a window is closed where no test runs: two minutes of the default bus."""
+MIN_QUIET_FRAMES = 1000
+"""Frames in a row that tell of no test, half a second or less: a window may end in their midst."""
+
+
+def windowed_recordings(
+    tables: Iterable[FrameTable],
+    bus_map: BusMap,
+    source: str,
+    held: int,
+    least: int = MIN_WINDOW_FRAMES,
+    candidates: CandidateTests | None = None,
+) -> Iterator[Recording]:
+    """Tests of a stream of frames in order of time; one recording without samples if there is none.
+
+    tables: blocks of frames in order of arrival; bus_map: what they mean; source: file or bus, for
+    reports; held: frames that a window may have at most; a test beyond that is cut, and said to be;
+    least: frames from which on a window is closed where no test runs; candidates: what to look for
+    where the bus does not say when which test ran. Yields each test as soon as it is complete.
+    """
+    reading = _WindowReader(bus_map, source, candidates)
+    empty: Recording | None = None
+    found = False
+    for window, cut in _windows(tables, reading, held, least):
+        for recording in reading.recordings(window, cut):
+            if recording.samples is not None or recording.test_id is not None:
+                found = True
+                yield recording
+            elif empty is None or _is_more_informative(recording, empty):
+                empty = recording
+    if not found and empty is not None:
+        yield empty
+
+
+def _is_more_informative(new: Recording, old: Recording) -> bool:
+    return new.outcome.state is not None or old.outcome.state is None
+
+
+def _windows(
+    tables: Iterable[FrameTable], reading: _WindowReader, held: int, least: int
+) -> Iterator[tuple[FrameTable, bool]]:
+    """Windows, and whether one was cut for its length."""
+    pending: list[FrameTable] = []
+    size, look_at = 0, least
+    for table in tables:
+        pending.append(table)
+        size += len(table)
+        if size < look_at:
+            continue
+        window = concatenate(pending)
+        end = reading.quiet_row(window)
+        if end:
+            yield window.rows(slice(0, end)), False
+            pending, size, look_at = [window.rows(slice(end, None))], size - end, least
+        elif size >= held:
+            yield window, True
+            pending, size, look_at = [], 0, least
+        else:
+            pending, look_at = [window], min(2 * size, held)
+    if size:
+        yield concatenate(pending), False
+
+
+class _WindowReader:
+    """What is known of a recording from the windows read so far."""
+
+    def __init__(
+        self, bus_map: BusMap, source: str, candidates: CandidateTests | None = None
+    ) -> None:
+        self._map = bus_map
+        self._candidates = candidates
+        self._source = source
+        self._has_timing = False
+        self._channels: frozenset[int] = frozenset()
+        telling = ("command.test_id", "status.state")
+        messages = {
+            name: replace(item, roles=tuple(role for role in item.roles if role.name in telling))
+            for name, item in bus_map.messages.items()
+        }
+        self._telling = replace(
+            bus_map, messages={name: item for name, item in messages.items() if item.roles}
+        )
+
+    def recordings(self, window: FrameTable, cut: bool) -> tuple[Recording, ...]:
+        """Tests of a window."""
+        self._channels |= channels_in(window, self._map)
+        notes = (f"cut off at {len(window)} frames, the most that are held at once",) if cut else ()
+        return assemble(
+            window,
+            self._map,
+            self._source,
+            notes,
+            channels=self._channels,
+            no_status_is_test=not self._has_timing,
+            candidates=self._candidates,
+        )
+
+    def quiet_row(self, window: FrameTable) -> int:
+        """Row at which a window may end: amidst the longest stretch of its second half without a
+        test, or where only foreign frames came; 0 if there is none."""
+        test_rows = self._rows_of_a_test(window)
+        half = len(window) // 2
+        test_rows = test_rows[test_rows >= half]
+        edges = np.concatenate(([half], test_rows, [len(window)]))
+        quiet = np.diff(edges)
+        longest = int(quiet.argmax())
+        if quiet[longest] < MIN_QUIET_FRAMES:
+            return 0
+        return int(edges[longest] + quiet[longest] // 2)
+
+    def _rows_of_a_test(self, window: FrameTable) -> IntArray:
+        decoded = decode(window, self._telling)
+        rows: list[IntArray] = []
         for item in decoded.messages.values():
-            if role in item.values:
-                value = item.values[role][slice(*np.searchsorted(item.row, [begin, end]))]
-                value = value[np.isfinite(value)]
-                return float(np.median(value)) if len(value) else None
-        return None
-
-    return Environment(
-        supply_pressure=median("supply_pressure"),
-        return_pressure=median("return_pressure"),
-        oil_temperature=median("oil_temperature"),
-    )
-
-
-def _rounding(bus_map: BusMap) -> float:
-    """What rounding the oil temperature to the bus's scale does, K; 0 of the computer's own."""
-    found = bus_map.find("environment.oil_temperature")
-    if found is None or found[1].signal.is_float:
-        return 0.0
-    role = found[1]
-    step = abs(role.signal.scale * role.gain)
-    zero = (role.gain * role.signal.offset + role.bias) / OWN_STEP_K
-    own = abs(step / OWN_STEP_K - 1.0) < SAME and abs(zero - round(zero)) < SAME
-    # A rig that holds 40 °C is off by the same half step, 0.05 K of 313.1 or 313.2 K, every day.
-    return 0.0 if own else 0.5 * step
+            self._has_timing |= len(item.row) > 0
+            for role, value in item.values.items():
+                if role == "command.test_id":
+                    rows.append(item.row[value > 0])
+                else:
+                    active = [
+                        key for key, state in self._map.states.items() if state in ACTIVE_BIT_STATES
+                    ]
+                    rows.append(item.row[np.isin(value, active)])
+        if not self._has_timing:
+            # Without commands and status all that is recorded is one test.
+            measured = (item for item in self._map.messages.values() if item.measures)
+            rows += [rows_of(window, item) for item in measured]
+        return np.sort(np.concatenate(rows)) if rows else np.empty(0, dtype=np.int64)

@@ -5,58 +5,47 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ehadiag.core.recording import BitReason, BitState, Outcome
-from firmware_iface.alignment.consistency import SAME_START, contradictions, time_bases
+from firmware_iface.alignment.status import (
+    START_SCATTER_TICKS,
+    StatusTable,
+    contradictions,
+    main_time_base,
+)
 from firmware_iface.alignment.ticks import TickAxis
-from firmware_iface.codec.decode import DecodedTable
-from firmware_iface.codec.protection import OUTSIDE
-from firmware_iface.codec.status import Status
-from firmware_iface.mapping.bus_map import BusMap
+from firmware_iface.bus_map import BusMap
+from firmware_iface.codec import DecodedTable
+from firmware_iface.protection import NO_POSITION
+from firmware_iface.recording import BitOutcome, BitReason, BitState, IntArray
 
-__all__ = ["Episode", "find_episodes"]
-
-BLIP = 2
+MAX_BLIP_FRAMES = 2
 """A run of other test ids this short inside a test is corruption, not another test."""
-MAX_TICKS = 1_000_000
+MAX_GRID_TICKS = 1_000_000
 """Longest test that is unfolded onto a tick grid."""
 
-ENDS = (BitState.COMPLETE, BitState.ABORTED)
+END_STATES = (BitState.COMPLETE, BitState.ABORTED)
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One test.
-
-    Attributes
-    ----------
-    first : int
-        Tick of row 0.
-    ticks : int
-        Length; 0 if the test never ran.
-    test_id : int | None
-        None if the bus does not say.
-    serial : int | None
-        See `test_id`.
-    outcome : Outcome
-        How it ended.
-    ended : int | None
-        Row of the status frame that told of the end; None without one.
-    notes : tuple[str, ...]
-        What a reader should know.
-    refused : tuple[str, ...]
-        Why it is not one test on one unit.
-    """
+    """One test."""
 
     first: int
+    """Tick of row 0."""
     ticks: int
+    """Length; 0 if the test never ran."""
     test_id: int | None
+    """None if the bus does not say."""
     serial: int | None
-    outcome: Outcome
+    """See `test_id`."""
+    outcome: BitOutcome
+    """How it ended."""
     ended: int | None = None
+    """Row of the status frame that told of the end; None without one."""
     notes: tuple[str, ...] = ()
+    """What a reader should know."""
     refused: tuple[str, ...] = ()
+    """Why it is not one test on one unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,23 +62,23 @@ class _Span:
 def find_episodes(
     decoded: DecodedTable,
     axis: TickAxis | None,
-    status: Status,
+    status: StatusTable,
     bus_map: BusMap,
     *,
-    unsaid_is_test: bool = True,
+    no_status_is_test: bool = True,
 ) -> tuple[Episode, ...]:
     """Find all tests, in order of time, refused ones (without ticks) among them.
 
     Command test ids bound a test exactly where its neighbours arrived; status frames tell the
-    first tick where they did not. Frames with neither are one test if `unsaid_is_test`.
+    first tick where they did not. Frames with neither are one test if `no_status_is_test`.
     """
     running = np.flatnonzero((status.state == BitState.RUNNING) & np.isfinite(status.elapsed))
-    running, second = time_bases(status, running)
+    running, second = main_time_base(status, running)
     spans: list[_Span] = []
     if axis is not None:
         spans = _spans_by_id(decoded, axis, bus_map)
         spans = _merge(spans, _spans_by_status(status, running, axis))
-        if not spans and unsaid_is_test and _tells_nothing(decoded, status, bus_map):
+        if not spans and no_status_is_test and _lacks_test_messages(decoded, status, bus_map):
             spans = [_Span(int(axis.tick.min()), int(axis.tick.max()) + 1, None)]
     found = []
     for index, span in enumerate(spans):
@@ -100,7 +89,7 @@ def find_episodes(
     return tuple(sorted(found, key=lambda item: item.first)) if found else (_never_ran(status),)
 
 
-def _tells_nothing(decoded: DecodedTable, status: Status, bus_map: BusMap) -> bool:
+def _lacks_test_messages(decoded: DecodedTable, status: StatusTable, bus_map: BusMap) -> bool:
     """Whether neither commands nor status could have told of a test."""
     command = bus_map.find("command.test_id")
     commands = command is not None and len(decoded.messages[command[0].name].row) > 0
@@ -113,7 +102,7 @@ def _spans_by_id(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> list
         return []
     item = decoded.messages[found[0].name]
     tick, value = axis.ticks[found[0].name], item.values["command.test_id"]
-    known = np.isfinite(value) & (tick > OUTSIDE // 2)
+    known = np.isfinite(value) & (tick > NO_POSITION // 2)
     order = np.argsort(tick[known], kind="stable")
     tick, ids = tick[known][order], value[known][order].astype(np.int64)
     runs = _runs(ids)
@@ -128,7 +117,7 @@ def _spans_by_id(decoded: DecodedTable, axis: TickAxis, bus_map: BusMap) -> list
     return spans
 
 
-def _runs(ids: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _runs(ids: IntArray) -> list[tuple[int, int]]:
     """Begin and end of stretches of one id; blips inside a stretch belong to it."""
     if len(ids) == 0:
         return []
@@ -140,7 +129,7 @@ def _runs(ids: NDArray[np.int64]) -> list[tuple[int, int]]:
         begin, end = bounds[index], bounds[index + 1]
         while (
             index + 3 < len(bounds)
-            and bounds[index + 2] - bounds[index + 1] <= BLIP
+            and bounds[index + 2] - bounds[index + 1] <= MAX_BLIP_FRAMES
             and ids[bounds[index + 2]] == ids[begin]
         ):
             index += 2
@@ -150,11 +139,11 @@ def _runs(ids: NDArray[np.int64]) -> list[tuple[int, int]]:
     return runs
 
 
-def _spans_by_status(status: Status, running: NDArray[np.int64], axis: TickAxis) -> list[_Span]:
+def _spans_by_status(status: StatusTable, running: IntArray, axis: TickAxis) -> list[_Span]:
     if len(running) == 0:
         return []
     start = status.start[running].astype(np.int64)
-    cuts = np.flatnonzero(np.abs(np.diff(start)) > SAME_START) + 1
+    cuts = np.flatnonzero(np.abs(np.diff(start)) > START_SCATTER_TICKS) + 1
     spans = []
     for group in np.split(np.arange(len(running)), cuts):
         first = _most_common(start[group])
@@ -166,7 +155,7 @@ def _spans_by_status(status: Status, running: NDArray[np.int64], axis: TickAxis)
     return spans
 
 
-def _stop(status: Status, last_running: int, first: int, axis: TickAxis) -> int:
+def _stop(status: StatusTable, last_running: int, first: int, axis: TickAxis) -> int:
     """One past the last tick of a test whose last running frame is given."""
     after = last_running + 1
     if after < len(status.row):
@@ -176,7 +165,7 @@ def _stop(status: Status, last_running: int, first: int, axis: TickAxis) -> int:
     return int(axis.tick.max()) + 1
 
 
-def _most_common(values: NDArray[np.int64]) -> int:
+def _most_common(values: IntArray) -> int:
     unique, count = np.unique(values, return_counts=True)
     return int(unique[np.argmax(count)])
 
@@ -188,8 +177,8 @@ def _merge(by_id: list[_Span], by_status: list[_Span]) -> list[_Span]:
         inside = [
             item
             for item in by_status
-            if item.stop - item.start > SAME_START
-            and span.start + SAME_START < item.start < span.stop - SAME_START
+            if item.stop - item.start > START_SCATTER_TICKS
+            and span.start + START_SCATTER_TICKS < item.start < span.stop - START_SCATTER_TICKS
             and item.test_id in (None, span.test_id)
         ]
         edges = [span.start, *(item.start for item in inside), span.stop]
@@ -210,17 +199,18 @@ def _merge(by_id: list[_Span], by_status: list[_Span]) -> list[_Span]:
     return sorted(merged, key=lambda item: item.start)
 
 
-def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | None) -> Episode:
+def _episode(span: _Span, limit: int | None, status: StatusTable, axis: TickAxis | None) -> Episode:
     notes: list[str] = []
     mine = _status_rows(span, limit, status)
     running = mine[(status.state[mine] == BitState.RUNNING) & np.isfinite(status.elapsed[mine])]
     first = span.start
     low = span.after + 1 if span.after is not None else None
     if len(running):
-        told = _most_common(status.start[running].astype(np.int64))
-        first = min(told, span.start) if low is None else min(max(told, low), span.start)
-        if abs(told - first) > 2:
-            notes.append(f"status and command ids differ by {abs(told - first)} ticks on the start")
+        stated = _most_common(status.start[running].astype(np.int64))
+        first = min(stated, span.start) if low is None else min(max(stated, low), span.start)
+        if abs(stated - first) > 2:
+            apart = abs(stated - first)
+            notes.append(f"status and command ids differ by {apart} ticks on the start")
     elif low is not None and low < span.start:
         notes.append(f"start of the test uncertain by {span.start - low} ticks")
     stop = span.stop
@@ -232,11 +222,15 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
         if span.test_id is not None and abs(stop - span.stop) > 2 and span.before == span.stop:
             notes.append(f"status and command ids differ by {span.stop - stop} ticks on the end")
     elif span.before is None and axis is not None and limit is None and len(mine) == 0:
-        stop = max(stop, int(axis.tick.max()) + 1) if axis.tick.max() - stop < SAME_START else stop
+        stop = (
+            max(stop, int(axis.tick.max()) + 1)
+            if axis.tick.max() - stop < START_SCATTER_TICKS
+            else stop
+        )
     ticks = stop - first
-    if ticks > MAX_TICKS:
-        notes.append(f"test cut off at {MAX_TICKS} ticks")
-        ticks = MAX_TICKS
+    if ticks > MAX_GRID_TICKS:
+        notes.append(f"test cut off at {MAX_GRID_TICKS} ticks")
+        ticks = MAX_GRID_TICKS
     following = status.following[mine]
     inside = mine[(following > first) & (following <= stop)]
     refused, odd = contradictions(status, inside, final, first, stop, span.test_id)
@@ -247,13 +241,13 @@ def _episode(span: _Span, limit: int | None, status: Status, axis: TickAxis | No
         test_id=span.test_id,
         serial=_most_common(serials[serials >= 0]) if np.any(serials >= 0) else None,
         outcome=outcome,
-        ended=int(status.row[final]) if final is not None and outcome.state in ENDS else None,
-        notes=(*notes, *_on_the_end(status, outcome), *odd),
+        ended=int(status.row[final]) if final is not None and outcome.state in END_STATES else None,
+        notes=(*notes, *_end_notes(status, outcome), *odd),
         refused=refused,
     )
 
 
-def _on_the_end(status: Status, outcome: Outcome) -> tuple[str, ...]:
+def _end_notes(status: StatusTable, outcome: BitOutcome) -> tuple[str, ...]:
     """Note where nothing tells how a test ended."""
     if len(status.row) == 0:
         return ("no status frames: nothing says how the test ended",)
@@ -262,39 +256,39 @@ def _on_the_end(status: Status, outcome: Outcome) -> tuple[str, ...]:
     return ()
 
 
-def _status_rows(span: _Span, limit: int | None, status: Status) -> NDArray[np.int64]:
+def _status_rows(span: _Span, limit: int | None, status: StatusTable) -> IntArray:
     """Status frames of a test; its end may be told right before the first tick of the next."""
-    mine = status.following >= span.start - SAME_START
+    mine = status.following >= span.start - START_SCATTER_TICKS
     if limit is not None:
         ended = (status.following == limit) & (status.state != BitState.RUNNING)
         mine &= (status.following < limit) | ended
     return np.flatnonzero(mine)
 
 
-def _outcome(mine: NDArray[np.int64], status: Status) -> tuple[Outcome, int | None]:
+def _outcome(mine: IntArray, status: StatusTable) -> tuple[BitOutcome, int | None]:
     """How a test ended: the first end after it ran."""
     state = status.state[mine]
     begun = np.flatnonzero(state == BitState.RUNNING)
     begin = int(begun[0]) if len(begun) else 0
-    ends = np.flatnonzero(np.isin(state, ENDS) & (np.arange(len(state)) >= begin))
+    ends = np.flatnonzero(np.isin(state, END_STATES) & (np.arange(len(state)) >= begin))
     if len(ends):
         final = int(mine[ends[0]])
-        return Outcome(BitState(int(status.state[final])), _reason(status, final)), final
+        return BitOutcome(BitState(int(status.state[final])), _reason(status, final)), final
     if len(begun):
-        return Outcome(BitState.RUNNING), None
+        return BitOutcome(BitState.RUNNING), None
     known = mine[state >= 0]
     if len(known):
         final = int(known[-1])
-        return Outcome(BitState(int(status.state[final])), _reason(status, final)), final
-    return Outcome(None), None
+        return BitOutcome(BitState(int(status.state[final])), _reason(status, final)), final
+    return BitOutcome(None), None
 
 
-def _reason(status: Status, index: int) -> BitReason:
+def _reason(status: StatusTable, index: int) -> BitReason:
     number = int(status.reason[index])
     return BitReason(number) if number in BitReason.__members__.values() else BitReason.NONE
 
 
-def _refusals(status: Status, ran: list[Episode]) -> list[Episode]:
+def _refusals(status: StatusTable, ran: list[Episode]) -> list[Episode]:
     """Episodes without ticks: requests that were refused while no test ran."""
     refused = status.state == BitState.REFUSED
     begins = np.flatnonzero(refused & ~np.concatenate(([False], refused[:-1])))
@@ -305,20 +299,20 @@ def _refusals(status: Status, ran: list[Episode]) -> list[Episode]:
     ]
 
 
-def _never_ran(status: Status) -> Episode:
+def _never_ran(status: StatusTable) -> Episode:
     """One episode without ticks: the last state known."""
     known = np.flatnonzero(status.state >= 0)
     if len(known) == 0:
-        return Episode(0, 0, None, None, Outcome(None))
+        return Episode(0, 0, None, None, BitOutcome(None))
     return _without_ticks(status, int(known[-1]))
 
 
-def _without_ticks(status: Status, index: int) -> Episode:
+def _without_ticks(status: StatusTable, index: int) -> Episode:
     test_id, serial = int(status.test_id[index]), int(status.serial[index])
     return Episode(
         first=int(status.following[index]),
         ticks=0,
         test_id=test_id if test_id > 0 else None,
         serial=serial if serial >= 0 else None,
-        outcome=Outcome(BitState(int(status.state[index])), _reason(status, index)),
+        outcome=BitOutcome(BitState(int(status.state[index])), _reason(status, index)),
     )

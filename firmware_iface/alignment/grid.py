@@ -1,67 +1,96 @@
-"""Lays a test's frames out on its control ticks: channels, commands, what stood still."""
+"""Lays a test's frames out on its control ticks: channels, commands, frozen signals."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ehadiag.core.recording import CommandMode, Samples
 from firmware_iface.alignment.episodes import Episode
 from firmware_iface.alignment.ticks import TickAxis
-from firmware_iface.codec.decode import DecodedTable
-from firmware_iface.mapping.bus_map import BusMap
+from firmware_iface.bus_map import BusMap
+from firmware_iface.codec import DecodedTable
+from firmware_iface.recording import (
+    CHANNEL_NAMES,
+    BoolArray,
+    CommandMode,
+    FloatArray,
+    IntArray,
+    Samples,
+)
 
-__all__ = ["CHANNEL_KEYS", "Filled", "Grid", "modes_told", "samples_of"]
 
-CHANNEL_KEYS = ("current", "spool", "pressure", "position")
-FROZEN_TICKS = 100
-FROZEN_LIVELY = 0.2
+@dataclass(frozen=True, slots=True, eq=False)
+class RowBounds:
+    """Finds the frames of a span of ticks without going through all of them."""
+
+    axis: TickAxis
+    """The control ticks of the recording."""
+    highest: IntArray
+    """Highest tick up to each axis frame; ascending."""
+    lowest: IntArray
+    """Lowest tick from each axis frame on; ascending."""
+
+    @classmethod
+    def of(cls, axis: TickAxis) -> RowBounds:
+        """Bounds of an axis.
+
+        axis: the control ticks of a recording. Returns where each tick's frames may stand.
+        """
+        lowest = np.minimum.accumulate(axis.tick[::-1])[::-1]
+        return cls(axis, np.maximum.accumulate(axis.tick), lowest)
+
+    def rows(self, episode: Episode, rows: int) -> tuple[int, int]:
+        """Rows of the table that belong to a test: from neighbour to neighbour.
+
+        They end with the word that the test has ended, if it has all its frames then: a live test
+        is judged on that word, and its recording goes on for a while.
+
+        episode: the test; rows: of the whole table. Returns the first row, and one past the last.
+        """
+        stop = episode.first + episode.ticks
+        low = int(np.searchsorted(self.highest, episode.first))
+        high = int(np.searchsorted(self.lowest, stop))
+        tick = self.axis.tick[low:high]
+        hits = np.flatnonzero((tick >= episode.first) & (tick < stop))
+        if len(hits) == 0:
+            return 0, rows
+        first, last = low + int(hits[0]), low + int(hits[-1])
+        begin = int(self.axis.row[first - 1]) + 1 if first > 0 else 0
+        end = int(self.axis.row[last + 1]) if last + 1 < len(self.axis.row) else rows
+        if episode.ended is not None:
+            end = min(end, max(episode.ended, int(self.axis.row[last])) + 1)
+        return begin, end
+
+
+MIN_FROZEN_TICKS = 100
+MIN_LIVELY_SHARE = 0.2
 """Share of ticks, outside a frozen stretch, in which a live channel changes its code."""
-LEAST_OF_A_MODE = 50
+MIN_MODE_COMMANDS = 50
 """Commands of a mode from which on a test may have been played in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid:
-    """One test's tick grid, and the rows of the table that can hold its frames.
-
-    Attributes
-    ----------
-    episode : Episode
-        The test.
-    decoded : DecodedTable
-        All frames.
-    axis : TickAxis
-        Their ticks.
-    bus_map : BusMap
-        What they mean.
-    begin : int
-        First row that can hold one of the test's.
-    end : int
-        One past the last.
-    """
+class TickGrid:
+    """One test's tick grid, and the rows of the table that can hold its frames."""
 
     episode: Episode
+    """The test."""
     decoded: DecodedTable
+    """All frames."""
     axis: TickAxis
+    """Their ticks."""
     bus_map: BusMap
+    """What they mean."""
     begin: int
+    """First row that can hold one of the test's."""
     end: int
+    """One past the last."""
 
-    def fill(self, role: str) -> Filled | None:
+    def fill(self, role: str) -> GridColumn | None:
         """Put the values of a role on the grid; of two frames for one tick the first counts.
 
-        Parameters
-        ----------
-        role : str
-            As in a mapping.
-
-        Returns
-        -------
-        Filled | None
-            None without a frame of the role's message.
+        role: as in a mapping. Returns None without a frame of the role's message.
         """
         found = self.bus_map.find(role)
         tick = self.axis.ticks.get(found[0].name) if found is not None else None
@@ -80,52 +109,36 @@ class Grid:
         saturated = np.zeros(self.episode.ticks, dtype=np.bool_)
         if role in item.saturated:
             saturated[at] = item.saturated[role][near][usable]
-        return Filled(out, saturated, host)
+        return GridColumn(out, saturated, host)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Filled:
-    """A role on the grid; NaN, False and -1 where no frame brought it.
+class GridColumn:
+    """A role on the grid; NaN, False and -1 where no frame brought it."""
 
-    Attributes
-    ----------
-    value : NDArray[np.float64]
-        Shape (ticks,).
-    saturated : NDArray[np.bool_]
-        At the converter's end, shape (ticks,).
-    host_ns : NDArray[np.int64]
-        Time stamps, shape (ticks,).
-    """
-
-    value: NDArray[np.float64]
-    saturated: NDArray[np.bool_]
-    host_ns: NDArray[np.int64]
+    value: FloatArray
+    """Shape (ticks,)."""
+    saturated: BoolArray
+    """At the converter's end, shape (ticks,)."""
+    host_ns: IntArray
+    """Time stamps, shape (ticks,)."""
 
 
-def samples_of(grid: Grid, mode: CommandMode | None = None) -> tuple[Samples, list[str]]:
+def samples_of(grid: TickGrid, mode: CommandMode | None = None) -> tuple[Samples, list[str]]:
     """Put the channels and the commands of one test on its ticks.
 
-    Parameters
-    ----------
-    grid : Grid
-        The test and its frames.
-    mode : CommandMode | None
-        Of the commands to take; None: that of most of them.
-
-    Returns
-    -------
-    tuple[Samples, list[str]]
-        The samples, and what a reader should know.
+    grid: the test and its frames; mode: of the commands to take; None: that of most of them.
+    Returns the samples, and what a reader should know.
     """
     ticks, period = grid.episode.ticks, grid.bus_map.tick_ns
-    nothing = Filled(
+    empty = GridColumn(
         np.full(ticks, np.nan), np.zeros(ticks, dtype=np.bool_), np.full(ticks, -1, dtype=np.int64)
     )
     notes: list[str] = []
-    filled: dict[str, Filled] = {}
-    for key in CHANNEL_KEYS:
+    filled: dict[str, GridColumn] = {}
+    for key in CHANNEL_NAMES:
         found = grid.fill(f"channels.{key}")
-        filled[key] = found or nothing
+        filled[key] = found or empty
         if found is None:
             notes.append(f"no frame brings the {key}")
             continue
@@ -133,7 +146,7 @@ def samples_of(grid: Grid, mode: CommandMode | None = None) -> tuple[Samples, li
         if frozen:
             seconds = frozen * period * 1e-9
             notes.append(f"{key} stood at one code for {seconds:.3g} s though it moves elsewhere")
-    mode, command, said = _command(grid, mode)
+    mode, command, command_notes = _command(grid, mode)
     samples = Samples(
         period_ns=period,
         mode=mode,
@@ -142,14 +155,14 @@ def samples_of(grid: Grid, mode: CommandMode | None = None) -> tuple[Samples, li
         pressure=filled["pressure"].value,
         position=filled["position"].value,
         command=command,
-        saturated=np.stack([filled[key].saturated for key in CHANNEL_KEYS]),
+        saturated=np.stack([filled[key].saturated for key in CHANNEL_NAMES]),
         host_ns=filled["spool"].host_ns,
         stated=grid.bus_map.stated,
     )
-    return samples, notes + said
+    return samples, notes + command_notes
 
 
-def _frozen(value: NDArray[np.float64], saturated: NDArray[np.bool_]) -> int:
+def _frozen(value: FloatArray, saturated: BoolArray) -> int:
     """Length of a frozen stretch in ticks, 0 if the channel never stood still suspiciously."""
     known = np.flatnonzero(np.isfinite(value) & ~saturated)
     if len(known) == 0:
@@ -159,40 +172,30 @@ def _frozen(value: NDArray[np.float64], saturated: NDArray[np.bool_]) -> int:
     lengths = np.diff(bounds)
     longest = int(lengths.argmax())
     run = int(lengths[longest])
-    elsewhere = len(known) - run
+    others = len(known) - run
     span = int(known[bounds[longest + 1]] - known[bounds[longest] + 1]) + 1
-    lively = elsewhere > FROZEN_TICKS and len(edges) >= FROZEN_LIVELY * elsewhere
-    return span if run >= FROZEN_TICKS and lively else 0
+    lively = others > MIN_FROZEN_TICKS and len(edges) >= MIN_LIVELY_SHARE * others
+    return span if run >= MIN_FROZEN_TICKS and lively else 0
 
 
-def modes_told(grid: Grid) -> tuple[CommandMode, ...]:
+def command_modes(grid: TickGrid) -> tuple[CommandMode, ...]:
     """Find the modes of a stretch's commands, each of at least a few dozens of them.
 
-    Parameters
-    ----------
-    grid : Grid
-        The stretch and its frames.
-
-    Returns
-    -------
-    tuple[CommandMode, ...]
-        Empty where no frame says a mode.
+    grid: the stretch and its frames. Returns empty where no frame says a mode.
     """
     modes = grid.fill("command.mode")
     if modes is None:
         return ()
     values, count = np.unique(modes.value[np.isfinite(modes.value)], return_counts=True)
-    told = {
+    found = {
         grid.bus_map.modes[int(value)]
         for value, times in zip(values, count, strict=True)
-        if times >= LEAST_OF_A_MODE and int(value) in grid.bus_map.modes
+        if times >= MIN_MODE_COMMANDS and int(value) in grid.bus_map.modes
     }
-    return tuple(sorted(told))
+    return tuple(sorted(found))
 
 
-def _command(
-    grid: Grid, mode: CommandMode | None
-) -> tuple[CommandMode, NDArray[np.float64], list[str]]:
+def _command(grid: TickGrid, mode: CommandMode | None) -> tuple[CommandMode, FloatArray, list[str]]:
     """Mode and command of a test; NaN where no frame said, or where it said another mode."""
     notes: list[str] = []
     bus_map = grid.bus_map

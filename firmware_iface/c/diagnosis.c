@@ -42,6 +42,7 @@ static void record(struct fcc_diagnosis *diagnosis, const struct fcc_node *node,
 static void hand_over(struct fcc_diagnosis *diagnosis, const struct fcc_node *node)
 {
     diagnosis->rig = node->rig;
+    diagnosis->serial = node->serial;
     diagnosis->begun = false;
     diagnosis->runs = 0;
     diagnosis->stop = false;
@@ -110,13 +111,14 @@ static bool begin(struct fcc_diagnosis *diagnosis)
     eha_unit unit = EHA_UNIT_DEFAULT;
 
     unit.closed = diagnosis->closed ? 1.0 : 0.0;
+    unit.serial = (double)diagnosis->serial;
     return eha_unit_environment(&unit, &environment) == 0 &&
            eha_identify_begin(&diagnosis->job, &unit) == 0;
 }
 
-bool fcc_diagnosis_work(struct fcc_diagnosis *diagnosis, double runs)
+bool fcc_diagnosis_work(struct fcc_diagnosis *diagnosis, double work)
 {
-    const eha_slice slice = {(double)diagnosis->ticks, runs};
+    const eha_slice slice = {(double)diagnosis->ticks, work};
     int32_t going = EHA_IDENTIFY_GOES_ON;
 
     if (!with_background(diagnosis)) {
@@ -132,7 +134,7 @@ bool fcc_diagnosis_work(struct fcc_diagnosis *diagnosis, double runs)
     } else if (begin(diagnosis)) {
         diagnosis->begun = true;
     } else {
-        going = EHA_IDENTIFY_REFUSED;
+        going = EHA_ERROR_RANGE;
     }
     if (going != EHA_IDENTIFY_GOES_ON) {
         diagnosis->stage = going == EHA_IDENTIFY_DONE ? FCC_DONE : FCC_GIVEN_UP;

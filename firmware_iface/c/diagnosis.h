@@ -10,7 +10,7 @@
  *
  * and the background, at its leisure:
  *
- *     for (;;) (void)fcc_diagnosis_work(&diagnosis, 1.0);
+ *     for (;;) (void)fcc_diagnosis_work(&diagnosis, 100.0);
  *
  * What they share belongs to one of them at a time, as `stage` says: to the background while a test
  * waits to be identified or is, to the tick otherwise. On a computer with several cores the caller
@@ -41,6 +41,7 @@ struct fcc_diagnosis {
     eha_tick recording[FCC_DIAGNOSIS_TICKS];
     uint32_t ticks;        /* in the recording */
     struct fcc_rig rig;    /* at the end of the test */
+    uint32_t serial;       /* of the unit */
     bool closed;           /* commands are positions */
     bool begun;            /* the background has begun */
     uint8_t test_id;
@@ -56,7 +57,7 @@ void fcc_diagnosis_init(struct fcc_diagnosis *diagnosis);
 size_t fcc_diagnosis_tick(struct fcc_diagnosis *diagnosis, const struct fcc_node *node,
                           const uint16_t codes[4], struct fcc_frame frames[FCC_DIAGNOSIS_FRAMES]);
 
-/* Go on for at least so many runs of the model; false if there is nothing to do. */
-bool fcc_diagnosis_work(struct fcc_diagnosis *diagnosis, double runs);
+/* Go on for at least so many ticks of a model; false if there is nothing to do. */
+bool fcc_diagnosis_work(struct fcc_diagnosis *diagnosis, double work);
 
 #endif

@@ -30,7 +30,7 @@ static void spare(void *self)
 {
     struct example *example = self;
 
-    (void)fcc_diagnosis_work(&example->diagnosis, 1.0);
+    (void)fcc_diagnosis_work(&example->diagnosis, 1e4);
 }
 
 int main(int argc, char **argv)

@@ -11,18 +11,17 @@ import struct
 import zlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.errors import InputOutputError, reason_of
-from firmware_iface.logs.budget import Spending
-from firmware_iface.transport.columns import ColumnBuilder
-from firmware_iface.transport.frames import FrameTable
-
-__all__ = ["BlfBlocks"]
+from firmware_iface.errors import InputOutputError, reason_of
+from firmware_iface.logs.log_files import DamagedLogError, Spending
+from firmware_iface.recording import IntArray
+from firmware_iface.transport.frames import ColumnBuilder, FrameTable
 
 Bytes = NDArray[np.uint8]
 
@@ -31,77 +30,82 @@ OBJECT_HEADER = struct.Struct("<4sHHLL")
 CONTAINER_HEADER = struct.Struct("<H6xL4x")
 FD_MESSAGE = struct.Struct("<HBBLLBBB5x")
 FD_MESSAGE_64 = struct.Struct("<BBBBLLLLLLLHBBL")
-SIGNATURE = int.from_bytes(b"LOBJ", "little")
-START_FIELD = 14
+OBJECT_SIGNATURE = int.from_bytes(b"LOBJ", "little")
+START_TIME_FIELD = 14
 """Where the start time begins among the fields of the file header."""
 
-CLASSIC, CLASSIC_2, CONTAINER = 1, 86, 10
-ERROR_EXT, FD, FD_64 = 73, 100, 101
-STORED, DEFLATED = 0, 2
-PIECE = 256 << 10
+
+class _Kind(IntEnum):
+    """Kinds of objects."""
+
+    CLASSIC, CLASSIC_2, CONTAINER = 1, 86, 10
+    ERROR_EXT, FD, FD_64 = 73, 100, 101
+
+
+class _Packing(IntEnum):
+    """How a container is packed."""
+
+    STORED, DEFLATED = 0, 2
+
+
+CONTAINER_PIECE_BYTES = 256 << 10
 """Bytes that are read from a container and handed to the unpacker at once."""
-BATCH = 2 << 20
+PARSE_BATCH_BYTES = 2 << 20
 """Unpacked bytes that are parsed at once: whatever a container unpacks to, no more is held."""
-MAX_OBJECT = 16 << 20
+MAX_OBJECT_BYTES = 16 << 20
 """Bytes of an object other than a container: an embedded text or picture, never a frame."""
-MAX_CONTAINER = 1 << 30
+MAX_CONTAINER_BYTES = 1 << 30
 """Bytes of a container as packed: loggers write 128 KiB."""
-RUN = 16
+MAX_STAMP_NS = 1 << 62
+"""Nanoseconds from 1970 to the start, at most, and from there to a frame: 146 years."""
+MIN_RUN_OBJECTS = 16
 """Objects of one size in a row from which on they are found in one step."""
 
 
-class BlfBlocks:
-    """The frames of a BLF file, one table after another.
+class BlfReader:
+    """Vector's binary log, see `LogReader`."""
 
-    Parameters
-    ----------
-    path : Path
-        File to read.
-    spending : Spending
-        What reading may still cost.
+    signature = b"LOGG"
 
-    Attributes
-    ----------
-    trouble : str
-        What ended the reading early; empty at the regular end.
+    def frames(self, path: Path, spending: Spending) -> Iterator[FrameTable]:
+        """Read a file.
 
-    Raises
-    ------
-    InputOutputError
-        Not a BLF file, it cannot be read, or it costs more than its budget.
-    """
-
-    trouble: str
-
-    def __init__(self, path: Path, spending: Spending) -> None:
-        self._path = path
-        self._spending = spending
-        self.trouble = ""
-
-    def __iter__(self) -> Iterator[FrameTable]:
+        path: the file; spending: what reading may still cost. Yields frames in order of arrival.
+        DamagedLogError: it breaks off or is damaged; InputOutputError: not a BLF file, it cannot be
+        read, or it costs more than its budget.
+        """
+        content = _BlfContent(spending)
         try:
-            with self._path.open("rb") as file:
-                parser = _Parser(_file_header(file, self._path))
-                for block in self._batches(file):
+            with path.open("rb") as file:
+                parser = _BlfParser(_file_header(file, path))
+                for block in content.batches(file):
                     table = parser.feed(block)
-                    self._spending.add_frames(len(table))
                     if len(table):
                         yield table
                     if parser.trouble:
                         break
         except OSError as error:
-            raise InputOutputError(f"log {self._path}: {reason_of(error)}") from None
-        self.trouble = self.trouble or parser.trouble
+            raise InputOutputError(f"log {path}: {reason_of(error)}") from None
+        if trouble := content.trouble or parser.trouble:
+            raise DamagedLogError(trouble)
 
-    def _batches(self, file: BinaryIO) -> Iterator[bytes]:
-        """Unpacked content in pieces of about `BATCH` bytes; sets `trouble` where it ends early."""
+
+class _BlfContent:
+    """Unpacks the containers of a file; `trouble` says what ended that early."""
+
+    def __init__(self, spending: Spending) -> None:
+        self._spending = spending
+        self.trouble = ""
+
+    def batches(self, file: BinaryIO) -> Iterator[bytes]:
+        """Unpacked content in pieces of about `PARSE_BATCH_BYTES`."""
         pending: list[bytes] = []
         held = 0
         for piece in self._unpacked(file):
             self._spending.add_bytes(len(piece))
             pending.append(piece)
             held += len(piece)
-            if held >= BATCH:
+            if held >= PARSE_BATCH_BYTES:
                 yield b"".join(pending)
                 pending, held = [], 0
         yield b"".join(pending)
@@ -112,11 +116,11 @@ class BlfBlocks:
                 self.trouble = "the log breaks off"
                 return
             signature, _, _, size, kind = OBJECT_HEADER.unpack(header)
-            if signature != b"LOBJ" or not OBJECT_HEADER.size <= size <= MAX_CONTAINER:
+            if signature != b"LOBJ" or not OBJECT_HEADER.size <= size <= MAX_CONTAINER_BYTES:
                 self.trouble = "the log is damaged"
                 return
             self._spending.look_at_clock()
-            if kind == CONTAINER:
+            if kind == _Kind.CONTAINER:
                 yield from self._container(file, size - OBJECT_HEADER.size)
             else:
                 file.seek(size - OBJECT_HEADER.size, os.SEEK_CUR)
@@ -130,13 +134,13 @@ class BlfBlocks:
             self.trouble = "the log breaks off"
             return
         method, _ = CONTAINER_HEADER.unpack(header)
-        if method not in (STORED, DEFLATED):
+        if method not in (_Packing.STORED, _Packing.DEFLATED):
             self.trouble = f"the log is packed in an unknown way ({method})"
             return
-        unpacker = zlib.decompressobj() if method == DEFLATED else None
+        unpacker = zlib.decompressobj() if method == _Packing.DEFLATED else None
         left = size - len(header)
         while left > 0:
-            packed = file.read(min(left, PIECE))
+            packed = file.read(min(left, CONTAINER_PIECE_BYTES))
             if not packed:
                 self.trouble = "the log breaks off"
                 return
@@ -148,10 +152,11 @@ class BlfBlocks:
             self.trouble = "the log breaks off"
 
     def _inflated(self, unpacker: zlib._Decompress, packed: bytes) -> Iterator[bytes]:
-        """What a piece unpacks to, never more than `PIECE` at a time: it may be a thousandfold."""
+        """What a piece unpacks to, never more than `CONTAINER_PIECE_BYTES` at a time: it may be a
+        thousandfold."""
         while packed and not unpacker.eof:
             try:
-                data = unpacker.decompress(packed, PIECE)
+                data = unpacker.decompress(packed, CONTAINER_PIECE_BYTES)
             except zlib.error:
                 self.trouble = "the log is damaged"
                 return
@@ -165,15 +170,18 @@ def _file_header(file: BinaryIO, path: Path) -> int:
         raise InputOutputError(f"log {path}: not a BLF file (no LOGG header); is the suffix right?")
     fields = FILE_HEADER.unpack(text)
     file.seek(max(fields[1], FILE_HEADER.size))
-    year, month, _, day, hour, minute, second, milli = fields[START_FIELD : START_FIELD + 8]
+    year, month, _, day, hour, minute, second, milli = fields[
+        START_TIME_FIELD : START_TIME_FIELD + 8
+    ]
     try:
         start = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return 0
-    return int(start.timestamp()) * 1_000_000_000 + milli * 1_000_000
+    start_ns = int(start.timestamp()) * 1_000_000_000 + milli * 1_000_000
+    return start_ns if 0 <= start_ns < MAX_STAMP_NS else 0
 
 
-class _Parser:
+class _BlfParser:
     """Objects of the joined containers into columns; an object may span two of them."""
 
     def __init__(self, start_ns: int) -> None:
@@ -193,9 +201,9 @@ class _Parser:
             self._append(data, places, kinds)
         return self._columns.table()
 
-    def _walk(self, text: bytes, data: Bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    def _walk(self, text: bytes, data: Bytes) -> tuple[IntArray, IntArray, int]:
         """Positions and kinds of all whole objects, and the bytes used."""
-        places: list[NDArray[np.int64]] = []
+        places: list[IntArray] = []
         at, end = 0, len(text)
         unpack = OBJECT_HEADER.unpack_from
         single: list[int] = []
@@ -208,13 +216,13 @@ class _Parser:
                     break
                 at = found
                 continue
-            if size < OBJECT_HEADER.size or size > MAX_OBJECT:
+            if size < OBJECT_HEADER.size or size > MAX_OBJECT_BYTES:
                 self.trouble = "the log is damaged"
                 break
             if at + size > end:
                 break
             count = _run(data, at, size) if size % 4 == 0 else 1
-            if count >= RUN:
+            if count >= MIN_RUN_OBJECTS:
                 places.extend((np.array(single, dtype=np.int64), at + size * np.arange(count)))
                 single = []
             else:
@@ -224,9 +232,9 @@ class _Parser:
         where = np.concatenate(places)
         return where, _u32(data, where + 12), at
 
-    def _append(self, data: Bytes, places: NDArray[np.int64], kinds: NDArray[np.int64]) -> None:
-        classic = (kinds == CLASSIC) | (kinds == CLASSIC_2)
-        special = np.flatnonzero(np.isin(kinds, (ERROR_EXT, FD, FD_64)))
+    def _append(self, data: Bytes, places: IntArray, kinds: IntArray) -> None:
+        classic = (kinds == _Kind.CLASSIC) | (kinds == _Kind.CLASSIC_2)
+        special = np.flatnonzero(np.isin(kinds, (_Kind.ERROR_EXT, _Kind.FD, _Kind.FD_64)))
         start = 0
         for index in special:
             self._classic(data, places[start:index][classic[start:index]])
@@ -234,7 +242,7 @@ class _Parser:
             start = int(index) + 1
         self._classic(data, places[start:][classic[start:]])
 
-    def _classic(self, data: Bytes, places: NDArray[np.int64]) -> None:
+    def _classic(self, data: Bytes, places: IntArray) -> None:
         """CAN_MESSAGE and CAN_MESSAGE2: the first 16 bytes of their body are the same."""
         version = _u16(data, places + 6)
         body = places + np.where(version == 2, 40, 32)
@@ -265,14 +273,17 @@ class _Parser:
         version = int(data[place + 6])
         size = int(_u32(data, np.array([place + 8]))[0])
         body = place + (40 if version == 2 else 32)
+        if body > place + size:
+            self.trouble = "the log is damaged"
+            return
         whole = data[body : place + size].tobytes()
         time_ns = int(self._times(data, np.array([place]))[0])
-        if kind == ERROR_EXT:
+        if kind == _Kind.ERROR_EXT:
             channel = int.from_bytes(whole[:2], "little")
             self._columns.add(time_ns, 0, b"", error=True, channel=channel)
             return
         try:
-            if kind == FD:
+            if kind == _Kind.FD:
                 channel, flags, _, can_id, _, _, fd_flags, valid = FD_MESSAGE.unpack_from(whole)
                 payload = whole[FD_MESSAGE.size :][: min(valid, 64)]
                 remote, sent, fd = bool(flags & 0x80), bool(flags & 1), bool(fd_flags & 1)
@@ -298,11 +309,11 @@ class _Parser:
             channel=channel,
         )
 
-    def _times(self, data: Bytes, places: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _times(self, data: Bytes, places: IntArray) -> IntArray:
         """Stamps in ns: object flag 1 counts 10 µs, all others ns."""
         ten_micros = _u32(data, places + 16) == 1
         stamp = _rows(data, places + 24, 8).view("<i8").reshape(-1).astype(np.int64)
-        limit = (1 << 62) // 10_000
+        limit = MAX_STAMP_NS // 10_000
         stamp = np.clip(stamp, 0, np.where(ten_micros, limit, limit * 10_000))
         return self._start_ns + np.where(ten_micros, stamp * 10_000, stamp)
 
@@ -310,15 +321,15 @@ class _Parser:
 def _run(data: Bytes, at: int, size: int) -> int:
     """Objects of that size that follow one another from `at` on, at least 1."""
     most = (len(data) - at) // size
-    if most < RUN or size > 256:
+    if most < MIN_RUN_OBJECTS or size > 256:
         return 1
-    found, probe = 0, RUN
+    found, probe = 0, MIN_RUN_OBJECTS
     # In growing steps: objects of changing size must not cost a look at all that follow.
     while found < most:
         count = min(probe, most - found)
         begin = at + found * size
         rows = data[begin : begin + count * size].reshape(count, size)
-        same = rows[:, :4].copy().view("<u4").reshape(-1) == SIGNATURE
+        same = rows[:, :4].copy().view("<u4").reshape(-1) == OBJECT_SIGNATURE
         same &= rows[:, 8:12].copy().view("<u4").reshape(-1) == size
         if not same.all():
             return max(found + int(np.argmin(same)), 1)
@@ -326,14 +337,14 @@ def _run(data: Bytes, at: int, size: int) -> int:
     return found
 
 
-def _rows(data: Bytes, places: NDArray[np.int64], width: int) -> Bytes:
+def _rows(data: Bytes, places: IntArray, width: int) -> Bytes:
     out: Bytes = data[places[:, None] + np.arange(width)]
     return out
 
 
-def _u32(data: Bytes, places: NDArray[np.int64]) -> NDArray[np.int64]:
+def _u32(data: Bytes, places: IntArray) -> IntArray:
     return _rows(data, places, 4).view("<u4").reshape(-1).astype(np.int64)
 
 
-def _u16(data: Bytes, places: NDArray[np.int64]) -> NDArray[np.int64]:
+def _u16(data: Bytes, places: IntArray) -> IntArray:
     return _rows(data, places, 2).view("<u2").reshape(-1).astype(np.int64)

@@ -1,31 +1,167 @@
-"""Reads the tests of a log: all of them, or the one to be diagnosed."""
+"""Reads logs (BLF, ASC, CSV, TRC, MF4, candump): frames in blocks of columns, and their tests."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ehadiag.core.errors import InputOutputError
-from ehadiag.core.find_test import Sought
-from ehadiag.core.recording import BitState, Recording
-from firmware_iface.alignment.windows import recordings_of
-from firmware_iface.logs.blocks import SUFFIXES, LogReader
-from firmware_iface.logs.budget import Budget
-from firmware_iface.mapping.bus_map import BusMap, default_map
+import numpy as np
+
+from firmware_iface.alignment.align import windowed_recordings
+from firmware_iface.bus_map import BusMap, default_map
+from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
+from firmware_iface.find_test import CandidateTests
+from firmware_iface.logs.can_readers import SkippedLines
+from firmware_iface.logs.log_files import (
+    Budget,
+    DamagedLogError,
+    LogReader,
+    Spending,
+    find_reader,
+    kind_of,
+    known_suffixes,
+    log_size,
+    unpacked_log,
+)
+from firmware_iface.recording import BitState, IntArray, Recording
 from firmware_iface.transport.frames import FrameTable, concatenate
 
-__all__ = [
-    "SUFFIXES",
-    "choose",
-    "describe",
-    "iterate_recordings",
-    "read_frames",
-    "read_recording",
-    "read_recordings",
-]
 
-MOST_NAMED = 3
+class FrameLog:
+    """The frames of a log, one table after another, in memory that does not grow with its length.
+
+    A log that breaks off is read up to the break; `notes` then say so.
+
+    Parameters
+    ----------
+    path : Path | str
+        File to read.
+    budget : Budget | None
+        Bytes, frames and seconds that reading may cost; None: the default.
+
+    Attributes
+    ----------
+    path : Path
+        File.
+    notes : tuple[str, ...]
+        Facts on the reading, complete once all blocks were taken.
+
+    Raises
+    ------
+    InputOutputError
+        The file is missing, no regular file, unreadable, not what its suffix says, without a
+        frame, or beyond its budget.
+    ConfigurationError
+        Unknown kind of log, or a faulty reader of another package.
+    """
+
+    path: Path
+    notes: tuple[str, ...]
+
+    def __init__(self, path: Path | str, budget: Budget | None = None) -> None:
+        self.path = Path(path)
+        self._budget = budget or Budget()
+        self._spending = Spending(self.path, self._budget)
+        size = log_size(self.path)
+        found = find_reader(self.path, decodes=False)
+        if found is None:
+            kind = kind_of(self.path) or "without a suffix"
+            raise ConfigurationError(
+                f"log {self.path}: unknown kind {kind}; known: {', '.join(known_suffixes())}, and"
+                " these packed as .gz"
+            )
+        self._reader: LogReader = found.reader
+        self.notes = found.notes
+        self._origin = found.origin
+        self._spending.check_size(size)
+        if size == 0:
+            raise InputOutputError(f"log {self.path}: the file is empty")
+
+    def __iter__(self) -> Iterator[FrameTable]:
+        stamps = _StampCounts()
+        with (
+            unpacked_log(self.path, self._budget.size) as plain,
+            SkippedLines() as complaints,
+        ):
+            trouble = yield from self._tables(plain.path, stamps)
+            trouble = plain.trouble or trouble
+        frames = self._spending.frames
+        if frames == 0:
+            reason = f" ({trouble})" if trouble else ""
+            raise InputOutputError(f"log {self.path}: no frames in it{reason}")
+        if complaints.count:
+            self.notes += (f"{complaints.count} lines of the log could not be read",)
+        self.notes += stamps.notes()
+        if trouble:
+            self.notes += (f"{trouble} after {frames} frames; the rest is lost",)
+
+    def _tables(self, plain: Path, stamps: _StampCounts) -> Generator[FrameTable, None, str]:
+        """Tables of frames; returns what ended the reading early, empty at the regular end."""
+        tables: Iterator[FrameTable] | None = None
+        while True:
+            try:
+                tables = tables or iter(self._reader.frames(plain, self._spending))
+                table = next(tables, None)
+            except DamagedLogError as error:
+                return str(error)
+            except EhadiagError:
+                raise
+            except Exception:
+                if not self._origin:
+                    raise
+                return "the log breaks off or is damaged"
+            if table is None:
+                return ""
+            if not isinstance(table, FrameTable):
+                raise ConfigurationError(f"log reader {self._origin}: yields no FrameTable")
+            self._spending.add_frames(len(table))
+            stamps.take(table.time_ns)
+            yield table
+
+
+MIN_BACKWARD_NS = 1_000_000
+"""Least step back, ns, that is counted: frames of several channels are sorted less exactly."""
+MAX_STANDING = 0.5
+"""Largest share of stamps, 1, that may equal the one before; bursts of a serial adapter have less
+than half of their frames in one stamp, a clock that stands all of them."""
+
+
+class _StampCounts:
+    """Counts stamps that run backward or stand still, of any format."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._steps = self._back = self._standing = 0
+        self._farthest = 0
+
+    def take(self, time_ns: IntArray) -> None:
+        """Take the stamps of the next frames."""
+        if not len(time_ns):
+            return
+        step = np.diff(time_ns, prepend=time_ns[0] if self._last is None else self._last)
+        self._steps += len(step) - (self._last is None)
+        self._standing += int((step == 0).sum()) - (self._last is None)
+        self._back += int((step <= -MIN_BACKWARD_NS).sum())
+        self._farthest = min(self._farthest, int(step.min()))
+        self._last = int(time_ns[-1])
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what a reader should know."""
+        found = []
+        if self._back:
+            found.append(
+                f"time stamps run backward {self._back} times in {self._steps + 1} frames, by up to"
+                f" {-1e-9 * self._farthest:.3g} s"
+            )
+        if self._standing > MAX_STANDING * self._steps:
+            found.append(
+                f"{self._standing} of {self._steps + 1} time stamps are those of the frame before"
+            )
+        return tuple(found)
+
+
+MAX_LISTED_TESTS = 3
 """Tests passed over that are told one by one."""
 
 
@@ -33,7 +169,7 @@ def iterate_recordings(
     path: Path | str,
     bus_map: BusMap | None = None,
     budget: Budget | None = None,
-    sought: Sought | None = None,
+    candidates: CandidateTests | None = None,
 ) -> Iterator[Recording]:
     """Read a log and give its tests in order of time, each as soon as it is complete.
 
@@ -48,7 +184,7 @@ def iterate_recordings(
         Which message and signal plays which role.
     budget : Budget | None
         Bytes, frames and seconds that reading may cost; None: the default.
-    sought : Sought | None
+    candidates : CandidateTests | None
         What to look for where the bus does not say when which test ran.
 
     Yields
@@ -64,8 +200,10 @@ def iterate_recordings(
         Unknown kind of log.
     """
     budget = budget or Budget()
-    reader = LogReader(path, budget)
-    tests = recordings_of(reader, bus_map or default_map(), str(path), budget.held, sought=sought)
+    reader = FrameLog(path, budget)
+    tests = windowed_recordings(
+        reader, bus_map or default_map(), str(path), budget.held, candidates=candidates
+    )
     for recording in tests:
         yield _with_notes(recording, reader.notes)
 
@@ -74,27 +212,27 @@ def read_recordings(
     path: Path | str,
     bus_map: BusMap | None = None,
     budget: Budget | None = None,
-    sought: Sought | None = None,
+    candidates: CandidateTests | None = None,
 ) -> tuple[Recording, ...]:
     """Read all tests in a log, in order of time; see `iterate_recordings`."""
-    return tuple(iterate_recordings(path, bus_map, budget, sought))
+    return tuple(iterate_recordings(path, bus_map, budget, candidates))
 
 
 def read_recording(
     path: Path | str,
     bus_map: BusMap | None = None,
     budget: Budget | None = None,
-    sought: Sought | None = None,
+    candidates: CandidateTests | None = None,
 ) -> Recording:
     """Read the last complete test of a log; the last one begun if none was completed.
 
     Its notes say what was passed over. Where tests lie on several adapter channels and none was
     chosen, it is refused.
     """
-    return choose(iterate_recordings(path, bus_map, budget, sought))
+    return choose_recording(iterate_recordings(path, bus_map, budget, candidates))
 
 
-def choose(recordings: Iterable[Recording]) -> Recording:
+def choose_recording(recordings: Iterable[Recording]) -> Recording:
     """Return the last complete test, or the last with samples, or the last.
 
     Its notes name the other tests. Only the best so far is held.
@@ -119,22 +257,25 @@ def choose(recordings: Iterable[Recording]) -> Recording:
     others: list[str] = []
     channels: set[int] = set()
     for count, item in enumerate(recordings, start=1):
-        others.append(describe(item, count))
+        others.append(describe_recording(item, count))
         if item.samples is not None and item.channel:
             channels.add(item.channel)
-        if best is None or _worth(item) >= _worth(best):
+        if best is None or _completeness(item) >= _completeness(best):
             best, place = item, count
     if best is None:
         raise ValueError("no recording to choose from")
     del others[place - 1]
-    notes = tuple(f"passed over: {item}" for item in others[-MOST_NAMED:])
-    if len(others) > MOST_NAMED:
-        notes = (f"{len(others) - MOST_NAMED} earlier tests of the recording passed over", *notes)
+    notes = tuple(f"passed over: {item}" for item in others[-MAX_LISTED_TESTS:])
+    if len(others) > MAX_LISTED_TESTS:
+        notes = (
+            f"{len(others) - MAX_LISTED_TESTS} earlier tests of the recording passed over",
+            *notes,
+        )
     best = _with_notes(best, notes)
     return _refused(best, sorted(channels)) if len(channels) > 1 else best
 
 
-def _worth(item: Recording) -> int:
+def _completeness(item: Recording) -> int:
     if item.samples is None:
         return 0
     return 2 if item.outcome.state is BitState.COMPLETE else 1
@@ -152,7 +293,7 @@ def _refused(item: Recording, channels: Sequence[int]) -> Recording:
     return replace(item, quality=replace(item.quality, refused=(*item.quality.refused, why)))
 
 
-def describe(item: Recording, number: int) -> str:
+def describe_recording(item: Recording, number: int) -> str:
     """A test of a log in one clause: number, length, outcome, serial number, channel."""
     state = item.outcome.state
     how = "how it ended is not said" if state is None else state.name.lower().replace("_", " ")
@@ -183,13 +324,13 @@ def read_frames(path: Path | str, budget: Budget | None = None) -> FrameTable:
     Raises
     ------
     InputOutputError, ConfigurationError
-        See `LogReader`; also where there are more frames than the budget allows to hold at
+        See `FrameLog`; also where there are more frames than the budget allows to hold at
         once.
     """
     budget = budget or Budget()
     tables: list[FrameTable] = []
     count = 0
-    for table in LogReader(path, budget):
+    for table in FrameLog(path, budget):
         tables.append(table)
         count += len(table)
         if count > budget.held:

@@ -10,13 +10,11 @@ from typing import Any
 
 import can
 
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.folder import create_file
-from firmware_iface.logs.can_library import mf4_library
+from firmware_iface.errors import ConfigurationError, install_command
+from firmware_iface.files import create_file
+from firmware_iface.logs.can_readers import mf4_library
 
-__all__ = ["FlushingBlfWriter", "open_writer"]
-
-FILE_BUFFER = 1 << 20
+FILE_BUFFER_BYTES = 1 << 20
 """Bytes. Larger than what comes between two flushes, so that each flush is one write and a killed
 process leaves no half line or half container."""
 
@@ -42,28 +40,14 @@ class FlushingBlfWriter(can.BLFWriter):
 def open_writer(path: Path) -> Any:
     """Create `path`, which must not exist, and return the writer for its suffix.
 
-    Parameters
-    ----------
-    path : Path
-        File to create; the suffix chooses the format.
-
-    Returns
-    -------
-    Any
-        A writer of python-can or asammdf.
-
-    Raises
-    ------
-    ConfigurationError
-        MF4 without its library.
-    OSError
-        The file exists or cannot be created.
+    path: file to create; the suffix chooses the format. Returns a writer of python-can or asammdf.
+    ConfigurationError: MF4 without its library; OSError: the file exists or cannot be created.
     """
     suffix = path.suffix.lower()
     descriptor = create_file(path)
 
     def begin(mode: Any, **text: Any) -> Any:
-        return open(path, mode, FILE_BUFFER, opener=lambda *_: descriptor, **text)
+        return open(path, mode, FILE_BUFFER_BYTES, opener=lambda *_: descriptor, **text)
 
     if suffix == ".mf4":
         file = begin("w+b")
@@ -73,7 +57,7 @@ def open_writer(path: Path) -> Any:
             file.close()
             path.unlink()
             raise ConfigurationError(
-                f"recording {path}: MF4 needs asammdf: pip install 'ehadiag[mf4]'"
+                f"recording {path}: MF4 needs asammdf: {install_command('mf4')}"
             ) from None
     if suffix == ".blf":
         return FlushingBlfWriter(begin("wb"))

@@ -10,16 +10,13 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.printable import printable
-from ehadiag.core.toml_file import read_toml
-from firmware_iface.mapping.bus_map import DIMENSIONS
-from firmware_iface.mapping.units import si_factor
+from firmware_iface.bus_map import ROLE_DIMENSIONS
+from firmware_iface.errors import ConfigurationError, printable
+from firmware_iface.files import read_toml
+from firmware_iface.mapping_file import si_factor
 
-__all__ = ["SCHEMA", "TIME", "Column", "ColumnMap", "load_columns", "named_columns"]
-
-SCHEMA = "ehadiag.columns/1"
-TIME = "time"
+COLUMNS_SCHEMA = "ehadiag.columns/1"
+TIME_ROLE = "time"
 SI_UNITS = {
     "current": "A",
     "length": "m",
@@ -27,35 +24,35 @@ SI_UNITS = {
     "temperature": "degC",
     "time": "s",
 }
-ROLES: dict[str, str] = {
-    TIME: "time",
+COLUMN_ROLES: dict[str, str] = {
+    TIME_ROLE: "time",
     **{
         f"{section}.{key}": str(dimension)
         for section in ("channels", "command", "environment")
-        for key, dimension in DIMENSIONS[section].items()
+        for key, dimension in ROLE_DIMENSIONS[section].items()
         if dimension is not None
     },
 }
 """Role: the quantity that it is."""
-SHORT = {
+SHORT_COLUMN_NAMES = {
     **{key: f"channels.{key}" for key in ("current", "spool", "pressure", "position")},
     "current_command": "command.current",
     "position_command": "command.position",
-    **{key.split(".")[1]: key for key in ROLES if key.startswith("environment.")},
-    TIME: TIME,
+    **{key.split(".")[1]: key for key in COLUMN_ROLES if key.startswith("environment.")},
+    TIME_ROLE: TIME_ROLE,
 }
 """Name of a column that needs no mapping: its role."""
-NEEDED = ("channels.spool", "channels.pressure", "channels.position")
-UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
-MOST_SHOWN = 12
+NEEDED_COLUMN_ROLES = ("channels.spool", "channels.pressure", "channels.position")
+UNIT_PATTERN = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+MAX_LISTED_COLUMNS = 12
 
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
+ColumnName = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One column. SI value = SI(unit, value * scale + offset)."""
 
-    column: Name
+    column: ColumnName
     unit: str | None = None
     """None: that in brackets behind the column's name or in the file's row of units, else SI."""
     scale: float = 1.0
@@ -91,38 +88,18 @@ class _ColumnsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """Columns by role; roles without one are looked for by their usual names.
-
-    Attributes
-    ----------
-    columns : Mapping[str, Column]
-        By role, as `channels.spool`; `time` for the time stamps.
-    tick_ns : int
-        Control period.
-    """
+    """Columns by role; roles without one are looked for by their usual names."""
 
     columns: Mapping[str, Column] = field(default_factory=dict)
+    """By role, as `channels.spool`; `time` for the time stamps."""
     tick_ns: int = 1_000_000
+    """Control period."""
 
     def resolve(self, present: Sequence[str], where: str) -> dict[str, Column]:
         """Find the column of each role in a file.
 
-        Parameters
-        ----------
-        present : Sequence[str]
-            Names of the file's columns.
-        where : str
-            Begins the error texts.
-
-        Returns
-        -------
-        dict[str, Column]
-            Columns by role, with names that the file has.
-
-        Raises
-        ------
-        ConfigurationError
-            A named column is missing.
+        present: names of the file's columns; where: begins the error texts. Returns columns by
+        role, with names that the file has. ConfigurationError: a named column is missing.
         """
         bare = {bare_name(name): name for name in reversed(present)}
         found: dict[str, Column] = {}
@@ -130,10 +107,11 @@ class ColumnMap:
             name = item.column if item.column in present else bare.get(item.column)
             if name is None:
                 raise ConfigurationError(
-                    f"{where}: no column {printable(item.column)!r} for {role}; {_shown(present)}"
+                    f"{where}: no column {printable(item.column)!r} for {role}; "
+                    f"{_column_list(present)}"
                 )
             found[role] = msgspec.structs.replace(item, column=name)
-        for short, role in SHORT.items():
+        for short, role in SHORT_COLUMN_NAMES.items():
             if role not in found and (name := bare.get(short) or bare.get(role)) is not None:
                 found[role] = Column(name)
         return found
@@ -141,119 +119,74 @@ class ColumnMap:
 
 def bare_name(name: str) -> str:
     """Name of a column without the unit in brackets behind it."""
-    parts = UNIT.match(name)
+    parts = UNIT_PATTERN.match(name)
     return parts["name"].strip() if parts else name.strip()
 
 
-def unit_of(column: Column, said: str, role: str, where: str) -> tuple[float, float]:
+def column_unit(column: Column, stated: str, role: str, where: str) -> tuple[float, float]:
     """Gain and bias of a column: SI value = gain * number + bias.
 
-    Parameters
-    ----------
-    column : Column
-        As mapped.
-    said : str
-        Unit that the file says; empty: none.
-    role : str
-        What it is.
-    where : str
-        Begins the error texts.
-
-    Returns
-    -------
-    tuple[float, float]
-        Gain and bias, the mapping's own scale and offset among them.
-
-    Raises
-    ------
-    ConfigurationError
-        The unit is none of the quantity.
+    column: as mapped; stated: unit that the file says; empty: none; role: what it is; where: begins
+    the error texts. Returns gain and bias, the mapping's own scale and offset among them.
+    ConfigurationError: the unit is none of the quantity.
     """
-    parts = UNIT.match(column.column)
-    dimension = ROLES[role]
-    unit = column.unit or (parts["unit"] if parts else "") or said or SI_UNITS[dimension]
+    parts = UNIT_PATTERN.match(column.column)
+    dimension = COLUMN_ROLES[role]
+    unit = column.unit or (parts["unit"] if parts else "") or stated or SI_UNITS[dimension]
     gain, bias = si_factor(unit, dimension, f"{where}: {role} ({printable(column.column)})")
     return gain * column.scale, gain * column.offset + bias
 
 
-def missing(found: Mapping[str, Column], present: Sequence[str]) -> str:
+def missing_channels(found: Mapping[str, Column], present: Sequence[str]) -> str:
     """Say which channels a file lacks, and what it has; empty where all are there."""
-    lacking = [role for role in NEEDED if role not in found]
+    lacking = [role for role in NEEDED_COLUMN_ROLES if role not in found]
     if not lacking:
         return ""
     return (
         f"no column for {', '.join(lacking)}: name it by --column ROLE=NAME:UNIT or in a mapping"
-        f" file ({SCHEMA}); {_shown(present)}"
+        f" file ({COLUMNS_SCHEMA}); {_column_list(present)}"
     )
 
 
-def _shown(present: Sequence[str]) -> str:
-    listed = ", ".join(printable(name) for name in present[:MOST_SHOWN])
-    return f"the file has {listed}" + (" …" if len(present) > MOST_SHOWN else "")
+def _column_list(present: Sequence[str]) -> str:
+    listed = ", ".join(printable(name) for name in present[:MAX_LISTED_COLUMNS])
+    return f"the file has {listed}" + (" …" if len(present) > MAX_LISTED_COLUMNS else "")
 
 
 def load_columns(path: Path | str) -> ColumnMap:
     """Read a mapping file of columns.
 
-    Parameters
-    ----------
-    path : Path | str
-        File to read.
-
-    Returns
-    -------
-    ColumnMap
-        The columns.
-
-    Raises
-    ------
-    InputOutputError
-        The file cannot be read.
-    ConfigurationError
-        Not such a file, or a unit that is none.
+    path: file to read. Returns the columns. InputOutputError: the file cannot be read;
+    ConfigurationError: not such a file, or a unit that is none.
     """
     tree = read_toml(Path(path), _ColumnsFile, "mapping file")
-    found = {} if tree.time is None else {TIME: tree.time}
+    found = {} if tree.time is None else {TIME_ROLE: tree.time}
     for section in ("channels", "command", "environment"):
         signals = getattr(tree, section)
         for key in signals.__struct_fields__:
             if (item := getattr(signals, key)) is not None:
                 found[f"{section}.{key}"] = item
     for role, item in found.items():
-        unit_of(item, "", role, f"mapping file {path}")
+        column_unit(item, "", role, f"mapping file {path}")
     return ColumnMap(found, round(tree.tick_ms * 1e6))
 
 
 def named_columns(options: Sequence[str], known: ColumnMap) -> ColumnMap:
     """Add columns named on the command line, `ROLE=NAME` or `ROLE=NAME:UNIT`.
 
-    Parameters
-    ----------
-    options : Sequence[str]
-        As typed.
-    known : ColumnMap
-        Those of a mapping file.
-
-    Returns
-    -------
-    ColumnMap
-        Both; the options win.
-
-    Raises
-    ------
-    ConfigurationError
-        Not of that form, an unknown role, a unit that is none.
+    options: as typed; known: those of a mapping file. Returns both; the options win.
+    ConfigurationError: not of that form, an unknown role, a unit that is none.
     """
     found = dict(known.columns)
     for text in options:
         short, separator, rest = text.partition("=")
-        role = SHORT.get(short, short)
-        if not separator or not rest or role not in ROLES:
+        role = SHORT_COLUMN_NAMES.get(short, short)
+        if not separator or not rest or role not in COLUMN_ROLES:
             raise ConfigurationError(
                 f"--column {printable(text)}: need ROLE=NAME or ROLE=NAME:UNIT, ROLE one of"
-                f" {', '.join(SHORT)}"
+                f" {', '.join(SHORT_COLUMN_NAMES)}"
             )
         name, colon, unit = rest.rpartition(":")
         found[role] = Column(name, unit) if colon and name else Column(rest)
-        unit_of(found[role], "", role, f"--column {printable(text)}")
+        column_unit(found[role], "", role, f"--column {printable(text)}")
     return ColumnMap(found, known.tick_ns)

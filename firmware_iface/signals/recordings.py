@@ -1,219 +1,230 @@
-"""Turns decoded signals into recordings of tests: ticks, test, instant within a tick."""
+"""Reads the tests of a recording, be it frames or decoded signals, in one file or more.
+
+Decoded signals are resampled to control ticks and matched with the stored tests.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.find_test import Found, Sought, find_test, found_tests, played_tests
-from ehadiag.core.recording import CommandMode, Environment, Outcome, Quality, Recording, Samples
-from firmware_iface.logs.budget import Budget
-from firmware_iface.signals.columns import NEEDED, ColumnMap
-from firmware_iface.signals.held import held_by_test, off_a_bus
-from firmware_iface.signals.resample import (
-    Clock,
-    bend,
-    held_on_ticks,
-    interval,
-    on_ticks,
+from firmware_iface.alignment.align import windowed_recordings
+from firmware_iface.bus_map import BusMap
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.find_test import (
+    CandidateTests,
+    extract_tests,
+    match_test,
+    search_tests,
 )
-from firmware_iface.signals.tables import Signal, joined, read_signals
+from firmware_iface.logs.log_files import Budget, holds_signals
+from firmware_iface.logs.reader import iterate_recordings, read_frames
+from firmware_iface.recording import (
+    CHANNELS,
+    Acquisition,
+    BitOutcome,
+    CommandMode,
+    Environment,
+    FloatArray,
+    Quality,
+    RecordedSignal,
+    Recording,
+    Samples,
+)
+from firmware_iface.sampling import sampling_interval
+from firmware_iface.signals.clock import fit_clock
+from firmware_iface.signals.columns import NEEDED_COLUMN_ROLES, ColumnMap
+from firmware_iface.signals.held import bus_signals, held_by_test
+from firmware_iface.signals.resample import (
+    TickClock,
+    held_on_ticks,
+    is_held,
+    on_ticks,
+    usual_lead,
+)
+from firmware_iface.signals.tables import join_tables, read_signals
+from firmware_iface.transport.frames import FrameTable, concatenate
 
-__all__ = ["recordings_of_signals"]
-
-MOST_TICKS = 1_000_000
-COARSE = (np.arange(-1.5, 1.51, 0.1), np.arange(-300e-6, 301e-6, 50e-6))
-FINE = (np.arange(-0.1, 0.101, 0.02), np.arange(-50e-6, 51e-6, 10e-6))
-"""Phase in ticks and rate of the logger's clock, over which the test's own command is fitted."""
-LEAST_SAMPLES = 100
-MOST_FITTED = 20_000
-MOST_ROUGHLY = 0.25
-"""Misfit of a test's command that delays of some ticks make: it is judged anew afterwards."""
-CHANNELS = {"current": ("mA", 1e3), "spool": ("mm", 1e3), "pressure": ("MPa", 1e-6),
-            "position": ("mm", 1e3)}  # fmt: skip
-
-Floats = NDArray[np.float64]
+MAX_SIGNAL_TICKS = 1_000_000
+"""About a quarter of an hour at 1 kHz; what is behind it is not looked at."""
+PLACED_MISFIT = 0.25
+"""Misfit of a command that is some ticks late, 1: it is judged again once it is placed."""
+MEASURED_ROLES = ("channels.spool", "channels.pressure", "channels.position")
 
 
 def recordings_of_signals(
-    paths: Sequence[Path | str], columns: ColumnMap, sought: Sought, budget: Budget
+    paths: Sequence[Path | str], columns: ColumnMap, candidates: CandidateTests, budget: Budget
 ) -> tuple[Recording, ...]:
     """Read the tests in one recording of decoded signals.
 
-    Parameters
-    ----------
-    paths : Sequence[Path | str]
-        Its files: one, or several that follow or complete one another.
-    columns : ColumnMap
-        Which column is what.
-    sought : Sought
-        The tests that may have been played.
-    budget : Budget
-        What reading may cost.
-
-    Returns
-    -------
-    tuple[Recording, ...]
-        At least one; without a test number where no stored test was found.
-
-    Raises
-    ------
-    InputOutputError
-        A file cannot be read.
-    ConfigurationError
-        A column is missing, or has a unit that is none of its quantity.
+    paths: its files: one, or several that follow or complete one another; columns: which column is
+    what; candidates: the tests that may have been played; budget: what reading may cost. Returns at
+    least one; without a test number where no stored test was found. InputOutputError: a file cannot
+    be read; ConfigurationError: a column is missing, or has a unit that is none of its quantity.
     """
     alone = len(paths) == 1
-    signals = joined(read_signals(path, columns, budget, complete=alone) for path in paths)
+    signals = join_tables(read_signals(path, columns, budget, complete=alone) for path in paths)
     source = ", ".join(str(path) for path in paths)
-    lacking = [role for role in NEEDED if role not in signals]
+    lacking = [role for role in NEEDED_COLUMN_ROLES if role not in signals]
     if lacking:
         raise ConfigurationError(f"log {source}: no column for {', '.join(lacking)}")
     period = columns.tick_ns * 1e-9
     start = min(item.time[0] for item in signals.values())
     held = held_on_ticks(signals, period)
-    rows: Mapping[str, Floats]
-    if held is not None:
+    if held is not None and any(role in held[1] for role in MEASURED_ROLES):
         clock, rows = held
         rate = float(np.mean(np.diff(clock.begin))) / period - 1.0
-        said: tuple[str, ...] = (f"ticks by the changes of held signals ({1e6 * rate:+.0f} ppm)",)
+        note = f"ticks by the changes of held signals ({1e6 * rate:+.0f} ppm)"
+        readings = [TickReading(clock, rows, None, note)]
     else:
-        clock, rows, said = _clock(signals, period, sought)
-    samples, rules = _samples(signals, rows, clock, columns.tick_ns, start)
+        readings = _readings(signals, period, candidates, start)
+    found = [
+        extract_tests(_whole(signals, item, columns.tick_ns, start, source), candidates)
+        for item in readings
+    ]
+    if len(found) == 1 or len(found[0]) != len(found[1]):
+        return found[0]
+    return tuple(replace(first, as_measured=other) for first, other in zip(*found, strict=True))
+
+
+class TickReading(NamedTuple):
+    """One way to put signals on ticks."""
+
+    clock: TickClock
+    """The ticks."""
+    held: Mapping[str, FloatArray]
+    """Values that a bus held, on them, by role."""
+    acquired: Acquisition | None
+    """How others were measured."""
+    note: str
+    """What showed the ticks."""
+
+
+def _whole(
+    signals: Mapping[str, RecordedSignal],
+    reading: TickReading,
+    tick_ns: int,
+    start: float,
+    source: str,
+) -> Recording:
+    """All that was recorded, on ticks."""
+    clock = reading.clock
+    samples, rules = _samples(signals, reading.held, clock, tick_ns, start, reading.acquired)
     jitter = max(item.jitter for item in signals.values())
     even = (
         f"time stamps jitter by {1e3 * jitter:.2g} ms: the rows' own even clock takes their place"
     )
     evened = (even,) if jitter > 0.0 else ()
     cut = _cut_off(signals, clock)
-    notes = ("decoded signals: no check sum, no counter", *evened, *cut, *said, *rules)
-    whole = Recording(
+    notes = ("decoded signals: no check sum, no counter", *evened, *cut, reading.note, *rules)
+    return Recording(
         source=source,
         samples=samples,
         test_id=None,
         serial=None,
-        outcome=Outcome(),
+        outcome=BitOutcome(),
         environment=_environment(signals),
         quality=Quality(notes=notes),
         start_ns=round((clock.begin[0]) * 1e9),
         by_time=True,
     )
-    return found_tests(whole, sought)
 
 
-def _clock(
-    signals: Mapping[str, Signal], period: float, sought: Sought
-) -> tuple[Clock, Mapping[str, Floats], tuple[str, ...]]:
-    """Ticks on the clock of a logger, held values on them, and what a reader should know."""
-    first = max(signals[role].time[0] for role in NEEDED)
-    last = min(signals[role].time[-1] for role in NEEDED)
-    ticks = min(max(int((last - first) / period), 1), MOST_TICKS)
-    even = Clock.even(first, period, ticks)
+def _readings(
+    signals: Mapping[str, RecordedSignal], period: float, candidates: CandidateTests, start: float
+) -> list[TickReading]:
+    """Ways to put signals on the ticks of a test, the likelier first."""
+    first = max(signals[role].time[0] for role in NEEDED_COLUMN_ROLES)
+    last = min(signals[role].time[-1] for role in NEEDED_COLUMN_ROLES)
+    ticks = min(max(int((last - first) / period), 1), MAX_SIGNAL_TICKS)
+    even = TickClock.even(first, period, ticks)
     samples, _ = _samples(signals, {}, even, round(period * 1e9), first)
-    found = find_test(samples, sought.tests, sought.controller)
-    led = None if found is None else _led(signals, found)
-    if found is None or led is None:
+    found = match_test(samples, candidates.tests, candidates.controller)
+    begin = None if found is None else first + found.first * period
+    fitted = None
+    if found is not None and begin is not None:
+        fitted = fit_clock(signals, begin, period, found, candidates.controller)
+    if fitted is None:
         unsure = "nothing shows where in a tick the signals were sampled: half a tick unsure"
-        return even, {}, (unsure,)
-    phase, rate = _fitted(led, even, period, found)
-    begin = first + period * (1.0 + rate) * (np.arange(ticks + 1)) + phase * period
-    held = off_a_bus(signals, period)
-    tests, _ = played_tests(samples, sought, most=MOST_ROUGHLY)
+        return [TickReading(even, {}, None, unsure)]
+    length = period * (1.0 + fitted.rate)
+    before = math.floor((fitted.begin - first) / length)
+    begins = fitted.begin + length * (np.arange(ticks + 1) - before)
+    clock = TickClock(begins[begins <= last + length])
+    readings: list[TickReading] = []
+    held = bus_signals(signals, period)
+    tests, _ = search_tests(samples, candidates, most=PLACED_MISFIT)
     if held and tests:
-        placed = held_by_test(held, Clock(begin), tests, sought.controller)
+        placed = held_by_test(held, clock, tests, candidates.controller)
         if placed is not None:
             late = placed.late * period * 1e3
-            return (
-                placed.clock,
-                placed.rows,
-                (
-                    f"values reach the logger late by {late:.1f} ms rms, some overtaken:"
-                    " the current against the test's command tells their ticks",
-                ),
+            note = (
+                f"values reach the logger late by {late:.1f} ms rms, some overtaken:"
+                " the current against the test's command tells their ticks"
             )
-    word = f"{phase % 1.0:.2f} of a tick, {1e6 * rate:+.0f} ppm"
-    said = f"ticks by the {found.by} against test {found.test.name!r} ({word})"
-    return Clock(begin), {}, (said,)
+            readings.append(TickReading(placed.clock, placed.rows, None, note))
+            if any(is_held(item, period) for item in held.values()):
+                return readings
+    leader = signals["channels.spool"]
+    acquired = Acquisition(
+        1.0 / sampling_interval(leader),
+        usual_lead(leader, clock, period),
+        fitted.std,
+        fitted.rate_std,
+        tuple(
+            replace(item, time=item.time - start)
+            for item in (signals[f"channels.{channel.name}"] for channel in CHANNELS[1:])
+        ),
+    )
+    note = (
+        f"ticks by the {fitted.by}, of test {found.test.name!r}"
+        f" ({1e6 * fitted.rate:+.0f} ppm; within {1e3 * fitted.std:.2g} ms)"
+    ) if found else ""  # fmt: skip
+    return [*readings, TickReading(clock, {}, acquired, note)]
 
 
-def _cut_off(signals: Mapping[str, Signal], clock: Clock) -> tuple[str, ...]:
+def _cut_off(signals: Mapping[str, RecordedSignal], clock: TickClock) -> tuple[str, ...]:
     """Say where more was recorded than is looked at."""
-    left = min(signals[role].time[-1] for role in NEEDED) - float(clock.begin[-1])
-    if clock.ticks < MOST_TICKS or left <= 0.0:
+    left = min(signals[role].time[-1] for role in NEEDED_COLUMN_ROLES) - float(clock.begin[-1])
+    if clock.ticks < MAX_SIGNAL_TICKS or left <= 0.0:
         return ()
     seen = float(clock.begin[-1] - clock.begin[0])
     return (f"the first {seen:.0f} s are looked at, the {left:.0f} s behind them are not",)
 
 
-def _led(signals: Mapping[str, Signal], found: Found) -> Signal | None:
-    """The signal that the test's command can be held against, sample by sample."""
-    if found.by == "command":
-        return signals["command.position" if found.test.closed_loop else "command.current"]
-    return signals["channels.current"] if found.by == "current" else None
-
-
-def _fitted(signal: Signal, even: Clock, period: float, found: Found) -> tuple[float, float]:
-    """Phase in ticks, and rate, at which the test's command explains a signal best."""
-    stored = found.test.command()
-    begin = even.begin[0] + found.first * period
-    inside = (signal.time >= begin - 2 * period) & (signal.time <= begin + len(stored) * period)
-    time, value = signal.time[inside], signal.value[inside]
-    every = max(len(time) // MOST_FITTED, 1)
-    time, value = time[::every], value[::every]
-    if len(time) < LEAST_SAMPLES:
-        return 0.0, 0.0
-
-    def misfit(phase: float, rate: float) -> float:
-        # The clock's rate turns about the recording's first tick, as in `_clock`.
-        at = (time - even.begin[0] - phase * period) / (period * (1.0 + rate)) - found.first
-        index = np.floor(at).astype(np.int64)
-        known = (index >= 0) & (index < len(stored))
-        away = value[known] - stored[index[known]]
-        return float(np.mean((away - away.mean()) ** 2)) if known.any() else np.inf
-
-    # Far from the beginning a rate also shifts the test: both together, in units of the test.
-    best = (0.0, 0.0)
-    for phases, rates in (COARSE, FINE):
-        tried = [
-            (best[0] + phase - (rate * found.first), best[1] + rate)
-            for phase in phases
-            for rate in rates
-        ]
-        best = min(tried, key=lambda item: misfit(*item))
-    return best
-
-
 def _samples(
-    signals: Mapping[str, Signal],
-    held: Mapping[str, Floats],
-    clock: Clock,
+    signals: Mapping[str, RecordedSignal],
+    held: Mapping[str, FloatArray],
+    clock: TickClock,
     tick_ns: int,
     start: float,
+    acquired: Acquisition | None = None,
 ) -> tuple[Samples, tuple[str, ...]]:
     """All signals on the ticks, and the rules by which they came there."""
     ticks, period = clock.ticks, tick_ns * 1e-9
-    nothing = np.full(ticks, np.nan)
-    filled: dict[str, Floats] = {}
+    lead = 0.0 if acquired is None else acquired.lead
+    empty = np.full(ticks, np.nan)
+    filled: dict[str, FloatArray] = {}
     rules: dict[str, list[str]] = {}
-    for key, (unit, factor) in CHANNELS.items():
+    for channel in CHANNELS:
+        key = channel.name
         signal = signals.get(f"channels.{key}")
         if signal is None:
-            filled[key] = nothing
+            filled[key] = empty
             rules.setdefault("not recorded", []).append(key)
             continue
         if f"channels.{key}" in held:
             filled[key], rule = held[f"channels.{key}"], "values as held, by their changes"
         else:
             # The computer holds the current through a tick, whoever measures it.
-            filled[key], rule = on_ticks(signal, clock, period, hold=key == "current")
-        if "line" in rule:
-            rule = f"{rule} (off by up to {factor * bend(signal):.2g} {unit})"
-        rules.setdefault(f"{1.0 / interval(signal):.0f} Hz, {rule}", []).append(key)
-    mode, command = CommandMode.CURRENT, nothing
+            filled[key], rule = on_ticks(signal, clock, period, hold=key == "current", lead=lead)
+        rules.setdefault(f"{1.0 / sampling_interval(signal):.0f} Hz, {rule}", []).append(key)
+    mode, command = CommandMode.CURRENT, empty
     for mode_of, role in (
         (CommandMode.POSITION, "command.position"),
         (CommandMode.CURRENT, "command.current"),
@@ -233,11 +244,12 @@ def _samples(
         command=command,
         saturated=np.zeros((len(CHANNELS), ticks), dtype=np.bool_),
         host_ns=np.rint((clock.begin[:-1] - start) * 1e9).astype(np.int64),
+        acquired=acquired,
     )
     return samples, tuple(f"{', '.join(keys)}: {rule}" for rule, keys in rules.items())
 
 
-def _environment(signals: Mapping[str, Signal]) -> Environment:
+def _environment(signals: Mapping[str, RecordedSignal]) -> Environment:
     def median(key: str) -> float | None:
         item = signals.get(f"environment.{key}")
         return float(np.median(item.value)) if item is not None and len(item.value) else None
@@ -247,3 +259,73 @@ def _environment(signals: Mapping[str, Signal]) -> Environment:
         return_pressure=median("return_pressure"),
         oil_temperature=median("oil_temperature"),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Interpretation:
+    """What the content of recordings means."""
+
+    bus_map: BusMap
+    """Of frames."""
+    columns: ColumnMap | None
+    """Of decoded signals; None: none are mapped, and they go by their usual names."""
+    candidates: CandidateTests
+    """What to look for where nothing says which test ran when."""
+
+
+def recorded_tests(
+    paths: Sequence[Path | str], meaning: Interpretation, budget: Budget | None = None
+) -> Iterator[Recording]:
+    """Read the tests of one recording, in order of time.
+
+    paths: its files: one; or several, split in time or one for each bus; meaning: mapping and
+    tests; budget: what reading may cost; None: the default. Yields each test; where there is none,
+    one recording with the reason. InputOutputError: a file cannot be read; ConfigurationError:
+    unknown kind of log, unfit mapping, frames and signals in one recording.
+    """
+    idle, found = None, False
+    for item in _stretches(paths, meaning, budget or Budget()):
+        # What no stored test fits, and no status calls a test, is the time between tests.
+        if item.test_id is None and item.outcome.state is None and not item.quality.refused:
+            idle = item if idle is None or item.samples is not None else idle
+        else:
+            yield item
+            found = True
+    if not found and idle is not None:
+        yield idle
+
+
+def _stretches(
+    paths: Sequence[Path | str], meaning: Interpretation, budget: Budget
+) -> Iterator[Recording]:
+    """What one recording holds, tests and the time between them."""
+    mapped = meaning.columns is not None
+    decoded = [holds_signals(path, mapped=mapped) for path in paths]
+    if any(decoded):
+        if not all(decoded):
+            odd = paths[decoded.index(False)]
+            raise ConfigurationError(f"log {odd}: holds frames, the others decoded signals")
+        columns = meaning.columns or ColumnMap(tick_ns=meaning.bus_map.tick_ns)
+        yield from recordings_of_signals(paths, columns, meaning.candidates, budget)
+    elif len(paths) == 1:
+        yield from iterate_recordings(paths[0], meaning.bus_map, budget, meaning.candidates)
+    else:
+        table = _merged_frames([read_frames(path, budget) for path in paths])
+        source = ", ".join(str(path) for path in paths)
+        yield from windowed_recordings(
+            [table], meaning.bus_map, source, len(table) + 1, candidates=meaning.candidates
+        )
+
+
+def _merged_frames(tables: Sequence[FrameTable]) -> FrameTable:
+    """Frames of several files in order of their stamps; each file keeps its own order at a tie.
+
+    Loggers number the adapter channels of each file anew: the mapping's identifiers tell the
+    messages apart.
+    """
+    whole = concatenate(tables)
+    # A stamp that goes back within a file does not break the file's order.
+    steady = np.concatenate([np.maximum.accumulate(table.time_ns) for table in tables])
+    order = np.argsort(steady, kind="stable")
+    channel = np.zeros(len(order), dtype=whole.channel.dtype)
+    return replace(whole.rows(order), channel=channel)

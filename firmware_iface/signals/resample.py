@@ -2,10 +2,11 @@
 
 A signal that a logger took from the computer's bus *holds* each value for a tick: its changes show
 the ticks of the computer, whatever clock the logger has, and each value is taken as it is. A
-signal that was measured by itself is read at the end of each tick, where the computer's converters
-sample: by a straight line between its neighbours; of many samples in a tick the mean of those
-within an eighth of a tick about that instant, against what is faster; of less than three in four
-ticks the nearest tick gets each, and the others none.
+signal that was measured by itself is read near the end of each tick, where the computer's
+converters sample: at the instant at which it was sampled mostly, by a cubic through two samples on
+either side; of many samples in a tick the mean of those within a sixteenth of a tick about the end,
+against what is faster; of less than three in four ticks the nearest tick gets each, and the others
+none.
 """
 
 from __future__ import annotations
@@ -14,61 +15,42 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_iface.signals.tables import Signal
+from firmware_iface.recording import FloatArray, IntArray, RecordedSignal
+from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 
-__all__ = [
-    "DENSE",
-    "Clock",
-    "Group",
-    "bend",
-    "forward",
-    "groups_of",
-    "held_on_ticks",
-    "holds",
-    "interval",
-    "on_ticks",
-]
 
-MOST_CHANGES = 1.1
-"""Changes a tick, where there are most, of a signal that holds each value for a tick."""
-LIVELY = 50
-"""Ticks in which they are counted."""
-RECENT = 300
-"""Changes whose least delay is that of the present ones."""
-EARLY = 0.15
-"""Ticks by which a change may be earlier than those."""
-LEAST_TOGETHER = 3
-"""Channels that change together from which on a tick without any change is a lost one."""
-DENSE = 1.5
-"""Samples a tick from which on a signal can show that it holds its values."""
-LEAST_CHANGES = 200
-SPARSE = 0.75
-"""Samples a tick below which each goes to the nearest tick."""
-MANY = 8.0
-"""Samples a tick from which on the mean of several is taken."""
-WINDOW = 0.125
-"""Ticks on either side of an instant whose samples are averaged."""
-GAP = 2.5
-"""Sampling intervals between two neighbours beyond which nothing is interpolated."""
+class HeldLimits(NamedTuple):
+    """Limits by which a signal holds its values for a tick, and its changes are counted."""
 
-Floats = NDArray[np.float64]
+    changes_per_tick: float = 1.1
+    """Most changes a tick, where there are most."""
+    span: int = 50
+    """Ticks in which the changes are counted."""
+    recent: int = 300
+    """Changes whose least delay is that of the present ones."""
+    early: float = 0.15
+    """Ticks by which a change may be earlier than those."""
+    group: int = 3
+    """Channels that change together from which on a tick without a change is a lost one."""
+    rate: float = 1.5
+    """Samples a tick from which on a signal can show that it holds its values."""
+    changes: int = 200
+    """Least changes of a signal that shows it."""
+
+
+HELD = HeldLimits()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Clock:
-    """Beginnings of control ticks on the logger's clock.
+class TickClock:
+    """Beginnings of control ticks on the logger's clock."""
 
-    Attributes
-    ----------
-    begin : Floats
-        Of each tick and of the one after the last, s, shape (ticks + 1,).
-    """
-
-    begin: Floats
+    begin: FloatArray
+    """Of each tick and of the one after the last, s, shape (ticks + 1,)."""
 
     @property
     def ticks(self) -> int:
@@ -76,106 +58,75 @@ class Clock:
         return len(self.begin) - 1
 
     @classmethod
-    def even(cls, start: float, period: float, ticks: int) -> Clock:
+    def even(cls, start: float, period: float, ticks: int) -> TickClock:
         """Ticks of one length."""
         return cls(start + period * np.arange(ticks + 1, dtype=np.float64))
 
 
-def interval(signal: Signal) -> float:
-    """Usual time between two samples, s."""
-    return float(np.median(np.diff(signal.time))) if len(signal.time) > 1 else np.inf
-
-
-def holds(signal: Signal, period: float) -> bool:
+def is_held(signal: RecordedSignal, period: float) -> bool:
     """Whether a signal keeps each value for a whole tick, as one taken from a bus does.
 
-    Parameters
-    ----------
-    signal : Signal
-        As recorded.
-    period : float
-        Length of a tick, s.
-
-    Returns
-    -------
-    bool
-        False of one that is sampled too seldom to show it.
+    signal: as recorded; period: length of a tick, s. Returns False of one that is sampled too
+    seldom to show it.
     """
-    if period / interval(signal) < DENSE:
+    if period / sampling_interval(signal) < HELD.rate:
         return False
     at = _changes(signal)
-    if len(at) < LEAST_CHANGES:
+    if len(at) < HELD.changes:
         return False
-    window = np.floor((at - at[0]) / (LIVELY * period)).astype(np.int64)
-    return float(np.bincount(window).max()) <= MOST_CHANGES * LIVELY
+    window = np.floor((at - at[0]) / (HELD.span * period)).astype(np.int64)
+    return float(np.bincount(window).max()) <= HELD.changes_per_tick * HELD.span
 
 
-def _changes(signal: Signal) -> Floats:
+def _changes(signal: RecordedSignal) -> FloatArray:
     """Instants of the first sample of each new value."""
     return signal.time[1:][np.diff(signal.value) != 0.0]
 
 
 def held_on_ticks(
-    signals: Mapping[str, Signal], period: float
-) -> tuple[Clock, dict[str, Floats]] | None:
+    signals: Mapping[str, RecordedSignal], period: float
+) -> tuple[TickClock, dict[str, FloatArray]] | None:
     """Put held signals on the ticks that their own changes show, by the order of the changes.
 
-    Parameters
-    ----------
-    signals : Mapping[str, Signal]
-        By role.
-    period : float
-        Nominal length of a tick, s.
-
-    Returns
-    -------
-    tuple[Clock, dict[str, Floats]] | None
-        The computer's clock on the logger's, and values by role, shape (ticks,): NaN in ticks in
-        which none of several channels that change together has changed; None where no signal
-        holds its values, or changes come too late to be told by their order alone.
+    signals: by role; period: nominal length of a tick, s. Returns the computer's clock on the
+    logger's, and values by role, shape (ticks,): NaN in ticks in which none of several channels
+    that change together has changed; None where no signal holds its values, or changes come too
+    late to be told by their order alone.
     """
-    held = {role: item for role, item in signals.items() if holds(item, period)}
+    held = {role: item for role, item in signals.items() if is_held(item, period)}
     if not held:
         return None
     groups = groups_of(held, period)
     lead = groups[0]
-    tick = _counted((lead.at - lead.at[0]) / period)
+    tick = _tick_sequence((lead.at - lead.at[0]) / period)
     rate = float(np.polyfit(tick, lead.at, 1)[0])
-    step = max(interval(held[role]) for role in lead.roles)
-    if _scatter(lead.at - rate * tick) > step + EARLY * period:
+    step = max(sampling_interval(held[role]) for role in lead.roles)
+    if _scatter(lead.at - rate * tick) > step + HELD.early * period:
         return None
     last = max(item.time[-1] for item in held.values())
     after = max(int((last - lead.at[-1]) / rate), 0)
     grid = np.arange(int(tick[-1]) + after + 2)
     known = np.append(tick, tick[-1] + after + 2)
     times = np.append(lead.at, lead.at[-1] + (after + 2) * rate)
-    clock = Clock(np.asarray(np.interp(grid, known, times), dtype=np.float64))
-    rows: dict[str, Floats] = {}
+    clock = TickClock(np.asarray(np.interp(grid, known, times), dtype=np.float64))
+    rows: dict[str, FloatArray] = {}
     for group in groups:
-        place = _beside(group, lead, tick)
-        inside = (place >= 0) & (place < clock.ticks)
+        place = _group_ticks(group, lead, tick)
         for role in group.roles:
             item = held[role]
-            value = np.full(clock.ticks, np.nan)
-            value[place[inside]] = item.value[np.searchsorted(item.time, group.at[inside])]
-            rows[role] = value if group.complete else forward(value, item.value[0])
+            value = group.on_ticks(item, place, clock.ticks)
+            rows[role] = value if group.complete else hold_forward(value, item.value[0])
     return clock, rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Group:
-    """Held signals that change together.
-
-    Attributes
-    ----------
-    roles : tuple[str, ...]
-        Which.
-    at : Floats
-        Times of the first samples of new values, s.
-    """
+class SignalGroup:
+    """Held signals that change together."""
 
     roles: tuple[str, ...]
-    at: Floats
+    """Which."""
+    at: FloatArray
+    """Times of the first samples of new values, s."""
 
     @property
     def command(self) -> bool:
@@ -185,23 +136,25 @@ class Group:
     @property
     def complete(self) -> bool:
         """Whether a tick without a change is one that did not arrive rather than an equal value."""
-        return len(self.roles) >= LEAST_TOGETHER
+        return len(self.roles) >= HELD.group
+
+    def values(self, signal: RecordedSignal) -> FloatArray:
+        """New values of one of its signals, shape (n,)."""
+        return signal.value[np.searchsorted(signal.time, self.at)]
+
+    def on_ticks(self, signal: RecordedSignal, tick: IntArray, ticks: int) -> FloatArray:
+        """New values at their ticks, shape (ticks,); NaN in the others."""
+        out = np.full(ticks, np.nan)
+        inside = (tick >= 0) & (tick < ticks)
+        out[tick[inside]] = self.values(signal)[inside]
+        return out
 
 
-def groups_of(held: Mapping[str, Signal], period: float) -> list[Group]:
+def groups_of(held: Mapping[str, RecordedSignal], period: float) -> list[SignalGroup]:
     """Channels that change together first, then what changes alone.
 
-    Parameters
-    ----------
-    held : Mapping[str, Signal]
-        Signals that hold their values, by role.
-    period : float
-        Length of a tick, s.
-
-    Returns
-    -------
-    list[Group]
-        Each role in one of them.
+    held: signals that hold their values, by role; period: length of a tick, s. Returns each role in
+    one of them.
     """
     channels = tuple(role for role in held if role.startswith("channels."))
     alone = [role for role in held if role not in channels]
@@ -209,59 +162,50 @@ def groups_of(held: Mapping[str, Signal], period: float) -> list[Group]:
     if channels:
         together = np.unique(np.concatenate([_changes(held[role]) for role in channels]))
         span = max(float(together[-1] - together[0]), period)
-        if len(together) * period <= MOST_CHANGES * span:
-            out.append(Group(channels, together))
+        if len(together) * period <= HELD.changes_per_tick * span:
+            out.append(SignalGroup(channels, together))
         else:
             alone = [*channels, *alone]
-    singles = [Group((role,), _changes(held[role])) for role in alone]
+    singles = [SignalGroup((role,), _changes(held[role])) for role in alone]
     return out + sorted(singles, key=lambda item: -len(item.at))
 
 
-def forward(values: Floats, first: float) -> Floats:
+def hold_forward(values: FloatArray, first: float) -> FloatArray:
     """Each value until the next one; `first` before there is any.
 
-    Parameters
-    ----------
-    values : Floats
-        NaN where there is none, shape (n,).
-    first : float
-        Value before the first one.
-
-    Returns
-    -------
-    Floats
-        Without NaN, shape (n,).
+    values: NaN where there is none, shape (n,); first: value before the first one. Returns without
+    NaN, shape (n,).
     """
     known = np.isfinite(values)
     index = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.where(index >= 0, values[np.maximum(index, 0)], first)
 
 
-def _scatter(values: Floats) -> float:
+def _scatter(values: FloatArray) -> float:
     """Width of a distribution but for its outermost hundredths."""
     low, high = np.quantile(values, [0.01, 0.99])
     return float(high - low)
 
 
-def _counted(since: Floats) -> NDArray[np.int64]:
+def _tick_sequence(since: FloatArray) -> IntArray:
     """Ticks of changes that follow one another: each is of a tick of its own.
 
     A change comes up to a sampling interval late. The earliest of late tell how late the present
     ones are at least; a logger with another clock makes that wander.
     """
     tick = np.zeros(len(since), dtype=np.int64)
-    recent: deque[float] = deque([0.0], RECENT)
+    recent: deque[float] = deque([0.0], HELD.recent)
     edge = 0.0
     for index in range(1, len(since)):
         at = float(since[index])
-        tick[index] = max(int(tick[index - 1]) + 1, math.floor(at - edge + EARLY))
-        gone = recent[0] if len(recent) == RECENT else math.inf
+        tick[index] = max(int(tick[index - 1]) + 1, math.floor(at - edge + HELD.early))
+        gone = recent[0] if len(recent) == HELD.recent else math.inf
         recent.append(at - float(tick[index]))
         edge = min(recent) if gone <= edge else min(edge, recent[-1])
     return tick
 
 
-def _beside(group: Group, lead: Group, tick: NDArray[np.int64]) -> NDArray[np.int64]:
+def _group_ticks(group: SignalGroup, lead: SignalGroup, tick: IntArray) -> IntArray:
     """Ticks of a group's changes: a command's is that of the telemetry that follows it."""
     if group is lead:
         return tick
@@ -277,89 +221,52 @@ def _beside(group: Group, lead: Group, tick: NDArray[np.int64]) -> NDArray[np.in
     return np.rint(part - phase).astype(np.int64)
 
 
-def on_ticks(signal: Signal, clock: Clock, period: float, *, hold: bool) -> tuple[Floats, str]:
+def on_ticks(
+    signal: RecordedSignal, clock: TickClock, period: float, *, hold: bool, lead: float = 0.0
+) -> tuple[FloatArray, str]:
     """Values of a signal on each tick, and the rule by which they came.
 
-    Parameters
-    ----------
-    signal : Signal
-        As recorded.
-    clock : Clock
-        The ticks.
-    period : float
-        Length of a tick, s.
-    hold : bool
-        Take the value in the middle of a tick, not that at its end: of what the computer holds.
-
-    Returns
-    -------
-    tuple[Floats, str]
-        NaN where there is none, shape (ticks,); the rule in words, with its error.
+    signal: as recorded; clock: the ticks; period: length of a tick, s; hold: take the value in the
+    middle of a tick, not that at its end: of what the computer holds; lead: time before the ticks'
+    ends whose values are taken, s. Returns NaN where there is none, shape (ticks,); the rule in
+    words, with its error.
     """
-    step = interval(signal)
+    step = sampling_interval(signal)
     if hold:
         instants = clock.begin[:-1] + 0.5 * period
-        return _last_before(
-            signal, instants, max(GAP * step, 1.5 * period)
-        ), "the value in the middle of each tick"
-    ends = clock.begin[1:]
-    rate = period / step
-    if rate < SPARSE:
-        return _nearest(signal, ends, period), (
-            "each sample at the nearest tick, off by up to half a tick"
-        )
-    if rate >= MANY:
-        return _mean(signal, ends, WINDOW * period), (
-            f"mean of the samples within {WINDOW * period * 1e3:.3g} ms of each tick's end"
-        )
-    return _line(signal, ends, GAP * step), "a straight line at each tick's end"
+        most = max(SAMPLING.gap * step, 1.5 * period)
+        rule = "the value next to the middle of each tick"
+        return _held_at(signal, instants, period, most), rule
+    return values_at(signal, clock.begin[1:] - lead, period)
 
 
-def bend(signal: Signal) -> float:
-    """Most that a straight line between two samples is off, SI: an eighth of second differences.
+def usual_lead(signal: RecordedSignal, clock: TickClock, period: float) -> float:
+    """Time before the ticks' ends at which a signal was sampled mostly, s.
 
-    Parameters
-    ----------
-    signal : Signal
-        As recorded.
-
-    Returns
-    -------
-    float
-        Of all but the largest 1 %, noise included.
+    signal: as recorded; clock: the ticks; period: length of a tick, s. Returns less than a sampling
+    interval; 0 of so many samples that their mean is taken, and of so few that each goes to the
+    nearest tick.
     """
-    second = np.abs(np.diff(signal.value, 2))
-    return float(np.quantile(second, 0.99)) / 8.0 if len(second) else 0.0
+    step = sampling_interval(signal)
+    if not SAMPLING.nearest <= period / step < SAMPLING.averaged:
+        return 0.0
+    ends = clock.begin[1:]
+    inside = (ends > signal.time[0]) & (ends < signal.time[-1])
+    before = np.searchsorted(signal.time, ends[inside], side="right") - 1
+    turn = np.exp(2j * np.pi * (ends[inside] - signal.time[before]) / step)
+    return float(np.angle(turn.sum()) / (2.0 * np.pi) % 1.0) * step
 
 
-def _last_before(signal: Signal, instants: Floats, most: float) -> Floats:
-    index = np.searchsorted(signal.time, instants, side="right") - 1
-    known = index >= 0
-    index = np.maximum(index, 0)
-    known &= instants - signal.time[index] <= most
+def _held_at(signal: RecordedSignal, middle: FloatArray, period: float, most: float) -> FloatArray:
+    """Value in the tick about each middle: its sample next to it, else the last one before."""
+    time = signal.time
+    before = np.searchsorted(time, middle, side="right") - 1
+    known = before >= 0
+    before = np.maximum(before, 0)
+    after = np.minimum(before + 1, len(time) - 1)
+    # A sample far from both edges is of this tick even where the edges are not known well.
+    near = np.where(np.abs(time[after] - middle) < np.abs(middle - time[before]), after, before)
+    within = np.abs(time[near] - middle) <= 0.5 * period
+    index = np.where(within, near, before)
+    known = within | (known & (middle - time[before] <= most))
     return np.where(known, signal.value[index], np.nan)
-
-
-def _line(signal: Signal, instants: Floats, most: float) -> Floats:
-    right = np.clip(np.searchsorted(signal.time, instants), 1, len(signal.time) - 1)
-    gap = signal.time[right] - signal.time[right - 1]
-    value = np.interp(instants, signal.time, signal.value)
-    inside = (instants >= signal.time[0]) & (instants <= signal.time[-1])
-    return np.where(inside & (gap <= most), value, np.nan)
-
-
-def _mean(signal: Signal, instants: Floats, width: float) -> Floats:
-    low = np.searchsorted(signal.time, instants - width)
-    high = np.searchsorted(signal.time, instants + width, side="right")
-    total = np.concatenate([[0.0], np.cumsum(signal.value - signal.value[0])])
-    count = high - low
-    mean = (total[high] - total[low]) / np.maximum(count, 1) + signal.value[0]
-    return np.where(count > 0, mean, np.nan)
-
-
-def _nearest(signal: Signal, instants: Floats, period: float) -> Floats:
-    out = np.full(len(instants), np.nan)
-    index = np.rint(np.interp(signal.time, instants, np.arange(len(instants)))).astype(np.int64)
-    near = np.abs(instants[index] - signal.time) <= 0.5 * period
-    out[index[near]] = signal.value[near]
-    return out

@@ -1,178 +1,227 @@
-"""Reads tables of decoded signals: CSV, Parquet, MF4; each signal with time stamps of its own."""
+"""Reads tables of decoded signals: CSV, Parquet; each signal with time stamps of its own.
+
+Stamps that scatter about the even clock of a logger are replaced by that clock.
+"""
 
 from __future__ import annotations
 
-import codecs
 import csv
 import itertools
-import stat
 import warnings
 from collections.abc import Iterable
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError, reason_of
-from ehadiag.core.printable import printable
-from firmware_iface.logs.budget import Budget
-from firmware_iface.logs.packed import beginning_of, kind_of, unpacked
-from firmware_iface.signals.columns import TIME, ColumnMap, missing, unit_of
-from firmware_iface.signals.row_clock import even_times
+from firmware_iface.errors import (
+    ConfigurationError,
+    EhadiagError,
+    InputOutputError,
+    install_command,
+    printable,
+)
+from firmware_iface.logs.log_files import (
+    MAX_TEXT_HEADER_BYTES,
+    UTF16_MARKS,
+    Budget,
+    beginning_of,
+    find_reader,
+    log_size,
+    unpacked_log,
+)
+from firmware_iface.recording import FloatArray, RecordedSignal
+from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
 
-__all__ = ["DECODED_SUFFIXES", "Signal", "holds_signals", "joined", "read_signals"]
 
-DECODED_SUFFIXES = (".csv", ".parquet", ".mf4")
-FRAMES_HEADER = "timestamp,arbitration_id"
-"""Begins the CSV log of python-can: frames, not signals."""
-HEADER_BYTES = 1 << 16
+class EvenClockLimits(NamedTuple):
+    """Limits by which stamps are replaced by an even clock."""
+
+    block: int = 200
+    """Rows whose median shows whether the stamps keep to one line."""
+    blocks: int = 5
+    """Least such blocks."""
+    scatter: float = 0.02
+    """Standard deviation of stamps that are not the clock's own, of an interval."""
+    offset: float = 0.5
+    """Intervals by which blocks may be off the line: a missing row makes one."""
+    deviation: float = 6.0
+    """Standard deviations of a block's median by which it may be off."""
+
+
+EVEN_CLOCK = EvenClockLimits()
+
+
+def even_times(time: FloatArray) -> tuple[FloatArray, float]:
+    """Replace stamps that scatter about even ones by these.
+
+    time: stamps in the order of the rows, s, shape (n,). Returns times, shape (n,), and the
+    deviation of the stamps from them, s; the stamps as they are and 0 where they are even already,
+    or do not keep to one line: where rows are missing or each row has an instant of its own.
+    """
+    blocks = len(time) // EVEN_CLOCK.block
+    if blocks < EVEN_CLOCK.blocks or not np.isfinite(time).all():
+        return time, 0.0
+    index = np.arange(len(time), dtype=np.float64)
+    step, level = np.polyfit(index, time - time[0], 1)
+    rest = time - time[0] - level - step * index
+    scatter = float(np.std(rest))
+    if step <= 0.0 or scatter < EVEN_CLOCK.scatter * step:
+        return time, 0.0
+    medians = np.median(rest[: blocks * EVEN_CLOCK.block].reshape(blocks, EVEN_CLOCK.block), axis=1)
+    # A median of stamps scatters by a quarter more than their mean.
+    allowed = max(
+        EVEN_CLOCK.offset * step,
+        EVEN_CLOCK.deviation * 1.25 * scatter / float(np.sqrt(EVEN_CLOCK.block)),
+    )
+    if float(np.ptp(medians)) > allowed or float(np.abs(rest).max()) > EVEN_CLOCK.block * step:
+        return time, 0.0
+    return time[0] + level + step * index, scatter
+
+
 DELIMITERS = ";\t,"
-LEAST_ROWS = 10
-UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-MOST_ROWS = 800_000
+MIN_TABLE_ROWS = 10
+MAX_TABLE_ROWS = 800_000
 """Of a table, which is held at once in some 300 MB: 13 minutes at 1 kHz, 40 s at 20 kHz."""
-MOST_CELLS = 10_000_000
+MAX_TABLE_CELLS = 10_000_000
 """Of a Parquet file, of which all columns are unpacked."""
-PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+DATE_RESOLUTIONS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Resolutions in which pandas holds dates."""
-EXTRA = "pip install 'ehadiag[daq]'"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Signal:
-    """One signal as recorded.
+class SignalReader(Protocol):
+    """Reads the decoded signals of one kind of log; made without arguments, one for each file.
 
-    Attributes
-    ----------
-    time : NDArray[np.float64]
-        s, ascending, shape (n,).
-    value : NDArray[np.float64]
-        SI, finite, shape (n,).
-    jitter : float
-        Deviation of the stamps from the even clock that took their place, s; 0: they are as read.
+    It may be the class of an entry point of `ehadiag.log_readers`, as `LogReader` of
+    `firmware_iface.logs.log_files` is for frames; that says what `signature` is.
     """
 
-    time: NDArray[np.float64]
-    value: NDArray[np.float64]
-    jitter: float = 0.0
+    signature: bytes
 
+    def signals(
+        self, path: Path, columns: ColumnMap, budget: Budget, *, complete: bool
+    ) -> dict[str, RecordedSignal]:
+        """Read the signals that have a role; `table_signals` does the most of it.
 
-def holds_signals(path: Path | str, *, mapped: bool) -> bool:
-    """Whether a log holds decoded signals rather than frames.
-
-    Parameters
-    ----------
-    path : Path | str
-        The log.
-    mapped : bool
-        Its columns are mapped: an MF4 file is then one of signals.
-
-    Returns
-    -------
-    bool
-        True too where its beginning cannot be read: the reader of signals says why.
-    """
-    path, kind = Path(path), kind_of(Path(path))
-    if kind == ".parquet":
-        return True
-    if kind == ".mf4":
-        return mapped
-    if kind != ".csv" or not path.is_file():
-        return False
-    try:
-        header = _head(path)
-    except InputOutputError:
-        return True
-    is_text = header != "" and all(c.isprintable() or c.isspace() for c in header)
-    return is_text and not header.startswith(FRAMES_HEADER)
-
-
-def _head(path: Path) -> str:
-    try:
-        text = beginning_of(path, HEADER_BYTES)
-    except OSError as error:
-        raise InputOutputError(f"log {path}: {reason_of(error)}") from None
-    if text.startswith(UTF16):
-        raise InputOutputError(f"log {path}: is in UTF-16: save it as UTF-8")
-    return text.decode("utf-8-sig", "replace").lstrip()
+        path: the file, unpacked already; it exists and is not empty; columns: which column is what;
+        budget: bytes and rows that reading may cost; complete: all channels must be in this one
+        file. Returns by role, SI.
+        """
 
 
 def read_signals(
     path: Path | str, columns: ColumnMap, budget: Budget, *, complete: bool = True
-) -> dict[str, Signal]:
+) -> dict[str, RecordedSignal]:
     """Read the signals that have a role.
 
-    Parameters
-    ----------
-    path : Path | str
-        CSV, Parquet or MF4; packed by gzip too.
-    columns : ColumnMap
-        Which column is what.
-    budget : Budget
-        Bytes and rows that reading may cost.
-    complete : bool
-        All channels must be in this one file.
-
-    Returns
-    -------
-    dict[str, Signal]
-        By role, SI.
-
-    Raises
-    ------
-    InputOutputError
-        Missing, unreadable, too large, without a library, without numbers.
-    ConfigurationError
-        A mapped column is missing, a unit is none of its quantity.
+    path: CSV, Parquet or MF4; packed by gzip too; columns: which column is what; budget: bytes and
+    rows that reading may cost; complete: all channels must be in this one file. Returns by role,
+    SI. InputOutputError: missing, unreadable, too large, without a library, without numbers;
+    ConfigurationError: a mapped column is missing, a unit is none of its quantity.
     """
     path = Path(path)
-    try:
-        info = path.stat()
-    except (OSError, ValueError) as error:  # ValueError: a name with a null character
-        reason = reason_of(error)
-        raise InputOutputError(f"log {path}: {reason}") from None
-    if not stat.S_ISREG(info.st_mode):
-        raise InputOutputError(f"log {path}: not a file")
-    size = info.st_size
+    size = log_size(path)
+    found = find_reader(path, decodes=True)
+    if found is None:
+        raise ConfigurationError(f"log {path}: no kind of decoded signals")
     if size > budget.size:
         raise InputOutputError(f"log {path}: larger than --max-log-size allows")
     if size == 0:
         raise InputOutputError(f"log {path}: the file is empty")
-    with unpacked(path, budget.size) as plain:
-        if kind_of(path) == ".mf4":
-            return _read_mf4(plain.path, path, columns, complete=complete)
-        table, units, present = _read_table(plain.path, path, columns, budget)
-    return _signals(table, units, present, columns, path, complete=complete)
+    reader: SignalReader = found.reader
+    with unpacked_log(path, budget.size) as plain:
+        try:
+            return reader.signals(plain.path, columns, budget, complete=complete)
+        except EhadiagError:
+            raise
+        except Exception:
+            if not found.origin:
+                raise
+            raise InputOutputError(f"log {path}: not readable by {found.origin}") from None
 
 
-def _read_table(
-    plain: Path, path: Path, columns: ColumnMap, budget: Budget
-) -> tuple[Any, dict[str, str], list[str]]:
-    """Read a data frame, the units that the file says by column, and the names of all columns."""
-    try:
-        import pandas  # noqa: PLC0415 - optional, and slow
-    except ImportError:
-        raise InputOutputError(f"log {path}: decoded signals need pandas: {EXTRA}") from None
-    if kind_of(path) == ".parquet":
+class ParquetReader:
+    """Tables of Apache Parquet."""
+
+    signature = b""
+
+    def signals(
+        self,
+        path: Path,
+        columns: ColumnMap,
+        budget: Budget,  # noqa: ARG002
+        *,
+        complete: bool,
+    ) -> dict[str, RecordedSignal]:
+        """Read a file, see `SignalReader`."""
+        _pandas(path)
         try:
             import pyarrow.parquet  # noqa: PLC0415 - optional, and slow
 
-            _check_size(pyarrow.parquet.read_metadata(plain), path)
-            table = pandas.read_parquet(plain)
+            about = pyarrow.parquet.read_metadata(path)
+            # What the file says of itself, before any of it is unpacked.
+            cells = about.num_rows * about.num_columns
+            if about.num_rows > MAX_TABLE_ROWS or cells > MAX_TABLE_CELLS:
+                raise _too_long(path)
+            table = pyarrow.parquet.read_table(
+                path, columns=_plain_columns(about), use_pandas_metadata=False
+            ).to_pandas(ignore_metadata=True)
         except ImportError:
-            raise InputOutputError(f"log {path}: Parquet needs pyarrow: {EXTRA}") from None
+            raise InputOutputError(
+                f"log {path}: Parquet needs pyarrow: {install_command('daq')}"
+            ) from None
         except InputOutputError:
             raise
         except Exception:  # pyarrow raises what it likes, and quotes the file
             raise InputOutputError(f"log {path}: not a readable Parquet file") from None
-        if table.index.name is not None:
-            table = table.reset_index()
         table.columns = [str(name) for name in table.columns]
-        return table, {}, list(table.columns)
-    lines = [line for line in _head(plain).splitlines()[:4] if line.strip()]
+        return table_signals(table, {}, list(table.columns), columns, path, complete=complete)
+
+
+def _plain_columns(about: Any) -> list[str]:
+    """Columns of numbers, one in each row: a text of any length takes a few bytes of a file."""
+    schema = about.schema
+    columns = (schema.column(index) for index in range(about.num_columns))
+    return [
+        item.path
+        for item in columns
+        if item.max_repetition_level == 0 and item.physical_type != "BYTE_ARRAY"
+    ]
+
+
+class CsvTableReader:
+    """Tables in text: a row of names, perhaps one of units, then numbers."""
+
+    signature = b""
+
+    def signals(
+        self, path: Path, columns: ColumnMap, budget: Budget, *, complete: bool
+    ) -> dict[str, RecordedSignal]:
+        """Read a file, see `SignalReader`."""
+        table, units, names = _read_csv(path, columns, budget)
+        return table_signals(table, units, names, columns, path, complete=complete)
+
+
+def _pandas(path: Path) -> Any:
+    try:
+        import pandas  # noqa: PLC0415 - optional, and slow
+    except ImportError:
+        raise InputOutputError(
+            f"log {path}: decoded signals need pandas: {install_command('daq')}"
+        ) from None
+    return pandas
+
+
+def _read_csv(
+    path: Path, columns: ColumnMap, budget: Budget
+) -> tuple[Any, dict[str, str], list[str]]:
+    """Read a data frame, the units that the file says by column, and the names of all columns."""
+    pandas = _pandas(path)
+    begin = beginning_of(path, MAX_TEXT_HEADER_BYTES)
+    if begin.startswith(UTF16_MARKS):
+        raise InputOutputError(f"log {path}: is in UTF-16: save it as UTF-8")
+    text = begin.decode("utf-8-sig", "replace").lstrip()
+    lines = [line for line in text.splitlines()[:4] if line.strip()]
     delimiter = max(DELIMITERS, key=lines[0].count)
     rows = list(csv.reader(lines, delimiter=delimiter))
     names = [name.strip() for name in rows[0]]
@@ -196,7 +245,7 @@ def _read_table(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             table = pandas.read_csv(
-                plain,
+                path,
                 sep=delimiter,
                 decimal=decimal,
                 skiprows=skipped,
@@ -204,7 +253,7 @@ def _read_table(
                 names=names,
                 usecols=wanted,
                 index_col=False,
-                nrows=min(budget.frames, MOST_ROWS) + 1,
+                nrows=min(budget.frames, MAX_TABLE_ROWS) + 1,
                 skip_blank_lines=True,
                 encoding="utf-8",
                 encoding_errors="replace",
@@ -212,21 +261,15 @@ def _read_table(
             )
     except (ValueError, OSError):
         raise InputOutputError(f"log {path}: not a readable table of signals") from None
-    if len(table) > MOST_ROWS:
+    if len(table) > MAX_TABLE_ROWS:
         raise _too_long(path)
     return table, units, names
 
 
-def _check_size(about: Any, path: Path) -> None:
-    """Refuse a Parquet file by what it says of itself, before any of it is unpacked."""
-    if about.num_rows > MOST_ROWS or about.num_rows * about.num_columns > MOST_CELLS:
-        raise _too_long(path)
-
-
 def _too_long(path: Path) -> InputOutputError:
     return InputOutputError(
-        f"log {path}: more than {MOST_ROWS} rows, or {MOST_CELLS} values, are too many to hold at"
-        " once; cut it about the test"
+        f"log {path}: more than {MAX_TABLE_ROWS} rows, or {MAX_TABLE_CELLS} values, are too"
+        " many to hold at once; cut it about the test"
     )
 
 
@@ -238,7 +281,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _signals(
+def table_signals(
     table: Any,
     units: dict[str, str],
     present: list[str],
@@ -246,37 +289,48 @@ def _signals(
     path: Path,
     *,
     complete: bool,
-) -> dict[str, Signal]:
+) -> dict[str, RecordedSignal]:
+    """Take the signals that have a role out of a table.
+
+    table: a data frame of pandas, with the columns that are needed at least; units: units that the
+    file gives, by column; present: names of all columns of the file; columns: which column is what;
+    path: file, for errors; complete: all channels must be there. Returns by role, SI.
+    InputOutputError: without numbers, or time stamps; ConfigurationError: a mapped column is
+    missing, a unit is none of its quantity.
+    """
     import pandas  # noqa: PLC0415 - read by now
 
     found = columns.resolve(present, f"log {path}")
-    if complete and (lacking := missing(found, present)):
+    if complete and (lacking := missing_channels(found, present)):
         raise ConfigurationError(f"log {path}: {lacking}")
-    if TIME not in found:
+    if TIME_ROLE not in found:
         raise ConfigurationError(
             f"log {path}: no column of time stamps: name it by --column time=NAME:UNIT"
         )
 
-    def numbers(role: str) -> NDArray[np.float64]:
+    def numbers(role: str) -> FloatArray:
         column = found[role]
-        gain, bias = unit_of(column, units.get(column.column, ""), role, f"log {path}")
+        gain, bias = column_unit(column, units.get(column.column, ""), role, f"log {path}")
         plain = pandas.to_numeric(table[column.column], errors="coerce")
         return np.asarray(plain, dtype=np.float64) * gain + bias
 
-    series = table[found[TIME].column]
-    instants = _instants(series)
-    time = numbers(TIME) if instants is None else instants
+    series = table[found[TIME_ROLE].column]
+    instants = _seconds(series)
+    time = numbers(TIME_ROLE) if instants is None else instants
     if not np.isfinite(time).any():
         begins = "" if series.dropna().empty else f" ({printable(str(series.dropna().iloc[0]))}, …)"
         raise InputOutputError(
-            f"log {path}: no time stamp in column {printable(found[TIME].column)!r}{begins}: need"
+            f"log {path}: no time stamp in column "
+            f"{printable(found[TIME_ROLE].column)!r}{begins}: need"
             " numbers, in s or the unit that --column time=NAME:UNIT says, or ISO 8601 such as"
             " 2026-03-01T12:00:00.001"
         )
-    return _checked(((role, (time, numbers(role))) for role in found if role != TIME), path)
+    return checked_signals(
+        ((role, (time, numbers(role))) for role in found if role != TIME_ROLE), path
+    )
 
 
-def _instants(series: Any) -> NDArray[np.float64] | None:
+def _seconds(series: Any) -> FloatArray | None:
     """Return dates and times of day, or spans of time, in s; None for numbers.
 
     Dates count from 1970, UTC; without a zone they are taken for UTC.
@@ -296,14 +350,32 @@ def _instants(series: Any) -> NDArray[np.float64] | None:
     values = series.to_numpy()
     unit, many = np.datetime_data(values.dtype)
     whole = values.astype(np.int64).astype(np.float64)
-    return np.where(np.isnat(values), np.nan, whole * (many / PER_SECOND[unit]))
+    return np.where(np.isnat(values), np.nan, whole * (many / DATE_RESOLUTIONS[unit]))
 
 
-def _checked(
-    found: Iterable[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]], path: Path
-) -> dict[str, Signal]:
-    """In order of time, once for each instant, numbers alone."""
-    out: dict[str, Signal] = {}
+def checked_signals(
+    found: Iterable[tuple[str, tuple[FloatArray, FloatArray]]], path: Path
+) -> dict[str, RecordedSignal]:
+    """Put signals in order of time, once for each instant, numbers alone.
+
+    Parameters
+    ----------
+    found : Iterable[tuple[str, tuple[FloatArray, FloatArray]]]
+        Role, time stamps (s) and values (SI) of each.
+    path : Path
+        File, for errors.
+
+    Returns
+    -------
+    dict[str, RecordedSignal]
+        By role.
+
+    Raises
+    ------
+    InputOutputError
+        Too few numbers of a channel.
+    """
+    out: dict[str, RecordedSignal] = {}
     for role, (stamps, value) in found:
         time, jitter = even_times(stamps)
         known = np.isfinite(time) & np.isfinite(value)
@@ -311,56 +383,22 @@ def _checked(
         order = np.argsort(at, kind="stable")
         at, values = at[order], values[order]
         once = np.diff(at, append=np.inf) > 0.0
-        if once.sum() >= LEAST_ROWS or (role.startswith("environment.") and once.any()):
-            out[role] = Signal(at[once], values[once], jitter)
+        if once.sum() >= MIN_TABLE_ROWS or (role.startswith("environment.") and once.any()):
+            out[role] = RecordedSignal(at[once], values[once], jitter)
         elif role.startswith("channels."):
             raise InputOutputError(
                 f"log {path}: {role} has {int(known.sum())} numbers, but only {int(once.sum())}"
-                f" different time stamps; at least {LEAST_ROWS} are needed"
+                f" different time stamps; at least {MIN_TABLE_ROWS} are needed"
             )
     return out
 
 
-def _read_mf4(plain: Path, path: Path, columns: ColumnMap, *, complete: bool) -> dict[str, Signal]:
-    try:
-        from asammdf import MDF  # noqa: PLC0415 - optional, and slow
-    except ImportError:
-        raise InputOutputError(f"log {path}: MF4 needs asammdf: {EXTRA}") from None
-    try:
-        with closing(MDF(plain)) as file:
-            present = sorted(file.channels_db)
-            found = columns.resolve(present, f"log {path}")
-            if complete and (lacking := missing(found, present)):
-                raise ConfigurationError(f"log {path}: {lacking}")
-            out = {}
-            for role, column in found.items():
-                if role == TIME:
-                    continue
-                got = file.get(column.column)
-                gain, bias = unit_of(column, str(got.unit or ""), role, f"log {path}")
-                values = np.asarray(got.samples, dtype=np.float64) * gain + bias
-                out[role] = (np.asarray(got.timestamps, dtype=np.float64), values)
-    except (ConfigurationError, InputOutputError):
-        raise
-    except Exception:  # asammdf raises what it likes, and quotes the file
-        raise InputOutputError(f"log {path}: not a readable MF4 file of signals") from None
-    return _checked(out.items(), path)
-
-
-def joined(parts: Iterable[dict[str, Signal]]) -> dict[str, Signal]:
+def join_tables(parts: Iterable[dict[str, RecordedSignal]]) -> dict[str, RecordedSignal]:
     """Put the files of one recording together: one after another, or beside each other.
 
-    Parameters
-    ----------
-    parts : Iterable[dict[str, Signal]]
-        Signals of each file, by role.
-
-    Returns
-    -------
-    dict[str, Signal]
-        All of them; of one role in order of time.
+    parts: signals of each file, by role. Returns all of them; of one role in order of time.
     """
-    whole: dict[str, list[Signal]] = {}
+    whole: dict[str, list[RecordedSignal]] = {}
     for role, signal in itertools.chain.from_iterable(part.items() for part in parts):
         whole.setdefault(role, []).append(signal)
     out = {}
@@ -370,5 +408,5 @@ def joined(parts: Iterable[dict[str, Signal]]) -> dict[str, Signal]:
         order = np.argsort(time, kind="stable")
         time, value = time[order], value[order]
         once = np.concatenate([np.diff(time) > 0.0, [True]])
-        out[role] = Signal(time[once], value[once], max(piece.jitter for piece in pieces))
+        out[role] = RecordedSignal(time[once], value[once], max(piece.jitter for piece in pieces))
     return out

@@ -1,14 +1,16 @@
-"""The types for frames: a single one, and many as columns."""
+"""The types for frames: a single one, and many as columns that grow frame by frame."""
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_CHANNEL", "MAX_PAYLOAD", "Frame", "FrameTable", "concatenate"]
+from firmware_iface.recording import BoolArray, IntArray
 
 MAX_PAYLOAD = 64
 """Bytes of the longest payload (CAN FD)."""
@@ -18,40 +20,28 @@ MAX_CHANNEL = 0xFFFF
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One data or error frame.
-
-    Attributes
-    ----------
-    time_ns : int
-        Host time stamp, ns since the epoch (or since the start of a log without a date).
-    can_id : int
-        Identifier, 11 or 29 bits, without flag bits.
-    data : bytes
-        Payload, 0 to 64 bytes.
-    extended : bool
-        29-bit identifier.
-    fd : bool
-        CAN FD frame.
-    error : bool
-        Error frame; identifier and payload then carry no message.
-    remote : bool
-        Remote request; carries no payload.
-    sent : bool
-        Transmitted by this program (own echo), not received.
-    channel : int
-        Adapter channel as loggers count them, from 1; 0 where the source has only one or does
-        not say.
-    """
+    """One data or error frame."""
 
     time_ns: int
+    """Host time stamp, ns since the epoch (or since the start of a log without a date)."""
     can_id: int
+    """Identifier, 11 or 29 bits, without flag bits."""
     data: bytes
+    """Payload, 0 to 64 bytes."""
     extended: bool = False
+    """29-bit identifier."""
     fd: bool = False
+    """CAN FD frame."""
     error: bool = False
+    """Error frame; identifier and payload then carry no message."""
     remote: bool = False
+    """Remote request; carries no payload."""
     sent: bool = False
+    """Transmitted by this program (own echo), not received."""
     channel: int = 0
+    """Adapter channel as loggers count them, from 1; 0 where the source has only one or does not
+    say.
+    """
 
     def __post_init__(self) -> None:
         limit = 0x1FFFFFFF if self.extended else 0x7FF
@@ -63,68 +53,43 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTable:
-    """Many frames as columns, in order of arrival; n rows.
+    """Many frames as columns, in order of arrival; n rows."""
 
-    Attributes
-    ----------
-    time_ns : NDArray[np.int64]
-        int64, shape (n,).
-    can_id : NDArray[np.uint32]
-        uint32, shape (n,).
-    length : NDArray[np.uint8]
-        uint8, payload bytes, shape (n,).
-    data : NDArray[np.uint8]
-        uint8, shape (n, width), zero beyond `length`; width 8, or 64 where a frame is longer.
-    extended : NDArray[np.bool_]
-        Bool, shape (n,).
-    fd : NDArray[np.bool_]
-        See `extended`.
-    error : NDArray[np.bool_]
-        See `extended`.
-    remote : NDArray[np.bool_]
-        See `extended`.
-    sent : NDArray[np.bool_]
-        See `extended`.
-    channel : NDArray[np.uint16]
-        uint16, adapter channel of each frame, 0 where it is not said, shape (n,).
-    """
-
-    time_ns: NDArray[np.int64]
+    time_ns: IntArray
+    """int64, shape (n,)."""
     can_id: NDArray[np.uint32]
+    """uint32, shape (n,)."""
     length: NDArray[np.uint8]
+    """uint8, payload bytes, shape (n,)."""
     data: NDArray[np.uint8]
-    extended: NDArray[np.bool_]
-    fd: NDArray[np.bool_]
-    error: NDArray[np.bool_]
-    remote: NDArray[np.bool_]
-    sent: NDArray[np.bool_]
+    """uint8, shape (n, width), zero beyond `length`; width 8, or 64 where a frame is longer."""
+    extended: BoolArray
+    """Bool, shape (n,)."""
+    fd: BoolArray
+    """See `extended`."""
+    error: BoolArray
+    """See `extended`."""
+    remote: BoolArray
+    """See `extended`."""
+    sent: BoolArray
+    """See `extended`."""
     channel: NDArray[np.uint16]
+    """uint16, adapter channel of each frame, 0 where it is not said, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def rows(self, chosen: slice | NDArray[np.bool_] | NDArray[np.int64]) -> FrameTable:
+    def rows(self, chosen: slice | BoolArray | IntArray) -> FrameTable:
         """Some of the rows; in the same order, or in that of the numbers given."""
         return FrameTable(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
 
     @classmethod
     def from_frames(cls, frames: Iterable[Frame]) -> FrameTable:
         """Collect frames into columns."""
-        rows = list(frames)
-        width = 8 if all(len(row.data) <= 8 for row in rows) else MAX_PAYLOAD
-        packed = b"".join(row.data.ljust(width, b"\0") for row in rows)
-        return cls(
-            time_ns=np.array([row.time_ns for row in rows], dtype=np.int64),
-            can_id=np.array([row.can_id for row in rows], dtype=np.uint32),
-            length=np.array([len(row.data) for row in rows], dtype=np.uint8),
-            data=np.frombuffer(packed, dtype=np.uint8).reshape(len(rows), width),
-            extended=np.array([row.extended for row in rows], dtype=np.bool_),
-            fd=np.array([row.fd for row in rows], dtype=np.bool_),
-            error=np.array([row.error for row in rows], dtype=np.bool_),
-            remote=np.array([row.remote for row in rows], dtype=np.bool_),
-            sent=np.array([row.sent for row in rows], dtype=np.bool_),
-            channel=np.array([row.channel for row in rows], dtype=np.uint16),
-        )
+        columns = ColumnBuilder()
+        for frame in frames:
+            columns.add_frame(frame)
+        return columns.table()
 
 
 def concatenate(tables: Sequence[FrameTable]) -> FrameTable:
@@ -137,15 +102,127 @@ def concatenate(tables: Sequence[FrameTable]) -> FrameTable:
         data = np.zeros((len(table), width), dtype=np.uint8)
         data[:, : table.data.shape[1]] = table.data
         wide.append(data)
-    return FrameTable(
-        time_ns=np.concatenate([table.time_ns for table in tables]),
-        can_id=np.concatenate([table.can_id for table in tables]),
-        length=np.concatenate([table.length for table in tables]),
-        data=np.concatenate(wide),
-        extended=np.concatenate([table.extended for table in tables]),
-        fd=np.concatenate([table.fd for table in tables]),
-        error=np.concatenate([table.error for table in tables]),
-        remote=np.concatenate([table.remote for table in tables]),
-        sent=np.concatenate([table.sent for table in tables]),
-        channel=np.concatenate([table.channel for table in tables]),
-    )
+    rest = {
+        item.name: np.concatenate([getattr(table, item.name) for table in tables])
+        for item in fields(FrameTable)
+        if item.name != "data"
+    }
+    return FrameTable(data=np.concatenate(wide), **rest)
+
+
+class _Flag(IntEnum):
+    """Bits of a frame's flags."""
+
+    EXTENDED, FD, ERROR, REMOTE, SENT = 1, 2, 4, 8, 16
+
+
+class ColumnBuilder:
+    """Collects frames into columns; no object per frame is kept.
+
+    Payloads take 8 bytes a frame until the first longer one comes, 64 from then on.
+    """
+
+    def __init__(self) -> None:
+        self._time = array("q")
+        self._id = array("I")
+        self._flags = bytearray()
+        self._length = bytearray()
+        self._channel = array("H")
+        self._data = bytearray()
+        self._width = 8
+
+    def __len__(self) -> int:
+        return len(self._time)
+
+    def add(
+        self,
+        time_ns: int,
+        can_id: int,
+        data: bytes,
+        *,
+        extended: bool = False,
+        fd: bool = False,
+        error: bool = False,
+        remote: bool = False,
+        sent: bool = False,
+        channel: int = 0,
+    ) -> None:
+        """Append one frame."""
+        size = len(data)
+        if size > self._width:
+            self._widen()
+        self._time.append(time_ns)
+        self._id.append(can_id)
+        self._length.append(size)
+        self._channel.append(channel)
+        self._flags.append(extended | fd << 1 | error << 2 | remote << 3 | sent << 4)
+        self._data += data
+        if size < self._width:
+            self._data += bytes(self._width - size)
+
+    def add_frame(self, frame: Frame, channel: int | None = None) -> None:
+        """Append one frame; `channel` takes the place of its own."""
+        self.add(
+            frame.time_ns,
+            frame.can_id & 0xFFFFFFFF,
+            frame.data,
+            extended=frame.extended,
+            fd=frame.fd,
+            error=frame.error,
+            remote=frame.remote,
+            sent=frame.sent,
+            channel=frame.channel if channel is None else channel,
+        )
+
+    def extend(
+        self,
+        *,
+        time_ns: IntArray,
+        can_id: NDArray[np.uint32],
+        length: NDArray[np.uint8],
+        data: NDArray[np.uint8],
+        extended: BoolArray,
+        remote: BoolArray,
+        sent: BoolArray,
+        channel: NDArray[np.uint16],
+    ) -> None:
+        """Append a block of classic data and remote frames; data of shape (n, 8)."""
+        self._time.frombytes(np.ascontiguousarray(time_ns, dtype=np.int64).tobytes())
+        self._id.frombytes(np.ascontiguousarray(can_id, dtype=np.uint32).tobytes())
+        flags = (
+            extended * np.uint8(_Flag.EXTENDED)
+            | remote * np.uint8(_Flag.REMOTE)
+            | sent * np.uint8(_Flag.SENT)
+        )
+        self._flags += flags.astype(np.uint8).tobytes()
+        self._length += length.astype(np.uint8).tobytes()
+        self._channel.frombytes(np.ascontiguousarray(channel, dtype=np.uint16).tobytes())
+        if self._width > 8:
+            wide = np.zeros((len(data), self._width), dtype=np.uint8)
+            wide[:, :8] = data
+            data = wide
+        self._data += np.ascontiguousarray(data).tobytes()
+
+    def _widen(self) -> None:
+        old = np.frombuffer(bytes(self._data), dtype=np.uint8).reshape(-1, self._width)
+        wide = np.zeros((len(old), MAX_PAYLOAD), dtype=np.uint8)
+        wide[:, : self._width] = old
+        self._data = bytearray(wide.tobytes())
+        self._width = MAX_PAYLOAD
+
+    def table(self) -> FrameTable:
+        """Copy of the columns so far."""
+        flags = np.frombuffer(bytes(self._flags), dtype=np.uint8)
+        payload = np.frombuffer(bytes(self._data), dtype=np.uint8)
+        return FrameTable(
+            time_ns=np.array(self._time, dtype=np.int64),
+            can_id=np.array(self._id, dtype=np.uint32),
+            length=np.frombuffer(bytes(self._length), dtype=np.uint8),
+            data=payload.reshape(-1, self._width),
+            extended=(flags & np.uint8(_Flag.EXTENDED)).astype(np.bool_),
+            fd=(flags & np.uint8(_Flag.FD)).astype(np.bool_),
+            error=(flags & np.uint8(_Flag.ERROR)).astype(np.bool_),
+            remote=(flags & np.uint8(_Flag.REMOTE)).astype(np.bool_),
+            sent=(flags & np.uint8(_Flag.SENT)).astype(np.bool_),
+            channel=np.array(self._channel, dtype=np.uint16),
+        )

@@ -11,41 +11,49 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Self
 
+from firmware_iface.errors import ConfigurationError
 from firmware_iface.transport.adapters import BusOptions, one_line, open_bus
+from firmware_iface.transport.base import Transport
 from firmware_iface.transport.frames import MAX_CHANNEL, Frame
-from firmware_iface.transport.interface import Transport
 
 if TYPE_CHECKING:
     import can
 
-__all__ = ["BusOptions", "PythonCanTransport", "frame_of", "message_of"]
-
-RECEIVE_BUFFER = 4 << 20
+RECEIVE_BUFFER_BYTES = 4 << 20
 """Bytes asked of the kernel for a socket's receive buffer: a second of a full bus and more."""
 SO_MEMINFO = 55
 """Linux: counts of a socket (linux/sock_diag.h); Python's socket module does not name it."""
 MEMINFO_DROPS = 8
 """Place of the number of dropped frames among them."""
-DROP_CHECK = 1024
+DROP_CHECK_CALLS = 1024
 """Calls between two looks at that number while the bus is busy."""
-PATIENCE = 0.5
-"""s; on a bus that takes no frame for so long nobody listens: frames are dropped."""
-RETRY = 0.1
-"""s between two tries of such a bus, each of which waits for `RETRY_PATIENCE`."""
-RETRY_PATIENCE = 0.02
-FULL_QUEUE_PAUSE = 0.001
-"""s until a full queue is tried again."""
-NO_ROOM = "Transmit buffer full"
+
+
+class BusTimes(NamedTuple):
+    """Times of a bus that takes no frames, s."""
+
+    send: float = 0.5
+    """Without room for so long nobody listens: frames are dropped."""
+    retry: float = 0.1
+    """Between two tries of such a bus."""
+    retry_timeout: float = 0.02
+    """Longest wait of each try."""
+    pause: float = 0.001
+    """Until a full queue is tried again."""
+
+
+BUS_TIMES = BusTimes()
+FULL_BUFFER_TEXT = "Transmit buffer full"
 """What python-can says of a socket that took no frame in time."""
-BUS_OFF = 0x40
+BUS_OFF_ERROR = 0x40
 """Bit of SocketCAN's error class (linux/can/error.h, CAN_ERR_BUSOFF)."""
-SOCKETCAN_ERRORS = ("socketcan", "virtual", "udp_multicast")
+SOCKETCAN_ERROR_INTERFACES = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames carry SocketCAN's error class as identifier."""
-ECHOES = ("udp_multicast",)
+ECHOING_INTERFACES = ("udp_multicast",)
 """Interfaces that hand a sender its own frames, unmarked."""
-NOT_A_FRAME = "could not unpack received message"
+BAD_DATAGRAM_TEXT = "could not unpack received message"
 """What python-can says of a datagram that is none of its own."""
 
 
@@ -55,38 +63,50 @@ class PythonCanTransport(Transport):
     A bus on which nobody listens fills up: frames that find no room are dropped and counted
     (DEGRADED), and sending goes on when there is room again.
 
-    Parameters
-    ----------
-    options : BusOptions
-        Which bus, and how to open it.
-    transmit : bool
-        Whether the bus may be sent to; otherwise it is opened listen-only where the adapter can
-        be.
-
-    Raises
-    ------
-    ConfigurationError, InputOutputError
-        See `open_bus`.
+    options: which bus, and how to open it; transmit: whether the bus may be sent to; otherwise it
+    is opened listen-only where the adapter can be; bus: open bus, which the caller closes; None: it
+    is opened and closed here. ConfigurationError, InputOutputError: see `open_bus`.
     """
 
-    def __init__(self, options: BusOptions, *, transmit: bool = False) -> None:
+    def __init__(
+        self, options: BusOptions, *, transmit: bool = False, bus: can.BusABC | None = None
+    ) -> None:
         name = f"{options.interface} {options.channel or ''}".strip()
         super().__init__(name, transmit=transmit)
         self._options = options
-        self._bus = open_bus(options, transmit=transmit)
+        self._bus = open_bus(options, transmit=transmit) if bus is None else bus
         _widen_buffer(self._bus)
         self._line = None
         if options.interface == "slcan":
             self._line = _descriptor(self._bus)
             self._flush()  # opening takes seconds, and what came meanwhile is old
-        self._bus_closed = False
+        self._bus_closed = bus is not None
         self._damaged = 0
-        self._echoes = _EchoFilter() if options.interface in ECHOES else None
+        self._echoes = _EchoFilter() if options.interface in ECHOING_INTERFACES else None
         self._received = 0
         self._dropped = 0
         self._unsent = 0
         self._next_try = 0.0
         self._channels: dict[str, int] = {}
+
+    @classmethod
+    def of_bus(cls, bus: can.BusABC, *, transmit: bool = False) -> Self:
+        """Return the transport of a bus that the caller has opened, and closes.
+
+        bus: the open bus; nobody else, such as a `can.Notifier`, may read it meanwhile; transmit:
+        whether the bus may be sent to. Returns the transport; closing it leaves the bus open.
+        ConfigurationError: the bus hands its own frames back, which look like another tester's.
+        """
+        interface = type(bus).__module__.removeprefix("can.interfaces.").partition(".")[0]
+        name = str(bus.channel_info or interface)
+        if getattr(bus, "receive_own_messages", False):
+            raise ConfigurationError(
+                f"{name}: open it without receive_own_messages: own requests would look like"
+                " another tester's"
+            )
+        transport = cls(BusOptions(interface), transmit=transmit, bus=bus)
+        transport._name = name
+        return transport
 
     @property
     def unsent(self) -> int:
@@ -111,34 +131,34 @@ class PythonCanTransport(Transport):
         except Exception as error:
             if self._is_damage(error):
                 self._damaged += 1
-                self._tell()
+                self._report_losses()
                 return None
             # Drivers raise what they like; all of it means that this bus gives no more frames.
             raise self._fail(one_line(error)) from None
         self._received += 1
-        if message is None or self._received % DROP_CHECK == 0:
+        if message is None or self._received % DROP_CHECK_CALLS == 0:
             self._look_for_drops()
         if message is None:
             return None
         frame = frame_of(message, self._channel(message.channel))
-        of_kernel = self._options.interface in SOCKETCAN_ERRORS
-        if frame.error and frame.can_id & BUS_OFF and of_kernel:
+        of_kernel = self._options.interface in SOCKETCAN_ERROR_INTERFACES
+        if frame.error and frame.can_id & BUS_OFF_ERROR and of_kernel:
             raise self._fail("bus off; check wiring and bit rate, then restart the interface")
         return frame
 
-    def _channel(self, said: object) -> int:
+    def _channel(self, stated: object) -> int:
         """Number of a frame's adapter channel: the driver's, or by name in order of appearance.
 
         0 where the bus was opened on the one channel that it was named by.
         """
-        if self._options.interface in ECHOES:  # there the sender says what it likes
+        if self._options.interface in ECHOING_INTERFACES:  # there the sender says what it likes
             return 0
-        if isinstance(said, int):
+        if isinstance(stated, int):
             several = "," in str(self._options.channel or "")
-            return min(max(said + 1, 0), MAX_CHANNEL) if several else 0
-        if not said or self._options.channel != "":
+            return min(max(stated + 1, 0), MAX_CHANNEL) if several else 0
+        if not stated or self._options.channel != "":
             return 0
-        return self._channels.setdefault(str(said), len(self._channels) % MAX_CHANNEL + 1)
+        return self._channels.setdefault(str(stated), len(self._channels) % MAX_CHANNEL + 1)
 
     def _read(self, timeout: float) -> can.Message | None:
         """Read from python-can; its SLCAN waits a millisecond also where it shall not wait."""
@@ -155,7 +175,7 @@ class PythonCanTransport(Transport):
 
     def _is_damage(self, error: Exception) -> bool:
         """Whether an error tells of something on the line that was no frame, not of its end."""
-        if str(error) == NOT_A_FRAME:
+        if str(error) == BAD_DATAGRAM_TEXT:
             return True
         if self._options.interface != "slcan":
             return False
@@ -175,11 +195,13 @@ class PythonCanTransport(Transport):
         if self._next_try and time.monotonic() < self._next_try:
             taken = False
         else:
-            taken = self._deliver(message_of(frame), RETRY_PATIENCE if self._next_try else PATIENCE)
-            self._next_try = 0.0 if taken else time.monotonic() + RETRY
+            taken = self._deliver(
+                message_of(frame), BUS_TIMES.retry_timeout if self._next_try else BUS_TIMES.send
+            )
+            self._next_try = 0.0 if taken else time.monotonic() + BUS_TIMES.retry
         if not taken:
             self._unsent += 1
-            self._tell()
+            self._report_losses()
 
     def _deliver(self, message: can.Message, patience: float) -> bool:
         """Hand a message to the bus; False where it had no room for so long."""
@@ -196,16 +218,16 @@ class PythonCanTransport(Transport):
                 return True
             if time.monotonic() >= deadline:
                 return False
-            time.sleep(FULL_QUEUE_PAUSE)
+            time.sleep(BUS_TIMES.pause)
 
     def _look_for_drops(self) -> None:
         """Say it when frames were lost between kernel and reader: no error tells of it."""
         dropped = self.dropped or 0
         if dropped > self._dropped:
             self._dropped = dropped
-            self._tell()
+            self._report_losses()
 
-    def _tell(self) -> None:
+    def _report_losses(self) -> None:
         counts = (
             (self._damaged, "messages on the line were no CAN frames"),
             (self._dropped, "frames dropped by the kernel, the reader was too slow"),
@@ -282,7 +304,10 @@ def message_of(frame: Frame) -> can.Message:
 def _timed_out(error: Exception) -> bool:
     """Whether python-can, or pyserial below it, found no room in time."""
     kinds = {type(item).__name__ for item in (error, error.__cause__)}
-    return bool(kinds & {"CanTimeoutError", "SerialTimeoutException"}) or str(error) == NO_ROOM
+    return (
+        bool(kinds & {"CanTimeoutError", "SerialTimeoutException"})
+        or str(error) == FULL_BUFFER_TEXT
+    )
 
 
 def _descriptor(bus: can.BusABC) -> int | None:
@@ -299,43 +324,31 @@ def _descriptor(bus: can.BusABC) -> int | None:
 def _socket_of(bus: can.BusABC) -> Iterator[socket.socket]:
     """The socket behind an interface, until the block ends.
 
-    Parameters
-    ----------
-    bus : can.BusABC
-        The open bus.
-
-    Yields
-    ------
-    socket.socket
-        The socket.
-
-    Raises
-    ------
-    NotImplementedError, OSError, AttributeError, TypeError
-        There is none.
+    bus: the open bus. Yields the socket. NotImplementedError, OSError, AttributeError, TypeError:
+    there is none.
     """
     descriptor = os.dup(bus.fileno())
     try:
-        twin = socket.socket(fileno=descriptor)
+        duplicate = socket.socket(fileno=descriptor)
     except OSError:  # a serial port
         os.close(descriptor)
         raise
-    with twin:
-        yield twin
+    with duplicate:
+        yield duplicate
 
 
 def _widen_buffer(bus: can.BusABC) -> None:
     """Ask the kernel for room, so that a reader that waits for a processor loses no frame."""
-    nothing_there = contextlib.suppress(NotImplementedError, OSError, AttributeError, TypeError)
-    with nothing_there, _socket_of(bus) as twin:
-        twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    absent = contextlib.suppress(NotImplementedError, OSError, AttributeError, TypeError)
+    with absent, _socket_of(bus) as duplicate:
+        duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
 def _kernel_drops(bus: can.BusABC) -> int | None:
     """Frames that found no room in the socket's buffer; None where that cannot be told."""
     try:
-        with _socket_of(bus) as twin:
-            info = twin.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (MEMINFO_DROPS + 1))
+        with _socket_of(bus) as duplicate:
+            info = duplicate.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (MEMINFO_DROPS + 1))
     except (NotImplementedError, OSError, AttributeError, TypeError):
         return None
     words = memoryview(info).cast("I")

@@ -15,28 +15,34 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from ehadiag.core.errors import BusLostError, ConfigurationError, InputOutputError
+from firmware_iface.errors import BusLostError, ConfigurationError, InputOutputError
+from firmware_iface.transport.base import Transport
 from firmware_iface.transport.frames import Frame
-from firmware_iface.transport.interface import Transport
-
-__all__ = ["Framer", "SerialTransport", "packet_of"]
 
 DEFAULT_BAUDRATE = 921_600
-BODY = struct.Struct("<HI8s")
-CRC = struct.Struct("<H")
-PACKET_BYTES = BODY.size + CRC.size
-LONGEST_CODED = PACKET_BYTES + 1
+PACKET_BODY = struct.Struct("<HI8s")
+PACKET_CRC = struct.Struct("<H")
+PACKET_BYTES = PACKET_BODY.size + PACKET_CRC.size
+MAX_CODED_BYTES = PACKET_BYTES + 1
 """COBS adds one byte to packets below 254 bytes."""
 TIME_WRAP_US = 1 << 32
 READ_BYTES = 4096
-POLL = 0.01
-"""s; the port's own time limit. Setting it anew at each call would reconfigure the line."""
-PATIENCE = 0.25
-"""s; a port that takes no byte for so long has nobody who reads at its other end."""
-RETRY = 0.1
-"""s between two tries of such a port, where it cannot be asked whether there is room again."""
+
+
+class PortTimes(NamedTuple):
+    """Times of a serial port, s."""
+
+    read: float = 0.01
+    """The port's own time limit; a new one at each call would set up the line anew."""
+    send: float = 0.25
+    """A port that takes no byte for so long has no reader at its other end."""
+    retry: float = 0.1
+    """Between two tries of such a port, where it does not show whether there is room."""
+
+
+PORT_TIMES = PortTimes()
 NO_WRITE_TIMEOUT = ("rfc2217://",)
 """pyserial URLs that refuse to open with a time limit on writing; they have one of their own."""
 
@@ -44,20 +50,8 @@ NO_WRITE_TIMEOUT = ("rfc2217://",)
 def packet_of(frame: Frame) -> bytes:
     """Encode one frame with its delimiter.
 
-    Parameters
-    ----------
-    frame : Frame
-        The frame to encode.
-
-    Returns
-    -------
-    bytes
-        The packet with its delimiter.
-
-    Raises
-    ------
-    ConfigurationError
-        The link carries 11-bit identifiers and payloads of up to 8 bytes only.
+    frame: the frame to encode. Returns the packet with its delimiter. ConfigurationError: the link
+    carries 11-bit identifiers and payloads of up to 8 bytes only.
     """
     from cobs import cobs  # noqa: PLC0415 - only serial users need it
 
@@ -65,25 +59,19 @@ def packet_of(frame: Frame) -> bytes:
         raise ConfigurationError(
             f"the serial link carries classic 8-byte data frames only, not {frame.can_id:#x}"
         )
-    body = BODY.pack(frame.can_id, frame.time_ns // 1000 % TIME_WRAP_US, frame.data)
-    coded: bytes = cobs.encode(body + CRC.pack(binascii.crc_hqx(body, 0xFFFF)))
+    body = PACKET_BODY.pack(frame.can_id, frame.time_ns // 1000 % TIME_WRAP_US, frame.data)
+    coded: bytes = cobs.encode(body + PACKET_CRC.pack(binascii.crc_hqx(body, 0xFFFF)))
     return coded + b"\0"
 
 
 @dataclass(slots=True)
 class Framer:
-    """Byte stream to frames; keeps at most one packet's bytes.
-
-    Attributes
-    ----------
-    bad : int
-        Packets dropped: not COBS, wrong length, wrong CRC, identifier beyond 11 bits.
-    bytes_seen : int
-        Bytes fed so far.
-    """
+    """Byte stream to frames; keeps at most one packet's bytes."""
 
     bad: int = 0
+    """Packets dropped: not COBS, wrong length, wrong CRC, identifier beyond 11 bits."""
     bytes_seen: int = 0
+    """Bytes fed so far."""
     _partial: bytes = b""
     _overlong: bool = False
     _last_us: int | None = None
@@ -112,7 +100,7 @@ class Framer:
                 frames.append(frame)
         if not self._overlong:
             self._partial += rest
-            if len(self._partial) > LONGEST_CODED:
+            if len(self._partial) > MAX_CODED_BYTES:
                 self.bad += 1
                 self._overlong = True
                 self._partial = b""
@@ -121,7 +109,7 @@ class Framer:
     def _frame(self, coded: bytes) -> Frame | None:
         from cobs import cobs  # noqa: PLC0415 - only serial users need it
 
-        if len(coded) != LONGEST_CODED:
+        if len(coded) != MAX_CODED_BYTES:
             return None
         try:
             packet = cobs.decode(coded)
@@ -129,9 +117,12 @@ class Framer:
             return None
         if len(packet) != PACKET_BYTES:
             return None
-        body = packet[: BODY.size]
-        can_id, stamp, data = BODY.unpack(body)
-        if binascii.crc_hqx(body, 0xFFFF) != CRC.unpack(packet[BODY.size :])[0] or can_id > 0x7FF:
+        body = packet[: PACKET_BODY.size]
+        can_id, stamp, data = PACKET_BODY.unpack(body)
+        if (
+            binascii.crc_hqx(body, 0xFFFF) != PACKET_CRC.unpack(packet[PACKET_BODY.size :])[0]
+            or can_id > 0x7FF
+        ):
             return None
         if self._last_us is None:
             self._time_us = stamp
@@ -152,22 +143,10 @@ class SerialTransport(Transport):
     fills up when nobody does: frames that find no room are dropped and counted (DEGRADED), and
     sending goes on when there is room again.
 
-    Parameters
-    ----------
-    url : str
-        Port, or pyserial URL.
-    baudrate : int
-        Bd; ignored by URLs without a line.
-    transmit : bool
-        Whether the bus may be sent to; otherwise it is opened listen-only where the adapter can
-        be.
-
-    Raises
-    ------
-    ConfigurationError
-        Pyserial does not know the URL or the settings.
-    InputOutputError
-        The port is absent or busy.
+    url: port, or pyserial URL; baudrate: bd; ignored by URLs without a line; transmit: whether the
+    bus may be sent to; otherwise it is opened listen-only where the adapter can be.
+    ConfigurationError: pyserial does not know the URL or the settings; InputOutputError: the port
+    is absent or busy.
     """
 
     def __init__(
@@ -177,7 +156,7 @@ class SerialTransport(Transport):
         self._framer = Framer()
         self._ready: deque[Frame] = deque()
         self._shift_ns: int | None = None
-        self._said_bad = 0
+        self._reported_bad = 0
         self._unsent = 0
         self._stalled = False
         self._cut = False
@@ -223,9 +202,9 @@ class SerialTransport(Transport):
             self._ready.append(
                 Frame(frame.time_ns + self._shift_ns, can_id=frame.can_id, data=frame.data)
             )
-        if self._framer.bad != self._said_bad:
-            self._said_bad = self._framer.bad
-            self._tell()
+        if self._framer.bad != self._reported_bad:
+            self._reported_bad = self._framer.bad
+            self._report_losses()
 
     def _has_come(self, timeout: float) -> bool:
         """Whether to read now; the port's own time limit is too coarse for a millisecond."""
@@ -238,7 +217,7 @@ class SerialTransport(Transport):
         with self._write_lock:
             if not self._write(packet):
                 self._unsent += 1
-                self._tell()
+                self._report_losses()
 
     def _write(self, packet: bytes) -> bool:
         """Hand a packet to the port; False where it had no room for all of it."""
@@ -252,7 +231,7 @@ class SerialTransport(Transport):
             self._port.write(b"\0" * self._cut + packet)
         except SerialTimeoutException:
             self._stalled = self._cut = True
-            self._next_try = time.monotonic() + RETRY
+            self._next_try = time.monotonic() + PORT_TIMES.retry
             return False
         except Exception as error:
             raise self._lost(error) from None
@@ -264,10 +243,12 @@ class SerialTransport(Transport):
         descriptor = _descriptor(self._port)
         if descriptor is None:
             return not self._stalled or time.monotonic() >= self._next_try
-        return bool(select.select([], [descriptor], [], 0.0 if self._stalled else PATIENCE)[1])
+        return bool(
+            select.select([], [descriptor], [], 0.0 if self._stalled else PORT_TIMES.send)[1]
+        )
 
-    def _tell(self) -> None:
-        parts = [f"{self._said_bad} damaged packets dropped"] if self._said_bad else []
+    def _report_losses(self) -> None:
+        parts = [f"{self._reported_bad} damaged packets dropped"] if self._reported_bad else []
         if self._unsent:
             parts.append(f"{self._unsent} frames not sent, nobody read at the other end")
         self._degrade("; ".join(parts))
@@ -292,10 +273,10 @@ def _descriptor(port: Any) -> int | None:
 def _open_port(url: str, baudrate: int) -> Any:
     import serial  # noqa: PLC0415 - only serial users need it
 
-    patience = None if url.lower().startswith(NO_WRITE_TIMEOUT) else PATIENCE
+    patience = None if url.lower().startswith(NO_WRITE_TIMEOUT) else PORT_TIMES.send
     try:
         return serial.serial_for_url(
-            url, baudrate=baudrate, timeout=POLL, write_timeout=patience, exclusive=True
+            url, baudrate=baudrate, timeout=PORT_TIMES.read, write_timeout=patience, exclusive=True
         )
     except (ValueError, NotImplementedError) as error:
         raise ConfigurationError(f"serial {url}: wrong option: {error}") from None

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from places import ROOT
-from told import as_told
+from printed_output import output_matches
 
 FOLDER = ROOT / "examples"
 PAGE = FOLDER / "README.md"
@@ -41,7 +41,7 @@ def test_example_prints_what_the_page_says(
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert as_told(told, done.stdout), done.stdout
+    assert output_matches(told, done.stdout), done.stdout
     for picture in re.findall(r"see (\S+\.png)", told):
         assert (tmp_path / picture).stat().st_size > 10_000
 
@@ -68,7 +68,7 @@ def test_the_notebook_runs_and_shows_table_picture_and_frames(tmp_path: Path) ->
     version, frame, table, picture, faults, study = shown
     assert re.match(r"'\d+\.\d+", version["text/plain"])
     assert "pressure" in frame["text/html"]
-    assert table["text/html"].startswith("<pre")
+    assert table["text/html"].startswith("<style>")
     assert "FSS" in table["text/html"]
     assert len(picture["image/png"]) > 10_000
     assert "interval" not in faults["text/plain"]

@@ -4,8 +4,8 @@ import pytest
 from bus_synth import play
 from places import LOGS
 
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.mapping.bus_map import default_map
+from firmware_iface.bus_map import default_map
+from firmware_iface.codec import Encoder
 
 
 @pytest.fixture(scope="session")

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.recording import BitReason, BitState, CommandMode
+from ehadiag import CommandMode
 from firmware_iface.alignment.align import assemble
-from firmware_iface.codec.encode import Encoder
+from firmware_iface.codec import Encoder
+from firmware_iface.recording import CHANNELS, BitReason, BitState
 from firmware_iface.transport.frames import Frame, FrameTable
 
 TICK = 1_000_000

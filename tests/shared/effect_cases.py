@@ -6,20 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.channels import POSITION, PRESSURE, SPOOL
-from ehadiag.core.stored_test import resolve_test
-from ehadiag.model.anchor import FREE_RUN
-from ehadiag.model.batch import SIGNALS, Batch
-from ehadiag.model.parameters import FAULTS, Unknowns, parameter
+from ehadiag import default_actuator
+from ehadiag.model.batch import NO_ANCHOR, SIGNAL_ROWS, Batch
 from ehadiag.model.plant import plant_constants
-from ehadiag.model.scalar.residuals import ScalarModel
-from ehadiag.model.simd.model import SimdModel
-from ehadiag_sim.plant.conditions import Effects, Faults
-from ehadiag_sim.plant.dynamics import Dynamics
+from ehadiag.model.registry import FAULTS, Unknowns, parameter
+from ehadiag.model.residual_models import ScalarModel, SimdModel
+from ehadiag_sim.conditions import Effects, Faults
+from ehadiag_sim.plant_dynamics import PlantDynamics
+from firmware_iface.recording import POSITION_CHANNEL, PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.stored_test import resolve_test
 
 TICK = 1e-3
-LSB = np.array([SPOOL.lsb, PRESSURE.lsb, POSITION.lsb])
+LSB = np.array([SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb, POSITION_CHANNEL.lsb])
 MODELS = {"scalar": ScalarModel, "simd": SimdModel}
 CURRENT = resolve_test("open").command()[1900:3000]
 """A, one a tick: from creeping through both stops of the valve to rest."""
@@ -27,17 +25,17 @@ CURRENT = resolve_test("open").command()[1900:3000]
 
 def simulated(faults=(0.3, 0.2, 0.4), effects=None, *, actuator=None, current=CURRENT, **sensors):
     """Spool, pressure and jack as the simulator's sensors see them, SI, shape (3, n)."""
-    plant = Dynamics(
+    plant = PlantDynamics(
         actuator or default_actuator(), Faults(*faults), effects or Effects(), **sensors
     )
-    out = np.empty((SIGNALS, len(current)))
+    out = np.empty((SIGNAL_ROWS, len(current)))
     for tick, value in enumerate(current.tolist()):
         plant.advance(value)
         out[:, tick] = plant.seen[1:]
     return out
 
 
-def batch_of(measured, current=CURRENT, *, anchor=FREE_RUN, rows=SIGNALS):
+def batch_of(measured, current=CURRENT, *, anchor=NO_ANCHOR, rows=SIGNAL_ROWS):
     """One test, weighed so that residuals are in LSB."""
     n = len(current)
     return Batch(

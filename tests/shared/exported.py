@@ -4,24 +4,43 @@ import ctypes
 from functools import cache
 
 import llvmlite.binding as llvm
+import msgspec
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.folder import RESULT_MODE, Folder
+from ehadiag import default_actuator
 from ehadiag.export.library import export_library
-from ehadiag.export.targets import target
+from ehadiag.export.targets import find_target
+from firmware_iface.files import RESULT_MODE, Folder
+from firmware_iface.stored_test import Line, SearchWindows, bundled_tests
 
 HEAD = 68
 """Bytes of an archive before its index."""
 
 
+def exported(name, place, ticks=0):
+    """Folder of an export for a target; ticks: of a short test that it identifies, 0: its own."""
+    return _exported(name, place, ticks)
+
+
 @cache
-def exported(name, place):
-    """Folder of an export for a target."""
-    out = place / name
+def _exported(name, place, ticks):
+    out = place / f"{name}-{ticks}"
     out.mkdir()
+    tests = [short_test(ticks)] if ticks else None
     with Folder.at(out, RESULT_MODE) as folder:
-        export_library(default_actuator(), target(name), folder)
+        export_library(default_actuator(), find_target(name), folder, tests=tests)
     return out
+
+
+def short_test(ticks):
+    """A test in open loop of so many ticks."""
+    end = ticks / 1000.0
+    windows = SearchWindows(
+        FDJ=((0.0, 0.5 * end),), Kintas=((0.3 * end, end),), FSS=((0.3 * end, end),),
+        refinement=((0.3 * end, end),),
+    )  # fmt: skip
+    return msgspec.structs.replace(
+        bundled_tests()["open"], segment=(Line(points=((0.0, 0.0), (end, 0.0))),), windows=windows
+    )
 
 
 def object_of(library):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ehadiag.history.records import Effect, Entry, Event, Severity, Source, Usage
+from ehadiag.estimate import Effect, Severity
+from ehadiag.history.records import Entry, MaintenanceEvent, SourceRecord, Usage
 
 NAMES = ("Kintas", "FSS", "FDJ")
 
@@ -26,15 +27,18 @@ def an_entry(
         "verdict": "HEALTHY",
         "reasons": (),
         "usage": Usage(hours),
-        "sources": (Source("a.blf", "00", samples),) if samples else (Source("a.blf", None, None),),
+        "sources": (SourceRecord("a.blf", "00", samples),) if samples else (SourceRecord("a.blf",
+        None, None),),
         "severities": tuple(
-            Severity(name, value, std, value - 2 * std, value + 2 * std, False, True)
+            Severity(
+                name=name, estimate=value, std=std, interval95=(value - 2 * std, value + 2 * std)
+            )
             for name, value in zip(NAMES, values, strict=True)
         ),
         "covariance": tuple(
             tuple(std**2 if i == j else 0.0 for j in range(3)) for i in range(3)
         ),
-        "effects": (Effect("null_bias", 1e-4, 1e-6, False),),
+        "effects": (Effect(name="null_bias", value=1e-4, std=1e-6),),
         "version": "0",
         "simulated": False,
         "result": '{"schema": "x"}',
@@ -42,7 +46,9 @@ def an_entry(
     return Entry(**(fields | changes))  # type: ignore[arg-type]
 
 
-def an_event(text: str = "filter changed", hours: float | None = None, **changes: object) -> Event:
+def an_event(
+    text: str = "filter changed", hours: float | None = None, **changes: object
+) -> MaintenanceEvent:
     fields: dict[str, object] = {
         "appended": "2026-03-02T12:00:00.000Z",
         "when": "2026-03-02T12:00:00.000Z",
@@ -52,4 +58,4 @@ def an_event(text: str = "filter changed", hours: float | None = None, **changes
         "text": text,
         "resets": (),
     }
-    return Event(**(fields | changes))  # type: ignore[arg-type]
+    return MaintenanceEvent(**(fields | changes))  # type: ignore[arg-type]

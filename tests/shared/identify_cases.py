@@ -5,15 +5,14 @@ from functools import lru_cache
 import numpy as np
 from places import LOGS
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.channels import CHANNELS, PRESSURE, SPOOL
-from ehadiag.core.recording import CommandMode, Environment, Samples
-from ehadiag.core.stored_test import resolve_test
+from ehadiag import CommandMode, Samples, default_actuator
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.model.parameters import FAULT_NAMES
-from ehadiag.model.scalar.response import respond
+from ehadiag.model.registry import FAULT_NAMES
+from ehadiag.model.residual_models import model_response
 from ehadiag_tools.damaged import damaged_unit
 from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import CHANNELS, PRESSURE_CHANNEL, SPOOL_CHANNEL, Environment
+from firmware_iface.stored_test import resolve_test
 
 PAPER_FAULTS = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))
 
@@ -31,7 +30,7 @@ def own_samples(faults, *, seed=0, noise_lsb=0.5, offsets_lsb=(0.0, 0.0)):
     """Open-loop test with the monitoring model as the plant: nothing is mismatched."""
     test = resolve_test("open")
     current = test.command()
-    truth = respond(damaged_unit(faults), current, 1e-3)
+    truth = model_response(damaged_unit(faults), current, 1e-3)
     rng = np.random.default_rng(seed)
     clean = (current, truth.spool, truth.pressure, truth.position)
     offsets = (0.0, *offsets_lsb, 0.0)
@@ -62,4 +61,7 @@ def named(faults):
     return dict(zip(FAULT_NAMES, faults, strict=True))
 
 
-NOISE = (SPOOL.lsb * np.sqrt(0.5**2 + 1 / 12), PRESSURE.lsb * np.sqrt(0.5**2 + 1 / 12))
+NOISE = (
+    SPOOL_CHANNEL.lsb * np.sqrt(0.5**2 + 1 / 12),
+    PRESSURE_CHANNEL.lsb * np.sqrt(0.5**2 + 1 / 12),
+)

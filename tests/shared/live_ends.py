@@ -11,9 +11,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import run_emulator
-from firmware_iface.transport.interface import Transport
+from ehadiag_sim.emulator import FccCore, run_emulator
+from firmware_iface.transport.base import Transport
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from importlib import resources
 
 import cantools.database
 
-from firmware_iface.codec.protection import crc8
+from firmware_iface.protection import crc8
 from firmware_iface.transport.frames import Frame
 
 TEXT = resources.files("firmware_iface").joinpath("data/eha_fcc.dbc").read_text()
@@ -21,10 +21,10 @@ def sealed(name, values, time_ns=0):
     return Frame(time_ns, message.frame_id, data + bytes([check]))
 
 
-def advance(state, test_id=1, verdict=30, runs=0, time_ns=0):
+def progress(state, test_id=1, verdict=30, runs=0, time_ns=0):
     """How far the computer is."""
-    said = {"OnboardState": state, "OnboardTestId": test_id, "OnboardRuns": runs}
-    return sealed("OnboardVerdict", said | {"OnboardVerdict": verdict}, time_ns)
+    values = {"OnboardState": state, "OnboardTestId": test_id, "OnboardRuns": runs}
+    return sealed("OnboardVerdict", values | {"OnboardVerdict": verdict}, time_ns)
 
 
 def findings(severities=None, time_ns=0):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag import Actuator, default_actuator
 
 
 def with_data(

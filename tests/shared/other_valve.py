@@ -7,12 +7,11 @@ from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 
-from ehadiag.core.actuator import Actuator
-from ehadiag.core.stored_test import StoredTest
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.plant.conditions import Effects, Faults
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.mapping.bus_map import BusMap
+from ehadiag import Actuator, StoredTest
+from ehadiag_sim.conditions import Effects, Faults
+from ehadiag_sim.emulator import FccCore
+from firmware_iface.bus_map import BusMap
+from firmware_iface.codec import Encoder
 from firmware_iface.transport.frames import Frame
 
 STROKE = 0.381 / 0.8
@@ -75,7 +74,7 @@ def write_rig(folder: Path, converters: str = CONVERTERS) -> Path:
     mapping += '[protection.JackTelemetry]\ncounter = "JackCounter"\ncounts = "ticks"\n'
     mapping += 'crc = "JackCrc8"\n'
     (folder / "rig.toml").write_text(mapping, encoding="utf-8")
-    test = packaged("ehadiag", "tests/open.toml").replace('"open"', '"open-40"')
+    test = packaged("firmware_iface", "tests/open.toml").replace('"open"', '"open-40"')
     test = re.sub(r"(?m)^id = 1$", "id = 41", test)
     head, tail = test.split("[windows]")
     for low, high in (("1.5]", "6.0]"), ("10.0]", "40.0]"), ("= 3.0\nf", "= 12.0\nf")):

@@ -5,22 +5,19 @@ import math
 import numpy as np
 import pytest
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.recording import CommandMode
-from ehadiag_sim.plant.coefficients import condition
-from ehadiag_sim.plant.conditions import DataErrors, Effects, Faults, Sensors
-from ehadiag_sim.plant.flat import (
-    INPUTS,
-    MEMORY,
-    OUTPUTS,
-    VALUES,
-    Settings,
+from ehadiag import CommandMode, default_actuator
+from ehadiag_sim.conditions import DataErrors, Effects, Faults, Sensors
+from ehadiag_sim.fmu_plant import (
+    FMU_VALUES,
+    PLANT_MEMORY,
+    FmuSettings,
     plant_plan,
     start_plant,
     tick_plant,
 )
-from ehadiag_sim.plant.simulator import Plant
+from ehadiag_sim.plant_laws import unit_condition
+from ehadiag_sim.simulation import Plant
+from firmware_iface.recording import CHANNELS
 
 PLAN = np.array(plant_plan(default_actuator()))
 FAULTS = Faults(0.3, 0.2, 0.1)
@@ -37,9 +34,9 @@ SENSORS = Sensors(
 
 
 def values_of(faults, effects, sensors, closed):
-    values = np.zeros(VALUES)
-    first = condition(faults, effects, sensors.filter_time, effects.oil_temperature)
-    rest = Settings(
+    values = np.zeros(FMU_VALUES.end)
+    first = unit_condition(faults, effects, sensors.filter_time, effects.oil_temperature)
+    rest = FmuSettings(
         effects.hysteresis,
         effects.plays,
         effects.null_bias,
@@ -47,38 +44,46 @@ def values_of(faults, effects, sensors, closed):
         *sensors.gains,
         closed,
     )
-    values[:INPUTS] = [*first, *rest]
+    values[: FMU_VALUES.inputs] = [*first, *rest]
     return values
 
 
 @pytest.mark.parametrize("mode", list(CommandMode))
 def test_the_same_as_the_simulator(mode):
     plant = Plant(default_actuator(), FAULTS, EFFECTS, SENSORS)
-    memory = np.zeros(MEMORY)
+    memory = np.zeros(PLANT_MEMORY.end)
     values = values_of(FAULTS, EFFECTS, SENSORS, mode is CommandMode.POSITION)
     addresses = memory.ctypes.data, PLAN.ctypes.data, values.ctypes.data
     assert start_plant(*addresses) == 0
     for k in range(150):
-        values[INPUTS] = 0.005 * math.sin(0.05 * k)
+        values[FMU_VALUES.inputs] = 0.005 * math.sin(0.05 * k)
         assert tick_plant(*addresses) == 0
-        codes = plant.tick(values[INPUTS], mode)
+        codes = plant.tick(values[FMU_VALUES.inputs], mode)
         shown = [float(c.decode(codes[i : i + 1])[0]) for i, c in enumerate(CHANNELS)]
-        np.testing.assert_allclose(values[OUTPUTS : OUTPUTS + 4], shown, rtol=1e-12)
-        np.testing.assert_allclose(values[OUTPUTS + 4 :], plant.truth, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(
+            values[FMU_VALUES.outputs : FMU_VALUES.outputs + 4], shown, rtol=1e-12
+        )
+        np.testing.assert_allclose(
+            values[FMU_VALUES.outputs + 4 :], plant.truth, rtol=1e-9, atol=1e-15
+        )
 
 
 @pytest.mark.parametrize(
-    ("index", "wrong"), [(0, 1.5), (1, -0.1), (5, 300.0), (6, 0.0), (0, math.nan), (INPUTS - 11, 0)]
+    ("index", "wrong"),
+    [(0, 1.5), (1, -0.1), (5, 300.0), (6, 0.0), (0, math.nan), (FMU_VALUES.inputs - 11, 0)],
 )
 def test_a_value_out_of_its_range_is_refused(index, wrong):
     values = values_of(Faults(), Effects(), Sensors(), False)
     values[index] = wrong
-    assert start_plant(np.zeros(MEMORY).ctypes.data, PLAN.ctypes.data, values.ctypes.data) == 1
+    assert (
+        start_plant(np.zeros(PLANT_MEMORY.end).ctypes.data, PLAN.ctypes.data, values.ctypes.data)
+        == 1
+    )
 
 
 def test_a_command_that_is_no_number_is_refused():
-    memory, values = np.zeros(MEMORY), values_of(Faults(), Effects(), Sensors(), False)
+    memory, values = np.zeros(PLANT_MEMORY.end), values_of(Faults(), Effects(), Sensors(), False)
     addresses = memory.ctypes.data, PLAN.ctypes.data, values.ctypes.data
     assert start_plant(*addresses) == 0
-    values[INPUTS] = math.nan
+    values[FMU_VALUES.inputs] = math.nan
     assert tick_plant(*addresses) == 1

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from places import CORPUS
 
-from firmware_iface.alignment.live_ticks import LiveTicks
-from firmware_iface.codec import live_decode as livedecode
+from firmware_iface import live_decode as livedecode
+from firmware_iface.live_decode import LiveTicks
 from firmware_iface.transport import serial_link as seriallink
 from firmware_iface.transport.frames import Frame
-from fuzz import targets
+from fuzz import native, targets
 
 
 @pytest.mark.parametrize("name", targets.TARGETS)
@@ -22,6 +25,37 @@ def test_kept_inputs_still_pass(name: str) -> None:
     for path in inputs:
         check(path.read_bytes())
     check(b"")
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler here")
+def test_kept_inputs_of_the_firmware_still_pass(tmp_path: Path) -> None:
+    inputs = sorted(map(str, (CORPUS / "fcc").iterdir()))
+    assert inputs
+    program = native.build("fcc", tmp_path, native.SANITIZERS)
+    done = subprocess.run([program, *inputs], capture_output=True, text=True, check=True)
+    assert int(done.stdout.split()[0]) == len(inputs)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler here")
+def test_kept_inputs_of_a_library_still_pass(tmp_path: Path) -> None:
+    inputs = sorted(map(str, (CORPUS / "onboard").iterdir()))
+    assert inputs
+    program = native.build("onboard", tmp_path, native.SANITIZERS)
+    subprocess.run([program, *inputs], capture_output=True, check=True)
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler here")
+def test_a_broken_promise_of_c_code_is_a_finding(tmp_path: Path) -> None:
+    broken = '#include "native.h"\nvoid check(const uint8_t *b, size_t n)'
+    (tmp_path / "broken.c").write_text(broken + '{ if (n > 2 && b[1] == 7) finding("seven"); }')
+    program = native.compiled([tmp_path / "broken.c"], tmp_path / "program")
+    command = [program, "1", "1000000", str(tmp_path)]
+    done = subprocess.run(
+        command, cwd=tmp_path, stdin=subprocess.DEVNULL, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (1, b"finding: seven\n")
+    assert (tmp_path / "finding.bin").read_bytes()[1] == 7
 
 
 def test_the_seeds_reach_the_readers() -> None:

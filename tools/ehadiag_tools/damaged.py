@@ -8,25 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, default_actuator
-from ehadiag.core.recording import Environment
-from ehadiag.model.parameters import FAULTS, Unknowns
 from ehadiag.model.plant import PlantConstants, plant_constants
-
-__all__ = ["damaged", "damaged_unit"]
+from ehadiag.model.registry import FAULTS, Unknowns
+from firmware_iface.recording import Environment
 
 
 def damaged(
     constants: PlantConstants, severities: Sequence[float] | NDArray[np.float64]
 ) -> PlantConstants:
-    """Constants of a unit with severities in the order of `FAULTS`.
-
-    Parameters
-    ----------
-    constants : PlantConstants
-        Of the unit as new.
-    severities : shape (k,)
-        0 … 1.
-    """
+    """Constants of a unit, given those as new, with severities 0 … 1 in the order of `FAULTS`."""
     point = np.asarray(severities, dtype=np.float64)
     return Unknowns(FAULTS, (constants,), {}).constants(point)
 

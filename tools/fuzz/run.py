@@ -20,17 +20,10 @@ from atheris.version_dependent import CMP_OP_SHIFT_AMOUNT
 NAMES = ("frames", "windows", "serial", "logs", "mappings", "signals", "configurations")
 SEEN = ("firmware_iface", "ehadiag", "cantools", "textparser", "tomllib", "can")
 """Packages whose branches guide the search."""
-AGAIN = "EHADIAG_FUZZ_TARGET"
-HANG_S = 20
-MEMORY_MB = 2048
+TARGET_VARIABLE = "EHADIAG_FUZZ_TARGET"
 COMPARISONS: tuple[Callable[[Any, Any], Any], ...] = (
-    operator.lt,
-    operator.le,
-    operator.eq,
-    operator.ne,
-    operator.gt,
-    operator.ge,
-)
+    operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge
+)  # fmt: skip
 """By atheris's numbers."""
 
 
@@ -38,14 +31,14 @@ def main() -> None:
     """Run until a finding, or until what the options say."""
     # libFuzzer starts this program again for a merge, without the target among the options.
     if len(sys.argv) > 1 and sys.argv[1] in NAMES:
-        os.environ[AGAIN] = sys.argv.pop(1)
-    name = os.environ.get(AGAIN)
+        os.environ[TARGET_VARIABLE] = sys.argv.pop(1)
+    name = os.environ.get(TARGET_VARIABLE)
     if name not in NAMES:
         raise SystemExit(f"usage: run.py {'|'.join(NAMES)} [FOLDER...] [-option...]")
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     with atheris.instrument_imports(include=list(SEEN)):
         from fuzz import targets  # noqa: PLC0415 - the fuzzer must see its imports
-    options = [f"-timeout={HANG_S}", f"-rss_limit_mb={MEMORY_MB}", *sys.argv[1:]]
+    options = ["-timeout=20", "-rss_limit_mb=2048", *sys.argv[1:]]
     atheris.Setup([sys.argv[0], *options], _without_leak(targets.target(name, targets.SHARE)))
     atheris.Fuzz()
 

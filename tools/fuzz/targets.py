@@ -11,37 +11,46 @@ input: the same input always takes the same path, and a change of one bit choose
 from __future__ import annotations
 
 import contextlib
+import gzip
 import struct
 import tempfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from enum import IntFlag, auto
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
-from ehadiag.core.errors import EhadiagError
-from ehadiag.core.recording import CommandMode
-from ehadiag.core.toml_file import decode_toml
-from firmware_iface.alignment.align import assemble
-from firmware_iface.alignment.live_ticks import LiveTicks
-from firmware_iface.alignment.windows import recordings_of
-from firmware_iface.codec.decode import Decoded, DecodedTable, decode
-from firmware_iface.codec.live_decode import CHANNELS, LiveDecoder
-from firmware_iface.codec.live_messages import BitStatus, Request, Sample
-from firmware_iface.codec.protection import crc8
-from firmware_iface.codec.validity import intact
+from ehadiag.core.actuator import default_actuator, load_actuator
+from firmware_iface import bus_map as busmap
+from firmware_iface.alignment.align import assemble, windowed_recordings
+from firmware_iface.bus_map import BusMap, default_map, load_map
+from firmware_iface.codec import Decoded, DecodedTable, decode
+from firmware_iface.dbc import parse_dbc
+from firmware_iface.errors import EhadiagError
+from firmware_iface.files import decode_toml
+from firmware_iface.find_test import CandidateTests
+from firmware_iface.live_decode import (
+    SAMPLE_FIELDS,
+    BitRequest,
+    BitStatus,
+    LiveDecoder,
+    LiveTicks,
+    Sample,
+)
 from firmware_iface.logs.blf import CONTAINER_HEADER, FILE_HEADER, OBJECT_HEADER
-from firmware_iface.logs.reader import choose, read_frames, read_recordings
-from firmware_iface.mapping import bus_map as busmap
-from firmware_iface.mapping.bus_map import BusMap, default_map
-from firmware_iface.mapping.dbc import parse_dbc
-from firmware_iface.mapping.file import MappingFile
+from firmware_iface.logs.log_files import Budget
+from firmware_iface.logs.reader import choose_recording, read_frames, read_recordings
+from firmware_iface.mapping_file import MappingFile
+from firmware_iface.protection import crc8, intact
+from firmware_iface.recording import CommandMode
+from firmware_iface.signals.columns import load_columns
+from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.stored_test import bundled_tests, load_test
 from firmware_iface.transport.frames import MAX_PAYLOAD, Frame, FrameTable
-from firmware_iface.transport.serial_link import LONGEST_CODED, Framer, packet_of
-from fuzz import files
-
-__all__ = ["SHARE", "TARGETS", "target"]
+from firmware_iface.transport.serial_link import MAX_CODED_BYTES, Framer, packet_of
 
 SHARE = 16
 """While fuzzing, inputs for one that goes all the way to recordings."""
@@ -49,13 +58,32 @@ SHARE = 16
 RECORD = struct.Struct("<BBhB8s")
 """One frame of the target `frames`: flags, choice of identifier (its two highest bits: the adapter
 channel), time step, length, payload."""
-SEALED, EXTENDED, ERROR, REMOTE, SLOW = 1, 2, 4, 8, 16
 IDENTIFIERS = (0x110, 0x111, 0x120, 0x200, 0x201, 0x110, 0x111, 0x7FF)
 KINDS = (".blf", ".asc", ".csv", ".trc", "container")
 """Logs by the first byte of an input; `container` is the inside of a sound BLF file."""
+SIGNALS = (".log", ".csv", ".parquet", ".log.gz", ".csv.gz", "packed.csv.gz", "packed.log.gz")
+"""Recordings by the first byte of an input; `packed`: the input is what a sound gzip file holds."""
+CONFIGURATIONS: tuple[Callable[[str], object], ...] = (
+    load_actuator,
+    load_test,
+    load_columns,
+    load_map,
+)
+"""Readers by the first byte of an input."""
+BUDGET = Budget(frames=100_000, size=1 << 20)
+MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
+"""In memory where the system has such a folder: a file is written for every input."""
 MOST_TICKS = 256
-MICROSECOND = 1000
-MILLISECOND = 1_000_000
+
+
+class Flags(IntFlag):
+    """First byte of a frame: right check sum, extended identifier, ..., steps in milliseconds."""
+
+    SEALED = auto()
+    EXTENDED = auto()
+    ERROR = auto()
+    REMOTE = auto()
+    SLOW = auto()
 
 
 def target(name: str, share: int = 1) -> Callable[[bytes], None]:
@@ -97,7 +125,7 @@ def _is_telemetry(frame: Frame, bus: BusMap) -> bool:
 
 
 def _compare(
-    answers: list[BitStatus | Sample | Request | None],
+    answers: list[BitStatus | Sample | BitRequest | None],
     decoded: DecodedTable,
     bus: BusMap,
     several_channels: bool,
@@ -106,7 +134,7 @@ def _compare(
 
     But what is in conflict, or of another channel than the first, only the columns still have.
     """
-    roles = {Sample: "channels.spool", Request: "request.code", BitStatus: "status.state"}
+    roles = {Sample: "channels.spool", BitRequest: "request.code", BitStatus: "status.state"}
     for kind, role in roles.items():
         found = bus.find(role)
         if found is None:
@@ -122,7 +150,7 @@ def _compare(
             if not several_channels and not _in_conflict(item, row):
                 raise AssertionError(f"{found[0].name}: a sound frame was left out")
     messages = decoded.messages.values()
-    for name, key in CHANNELS.items():
+    for name, key in SAMPLE_FIELDS.items():
         live = [getattr(answer, key) for answer in answers if isinstance(answer, Sample)]
         item = next(item for item in messages if name in item.values)
         taken = [type(answers[row]) is Sample for row in item.row.tolist()]
@@ -146,9 +174,9 @@ def _frames_of(data: bytes) -> list[Frame]:
     now = 0
     for at in range(0, len(data) - RECORD.size + 1, RECORD.size):
         flags, choice, step, length, payload = RECORD.unpack_from(data, at)
-        now += step * (MILLISECOND if flags & SLOW else MICROSECOND)
+        now += step * (1_000_000 if flags & Flags.SLOW else 1000)
         can_id = IDENTIFIERS[choice % len(IDENTIFIERS)]
-        if flags & SEALED:
+        if flags & Flags.SEALED:
             payload = payload[:7] + bytes((crc8(can_id.to_bytes(2, "little") + payload[:7]),))
         elif length != len(payload):
             payload = (payload * 8)[: length % (MAX_PAYLOAD + 1)]
@@ -157,10 +185,10 @@ def _frames_of(data: bytes) -> list[Frame]:
                 now,
                 can_id,
                 payload,
-                extended=bool(flags & EXTENDED),
+                extended=bool(flags & Flags.EXTENDED),
                 fd=len(payload) > 8,
-                error=bool(flags & ERROR),
-                remote=bool(flags & REMOTE),
+                error=bool(flags & Flags.ERROR),
+                remote=bool(flags & Flags.REMOTE),
                 channel=choice >> 6,
             )
         )
@@ -177,12 +205,12 @@ def _windows(_: int) -> Callable[[bytes], None]:
             return
         held = 20 + data[0]
         tables = [FrameTable.from_frames(frames[at : at + 10]) for at in range(0, len(frames), 10)]
-        found = list(recordings_of(tables, bus, "fuzz", held, least=20))
+        found = list(windowed_recordings(tables, bus, "fuzz", held, least=20))
         if not found:
             raise AssertionError("no recording at all")
         if any(item.quality.total("received") > min(len(frames), held + 10) for item in found):
             raise AssertionError("a test has more frames than a window")
-        best = choose(found)
+        best = choose_recording(found)
         if best.samples is None and any(item.samples is not None for item in found):
             raise AssertionError("a test was passed over for nothing")
 
@@ -198,7 +226,7 @@ def _serial(_: int) -> Callable[[bytes], None]:
         found = []
         for at in range(0, len(data), cut):
             found += pieces.feed(data[at : at + cut])
-            if len(pieces._partial) > LONGEST_CODED:
+            if len(pieces._partial) > MAX_CODED_BYTES:
                 raise AssertionError("the framer keeps more than a packet")
         if (found, pieces.bad, pieces.bytes_seen) != (frames, whole.bad, whole.bytes_seen):
             raise AssertionError("the framer depends on how the bytes come")
@@ -212,8 +240,6 @@ def _serial(_: int) -> Callable[[bytes], None]:
 
 def _logs(share: int) -> Callable[[bytes], None]:
     bus = default_map()
-    # In memory where the system has such a folder: a file is written for every input.
-    memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
 
     def check(data: bytes) -> None:
         if not data:
@@ -221,16 +247,11 @@ def _logs(share: int) -> Callable[[bytes], None]:
         kind, content = KINDS[data[0] % len(KINDS)], data[1:]
         if kind == "container":
             kind, content = ".blf", _blf_around(content)
-        with tempfile.NamedTemporaryFile(dir=memory, suffix=kind, delete=False) as file:
-            file.write(content)
-        try:
-            with contextlib.suppress(EhadiagError):
-                if _chosen(data, share):
-                    read_recordings(file.name, bus)
-                else:
-                    read_frames(file.name)
-        finally:
-            Path(file.name).unlink()
+        with _file(kind, content) as name, contextlib.suppress(EhadiagError):
+            if _chosen(data, share):
+                read_recordings(name, bus)
+            else:
+                read_frames(name)
 
     return check
 
@@ -266,12 +287,51 @@ def _mappings(_: int) -> Callable[[bytes], None]:
     return check
 
 
+def _signals(_: int) -> Callable[[bytes], None]:
+    """Recordings that are not binary logs, to their tests."""
+    candidates = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
+    meaning = Interpretation(default_map(), None, candidates)
+
+    def check(data: bytes) -> None:
+        if not data:
+            return
+        kind, content = SIGNALS[data[0] % len(SIGNALS)], data[1:]
+        if kind.startswith("packed"):
+            kind, content = kind.removeprefix("packed"), gzip.compress(content, 1)
+        with _file(kind, content) as path, contextlib.suppress(EhadiagError):
+            list(recorded_tests([path], meaning, BUDGET))
+
+    return check
+
+
+def _configurations(_: int) -> Callable[[bytes], None]:
+    """Actuator files, test files, mappings of columns, mappings of frames that name a DBC."""
+
+    def check(data: bytes) -> None:
+        if not data:
+            return
+        with _file(".toml", data[1:]) as path, contextlib.suppress(EhadiagError):
+            CONFIGURATIONS[data[0] % len(CONFIGURATIONS)](path)
+
+    return check
+
+
+@contextmanager
+def _file(suffix: str, content: bytes) -> Iterator[str]:
+    with tempfile.NamedTemporaryFile(dir=MEMORY, suffix=suffix, delete=False) as file:
+        file.write(content)
+    try:
+        yield file.name
+    finally:
+        Path(file.name).unlink()
+
+
 TARGETS: Mapping[str, Callable[[int], Callable[[bytes], None]]] = {
     "frames": _frames,
     "windows": _windows,
     "serial": _serial,
     "logs": _logs,
     "mappings": _mappings,
-    "signals": files.signals,
-    "configurations": files.configurations,
+    "signals": _signals,
+    "configurations": _configurations,
 }

@@ -28,9 +28,10 @@ const list = (place, lines) => place.replaceChildren(...lines.map((line) => {
 const number = (value, digits) => ({ number: text(value, digits) });
 
 function show(snapshot) {
+  at("result").hidden = snapshot === null || !snapshot.ending;
   if (snapshot === null) return;
   const { bus, test, residuals, ending, signals } = snapshot;
-  at("unit").textContent = snapshot.actuator + ", serial " + text(snapshot.serial) + " (" + snapshot.command + ")";
+  at("unit").textContent = snapshot.actuator + ", unit " + text(snapshot.serial);
   at("verdict").textContent = ending ? ending.verdict.replace("_", " ") : "";
   at("verdict").className = "verdict " + (ending ? ending.verdict.replace(" ", "_") : "");
   list(at("reasons"), ending ? ending.reasons : []);
@@ -49,7 +50,7 @@ function show(snapshot) {
     [name, number(residuals[name], 2), number(residuals[name + "_above"], 2), number(residuals[name + "_below"], 2)]) : []);
   at("against").textContent = residuals && residuals.against ? "Compared with " + residuals.against : "";
   at("alarm-count").textContent = snapshot.alarm_count;
-  fill(at("alarms"), snapshot.alarms.map((item) => [item.time, item.signal, item.side, item.during]).reverse());
+  fill(at("alarms"), snapshot.alarms.map((item) => [item.time.slice(11, 19) || item.time, item.causes.length ? item.causes.join("; or ") : item.signal, item.side, item.during]).reverse());
   list(at("notes"), snapshot.notes);
   draw(signals);
 }
@@ -64,7 +65,7 @@ function draw(signals) {
   source.data = data;
 }
 
-function tell(path, body) {
+function request(path, body) {
   const token = new URLSearchParams(location.hash.slice(1)).get("token") ?? "";
   at("answer").textContent = "";
   fetch(path, { method: "POST", headers: { "X-Ehadiag-Token": token }, body: JSON.stringify(body) })
@@ -73,15 +74,39 @@ function tell(path, body) {
     .catch(() => { at("answer").textContent = "ehadiag serve does not answer"; });
 }
 
+const sliders = [...document.querySelectorAll("input[type=range]")];
+for (const slider of sliders) {
+  slider.addEventListener("input", () => { slider.nextElementSibling.textContent = slider.value + " %"; });
+}
 if (at("start")) {
-  at("start").addEventListener("click", () => tell("/start", { test: at("test").value }));
-  at("abort").addEventListener("click", () => tell("/abort", {}));
+  at("start").addEventListener("click", () => {
+    at("confirm-test").textContent = at("test").value;
+    at("confirm").showModal();
+  });
+  at("cancel").addEventListener("click", () => at("confirm").close());
+  at("go").addEventListener("click", () => {
+    at("confirm").close();
+    const severities = Object.fromEntries(sliders.map((item) => [item.dataset.symbol, Number(item.value) / 100]));
+    request("/start", sliders.length ? { test: at("test").value, severities } : { test: at("test").value });
+  });
+  at("abort").addEventListener("click", () => request("/abort", {}));
+  addEventListener("keydown", (event) => {
+    if (event.key === "Escape" && !at("confirm").open && !at("abort").disabled) request("/abort", {});
+  });
 }
 const stream = new EventSource("/live");
 stream.addEventListener("snapshot", (event) => show(JSON.parse(event.data)));
 stream.addEventListener("state", (event) => {
   const state = JSON.parse(event.data);
   at("said").textContent = state.said.join("\n");
+  const pages = state.said.flatMap((line) => line.match(/[^\/\\\s,]+\.html/g) ?? []);
+  at("report").hidden = pages.length === 0;
+  if (pages.length) at("report").href = "/reports/" + encodeURIComponent(pages.at(-1));
+  if (state.running !== null && state.starting) {
+    at("unit").textContent = "Starting test " + state.running + " …";
+    at("phase").textContent = "Loading the model and opening the bus";
+    at("share").removeAttribute("value");
+  }
   if (at("start")) { at("start").disabled = state.running !== null; at("abort").disabled = state.running === null; }
 });
 stream.addEventListener("error", () => { at("phase").textContent = "ehadiag serve does not answer"; });

@@ -8,16 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ehadiag import Verdict, bundled_tests, default_actuator
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.assess.verdict import Verdict
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.stored_test import bundled_tests, resolve_test
-from ehadiag.report.asked import Asked
-from ehadiag.report.json_line import json_line
-from ehadiag.report.spent import Spent
-from ehadiag.report.table import text_of
-from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
-from ehadiag_sim.plant.simulator import simulate
+from ehadiag.records import result_of
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.simulation import simulate
+from firmware_iface.stored_test import resolve_test
 
 pytestmark = pytest.mark.slow
 
@@ -64,8 +60,8 @@ def test_a_single_cause_is_named(effects, sensors, name, advice):
     assert found.culprit.suspects[0].share > 0.6
     assert found.culprit.advice.startswith(advice)
     assert 0.0 <= found.culprit.start < found.culprit.end <= 5.5
-    assert advice in text_of(found)
-    told = json.loads(json_line(found, Spent(), Asked()))["culprit"]
+    assert advice in str(result_of(found))
+    told = json.loads(result_of(found).to_json())["culprit"]
     assert told["suspects"][0]["name"] == name
     assert told["advice"] == found.culprit.advice
 

@@ -11,23 +11,22 @@ import pytest
 from cli_result import Run
 from places import LOGS
 
-from ehadiag.assess.acceptance import nothing_is_under_way
+from ehadiag import Recording, StoredTest, default_actuator
+from ehadiag.assess.acceptance import is_complete_recording
 from ehadiag.assess.diagnosis import DiagnosisSession
-from ehadiag.cli.ahead import Ahead, working_ahead
-from ehadiag.cli.deadline import Deadline
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import BitState, Recording
-from ehadiag.core.stored_test import StoredTest, resolve_test
+from ehadiag.session.bit_session import EarlyIdentification, early_identification
+from ehadiag.setup import Deadline
+from firmware_iface.handshake import Phase
 from firmware_iface.logs.reader import read_frames
-from firmware_iface.session.assembler import Assembler
-from firmware_iface.session.handshake import Phase
-from firmware_iface.session.tester import Progress
+from firmware_iface.recording import BitState
+from firmware_iface.stored_test import resolve_test
+from firmware_iface.tester import Assembler, BitProgress
 from firmware_iface.transport.frames import Frame
 
 TEST = resolve_test("open")
 
 
-def heard(
+def assembler_of(
     name: str, *, until: BitState = BitState.COMPLETE, without: int = 0, before: int = 0
 ) -> Assembler:
     """Frames of a log up to the first status that says so.
@@ -58,9 +57,9 @@ def test_stages_run_when_they_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
         taken.release()
 
     monkeypatch.setattr(session, "feed", take)
-    with working_ahead(session, heard("paper-open-1.blf"), TEST) as ahead:
+    with early_identification(session, assembler_of("paper-open-1.blf"), TEST) as ahead:
         for tenth in range(54):
-            ahead.watch(Progress(Phase.RUNNING, tenth / 10.0, TEST.duration, 0, None))
+            ahead.watch(BitProgress(Phase.RUNNING, tenth / 10.0, TEST.duration, 0, None))
         assert all(taken.acquire(timeout=60.0) for _ in range(due))
         assert ahead.finish(Deadline(60.0), threading.Event())
     assert due == 4
@@ -102,17 +101,17 @@ class Numbered:
         return table
 
 
-def watched(ahead: Ahead, session: Blocked) -> None:
+def watched(ahead: EarlyIdentification, session: Blocked) -> None:
     """Let every snapshot fall due; the first one is at work then, the others wait."""
     for at in session.due_s(TEST):
-        ahead.watch(Progress(Phase.RUNNING, at + 0.05, 1.0, 0, None))
+        ahead.watch(BitProgress(Phase.RUNNING, at + 0.05, 1.0, 0, None))
         assert session.begun.wait(60.0)
 
 
 def test_the_end_does_not_wait_for_stale_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
     session: Any = Blocked()
     assembler: Any = Numbered()
-    with working_ahead(session, assembler, TEST) as ahead:
+    with early_identification(session, assembler, TEST) as ahead:
         watched(ahead, session)
         join = ahead._thread.join
 
@@ -134,13 +133,13 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
         told.append("finish")
         raise KeyboardInterrupt
 
-    def abandon(ahead: Ahead) -> None:
+    def abandon(ahead: EarlyIdentification) -> None:
         told.append("abandon")
         leave(ahead)
 
-    leave = Ahead.abandon
-    monkeypatch.setattr(Ahead, "finish", interrupted)
-    monkeypatch.setattr(Ahead, "abandon", abandon)
+    leave = EarlyIdentification.abandon
+    monkeypatch.setattr(EarlyIdentification, "finish", interrupted)
+    monkeypatch.setattr(EarlyIdentification, "abandon", abandon)
     result = run("bit", "--simulate", "--fast", "--json", "--test", "open", "--record", "a.blf")
     assert (result.code, told) == (30, ["finish", "abandon"])
     assert result.objects[0]["reasons"] == ["stopped by the user"]
@@ -149,7 +148,7 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
 def test_the_wait_for_what_runs_ahead_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     online: Any = Blocked()
     assembler: Any = Numbered()
-    with working_ahead(online, assembler, TEST) as ahead:
+    with early_identification(online, assembler, TEST) as ahead:
         watched(ahead, online)
         assert not ahead.finish(Deadline(0.01), threading.Event())
         stop = threading.Event()
@@ -160,34 +159,36 @@ def test_the_wait_for_what_runs_ahead_has_an_end(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_test_that_is_all_there_needs_no_more_listening() -> None:
-    with working_ahead(a_session(), heard("paper-open-1.blf"), TEST) as ahead:
+    with early_identification(a_session(), assembler_of("paper-open-1.blf"), TEST) as ahead:
         assert ahead.all_there()
         assert ahead.finish(Deadline(60.0), threading.Event())
-    assert ahead.whole is not None
-    assert ahead.whole.outcome.state is BitState.COMPLETE
+    assert ahead.complete_recording is not None
+    assert ahead.complete_recording.outcome.state is BitState.COMPLETE
     assert ahead.ended_at is not None
 
 
 @pytest.mark.parametrize(("without", "before"), [(1, 0), (1, 49), (40, 0)])
 def test_frames_that_are_missing_may_be_under_way(without: int, before: int) -> None:
-    log = heard("paper-open-1.blf", without=without, before=before)
-    with working_ahead(a_session(), log, TEST) as ahead:
+    log = assembler_of("paper-open-1.blf", without=without, before=before)
+    with early_identification(a_session(), log, TEST) as ahead:
         assert not ahead.all_there()
         ahead.abandon()
-    assert ahead.whole is None
+    assert ahead.complete_recording is None
 
 
 def test_what_may_be_under_way() -> None:
-    assert nothing_is_under_way(heard("paper-open-1.blf").recording(), TEST)
-    assert not nothing_is_under_way(heard("paper-open-1.blf").recording(), resolve_test("closed"))
-    lossy = heard("lossy-open.blf").recording()
+    assert is_complete_recording(assembler_of("paper-open-1.blf").recording(), TEST)
+    assert not is_complete_recording(
+        assembler_of("paper-open-1.blf").recording(), resolve_test("closed")
+    )
+    lossy = assembler_of("lossy-open.blf").recording()
     assert np.isnan(lossy.samples.spool).sum() > 50
-    assert nothing_is_under_way(lossy, TEST), "none of its last samples is lost"
-    lost = heard("paper-open-1.blf", without=3, before=50).recording()
+    assert is_complete_recording(lossy, TEST), "none of its last samples is lost"
+    lost = assembler_of("paper-open-1.blf", without=3, before=50).recording()
     assert not np.isfinite(lost.samples.spool).all()
-    assert nothing_is_under_way(lost, TEST), "lost for good"
-    blind = heard("paper-open-1.blf").recording()
+    assert is_complete_recording(lost, TEST), "lost for good"
+    blind = assembler_of("paper-open-1.blf").recording()
     blind = replace(blind, samples=replace(blind.samples, position=np.full(TEST.ticks, np.nan)))
-    assert nothing_is_under_way(blind, TEST), "a channel that is not on this bus"
-    running = heard("paper-open-1.blf", until=BitState.RUNNING).recording()
-    assert not nothing_is_under_way(running, TEST)
+    assert is_complete_recording(blind, TEST), "a channel that is not on this bus"
+    running = assembler_of("paper-open-1.blf", until=BitState.RUNNING).recording()
+    assert not is_complete_recording(running, TEST)

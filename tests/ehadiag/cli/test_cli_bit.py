@@ -1,4 +1,7 @@
-"""`ehadiag bit` on a bus: verdicts, refusals, silence, other testers."""
+"""`ehadiag bit` on a bus: verdicts, refusals, silence, other testers.
+
+A time limit ends a search between two of its steps, wherever it runs out.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +14,23 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import can
+import can.interfaces.virtual
 import pytest
 from cli_result import Run
+from identify_cases import own_experiment
 from places import LOGS, ROOT
 
-from ehadiag.cli.simulator import emulator_beside
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import BitState
-from ehadiag.core.stored_test import bundled_tests
-from ehadiag_sim.fcc.computer import FccCore
-from firmware_iface.codec.encode import Encoder
+from ehadiag import NotTestedError, bundled_tests, default_actuator
+from ehadiag.identify.identification_session import NuisanceMode, identify
+from ehadiag.model.residual_models import SimdModel
+from ehadiag.setup import Deadline
+from ehadiag_sim.emulator import FccCore, emulator_in_thread
+from firmware_iface.codec import Encoder
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from firmware_iface.recording import BitState
+from firmware_iface.transport.adapters import BusOptions
+from firmware_iface.transport.frames import Frame
+from firmware_iface.transport.python_can import PythonCanTransport
 
 FAST = ("bit", "--simulate", "--fast", "--json")
 NAMES = ("Kintas", "FSS", "FDJ")
@@ -41,7 +49,7 @@ def computer(channel: str) -> Iterator[FccCore]:
     with ExitStack() as stack:
         bus = PythonCanTransport(BusOptions("virtual", channel), transmit=True)
         stack.enter_context(bus)
-        stack.enter_context(emulator_beside(core, bus))
+        stack.enter_context(emulator_in_thread(core, bus))
         yield core
 
 
@@ -49,7 +57,7 @@ def computer(channel: str) -> Iterator[FccCore]:
     ("test", "faults", "verdict", "code"),
     [
         ("open", (0.1, 0.05, 0.2), "HEALTHY", 0),
-        ("open", (0.1, 0.5, 0.2), "DEGRADED", 10),
+        pytest.param("open", (0.1, 0.5, 0.2), "DEGRADED", 10, marks=pytest.mark.slow),
         ("closed", (0.2, 0.1, 0.9), "FAULT", 20),
     ],
 )
@@ -57,7 +65,7 @@ def test_verdict_on_the_simulated_actuator(
     test: str, faults: tuple[float, float, float], verdict: str, code: int, run: Run
 ) -> None:
     options = [f"--{name}={value}" for name, value in zip(NAMES, faults, strict=True)]
-    result = run(*FAST, "--test", test, *options, "--serial-number", 815)
+    result = run(*FAST, "--test", test, *options, "--unit", 815)
     (found,) = result.objects
     assert (found["verdict"], result.code) == (verdict, code)
     assert (found["test"], found["serial"]) == (test, 815)
@@ -79,6 +87,7 @@ def test_everything_is_written_and_the_recording_gives_the_same_digits(
     assert again.objects[0]["quality"] == result.objects[0]["quality"]
 
 
+@pytest.mark.slow
 def test_the_simulated_noise_follows_its_seed(run: Run) -> None:
     one, again, other = (
         run(*FAST, "--test", "open", "--FDJ", 0.3, "--simulator-seed", seed).objects[0]["faults"]
@@ -134,7 +143,7 @@ def test_exceeded_limit_aborts(run: Run) -> None:
 def test_computer_that_does_not_know_the_test_refuses(
     run: Run, computer: FccCore, channel: str, tmp_path: Path
 ) -> None:
-    data = (ROOT / "ehadiag/data/tests/open.toml").read_text()
+    data = (ROOT / "firmware_iface/data/tests/open.toml").read_text()
     (tmp_path / "own.toml").write_text(data.replace("id = 1", "id = 77"))
     result = run("bit", "--json", "--test", "own.toml", "-i", "virtual", "-c", channel)
     assert (result.code, result.objects[0]["reasons"]) == (30, ["refused: unknown test"])
@@ -178,23 +187,25 @@ def test_busy_computer(run: Run, computer: FccCore, channel: str) -> None:
     with PythonCanTransport(BusOptions("virtual", channel), transmit=True) as other:
         for frame in Encoder().request("start", 2, 0):
             other.send(frame)
-        deadline = time.monotonic() + 10.0
         while computer.state is not BitState.RUNNING:
-            assert time.monotonic() < deadline
             time.sleep(0.01)
         result = run("bit", "--json", "--test", "open", "-i", "virtual", "-c", channel)
     assert result.code == 30
     assert result.objects[0]["reasons"] == ["test 2 of another tester is running"]
 
 
+@pytest.mark.slow  # a whole test in real time
 def test_listening_sends_nothing(run: Run, computer: FccCore, channel: str) -> None:
     def request() -> None:
+        while len(can.interfaces.virtual.channels[channel]) == buses:  # nobody listens yet
+            time.sleep(0.01)
         with PythonCanTransport(BusOptions("virtual", channel), transmit=True) as other:
             for frame in Encoder().request("start", 1, 0):
                 other.send(frame)
 
-    starter = threading.Timer(1.0, request)
+    starter = threading.Thread(target=request, daemon=True)
     with can.Bus(interface="virtual", channel=channel) as witness:
+        buses = len(can.interfaces.virtual.channels[channel])
         starter.start()
         result = run("bit", "--json", "--listen", "--test", "open", "-i", "virtual", "-c", channel)
         starter.join()
@@ -218,7 +229,7 @@ def test_check_bus_says_how_long_a_bus_was_silent(run: Run, channel: str) -> Non
     result = run("check-bus", "-i", "virtual", "-c", channel, "--duration", "0.2")
     assert result.code == 30
     first, *_, last = result.out.splitlines()
-    assert first == f"listened to virtual {channel} for 0.2 s, sent nothing"
+    assert re.fullmatch(rf"listened to virtual {channel} for \d+\.\d s, sent nothing", first)
     assert last == "the bus is silent"
 
 
@@ -232,7 +243,9 @@ def test_check_bus_reads_logs(run: Run) -> None:
 def test_replay_puts_every_frame_on_the_bus(run: Run, channel: str) -> None:
     log = LOGS / "paper-open-1.blf"
     with can.Bus(interface="virtual", channel=channel) as listener:
-        result = run("replay", log, "-i", "virtual", "-c", channel, "--speed", "0")
+        result = run(
+            "replay", log, "-i", "virtual", "-c", channel, "--speed", "0", "--with-requests"
+        )
         heard = []
         while (message := listener.recv(0)) is not None:
             heard.append((message.arbitration_id, bytes(message.data)))
@@ -248,3 +261,70 @@ def test_sim_ends_by_itself(run: Run, channel: str) -> None:
     first, last = result.err.splitlines()
     assert first.startswith(f"ehadiag: flight-control computer on virtual {channel}, tests ")
     assert re.fullmatch(r"ehadiag: stopped after \d+ ticks, 0 tests started", last)
+
+
+TICK_S = 2e-7
+"""What a tick of a run takes by the clock of these tests, 1 to 2 ms for a whole test: twice what it
+takes a slow machine."""
+OVERSHOOT_S = 0.15
+
+
+class Clock:
+    """A clock that only runs of the model move on."""
+
+    def __init__(self, patched: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        for name in ("residuals", "costs"):
+            patched.setattr(SimdModel, name, self._timed(getattr(SimdModel, name)))
+
+    def __call__(self) -> float:
+        return self.now
+
+    def _timed(self, run):
+        def timed(model, points, *rest):
+            self.now += TICK_S * len(points) * len(model.batch.current)
+            return run(model, points, *rest)
+
+        return timed
+
+
+@pytest.mark.parametrize(
+    ("nuisances", "limit", "stage"),
+    [
+        (NuisanceMode.AUTO, 0.05, "search"),
+        (NuisanceMode.AUTO, 0.18, "refinement"),
+        (NuisanceMode.ALL, 0.27, "nuisances"),
+        (NuisanceMode.ALL, 0.3, "nuisances"),
+    ],
+)
+def test_a_search_ends_soon_after_its_time(
+    nuisances: NuisanceMode, limit: float, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    deadline = Deadline(limit, clock)
+    tell = deadline.watch(lambda _stage, _share: None)
+    with pytest.raises(NotTestedError, match=f"given up in the {stage}"):
+        identify([own_experiment((0.3, 0.4, 0.2))], nuisances=nuisances, progress=tell)
+    assert deadline.passed
+    assert clock.now < limit + OVERSHOOT_S
+
+
+def test_a_computer_too_busy_to_simulate_is_not_the_actuators_fault(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = FccCore.step
+    ticks = 0
+
+    def slow(core: FccCore) -> list[Frame]:
+        nonlocal ticks
+        ticks += 1
+        if ticks > 600:
+            time.sleep(0.3)
+        return step(core)
+
+    monkeypatch.setattr(FccCore, "step", slow)
+    (found,) = run("bit", "--simulate", "--json", "--test", "open").objects
+    assert found["verdict"] == "NOT_TESTED"
+    (reason,) = found["reasons"]
+    assert reason.startswith("this computer is too busy to simulate in real time")
+    assert "--fast" in reason

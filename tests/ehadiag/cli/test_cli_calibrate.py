@@ -1,7 +1,11 @@
-"""`ehadiag calibrate`: its file, its table, its JSON object, and what it refuses."""
+"""`ehadiag calibrate`: its file, its table, its JSON object, and what it refuses.
+
+`ehadiag design` as a user calls it.
+"""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -9,7 +13,8 @@ import pytest
 from cli_result import REPOSITORY, Run
 from places import LOGS
 
-from ehadiag.core.actuator import load_actuator
+from ehadiag import load_actuator, load_test
+from ehadiag.cli.main import main
 
 OPEN, CLOSED = LOGS / "healthy-open.blf", LOGS / "healthy-closed.blf"
 
@@ -66,3 +71,49 @@ def test_a_unit_is_learned_and_diagnosed_with_its_file(run: Run) -> None:
     assert after.code == 10
     assert "actuator calibrated on" in after.out
     assert run("diagnose", "--actuator", "new/unit.toml", "--tolerance", 0.05, OPEN).code == 2
+
+
+def test_the_score_is_a_table(capsys):
+    assert main(["design", "--test", "closed"]) == 0
+    out = capsys.readouterr().out
+    assert "test closed:" in out
+    assert "FSS alone, %" in out
+    assert "travel 10." in out
+
+
+def test_a_better_test_is_written_and_told(tmp_path, capsys):
+    file = tmp_path / "better.toml"
+    code = main(["design", "--out", str(file), "--budget", "25", "--seed", "1", "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert told["schema"] == "ehadiag.design/1"
+    assert told["file"] == str(file)
+    assert told["proposed"]["figure"] < told["scored"]["figure"]
+    test = load_test(file)
+    assert (test.name, test.id) == ("open-designed", 101)
+    assert "seed 1" in test.description
+    # Not a second time over it.
+    assert main(["design", "--out", str(file), "--budget", "13"]) == 3
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_limits_that_nothing_keeps_are_told(tmp_path, capsys):
+    file = tmp_path / "none.toml"
+    assert main(["design", "--out", str(file), "--budget", "13", "--max-travel", "0.001"]) == 0
+    assert "all exceed the limits" in capsys.readouterr().err
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--id", "300", "--out", "x.toml"], "need 1 … 255"),
+        (["--test", "nothing"], "neither a stored test"),
+        (["--name", "n" * 65, "--out", "x.toml"], "64 characters"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, said, capsys):
+    assert main(["design", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1

@@ -1,18 +1,40 @@
-"""Defaults from files and variables, templates, completion, `-v`."""
+"""Defaults from files and variables, templates, completion, `-v`.
+
+Options of the simulated unit: every effect has one, in its unit, and does what it says.
+"""
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cli_result import COMMAND, Run
 from places import LOGS
 
 import ehadiag
-from ehadiag.cli.main import _parser_and_commands
+from ehadiag import CommandMode, bundled_tests, default_actuator
+from ehadiag.cli.main import parser_and_commands
+from ehadiag.cli.simulator_options import (
+    DATA_ERROR_NAMES,
+    add_simulator_options,
+    simulator_settings,
+)
+from ehadiag_sim.conditions import (
+    DataErrors,
+    Effects,
+    Faults,
+    Sensors,
+    UnmodelledEffects,
+    condition_options,
+)
+from ehadiag_sim.emulator import emulated_computer
+from firmware_iface.bus_map import default_map
 
 HEALTHY = LOGS / "healthy-open.blf"
 
@@ -66,7 +88,7 @@ def test_files_are_looked_for_beside_the_users_own_defaults(run: Run, own: Path)
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("seed = -1\n", "a seed is a whole number"),
+        ("seed = -1\n", "need a whole number, 0 …"),
         ('solver = "guess"\n', "is none of cga, pygad"),
         ("json = 3\n", "need true or false"),
         ("diagnose = 3\n", "need a table [diagnose]"),
@@ -113,7 +135,7 @@ def test_verbs_and_options_that_exclude_each_other_have_defaults(
     run: Run, own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run("history", "init", "--history", "h.sqlite")
-    monkeypatch.setenv("EHADIAG_SERIAL", "7")
+    monkeypatch.setenv("EHADIAG_UNIT", "7")
     own.write_text('[history]\nhistory = "h.sqlite"\n[export]\nfmu = true\nlist = false\n')
     result = run("history", "plot", "--out", "x.png")
     assert "serial 7: no diagnosis with severities" in result.message
@@ -236,5 +258,108 @@ def test_verbose_tells_versions_and_options(environment: dict[str, str], tmp_pat
 
 
 def test_every_command_takes_verbose() -> None:
-    commands = _parser_and_commands()[1]
+    commands = parser_and_commands()[1]
     assert all("-v" in command._option_string_actions for command in commands.values())
+
+
+FAST = ("bit", "--simulate", "--fast", "--json", "--record", "a.blf", "--test", "open")
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    add_simulator_options(parser)
+    return parser.parse_args([*words])
+
+
+def test_every_condition_has_an_option() -> None:
+    kinds = (Faults, Effects, Sensors, UnmodelledEffects)
+    found = [item.field for kind in kinds for item in condition_options(kind)]
+    named = {item.name for kind in kinds for item in fields(kind)}
+    assert set(found) | {"data", "unmodelled", "return_pressure"} == named
+    assert len(found) == len(set(found))
+    assert set(DATA_ERROR_NAMES) == {item.name for item in fields(DataErrors)}
+
+
+def test_without_options_there_is_no_effect() -> None:
+    settings = simulator_settings(parsed())
+    found = settings["faults"], settings["effects"], settings["sensors"]
+    assert found == (Faults(), Effects(), Sensors())
+
+
+@pytest.mark.parametrize(
+    ("kind", "item"),
+    [
+        (kind, item)
+        for kind in (Faults, Effects, Sensors, UnmodelledEffects)
+        for item in condition_options(kind)
+        if item.default == 0.0
+    ],
+    ids=lambda value: getattr(value, "flag", ""),
+)
+def test_values_are_in_the_unit_of_the_name(kind, item, tmp_path) -> None:
+    settings = simulator_settings(
+        in_scenario(tmp_path, f"{item.flag[2:].replace('-', '_')} = 0.02")
+    )
+    unmodelled = settings["effects"].unmodelled
+    holder = next(found for found in (*settings.values(), unmodelled) if isinstance(found, kind))
+    assert getattr(holder, item.field) == pytest.approx(0.02 * item.scale)
+
+
+def in_scenario(folder, text: str, *words: str) -> argparse.Namespace:
+    (folder / "scenario.toml").write_text(text)
+    return parsed("--simulate", str(folder / "scenario.toml"), *words)
+
+
+def test_sensors_data_and_plays_arrive_and_the_command_line_overrules(tmp_path) -> None:
+    text = "early_ms = 0.1\nsupply_error_MPa = -0.1\nsensor_gains = [0, 0.01, -0.01, 0.002]\n"
+    text += "plays = 8\nFSS = 0.1\nnoise = 3\ndata_error = { GM = 0.02, MJ = -0.03 }\n"
+    words = ["--offsets", "1", "2", "3", "4", "--noise", "0.25", "--supply", "21", "--fss", "0.5"]
+    settings = simulator_settings(in_scenario(tmp_path, text, *words))
+    sensors, effects = settings["sensors"], settings["effects"]
+    assert sensors.gains == (0.0, 0.01, -0.01, 0.002)
+    assert (sensors.offsets_lsb, sensors.noise_lsb) == ((1.0, 2.0, 3.0, 4.0), 0.25)
+    assert (sensors.early, sensors.supply_error) == pytest.approx((0.1e-3, -0.1e6))
+    assert (effects.plays, effects.data) == (8, DataErrors(GM=0.02, MJ=-0.03))
+    assert (effects.supply_pressure, settings["faults"].FSS) == (21e6, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("hysteresis = 2", "hysteresis: 2 is outside 0 … 1"),
+        ("plays = 0", "plays: 0 is outside 1 … 256"),
+        ("plays = 1.5", "scenario s.toml: plays: 1.5 is no such number"),
+        ("sensor_gains = [0.1]", "need 4 numbers"),
+        ("data_error = 1", "need a table"),
+        ("data_error = { XX = 1 }", "XX = 1: need a fraction of one of GM, "),
+        ('data_error = { GM = "x" }', "GM = 'x': need a fraction"),
+        ("early_ms = 1", "early"),
+        ('broken = "bent-rod"', "not one of seized-spool"),
+        ("null_bias_mA = nan", "null_bias"),
+        ("null_bais_mA = 1", "there is no key null_bais_mA, did you mean null_bias_mA?"),
+    ],
+)
+def test_wrong_values_are_one_line(text, says, run, tmp_path) -> None:
+    (tmp_path / "s.toml").write_text(text)
+    result = run("bit", "--fast", "--json", "--test", "open", "--simulate", "s.toml")
+    assert result.code == 2
+    assert says in result.err
+    assert len(result.err.strip().splitlines()) == 1
+
+
+def spool_codes(folder, text: str = "") -> list[int]:
+    """Of the emulated computer's actuator under a sine of 4 mA."""
+    settings = simulator_settings(in_scenario(folder, text))
+    core = emulated_computer(
+        default_actuator(), bundled_tests().values(), default_map(), **settings
+    )
+    drive = 4e-3 * np.sin(0.1 * np.arange(100))
+    return [int(core.plant.tick(float(x), CommandMode.CURRENT)[1]) for x in drive]
+
+
+def test_scenarios_reach_the_actuator_of_the_computer(tmp_path) -> None:
+    plain = spool_codes(tmp_path)
+    assert spool_codes(tmp_path) == plain
+    for text in ("null_bias_mA = 0.2", "data_error = { GM = 0.05 }", "torque_cubic = 0.3"):
+        assert np.abs(np.subtract(spool_codes(tmp_path, text), plain)).max() > 10
+    assert np.ptp(spool_codes(tmp_path, 'broken = "dead-spool"')) < 10

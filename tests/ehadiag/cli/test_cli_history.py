@@ -15,7 +15,7 @@ import pytest
 from cli_result import Result, Run
 from places import LOGS
 
-from ehadiag.history.counted import NEAR_S
+from ehadiag.history.records import MAX_DATE_ROUNDING_S
 
 HEALTHY = LOGS / "healthy-open.blf"
 WORN = LOGS / "paper-open-4.blf"
@@ -64,9 +64,9 @@ def test_the_users_own_history_is_kept_once_it_was_begun(run: Run) -> None:
 
 
 def test_a_simulated_unit_goes_into_a_named_history_only(run: Run) -> None:
-    bit = ("bit", "--simulate", "--fast", "--json", "--test", "open", "--serial-number", 9)
+    bit = ("bit", "--simulate", "--fast", "--json", "--test", "open", "--unit", 9)
     run("history", "init")
-    assert run(*bit).code == 0
+    assert run(*bit, "--supply", 10).code == 30  # refused, which is kept as well
     assert run("history", "list", "--json").objects == []
     assert run(*bit, "--history", "h.sqlite", "--hours", 3).code == 0
     (found,) = listed(run)
@@ -115,7 +115,7 @@ def test_events_are_listed_with_the_diagnoses(run: Run) -> None:
     history = ("--history", "h.sqlite")
     run("diagnose", *history, HEALTHY)
     event = run(
-        "history", "event", "--serial", 1, "filter\x1b[31m changed", "--hours", 30,
+        "history", "event", "--unit", 1, "filter\x1b[31m changed", "--hours", 30,
         "--resets", "Kintas", "--when", "2026-03-01", *history,
     )  # fmt: skip
     assert event.code == 0
@@ -130,7 +130,7 @@ def test_events_are_listed_with_the_diagnoses(run: Run) -> None:
 def test_what_is_withdrawn_counts_no_more_and_stays(run: Run) -> None:
     history = ("--history", "h.sqlite")
     run("diagnose", *history, HEALTHY, WORN)
-    run("history", "event", "--serial", 1, "filter changed", *history)
+    run("history", "event", "--unit", 1, "filter changed", *history)
     for kind in ("event", "diagnosis"):
         said = run("history", "withdraw", kind, 1, "=of unit\x1b[31m 8", *history)
         assert (said.code, "\x1b" in said.out) == (0, False)
@@ -151,13 +151,14 @@ def test_what_is_withdrawn_counts_no_more_and_stays(run: Run) -> None:
         assert words in again.err
 
 
+@pytest.mark.slow
 def test_two_tests_of_a_simulated_unit_count_both(run: Run) -> None:
     """Their noise has the same seed, so their samples are the same."""
     for hours in (10, 20):
         run("bit", "--simulate", "--fast", "--test", "open", "--history", "h.sqlite",
             "--hours", hours, "--no-picture")  # fmt: skip
         # No real test is over so soon: dates nearer than this are taken for one.
-        time.sleep(NEAR_S)
+        time.sleep(MAX_DATE_ROUNDING_S)
     found = listed(run)
     assert [item["hours"] for item in found] == [10, 20]
     first, second = (
@@ -181,16 +182,16 @@ def test_plot_draws_a_picture(run: Run) -> None:
     history = ("--history", "h.sqlite")
     for hours, log in ((10, HEALTHY), (200, WORN)):
         run("diagnose", *history, "--hours", hours, log)
-    run("history", "event", "--serial", 1, "$oiled", "--hours", 100, *history)
-    assert run("history", "plot", *history, "--serial", 1, "--out", "h.png").code == 0
+    run("history", "event", "--unit", 1, "$oiled", "--hours", 100, *history)
+    assert run("history", "plot", *history, "--unit", 1, "--out", "h.png").code == 0
     assert Path("h.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
 def test_the_largest_serial(run: Run) -> None:
     largest = (1 << 63) - 1
     run("history", "init", *GOOD)
-    assert run("history", "event", "--serial", largest, "oiled", *GOOD).code == 0
-    listed = run("history", "list", "--serial", largest, "--json", *GOOD).objects
+    assert run("history", "event", "--unit", largest, "oiled", *GOOD).code == 0
+    listed = run("history", "list", "--unit", largest, "--json", *GOOD).objects
     assert [item["serial"] for item in listed] == [largest]
 
 
@@ -206,22 +207,22 @@ def test_the_largest_serial(run: Run) -> None:
         (("history", "list", "--history", "none"), 2, "begin one by ehadiag history init"),
         (("history", "show", "5", *GOOD), 2, "has no diagnosis 5"),
         (
-            ("history", "plot", "--serial", "5", "--out", "x.png", *GOOD),
+            ("history", "plot", "--unit", "5", "--out", "x.png", *GOOD),
             2,
             "serial 5",
         ),
         (
-            ("history", "event", "--serial", "5", "a", "--resets", "x", *GOOD),
+            ("history", "event", "--unit", "5", "a", "--resets", "x", *GOOD),
             2,
             "FSS",
         ),
-        (("history", "event", "--serial", "5", "a", "--when", "x", *GOOD), 2, "8601"),
+        (("history", "event", "--unit", "5", "a", "--when", "x", *GOOD), 2, "8601"),
         (("history", "export", "--out", "no/x.csv", *GOOD), 3, "No such file"),
-        (("history", "list", "--serial", "9" * 20, *GOOD), 2, "serial number is a whole number"),
-        (("history", "list", "--serial", 1 << 63, *GOOD), 2, "0 … 9223372036854775807"),
-        (("history", "event", "--serial", "-1", "a", *GOOD), 2, "whole number"),
-        (("history", "event", "--serial", "9" * 5000, "a", *GOOD), 2, "whole number"),
-        (("rul", "--serial", "9" * 20, *GOOD), 2, "serial number is a whole number"),
+        (("history", "list", "--unit", "9" * 20, *GOOD), 2, "serial number is a whole number"),
+        (("history", "list", "--unit", 1 << 63, *GOOD), 2, "0 … 9223372036854775807"),
+        (("history", "event", "--unit", "-1", "a", *GOOD), 2, "whole number"),
+        (("history", "event", "--unit", "9" * 5000, "a", *GOOD), 2, "whole number"),
+        (("rul", "--unit", "9" * 20, *GOOD), 2, "serial number is a whole number"),
     ],
 )
 def test_wrong_usage_is_one_line(

@@ -10,25 +10,34 @@ import re
 import shlex
 import shutil
 import sys
+from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jsonschema
+import msgspec
 import pytest
 from cli_result import Run
 from places import LOGS, ROOT
+from stored_results import LINES, former_result
 from two_actuators import write_log, write_mappings
 
-from ehadiag.cli.batch.row import COLUMNS
-from ehadiag.cli.batch.summary import Summary, worst_code
+from ehadiag.batch.result_files import (
+    BatchSummary,
+    junit_report,
+    result_columns,
+    summary_lines,
+)
+from ehadiag.result import Result
+from ehadiag.terminal.output import worst_exit_code
 
 HEALTHY = LOGS / "healthy-open.blf"
 WORN = LOGS / "paper-open-4.blf"
 
 
 def valid(tree: dict[str, Any]) -> bool:
-    schema = resources.files("ehadiag").joinpath("data/schemas/diagnosis-2.json").read_text()
+    schema = resources.files("ehadiag").joinpath("data/schemas/diagnosis-3.json").read_text()
     jsonschema.Draft202012Validator(json.loads(schema)).validate(tree)
     return True
 
@@ -115,7 +124,7 @@ def test_tables_and_report_are_read_by_others(folder: Path, run: Run) -> None:
     assert [json.loads(line) for line in Path("r.jsonl").read_text().splitlines()] == objects
     with Path("r.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == list(COLUMNS)
+    assert list(rows[0]) == list(result_columns())
     assert [row["verdict"] for row in rows] == ["HEALTHY", "DEGRADED", ""]
     assert float(rows[1]["FSS"]) == objects[1]["faults"]["FSS"]["estimate"]
     table = pandas.read_parquet("r.parquet")
@@ -123,6 +132,27 @@ def test_tables_and_report_are_read_by_others(folder: Path, run: Run) -> None:
     assert table["error"][2] == objects[2]["error"]["text"]
     (suite,) = junitparser.JUnitXml.fromfile("r.xml")
     assert (suite.tests, suite.failures, suite.errors, suite.skipped) == (3, 1, 1, 0)
+    assert suite.hostname
+    assert datetime.fromisoformat(suite.timestamp) <= datetime.now(UTC).replace(tzinfo=None)
+
+
+@pytest.mark.parametrize(("kind", "counts"), [("skipped", (0, 1)), ("error", (1, 0))])
+def test_not_tested_is_what_the_build_server_is_to_see(tmp_path: Path, kind: str, counts: object):
+    import junitparser
+
+    result = Result.from_json(LINES[4])
+    with junit_report(str(tmp_path / "r.xml"), kind) as take:
+        take(result)
+    (suite,) = junitparser.JUnitXml.fromfile(str(tmp_path / "r.xml"))
+    assert (suite.errors, suite.skipped) == counts
+
+
+def test_a_summary_says_how_many_more_there_are():
+    summary = BatchSummary(30)
+    for number in range(30):
+        summary.take(msgspec.structs.replace(Result.from_json(LINES[4]), source=f"{number}.blf"))
+    lines = summary_lines(summary.tree(30, 1))
+    assert lines[-1] == "and 20 more NOT TESTED"
 
 
 def test_a_call_goes_on_where_another_stopped(folder: Path, run: Run) -> None:
@@ -173,7 +203,7 @@ def test_whatever_decides_a_result_decides_whether_it_is_taken(run: Run) -> None
     log = Path("d.blf")
     log.write_bytes(b"no recording")
     for name, package, source, word in (
-        ("mine.toml", "ehadiag", "tests/open.toml", ("0.7, 1.5", "0.7, 1.6")),
+        ("mine.toml", "firmware_iface", "tests/open.toml", ("0.7, 1.5", "0.7, 1.6")),
         ("unit.toml", "ehadiag", "actuator.toml", ("MJ  = 150", "MJ  = 151")),
         ("bus.toml", "firmware_iface", "eha_fcc.toml", ("tick_ms = 1.0", "tick_ms = 1.5")),
         ("eha_fcc.dbc", "firmware_iface", "eha_fcc.dbc", ("", "")),
@@ -191,7 +221,7 @@ def test_whatever_decides_a_result_decides_whether_it_is_taken(run: Run) -> None
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        (["--results", "r.txt"], "need a name in .jsonl, .csv or .parquet"),
+        (["--results", "r.txt"], "need a name in .jsonl, .csv, .parquet"),
         (["--joint", "--summary", "s.json"], "--joint gives one result"),
         (["--cluster", "tcp://127.0.0.1:1", "--jobs", 2], "a cluster has its own number"),
     ],
@@ -208,17 +238,6 @@ def test_a_report_that_cannot_be_written_keeps_the_verdict(run: Run) -> None:
     assert result.objects[0]["verdict"] == "HEALTHY"
     assert result.code == 3
     assert "summary s.json: Is a directory" in result.message
-
-
-def test_the_first_version_on_request(run: Run) -> None:
-    new = run("diagnose", "--json", HEALTHY, "missing.blf").objects
-    old = run("diagnose", "--json", "--json-version", 1, HEALTHY, "missing.blf").objects
-    assert [item["schema"] for item in old] == ["ehadiag.diagnosis/1"]
-    assert len(new) == 2
-    assert set(old[0]) < set(new[0])
-    for key in set(old[0]) - {"schema", "timing_s", "fit"}:
-        assert old[0][key] == new[0][key]
-    assert set(old[0]["fit"]) < set(new[0]["fit"])
 
 
 def test_same_names_of_other_folders_are_not_overwritten(
@@ -259,24 +278,20 @@ def test_the_page_works_as_typed(run: Run, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_the_worst_code() -> None:
-    assert worst_code({0, 10, 30, 3, 20}) == 20
-    assert worst_code({0, 10, 30, 2}) == 3
-    assert worst_code({0, 10, 30}) == 30
-    assert worst_code(set()) == 0
+    assert worst_exit_code({0, 10, 30, 3, 20}) == 20
+    assert worst_exit_code({0, 10, 30, 2}) == 3
+    assert worst_exit_code({0, 10, 30}) == 30
+    assert worst_exit_code(set()) == 0
 
 
 def test_a_summary_does_not_grow() -> None:
-    summary = Summary(1000)
+    summary = BatchSummary(1000)
     for number in range(1000):
-        summary.take(
-            {
-                "error": {"text": "no"} if number % 2 else None,
-                "verdict": "FAULT",
-                "source": f"{number}.blf",
-                "serial": number // 4,
-                "faults": {"FSS": {"estimate": number / 1000, "interval95": [0.0, 1.0]}},
-            }
-        )
+        found = former_result({"FSS": number / 1000}, serial=number // 4, verdict="FAULT")
+        found |= {"source": f"{number}.blf"}
+        if number % 2:
+            found["error"] = {"text": "no", "exit_code": 3, "log": None}
+        summary.take(Result.from_json(json.dumps(found)))
     tree = summary.tree(20, 1)
     assert len(tree["failures"]) == 100
     assert [item["serial"] for item in tree["worst"]] == list(range(249, 239, -1))

@@ -15,14 +15,15 @@ import can
 import pytest
 from cli_result import REPOSITORY, Run
 from places import LOGS
+from stored_results import former_result
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.stored_test import bundled_tests
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.plant.conditions import Faults
-from firmware_iface.codec.encode import Encoder
+from ehadiag import bundled_tests, default_actuator
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.emulator import FccCore
+from firmware_iface.codec import Encoder
 from firmware_iface.logs.reader import read_frames
-from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from firmware_iface.transport.adapters import BusOptions
+from firmware_iface.transport.python_can import PythonCanTransport
 
 HEALTHY, WORN = LOGS / "healthy-open.blf", LOGS / "paper-open-2.blf"
 
@@ -89,9 +90,9 @@ def test_a_history_knows_the_unit_by_the_serial_number_on_the_bus(run: Run, tmp_
     assert unit["event"] == "unit"
     assert unit["severities"]["FSS"] == pytest.approx(0.6, abs=0.02)
     serial = unit["serial"]
-    named = run("monitor", "--log", WORN, "--history", "h.sqlite", "--serial-number", serial)
+    named = run("monitor", "--log", WORN, "--history", "h.sqlite", "--unit", serial)
     assert named.code == 0
-    other = run("monitor", "--log", WORN, "--history", "h.sqlite", "--serial-number", 999)
+    other = run("monitor", "--log", WORN, "--history", "h.sqlite", "--unit", 999)
     assert (other.code, "no diagnosis of serial number 999" in other.err) == (2, True)
 
 
@@ -108,12 +109,9 @@ def test_a_unit_that_the_history_does_not_know_is_taken_as_new_and_said(run: Run
         ("", "is none of ehadiag's JSON results"),
         ("[]", "is none of ehadiag's JSON results"),
         ('{"schema": "other/1"}', "its schema is other/1"),
-        ('{"schema": "ehadiag.diagnosis/2", "actuator": "left"}', "of actuator left"),
-        (
-            '{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": null}',
-            "holds no severities",
-        ),
-        ('{"schema": "ehadiag.diagnosis/2", "actuator": "reference-31", "fit": {}}', "is none of"),
+        (json.dumps(former_result(actuator="left")), "of actuator left"),
+        (json.dumps(former_result(fit=None)), "holds no severities"),
+        (json.dumps(former_result(fit={})), "is none of"),
     ],
 )
 def test_what_is_no_result_is_refused(run: Run, tmp_path: Path, content: str, said: str) -> None:
@@ -129,7 +127,7 @@ def test_what_is_no_result_is_refused(run: Run, tmp_path: Path, content: str, sa
     [
         ((), "no bus named"),
         (("--log", HEALTHY, "--from", "r.json", "--history", "h"), "exclude each other"),
-        (("--log", HEALTHY, "--serial-number", "3"), "no health history"),
+        (("--log", HEALTHY, "--unit", "3"), "no health history"),
         (("--log", HEALTHY, "--hours", "1e9"), "hours between false alarms"),
         (("--log", HEALTHY, "--on-alarm", "'open"), "--on-alarm"),
         (("--log", HEALTHY, "--history", "missing.sqlite"), "no history"),
@@ -180,12 +178,18 @@ def test_a_silent_bus_is_not_monitored_and_the_time_ends_it(run: Run) -> None:
     assert "NOT MONITORED: the bus was silent" in found.err
 
 
-def test_a_bus_whose_ticks_cannot_be_told_is_refused_before_it_is_opened(run: Run) -> None:
+def test_a_bus_whose_frames_do_not_tell_ticks_is_watched_too(run: Run) -> None:
     mapping = REPOSITORY / "docs" / "examples" / "buses" / "canaerospace.toml"
-    found = run("monitor", "-i", "virtual", "-c", "monitor-other", "--mapping", mapping)
-    assert found.code == 2
-    assert "to follow single ticks" in found.err
-    assert found.err.count("\n") == 1
+    options = ("--mapping", mapping, "--duration", "0.3")
+    found = run("monitor", "-i", "virtual", "-c", "monitor-other", *options)
+    assert found.code == 30
+    assert "the bus was silent" in found.err
+
+
+def test_too_few_monitored_ticks_are_an_exit_code(run: Run) -> None:
+    found = run("monitor", "--log", HEALTHY, "--least-monitored", "0.999")
+    assert found.code == 30
+    assert "ticks monitored" in found.err
 
 
 def test_ctrl_c_ends_it_in_order(tmp_path: Path, environment: dict[str, str]) -> None:
@@ -252,14 +256,6 @@ def _play(core: FccCore, fcc: PythonCanTransport, listening: Path, ended: thread
 
 
 def _result(severities: dict[str, float]) -> dict[str, Any]:
-    faults = {name: {"estimate": value, "std": 0.001} for name, value in severities.items()}
-    offsets = {"spool_offset_mm": 0.0, "pressure_offset_MPa": 0.0}
+    fit = former_result()["fit"] | {"spool_offset_mm": 0.0, "pressure_offset_MPa": 0.0}
     noise = {"spool_noise_mm": 1.4e-4, "pressure_noise_MPa": 7e-3}
-    return {
-        "schema": "ehadiag.diagnosis/2",
-        "actuator": "reference-31",
-        "serial": 1,
-        "faults": faults,
-        "fit": {**offsets, **noise},
-        "other": [],
-    }
+    return former_result(severities, fit=fit | noise)

@@ -107,7 +107,7 @@ def test_the_history_of_the_environment_is_kept_too(
         history.execute("SELECT * FROM diagnosis").fetchall()
 
 
-@pytest.mark.parametrize("verb", [("export",), ("plot", "--serial", 1)])
+@pytest.mark.parametrize("verb", [("export",), ("plot", "--unit", 1)])
 def test_exports_of_a_history_do_not_replace_it(
     verb: tuple[object, ...], place: Path, run: Run
 ) -> None:

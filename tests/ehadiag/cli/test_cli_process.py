@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,14 +15,15 @@ import pytest
 from cli_result import COMMAND, REPOSITORY
 from places import LOGS
 
-from ehadiag.compile.kernel_cache import cache_folder
+from ehadiag.compile.sources import cache_folder
 
 LOOPNET = REPOSITORY / "tools" / "loopnet.sh"
 NO_NAMESPACE = 125
+ATTEMPTS = 5
+TOO_LATE = re.compile("not complete 1 s after|no answer within 1 s")
 PAPER = ((0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
 """First and last of the paper's cases: each takes the seconds of a test."""
 CASES = [(test, faults) for test in ("open", "closed") for faults in PAPER]
-DEFAULT_CASE = ("closed", PAPER[0])
 BOTH_ENDS = """
 "$PYTHON" -m ehadiag sim --interface udp_multicast "$@" 2> sim.err &
 sim=$!
@@ -39,10 +41,8 @@ exit $code
 """
 
 
-@pytest.mark.parametrize(
-    ("test", "faults"),
-    [pytest.param(*case, marks=() if case == DEFAULT_CASE else pytest.mark.slow) for case in CASES],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("test", "faults"), CASES)
 def test_two_processes_on_multicast(
     test: str,
     faults: tuple[float, float, float],
@@ -51,15 +51,20 @@ def test_two_processes_on_multicast(
 ) -> None:
     names = ("Kintas", "FSS", "FDJ")
     options = [f"--{name}={value}" for name, value in zip(names, faults, strict=True)]
-    done = subprocess.run(
-        [LOOPNET, "sh", "-c", BOTH_ENDS, "ends", *options, "--serial-number=4711"],
-        cwd=tmp_path,
-        env=environment | {"PYTHON": sys.executable, "TEST": test},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    for _ in range(ATTEMPTS):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        done = subprocess.run(
+            [LOOPNET, "sh", "-c", BOTH_ENDS, "ends", *options, "--unit=4711"],
+            cwd=tmp_path,
+            env=environment | {"PYTHON": sys.executable, "TEST": test},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        # The computer's time is real: on a busy machine it comes too late, and is asked again.
+        if not ('"NOT_TESTED"' in done.stdout and TOO_LATE.search(done.stdout)):
+            break
     if done.returncode == NO_NAMESPACE:
         pytest.skip(f"no network namespace: {done.stderr.strip()}")
     assert done.returncode == 10, done.stdout + done.stderr
@@ -122,7 +127,7 @@ def without_home(
         env=kept,
         capture_output=True,
         text=True,
-        timeout=180,
+        timeout=900,
         check=False,
     )
 
@@ -146,10 +151,10 @@ def test_read_only_installation_without_home(
     done = without_home(site, temporary, arguments, environment, cache)
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if "font cache" not in line]
-    assert [line.partition(":")[0] for line in said] == ["ehadiag"] * (1 if warm else 3)
+    assert [line.partition(":")[0] for line in said] == ["ehadiag"] * (1 if warm else 5)
     assert json.loads(done.stdout)["verdict"] == "HEALTHY"
     assert sorted(site.rglob("*")) == before
-    told = "compiling the model's kernels, in memory, at each start" in done.stderr
+    told = "compiling the model's kernels (search, model), in memory, at each start" in done.stderr
     assert told is not warm
     there = {path.name for path in temporary.iterdir()}
     assert there == {"reports", *(["kept"] if warm else [])}

@@ -34,7 +34,7 @@ def commands(page: str) -> list[tuple[str, str]]:
 
 def estimates(text: str) -> dict[str, float]:
     """Estimates in a printed table."""
-    rows = re.findall(r"^(Kintas|FSS|FDJ) +[\d.]+ +[\d.]+ +([\d.]+)", text, re.MULTILINE)
+    rows = re.findall(r"^(Kintas|FSS|FDJ) +([\d.]+)", text, re.MULTILINE)
     return {name: float(value) for name, value in rows}
 
 
@@ -96,15 +96,15 @@ def follow(page: str, folder: Path, environment: dict[str, str]) -> dict[str, tu
     return results
 
 
-def assert_as_told(page: str, results: dict[str, tuple[int, str]]) -> None:
-    told = estimates((PAGES / f"{page}.md").read_text(encoding="utf-8"))
-    assert set(told) == {"Kintas", "FSS", "FDJ"}
+def assert_estimates_of_page(page: str, results: dict[str, tuple[int, str]]) -> None:
+    stated = estimates((PAGES / f"{page}.md").read_text(encoding="utf-8"))
+    assert set(stated) == {"Kintas", "FSS", "FDJ"}
     code, output = results["bit"]
     if code == NOT_TESTED and ("not complete 1 s" in output or "no answer within" in output):
         pytest.skip("this machine is too slow, now, for the computer's real time")
     assert code == 10, output
     # Frames may be lost on a loaded machine: the same estimates, not the same digits.
-    assert estimates(output) == pytest.approx(told, abs=2e-3)
+    assert estimates(output) == pytest.approx(stated, abs=2e-3)
 
 
 @pytest.mark.slow
@@ -114,7 +114,7 @@ def test_the_slcan_page(tmp_path: Path, environment: dict[str, str]) -> None:
     results = follow("slcan", tmp_path, environment)
     assert set(results) == {"check-bus", "bit"}
     assert "ServoTelemetry" in results["check-bus"][1]
-    assert_as_told("slcan", results)
+    assert_estimates_of_page("slcan", results)
 
 
 @pytest.mark.socketcan
@@ -123,7 +123,7 @@ def test_the_socketcan_page(tmp_path: Path, environment: dict[str, str]) -> None
         pytest.skip("no vcan0 here: run inside tools/with-vcan.sh")
     results = follow("socketcan", tmp_path, environment)
     assert set(results) == {"check-bus", "bit", "diagnose"}
-    assert_as_told("socketcan", results)
+    assert_estimates_of_page("socketcan", results)
     assert results["diagnose"][0] == 10
     assert estimates(results["diagnose"][1]) == estimates(results["bit"][1])
 

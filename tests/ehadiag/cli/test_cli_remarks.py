@@ -10,13 +10,11 @@ import pytest
 from cli_result import Run
 from places import LOGS
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose
-from ehadiag.assess.verdict import Verdict
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import BitState, Environment, Outcome, Recording
-from ehadiag.core.stored_test import bundled_tests
+from ehadiag import Diagnosis, Recording, Verdict, bundled_tests, default_actuator
+from ehadiag.assess.diagnosis import diagnose
 from firmware_iface.logs.reader import read_frames, read_recording
 from firmware_iface.logs.recorder import Recorder
+from firmware_iface.recording import BitOutcome, BitState, Environment
 from firmware_iface.transport.frames import Frame, FrameTable
 
 TELEMETRY, COMMAND, ENVIRONMENT = 0x110, 0x111, 0x120
@@ -116,7 +114,7 @@ def test_a_single_lost_frame_at_the_end_is_no_cut(recording: Recording) -> None:
 
 
 def test_a_recording_without_the_word_of_completion_says_so(recording: Recording) -> None:
-    running = replace(recording, outcome=Outcome(BitState.RUNNING))
+    running = replace(recording, outcome=BitOutcome(BitState.RUNNING))
     (note,) = diagnosis_of(running).notes
     assert note == "the recording ends before the computer's word that the test is complete"
 
@@ -158,7 +156,9 @@ def test_open_loop_needs_no_command_frames(run: Run, tmp_path: Path) -> None:
     assert run("diagnose", rewritten("paper-open-1.blf", tmp_path, COMMAND)).code == 10
 
 
-@pytest.mark.parametrize(("every", "tested"), [(100, True), (9, False)])
+@pytest.mark.parametrize(
+    ("every", "tested"), [pytest.param(100, True, marks=pytest.mark.slow), (9, False)]
+)
 def test_closed_loop_with_lost_positions_is_judged_up_to_a_stated_share(
     every: int, tested: bool
 ) -> None:

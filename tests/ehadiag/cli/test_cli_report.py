@@ -1,19 +1,29 @@
-"""`--report`, and `ehadiag report`."""
+"""`--report`, and `ehadiag report`. `ehadiag rul`: remaining life on the command line."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cli_result import Run
+from history_cases import an_entry
 from places import LOGS
 
-from ehadiag.cli import report_page
+import ehadiag
+from ehadiag.history.store import History
 
 HEALTHY = LOGS / "healthy-open.blf"
 WORN = LOGS / "paper-open-4.blf"
+
+
+@pytest.fixture(scope="module")
+def result() -> str:
+    """The JSON of a diagnosis."""
+    return ehadiag.diagnose(HEALTHY).to_json()
 
 
 def test_a_page_is_written_beside_result_and_picture(run: Run) -> None:
@@ -22,11 +32,34 @@ def test_a_page_is_written_beside_result_and_picture(run: Run) -> None:
     assert "o/paper-open-4.html" in result.err
     page = Path("o/paper-open-4.html").read_text()
     assert "DEGRADED" in page
-    assert "Advisory level 0.3" in page
+    assert "advisory level 0.3" in page
+
+
+def test_an_index_lists_the_results_worst_first_with_links(run: Run) -> None:
+    run("diagnose", "--no-picture", "--out", "o", HEALTHY, WORN)
+    names = ("o/healthy-open.json", "o/paper-open-4.json")
+    assert run("report", *names, "--index", "all.html").code == 0
+    page = Path("all.html").read_text()
+    assert page.index("DEGRADED<") < page.index("HEALTHY<")
+    assert 'href="o/paper-open-4.html"' in page
+    assert "60 %" in page
+    twice = run("report", *names, "--index", "o/healthy-open.html")
+    assert (twice.code, "name another file" in twice.message) == (2, True)
 
 
 def test_a_trend_where_there_is_a_history(run: Run) -> None:
-    run("diagnose", "--report", "--out", "o", "--history", "h", "--hours", 5, HEALTHY)
+    run(
+        "diagnose",
+        "--report",
+        "--no-picture",
+        "--out",
+        "o",
+        "--history",
+        "h",
+        "--hours",
+        5,
+        HEALTHY,
+    )
     page = Path("o/healthy-open.html").read_text()
     assert "Trend of this unit" in page
     assert "no number: 1 diagnosis of the unit, needs 3" in page
@@ -34,7 +67,7 @@ def test_a_trend_where_there_is_a_history(run: Run) -> None:
 
 def test_a_page_from_a_stored_result(run: Run) -> None:
     shutil.copy(WORN, "w.blf")
-    run("diagnose", "--out", "o", "w.blf")
+    run("diagnose", "--no-picture", "--out", "o", "w.blf")
     assert not Path("o/w.html").exists()
     assert run("report", "o/w.json").code == 0
     assert "Measured and modelled" in Path("o/w.html").read_text()
@@ -49,7 +82,7 @@ def test_a_page_from_a_stored_result(run: Run) -> None:
 
 def test_another_recording_under_the_same_name_is_not_drawn(run: Run) -> None:
     shutil.copy(WORN, "w.blf")
-    run("diagnose", "--out", "o", "w.blf")
+    run("diagnose", "--no-picture", "--out", "o", "w.blf")
     shutil.copy(HEALTHY, "w.blf")
     assert "diagnosed otherwise now" in run("report", "o/w.json").err
     assert "No responses are drawn" in Path("o/w.html").read_text()
@@ -57,7 +90,7 @@ def test_another_recording_under_the_same_name_is_not_drawn(run: Run) -> None:
 
 def test_an_old_page_does_not_stay_beside_a_new_result(run: Run) -> None:
     run("diagnose", "--report", "--out", "o", HEALTHY)
-    run("diagnose", "--out", "o", HEALTHY)
+    run("diagnose", "--no-picture", "--out", "o", HEALTHY)
     assert not Path("o/healthy-open.html").exists()
 
 
@@ -74,7 +107,7 @@ def test_what_is_no_result_is_refused(run: Run, content: str) -> None:
 
 
 def test_the_page_goes_by_the_levels_of_its_result(run: Run) -> None:
-    assert run("diagnose", "--out", "o", "--limit", 0.5, WORN).code == 20
+    assert run("diagnose", "--no-picture", "--out", "o", "--limit", 0.5, WORN).code == 20
     run("report", "o/paper-open-4.json")
     page = Path("o/paper-open-4.html").read_text()
     assert "limit 0.5" in page
@@ -82,7 +115,7 @@ def test_the_page_goes_by_the_levels_of_its_result(run: Run) -> None:
 
 
 def test_other_actuator_data_draw_no_responses(run: Run) -> None:
-    run("diagnose", "--out", "o", HEALTHY)
+    run("diagnose", "--no-picture", "--out", "o", HEALTHY)
     run("init", "actuator", ".")
     text = Path("actuator.toml").read_text()
     Path("other.toml").write_text(text.replace("511.6", "511.7"))
@@ -102,9 +135,10 @@ def test_other_actuator_data_draw_no_responses(run: Run) -> None:
         lambda tree: tree["solver"].update(seed=1 << 80),
     ],
 )
-def test_a_result_with_keys_of_the_wrong_kind_ends_in_one_line(run: Run, change) -> None:  # type: ignore[no-untyped-def]
-    run("diagnose", "--out", "o", HEALTHY)
-    tree = json.loads(Path("o/healthy-open.json").read_text())
+def test_a_result_with_keys_of_the_wrong_kind_ends_in_one_line(
+    run: Run, change: Callable[[dict[str, Any]], None], result: str
+) -> None:
+    tree = json.loads(result)
     change(tree)
     Path("r.json").write_text(json.dumps(tree))
     found = run("report", "r.json")
@@ -112,19 +146,63 @@ def test_a_result_with_keys_of_the_wrong_kind_ends_in_one_line(run: Run, change)
     assert "none of ehadiag's JSON results" in found.err
 
 
-@pytest.mark.parametrize(
-    "arguments", [("diagnose", "--report", "--out", "o", HEALTHY), ("report", "o/x.json")]
-)
-def test_without_its_libraries_there_is_no_report(
-    run: Run, arguments: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(report_page, "find_spec", lambda _: None)
-    found = run(*arguments)
-    assert found.code == 2
-    assert "pip install 'ehadiag[report]'" in found.message
-
-
 def test_a_page_needs_a_folder(run: Run) -> None:
     found = run("diagnose", "--report", HEALTHY)
     assert found.code == 2
     assert "--out" in found.message
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Path:
+    with History(tmp_path / "fleet", create=True) as history:
+        for n in range(1, 13):
+            values = (0.02 * n + 0.004 * (n % 3), 0.3, 0.1)
+            history.append(an_entry(7, 100.0 * n, values, samples=f"{n}"))
+    return tmp_path / "fleet"
+
+
+def test_a_table_for_people(run: Run, fleet: Path) -> None:
+    found = run("rul", "--unit", 7, "--history", fleet)
+    assert found.code == 0
+    assert "12 of 12 diagnoses say hours" in found.out
+    assert "80 %" in found.out
+    assert "no number: 12 diagnoses over 1100 hours show no growth" in found.out
+
+
+def test_an_object_for_programs(run: Run, fleet: Path) -> None:
+    (found,) = run("rul", "--unit", 7, "--json", "--history", fleet, "--limit", 0.5).objects
+    limit = found["severities"]["Kintas"]["remaining"]["limit"]
+    low, high = limit["interval80"]
+    assert found["schema"] == "ehadiag.rul/2"
+    assert limit["level"] == 0.5
+    assert low < limit["median"] < high
+    assert found["severities"]["FSS"]["remaining"]["limit"]["median"] is None
+    assert found["severities"]["FSS"]["remaining"]["advisory"]["median"] == 0.0
+    (again,) = run("rul", "--unit", 7, "--json", "--history", fleet, "--limit", 0.5).objects
+    assert again == found
+
+
+def test_no_number_is_no_failure(run: Run, fleet: Path) -> None:
+    with History(fleet) as history:
+        history.append(an_entry(8, 100.0))
+    found = run("rul", "--unit", 8, "--history", fleet)
+    assert found.code == 0
+    assert "no number: 1 diagnosis of the unit" in found.out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "--unit"),
+        (("--unit", "7"), "no health history"),
+        (("--unit", "7", "--history", "none"), "no history none"),
+        (("--unit", "7", "--in", "weeks"), "weeks"),
+        (("--unit", "hours"), "--in hours"),
+        (("--serial", "7"), "--unit N for the unit"),
+        (("--unit", "7", "--advisory", "0.9"), "levels"),
+    ],
+)
+def test_wrong_usage_is_two(run: Run, options: tuple[str, ...], said: str) -> None:
+    found = run("rul", *options)
+    assert found.code == 2
+    assert said in found.message

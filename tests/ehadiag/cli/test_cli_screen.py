@@ -1,9 +1,16 @@
-"""The live view: fits its terminal, shows texts of others as text, says each thing once."""
+"""The live view: fits its terminal, shows texts of others as text, says each thing once.
+
+`ehadiag serve` as it is called: what it refuses, what it hands on, and one simulated test.
+"""
 
 from __future__ import annotations
 
+import http.client
 import io
+import json
 import os
+import pickle
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,19 +19,22 @@ import pytest
 from cli_result import Run
 from rich.console import Console
 
-from ehadiag.cli.screen.draw import drawn, spark
-from ehadiag.cli.screen.lines import Lines
-from ehadiag.cli.screen.show import shown, wants_screen
-from ehadiag.live.snapshot import (
+from ehadiag.cli.main import main, parse_arguments
+from ehadiag.cli.serve_command import bit_arguments, monitor_arguments
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.estimate import Severity
+from ehadiag.live import (
     Alarm,
-    Bus,
+    BusState,
     Ending,
     Residuals,
     RunningTest,
-    Severity,
     Signals,
     Snapshot,
+    publish,
 )
+from ehadiag.terminal.live_view import draw_snapshot, sparkline
+from ehadiag.terminal.screen import SessionScreen, StatusLines, can_show_screen
 
 HOSTILE = "[bold red]x[/] \x1b[2J\u202e:bomb: <script>alert(1)</script>"
 
@@ -38,7 +48,7 @@ def snapshot(number: int = 1, text: str = "left aileron", **changes: object) -> 
         command="monitor",
         actuator=text,
         serial=12,
-        bus=Bus(name=text, state="open", frames=4000, rate_per_s=2070.0, load=0.23, lost=1),
+        bus=BusState(name=text, state="open", frames=4000, rate_per_s=2070.0, load=0.23, lost=1),
         test=RunningTest(
             name=text, number=1, phase="running", elapsed_s=2.0, duration_s=5.5, left_s=3.5
         ),
@@ -67,7 +77,7 @@ def alarm(number: int, text: str = "open") -> Alarm:
 def printed(item: Snapshot, width: int, *, unicode: bool = True) -> list[str]:
     out = io.StringIO()
     console = Console(file=out, width=width, markup=False, emoji=False, highlight=False)
-    console.print(drawn(item, width, unicode=unicode))
+    console.print(draw_snapshot(item, width, unicode=unicode))
     return out.getvalue().splitlines()
 
 
@@ -104,10 +114,10 @@ def test_a_test_shows_residuals_and_alarms_too_and_against_what() -> None:
     for width in (80, 200):
         whole = "\n".join(printed(item, width))
         for part in ("-3.2 σ", "100% of the alarm, below", "against: [bold red]x", "1 alarms",
-                     "spool above model during open"):  # fmt: skip
+                     "spool above what the model says during open"):  # fmt: skip
             assert part in whole
     assert "residual" not in "\n".join(printed(snapshot(command="bit", residuals=None), 80))
-    assert list(Lines().of(item))[3].endswith(f"during test 'open', compared with {HOSTILE}")
+    assert list(StatusLines().of(item))[3].endswith(f"during test 'open', compared with {HOSTILE}")
 
 
 def test_a_terminal_without_block_characters_gets_ascii() -> None:
@@ -116,14 +126,14 @@ def test_a_terminal_without_block_characters_gets_ascii() -> None:
 
 
 def test_a_spark_lies_between_least_and_most_and_shows_holes() -> None:
-    assert spark((0.0, None, 1.0), 10) == "▁ █"
-    assert spark((1.0, 2.0, 3.0), 2) == "▁█"
-    assert spark((5.0, 5.0), 10) == "▄▄"
-    assert spark((None, None), 10) == ""
+    assert sparkline((0.0, None, 1.0), 10) == "▁ █"
+    assert sparkline((1.0, 2.0, 3.0), 2) == "▁█"
+    assert sparkline((5.0, 5.0), 10) == "▄▄"
+    assert sparkline((None, None), 10) == ""
 
 
 def test_lines_say_each_thing_once() -> None:
-    lines = Lines()
+    lines = StatusLines()
     first = list(lines.of(snapshot(1)))
     assert first == [
         "bus left aileron open",
@@ -141,7 +151,7 @@ def test_lines_say_each_thing_once() -> None:
 
 
 def test_the_screens_process_draws_what_it_reads_and_ends_with_it() -> None:
-    process = [sys.executable, "-P", "-m", "ehadiag.cli.screen.terminal"]
+    process = [sys.executable, "-P", "-m", "ehadiag.terminal.screen_process"]
     given = b"".join(snapshot(number).to_json() + b"\n" for number in range(1, 4))
     done = subprocess.run(
         process, input=given, capture_output=True, timeout=60, check=False,
@@ -152,8 +162,8 @@ def test_the_screens_process_draws_what_it_reads_and_ends_with_it() -> None:
 
 
 def test_no_screen_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    assert not wants_screen(plain=False)
-    with shown(snapshot, plain=False):
+    assert not can_show_screen(plain=False)
+    with SessionScreen(plain=False) as screen, publish(snapshot, screen.take):
         pass
     assert "test 'left aileron': running" in capsys.readouterr().err
 
@@ -166,3 +176,75 @@ def test_a_test_is_told_in_plain_lines_where_there_is_no_terminal(run: Run) -> N
     assert "FSS 0.2" in found.err or "FSS 0.3" in found.err
     assert "(final)" in found.err
     assert "DEGRADED" in found.out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "no bus named"),
+        (["--simulate"], "--allow-tests"),
+        (["--simulate", "--allow-tests", "--http-port", "70000"], "need a port"),
+        (["--simulate", "--allow-tests", "--test", "nothing"], "nothing"),
+        (["--simulate", "--allow-tests", "--actuator", "missing.toml"], "missing.toml"),
+    ],
+)
+def test_wrong_usage_is_one_line(options, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main(["serve", *options])
+    except SystemExit as error:
+        code = error.code
+    assert code in (2, 3)
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert words in said[0]
+
+
+def test_options_are_handed_on_as_they_were_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "own"))
+    (tmp_path / "own" / "ehadiag").mkdir(parents=True)
+    file = tmp_path / "own" / "ehadiag" / "ehadiag.toml"
+    file.write_text("[bit]\nmax_position = 20.0\n[serve]\nadvisory = 0.3\n")
+    given = ["-i", "socketcan", "-c", "can 0", "--fd", "--bus-kwargs", "a=1", "b=2", "--hours", "5"]
+    arguments = parse_arguments(["serve", *given, "--mapping", "m.toml", "--http-port", "0"])
+    test = bit_arguments(arguments, "closed")
+    assert (test.interface, test.channel, test.fd) == ("socketcan", "can 0", True)
+    assert (test.bus_kwargs, test.hours, test.mapping) == (["a=1", "b=2"], 5.0, ["m.toml"])
+    assert (test.test, test.report, test.no_picture) == ("closed", True, True)
+    assert (test.max_position, test.advisory, test.limit) == (20.0, 0.3, 0.75)
+    watch = monitor_arguments(arguments)
+    assert (watch.interface, watch.bus_kwargs, watch.mapping) == (
+        "socketcan", ["a=1", "b=2"], "m.toml",
+    )  # fmt: skip
+    assert watch.hours == FALSE_ALARM_INTERVAL_H
+    pickle.loads(pickle.dumps((test, watch)))
+
+
+@pytest.mark.slow
+def test_a_simulated_test_is_run_from_the_page(tmp_path):
+    command = ["serve", "--simulate", "--allow-tests", "--http-port", "0", "--out", str(tmp_path)]
+    program = [sys.executable, "-m", "ehadiag", *command]
+    with subprocess.Popen(program, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        try:
+            said = process.stderr.readline()
+            address, token = said.split()[2].split("#token=")
+            port = int(address.rstrip("/").rpartition(":")[2])
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
+            headers = {"X-Ehadiag-Token": token}
+            connection.request("POST", "/start", json.dumps({"test": "open"}), headers)
+            assert connection.getresponse().read() == b"{}"
+            stream = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
+            stream.request("GET", "/live")
+            answer, ending, running = stream.getresponse(), None, True
+            while ending is None or running:
+                line = answer.readline()
+                assert line, "the page's stream ended before the test"
+                data = json.loads(line[6:]) if line.startswith(b"data: {") else {}
+                ending = data.get("ending", ending)
+                running = data.get("running", running)
+            assert ending["verdict"] in ("HEALTHY", "NOT TESTED")
+            assert list(tmp_path.glob("*.json"))
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0

@@ -16,20 +16,37 @@ import pytest
 from cli_result import COMMAND, Run
 from places import LOGS
 
-from ehadiag.cli import acquire as acquiring
-from ehadiag.cli.interrupt import (
+from ehadiag.cli.result_output import ResultWriter
+from ehadiag.core.interruption import (
+    defer_signals,
     interrupt_on_signals,
-    keep_signals,
     signals_restored,
     stop_on_signals,
 )
-from ehadiag.cli.results import Results
-from ehadiag.core.recording import BitState
+from ehadiag.session.bit_run import STOPPED_TWICE_REASON
+from ehadiag.session.bit_session import EarlyIdentification
 from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import BitState
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 ALL = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ONE = (
+    signal.SIGTERM,
+    *(pytest.param(item, marks=pytest.mark.slow) for item in (signal.SIGINT, signal.SIGHUP)),
+)
+"""What each of them does is in `test_what_signals_do`; a process with each takes its time."""
+ATTEMPTS = 5
 BIT = (*COMMAND, "bit", "--test", "open", "--simulate", "--json", "--record", "cut.blf")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _as_in_a_terminal() -> Iterator[None]:
+    """Under nohup, or in the background of a shell, a process begins with some ignored."""
+    handlers = (signal.default_int_handler, signal.SIG_DFL, signal.SIG_DFL)
+    before = [signal.signal(*item) for item in zip(ALL, handlers, strict=True)]
+    yield
+    for item in zip(ALL, before, strict=True):
+        signal.signal(*item)
 
 
 @pytest.fixture
@@ -65,7 +82,7 @@ class Bit:
         return json.loads(output)
 
 
-@pytest.mark.parametrize("number", ALL)
+@pytest.mark.parametrize("number", ONE)
 def test_a_signal_aborts_the_test(
     number: signal.Signals, tmp_path: Path, environment: dict[str, str]
 ) -> None:
@@ -81,16 +98,23 @@ def test_a_signal_aborts_the_test(
     assert read_recording(bit.recording).outcome.state is BitState.ABORTED
 
 
+@pytest.mark.slow
 def test_a_hang_up_that_is_ignored_stays_ignored(
     tmp_path: Path, environment: dict[str, str]
 ) -> None:
-    bit = Bit(tmp_path, environment, "nohup")
-    try:
-        for _ in range(3):
-            bit.process.send_signal(signal.SIGHUP)
-        found = bit.end()
-    finally:
-        bit.process.kill()
+    for attempt in range(ATTEMPTS):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        bit = Bit(folder, environment, "nohup")
+        try:
+            for _ in range(3):
+                bit.process.send_signal(signal.SIGHUP)
+            found = bit.end()
+        finally:
+            bit.process.kill()
+        # The simulator's time is real: on a busy machine the end of the test may come too late.
+        if not any("too busy to simulate" in reason for reason in found["reasons"]):
+            break
     assert (bit.process.returncode, found["verdict"]) == (0, "HEALTHY")
 
 
@@ -105,26 +129,26 @@ def test_the_second_one_does_not_wait_for_the_abort(
     second: signal.Signals, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The computer obeys, but its word does not come."""
-    from firmware_iface.session import tester
+    from firmware_iface import tester
 
-    asked = tester._Session._request
+    asked = tester._BitSession._request
     requests = []
 
     def request(session, action) -> None:
         requests.append(action)
         asked(session, action)
-        if action is tester.Action.ABORT and len(requests) == 2:
+        if action is tester.HandshakeAction.ABORT and len(requests) == 2:
             send(second)
 
     def watch(_ahead, progress) -> None:
         if progress.elapsed > 0.5 and len(requests) == 1:
             send(signal.SIGINT)
 
-    monkeypatch.setattr(tester._Session, "_request", request)
-    monkeypatch.setattr(acquiring.Ahead, "watch", watch)
+    monkeypatch.setattr(tester._BitSession, "_request", request)
+    monkeypatch.setattr(EarlyIdentification, "watch", watch)
     result = run("bit", "--json", "--simulate", "--fast", "--test", "open", "--out", "o")
     assert result.code == 30
-    assert result.objects[0]["reasons"] == [acquiring.STOPPED_TWICE]
+    assert result.objects[0]["reasons"] == [STOPPED_TWICE_REASON]
     assert [action.value for action in requests] == ["start", "abort", "abort"]
     (written,) = Path("o").glob("*.json")
     assert json.loads(written.read_text()) == result.objects[0]
@@ -132,7 +156,7 @@ def test_the_second_one_does_not_wait_for_the_abort(
 
 
 @pytest.mark.usefixtures("_restored")
-@pytest.mark.parametrize("number", ALL)
+@pytest.mark.parametrize("number", ONE)
 @pytest.mark.parametrize("command", ["diagnose", "bit"])
 def test_one_in_the_identification(
     command: str, number: signal.Signals, run: Run, monkeypatch: pytest.MonkeyPatch
@@ -147,7 +171,7 @@ def test_one_in_the_identification(
         result = run("diagnose", "--json", "--out", "o", *logs)
         assert "paper-open-1.blf is not diagnosed" in result.err
     (found,) = result.objects
-    assert result.code == 30
+    assert result.code == (30 if command == "bit" else 130)  # a log was left
     assert (found["verdict"], found["reasons"]) == ("NOT_TESTED", ["stopped by the user"])
     assert found["quality"]["frames"] > 10_000
     assert len(list(Path("o").glob("*.json"))) == 1
@@ -160,19 +184,19 @@ def test_one_after_the_verdict(
     times: int, number: signal.Signals, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between result and picture; the code is the verdict's."""
-    show = Results._print
+    show = ResultWriter._print
 
     def shown(results, *arguments) -> None:
         show(results, *arguments)
         send(*[number] * times)
 
-    monkeypatch.setattr(Results, "_print", shown)
+    monkeypatch.setattr(ResultWriter, "_print", shown)
     result = run("diagnose", "--json", "--out", "o", LOGS / "paper-open-1.blf")
     assert result.code == 10
     assert [path.name for path in Path("o").iterdir()] == ["paper-open-1.json"]
 
 
-@pytest.mark.parametrize("number", ALL)
+@pytest.mark.parametrize("number", ONE)
 def test_one_while_nobody_reads_the_result(
     number: signal.Signals, tmp_path: Path, environment: dict[str, str]
 ) -> None:
@@ -193,7 +217,6 @@ def test_one_while_nobody_reads_the_result(
         while not written.exists():
             assert process.poll() is None
             time.sleep(0.02)
-        time.sleep(0.5)
         while process.poll() is None:
             process.send_signal(number)
             time.sleep(0.2)
@@ -209,15 +232,16 @@ def test_one_while_nobody_reads_the_result(
 ENTRY = """
 import os, signal, sys
 import ehadiag.cli.main as program
+from ehadiag.cli import setup_commands
 class Exiting:
     def __del__(self):
         os.kill(os.getpid(), signal.{name})
 def run(_):
-    from ehadiag.cli.interrupt import keep_signals
-    keep_signals()
+    from ehadiag.core.interruption import defer_signals
+    defer_signals()
     os.kill(os.getpid(), signal.{name})
     return 20
-program.tests.run = run
+setup_commands.run_tests = run
 sys.argv = ["ehadiag", "tests"]
 sys.last = Exiting()
 program.process()
@@ -246,7 +270,7 @@ def test_what_signals_do(number: signal.Signals) -> None:
         send(number)  # a third must not get in the way of the abort
     with pytest.raises(KeyboardInterrupt):
         send(number)
-    came = keep_signals()
+    came = defer_signals()
     assert not came.is_set()
     send(number)
     assert came.is_set()
@@ -259,7 +283,7 @@ def test_an_ignored_hang_up_is_left_alone() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     interrupt_on_signals()
     with stop_on_signals() as stop:
-        keep_signals()
+        defer_signals()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         send(signal.SIGHUP)
         assert not stop.is_set()

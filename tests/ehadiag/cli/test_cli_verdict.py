@@ -1,23 +1,41 @@
-"""Verdicts: every reason for NOT TESTED, and the two levels."""
+"""Verdicts: every reason for NOT TESTED, and the two levels.
+
+One order of exit codes, whichever way several things come of a call. Every reference recording
+through the command line: verdict, estimates, counted losses.
+"""
 
 from __future__ import annotations
 
+import csv
+import itertools
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from cli_result import Run
 from places import LOGS
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose
-from ehadiag.assess.verdict import Levels, Rule, Verdict, judge
-from ehadiag.core.actuator import Actuator, default_actuator
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.recording import BitReason, BitState, Environment, Outcome, Recording
-from ehadiag.core.stored_test import bundled_tests
+from ehadiag import (
+    Actuator,
+    ConfigurationError,
+    Diagnosis,
+    Levels,
+    Recording,
+    Verdict,
+    bundled_tests,
+    default_actuator,
+)
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import VerdictRule, judge
+from ehadiag.cli import diagnose_commands as command
+from ehadiag.setup import Reading, Setup
+from ehadiag.terminal.output import exit_code_of_inputs, worst_exit_code
 from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import BitOutcome, BitReason, BitState, Environment
 
 TESTS = bundled_tests()
 
@@ -54,11 +72,11 @@ def test_the_recording_itself_is_sound(recording: Recording) -> None:
 
 
 def test_a_test_that_did_not_come_about(recording: Recording) -> None:
-    cold = Outcome(BitState.REFUSED, BitReason.OIL_TOO_COLD)
+    cold = BitOutcome(BitState.REFUSED, BitReason.OIL_TOO_COLD)
     assert reasons(replace(recording, outcome=cold)) == (
         "refused by the flight-control computer: oil too cold",
     )
-    aborted = replace(recording, outcome=Outcome(BitState.ABORTED))
+    aborted = replace(recording, outcome=BitOutcome(BitState.ABORTED))
     assert reasons(aborted) == ("the test was aborted",)
     assert reasons(replace(recording, samples=None)) == ("no telemetry of a test in the recording",)
 
@@ -207,7 +225,7 @@ def test_levels_of_the_estimates(
     estimates = [
         SimpleNamespace(name=name, value=value) for name, value in zip(names, values, strict=True)
     ]
-    given, why = judge(SimpleNamespace(estimates=estimates), Levels(rule=Rule.ESTIMATE))
+    given, why = judge(SimpleNamespace(estimates=estimates), Levels(rule=VerdictRule.ESTIMATE))
     assert given is verdict
     assert [reason.split()[0] for reason in why] == named
 
@@ -218,3 +236,78 @@ def test_levels_of_the_estimates(
 def test_levels_out_of_order(advisory: float, limit: float) -> None:
     with pytest.raises(ConfigurationError, match="need 0 < advisory < limit <= 1"):
         Levels(advisory, limit)
+
+
+HEALTHY, CLOSED = (LOGS / name for name in ("healthy-open.blf", "healthy-closed.blf"))
+WORST_FIRST = (20, 40, 3, 30, 10, 0)
+
+
+def test_the_order() -> None:
+    for worse, better in itertools.combinations(WORST_FIRST, 2):
+        assert worst_exit_code((better, worse)) == worst_exit_code((worse, better)) == worse
+    assert worst_exit_code(()) == 0
+    assert worst_exit_code((2, 30)) == 3
+    assert exit_code_of_inputs([2]) == 2
+    assert exit_code_of_inputs([2, 2]) == 3
+
+
+@pytest.mark.parametrize(("codes", "worst"), [((20, 30), 20), ((30, 3), 3), ((10, 0), 10)])
+def test_tests_of_one_recording(
+    codes: tuple[int, int], worst: int, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two tests of one recording; their verdicts are put in their place."""
+    ended, read = iter(codes), Setup.read
+    monkeypatch.setattr(
+        Setup, "read", lambda self, log, _: Reading(read(self, log).recordings * 2, (), None, 0.0)
+    )
+    monkeypatch.setattr(command, "diagnose_and_deliver", lambda *_: (None, next(ended)))
+    assert run("diagnose", "--merge", "--all", HEALTHY, CLOSED).code == worst
+    assert next(ended, None) is None
+
+
+def test_inputs_that_cannot_be_read(run: Run) -> None:
+    Path("x.unknown").write_text("x")
+    Path("y.unknown").write_text("y")
+    for options in (["--list"], ["--joint"], []):
+        alone = run("diagnose", *options, "x.unknown")
+        assert alone.code == 2
+        assert run("diagnose", *options, "x.unknown", "y.unknown").code == 3
+    assert run("report", "x.unknown").code == 2
+    assert run("report", "x.unknown", "y.unknown").code == 3
+
+
+FAULTS = ("Kintas", "FSS", "FDJ")
+TOLERANCE = 5e-4
+TRUTH = {row["file"]: row for row in csv.DictReader((LOGS / "truth.csv").read_text().splitlines())}
+CODES = {"HEALTHY": 0, "DEGRADED": 10}
+
+
+@pytest.mark.parametrize("name", sorted(TRUTH))
+def test_estimates_are_the_truth(name: str, run: Run) -> None:
+    truth = {fault: float(TRUTH[name][fault]) for fault in FAULTS}
+    result = run("diagnose", "--json", LOGS / name)
+    (found,) = result.objects
+    verdict = "DEGRADED" if max(truth.values()) >= 0.25 else "HEALTHY"
+    assert (found["verdict"], result.code) == (verdict, CODES[verdict])
+    assert found["test"] == TRUTH[name]["test"]
+    assert found["serial"] == 1
+    for fault, value in truth.items():
+        assert found["faults"][fault]["estimate"] == pytest.approx(value, abs=TOLERANCE)
+        assert found["faults"][fault]["std"] < 2 * TOLERANCE
+    named = [reason.split()[0] for reason in found["reasons"]]
+    assert named == [fault for fault in FAULTS if truth[fault] >= 0.25]
+
+
+def test_losses_of_the_lossy_recording_are_counted(run: Run) -> None:
+    (found,) = run("diagnose", "--json", LOGS / "lossy-open.blf").objects
+    quality = found["quality"]
+    assert quality["lost"] == pytest.approx(0.02 * 11331, rel=0.2)
+    assert quality["crc_errors"] == pytest.approx(0.005 * 11331, rel=0.3)
+    assert quality["frames"] + quality["lost"] == 11331
+
+
+def test_a_sound_recording_has_nothing_to_count(run: Run) -> None:
+    (found,) = run("diagnose", "--json", LOGS / "paper-open-1.blf").objects
+    counted = ("lost", "repeated", "crc_errors", "out_of_order", "length_errors", "foreign")
+    assert {name: found["quality"][name] for name in counted} == dict.fromkeys(counted, 0)
+    assert found["quality"]["frames"] == 11331

@@ -18,12 +18,9 @@ import pytest
 from cli_result import Run
 from places import LOGS
 
-from ehadiag.calibration.result import Calibrated
+from ehadiag import Actuator, Calibrated, Recording, StoredTest, default_actuator
 from ehadiag.cli.main import main
-from ehadiag.core.actuator import Actuator, default_actuator
-from ehadiag.core.calibration import Calibration, Goodness
-from ehadiag.core.recording import Recording
-from ehadiag.core.stored_test import StoredTest
+from ehadiag.core.actuator import Calibration, FitQuality
 from ehadiag.design.propose import Proposal
 from ehadiag.design.score import Score
 from ehadiag.identify.experiment import build_experiment
@@ -42,7 +39,7 @@ WRITTEN = {
     "history": (".sqlite", "history", "init", "--history", "{}"),
     "exported history": (".csv", "history", "export", "--history", "h.sqlite", "--out", "{}"),
     "trend": (
-        ".png", "history", "plot", "--serial", "1", "--history", "h.sqlite", "--out", "{}"
+        ".png", "history", "plot", "--unit", "1", "--history", "h.sqlite", "--out", "{}"
     ),
     "page": (".html", "report"),
     "channels over time": (".png", "check-bus", "--log", "v.blf", "--plot", "{}"),
@@ -81,7 +78,7 @@ def nothing_slow(monkeypatch: pytest.MonkeyPatch) -> None:
         calibration=Calibration(
             date="2026-01-02T03:04:05Z", start="reference-31", serial=7, plays=1, effects={},
             parameters=("null_bias",), std=(1e-7,), root=((1.0,),), held={},
-            fit=Goodness(excess=1.0, outliers=0.0, spool_rms=1.0, pressure_rms=1.0),
+            fit=FitQuality(excess=1.0, outliers=0.0, spool_rms=1.0, pressure_rms=1.0),
             recordings=(),
         ),
     )  # fmt: skip
@@ -102,7 +99,7 @@ def nothing_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     def propose(test: StoredTest, *_: object, **__: object) -> Proposal:
         return Proposal(test, score, scored=1, better=True)
 
-    monkeypatch.setattr("ehadiag.calibration.unit.calibrate", calibrate)
+    monkeypatch.setattr("ehadiag.calibration.calibrate_unit.calibrate", calibrate)
     monkeypatch.setattr("ehadiag.design.score.score", lambda *_: score)
     monkeypatch.setattr("ehadiag.design.propose.propose", propose)
     monkeypatch.setattr("ehadiag.export.library.object_code", lambda *_, **__: b"code")

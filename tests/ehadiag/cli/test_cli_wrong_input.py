@@ -10,14 +10,14 @@ import pytest
 from cli_result import Run
 from places import LOGS
 
-from firmware_iface.codec.encode import Encoder
+from firmware_iface.codec import Encoder
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.transport.frames import Frame
 
 LOG = LOGS / "paper-open-1.blf"
 DATA = resources.files("ehadiag").joinpath("data")
 ACTUATOR = DATA.joinpath("actuator.toml").read_text()
-TEST = DATA.joinpath("tests/closed.toml").read_text()
+TEST = resources.files("firmware_iface").joinpath("data/tests/closed.toml").read_text()
 
 
 def changed(text: str, old: str, new: str) -> str:
@@ -167,7 +167,7 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["--test", "open"], 2, "no bus named: give --interface and --channel, or --serial"),
+        (["--test", "open"], 2, "no bus named: give --interface and --channel, or --port"),
         (
             ["--test", "opne", "--simulate"],
             2,
@@ -176,20 +176,20 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
         (["--test", "gone.toml", "--simulate"], 3, "test file gone.toml: No such file"),
         (["--simulate"], 2, "bit: the following arguments are required: --test; see ehadiag bit"),
         (["--test", "open", "-i", "nonsense"], 2, "interface 'nonsense' unknown, need one of"),
-        (["--test", "open", "--serial", "/dev/none"], 3, "serial /dev/none: cannot open"),
-        (["--test", "open", "--serial", "spam://x"], 2, "serial spam://x: "),
+        (["--test", "open", "--port", "/dev/none"], 3, "serial /dev/none: cannot open"),
+        (["--test", "open", "--port", "spam://x"], 2, "serial spam://x: "),
         (["--test", "open", "-i", "virtual", "--bus-kwargs", "a"], 2, "a: need KEY=VALUE"),
         (["--test", "open", "-i", "virtual", "-b", "-5"], 2, "'-5': need a whole number above 0"),
         (["--test", "open", "-i", "udp_multicast", "-c", "x"], 2, "x: not an IP address; need"),
         (["--test", "open", "--simulate", "--listen"], 2, "--simulate and --listen exclude"),
         (["--test", "open", "--fast"], 2, "add --simulate"),
-        (["--test", "open", "--simulate", "--serial", "loop://"], 2, "a serial link has two ends"),
+        (["--test", "open", "--simulate", "--port", "loop://"], 2, "a serial link has two ends"),
         (["--test", "open", "--simulate", "--fast", "-i", "virtual"], 2, "leave --interface out"),
         (["--test", "open", "--simulate", "--Kintas", "1.5"], 2, "fault Kintas: 1.5 is outside 0"),
         (["--test", "open", "--simulate", "--FSS", "nan"], 2, "fault FSS: nan is outside 0 … 1"),
         (["--test", "open", "--simulate", "--noise", "-1"], 2, "noise (LSB): -1 is outside"),
-        (["--test", "open", "--simulate", "--serial-number", "70000"], 2, "serial 70000: outside"),
-        (["--test", "open", "--simulate", "--seed", "-1"], 2, "a seed is a whole number"),
+        (["--test", "open", "--simulate", "--unit", "70000"], 2, "serial 70000: outside"),
+        (["--test", "open", "--simulate", "--seed", "-1"], 2, "need a whole number, 0 …"),
         (["--test", "open", "--simulate", "--max-position", "-2"], 2, "need a number above 0"),
         (["--test", "open", "--simulate", "--limit", "0.1"], 2, "need 0 < advisory < limit <= 1"),
         (["--test", "open", "--simulate", "--record", "a.txt"], 2, "recording a.txt: suffix"),
@@ -197,7 +197,14 @@ def test_test_at_another_rate_than_the_controller(run: Run, tmp_path: Path) -> N
         (["--test", "open", "--simulate", "--out", "file"], 3, "output folder file: "),
         (["--test", "open", "--simulate", "--dbc", "x.dbc"], 3, "DBC file x.dbc: No such file"),
         (["--test", "open", "--simulate", "--mapping", "m.toml"], 3, "m.toml"),
-        (["--test", "open", "--simul"], 2, "unrecognized arguments: --simul"),
+        (
+            ["--test", "open", "--simul"],
+            2,
+            "unrecognized arguments: --simul (did you mean --simulate?); see ehadiag bit --help",
+        ),
+        (["--test", "open", "--serial", "7"], 2, "--port URL for a serial port, --unit N for the"),
+        (["--test", "open", "--simulate", "--serial-number=7"], 2, "another name now: --unit N"),
+        (["--test", "open", "--simulate", "--fast", "--port", "x"], 2, "leave --port out"),
     ],
 )
 def test_wrong_request(options: list[str], code: int, words: str, run: Run, tmp_path: Path) -> None:
@@ -218,14 +225,14 @@ def test_a_recording_is_never_overwritten(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "the following arguments are required: COMMAND; see ehadiag --help"),
-        (["diagnosis"], "invalid choice: 'diagnosis'"),
+        (["--verbose"], "the following arguments are required: COMMAND; see ehadiag --help"),
+        (["diagnosis"], "there is no command 'diagnosis', did you mean diagnose?"),
         (["diagnose"], "diagnose: the following arguments are required: LOG"),
         (["diagnose", "--solver", "luck", LOG], "invalid choice: 'luck'"),
         (["diagnose", "--advisory", "2", LOG], "need 0 < advisory < limit <= 1, not 2 and 0.75"),
         (["check-bus"], "no bus named"),
         (["check-bus", "-i", "virtual", "--duration", "0"], "need a number above 0"),
-        (["check-bus", "-i", "virtual", "--serial", "loop://"], "exclude each other: name one bus"),
+        (["check-bus", "-i", "virtual", "--port", "loop://"], "exclude each other: name one bus"),
         (["replay", LOG], "no bus named"),
         (["replay", LOG, "-i", "virtual", "--speed", "-1"], "need a number above 0"),
         (["sim"], "no bus named"),
@@ -247,12 +254,12 @@ def test_wrong_usage(arguments: list[str], words: str, run: Run) -> None:
 def test_two_buses_are_refused_before_anything_is_done(
     arguments: tuple[str, ...], run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for place in ("bit.make_folder", "sim.say_if_compiling"):
-        monkeypatch.setattr(f"ehadiag.cli.commands.{place}", forbidden)
+    for place in ("bit_command", "bus_commands"):
+        monkeypatch.setattr(f"ehadiag.cli.{place}.print_compiling_notice", forbidden)
     monkeypatch.setattr("firmware_iface.logs.reader.read_frames", forbidden)
-    result = run(*arguments, "-i", "virtual", "--serial", "loop://")
+    result = run(*arguments, "-i", "virtual", "--port", "loop://")
     assert (result.code, result.out) == (2, "")
-    assert "--serial and --interface exclude each other: name one bus" in result.message
+    assert "--port and --interface exclude each other: name one bus" in result.message
     assert not list(tmp_path.iterdir())
 
 
@@ -265,7 +272,7 @@ def test_a_serial_link_beside_the_bus_of_the_environment(
 ) -> None:
     """CAN_INTERFACE is a default, not a second bus."""
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
-    result = run("bit", "--test", "open", "--serial", "spam://x")
+    result = run("bit", "--test", "open", "--port", "spam://x")
     assert "serial spam://x: " in result.message
 
 
@@ -303,7 +310,7 @@ def test_multicast_stays_on_the_machine_unless_asked(
 ) -> None:
     route = tmp_path / "route"
     route.write_text("head\neth0 00000000 0101A8C0 0003 0 0 0 00000000 0 0 0\n")
-    monkeypatch.setattr("firmware_iface.transport.adapters.ROUTES", route)
+    monkeypatch.setattr("firmware_iface.transport.adapters.ROUTES_FILE", route)
     result = run("sim", "-i", "udp_multicast")
     assert result.code == 2
     assert "would leave the machine through eth0" in result.message

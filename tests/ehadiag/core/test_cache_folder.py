@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ehadiag.core.cache_folder import private_folder
+from firmware_iface.files import private_folder
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links, owners and permissions")
 OTHER = 12345

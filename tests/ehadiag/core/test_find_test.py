@@ -7,21 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.find_test import Sought, find_test, found_tests
-from ehadiag.core.recording import (
-    CommandMode,
-    Environment,
-    Outcome,
-    Quality,
-    Recording,
-    Samples,
-)
-from ehadiag.core.stored_test import bundled_tests
+from ehadiag import CommandMode, Recording, Samples, bundled_tests, default_actuator
+from firmware_iface.find_test import CandidateTests, extract_tests, match_test
+from firmware_iface.recording import BitOutcome, Environment, Quality
 
 CONTROLLER = default_actuator().controller
 TESTS = tuple(bundled_tests().values())
-SOUGHT = Sought(TESTS, CONTROLLER)
+SOUGHT = CandidateTests(TESTS, CONTROLLER)
 BY_NAME = bundled_tests()
 
 
@@ -52,13 +44,15 @@ def samples_of(name: str, before: int = 0, after: int = 0, *, beside: int = 0) -
 
 
 def recording(samples: Samples) -> Recording:
-    return Recording("made up", samples, None, None, Outcome(), Environment(), Quality(), None, 0)
+    return Recording(
+        "made up", samples, None, None, BitOutcome(), Environment(), Quality(), None, 0
+    )
 
 
 @pytest.mark.parametrize("name", ["open", "closed"])
 @pytest.mark.parametrize(("before", "after"), [(0, 0), (1, 5), (9_999, 300)])
 def test_a_test_is_found_by_its_command(name: str, before: int, after: int) -> None:
-    (found,) = found_tests(recording(samples_of(name, before, after)), SOUGHT)
+    (found,) = extract_tests(recording(samples_of(name, before, after)), SOUGHT)
     assert found.test_id == BY_NAME[name].id
     assert found.samples is not None
     assert found.samples.ticks == BY_NAME[name].ticks
@@ -71,7 +65,7 @@ def test_a_test_is_found_by_its_command(name: str, before: int, after: int) -> N
 def test_without_a_command_the_current_tells(name: str, by: str) -> None:
     whole = samples_of(name, 1234, 77)
     bare = replace(whole, command=np.full(whole.ticks, np.nan), mode=CommandMode.CURRENT)
-    (found,) = found_tests(recording(bare), SOUGHT)
+    (found,) = extract_tests(recording(bare), SOUGHT)
     assert found.test_id == BY_NAME[name].id
     assert found.start_ns == 1234 * 1_000_000
     assert f"by its {by}" in found.quality.notes[-1]
@@ -80,7 +74,7 @@ def test_without_a_command_the_current_tells(name: str, by: str) -> None:
 @pytest.mark.parametrize("beside", [-3, -1, 0, 2])
 @pytest.mark.parametrize("name", ["open", "closed"])
 def test_telemetry_beside_its_command_is_put_right_by_the_current(name: str, beside: int) -> None:
-    found = find_test(samples_of(name, 500, 500, beside=beside), TESTS, CONTROLLER)
+    found = match_test(samples_of(name, 500, 500, beside=beside), TESTS, CONTROLLER)
     assert found is not None
     assert (found.first, found.command_first) == (500, 500 + beside)
     assert found.sure
@@ -94,14 +88,14 @@ def test_two_tests_in_one_recording_are_both_found() -> None:
     }
     ticks = first.ticks + second.ticks
     joined = replace(first, **both, host_ns=np.arange(ticks) * 1_000_000)
-    found = found_tests(recording(joined), SOUGHT)
+    found = extract_tests(recording(joined), SOUGHT)
     assert [item.start_ns for item in found] == [100_000_000, (6000 + 300) * 1_000_000]
 
 
 def test_what_is_no_stored_test_is_said_and_left_whole() -> None:
     samples = samples_of("open")
     strange = replace(samples, command=np.sin(np.arange(samples.ticks) / 300.0) * 5e-3)
-    (found,) = found_tests(recording(strange), SOUGHT)
+    (found,) = extract_tests(recording(strange), SOUGHT)
     assert found.test_id is None
     assert found.samples is strange
     assert "no stored test was played: the nearest" in found.quality.notes[-1]
@@ -114,9 +108,9 @@ def test_the_user_may_say_where_it_lies() -> None:
         command=samples.command + np.roll(samples.command, 7000),
         current=samples.current + np.roll(samples.current, 7000),
     )
-    (late,) = found_tests(recording(twice), replace(SOUGHT, start_s=8.0))
+    (late,) = extract_tests(recording(twice), replace(SOUGHT, start_s=8.0))
     assert late.start_ns == 9_000_000_000
-    (early,) = found_tests(recording(twice), replace(SOUGHT, end_s=8.0))
+    (early,) = extract_tests(recording(twice), replace(SOUGHT, end_s=8.0))
     assert early.start_ns == 2_000_000_000
 
 
@@ -124,8 +118,8 @@ def test_a_named_start_stands_where_nothing_shows_it() -> None:
     samples = samples_of("open", 2000, 100)
     nothing = np.full(samples.ticks, np.nan)
     mute = replace(samples, command=nothing, current=nothing)
-    only = Sought((BY_NAME["open"],), CONTROLLER, start_s=2.0)
-    (found,) = found_tests(recording(mute), only)
+    only = CandidateTests((BY_NAME["open"],), CONTROLLER, start_s=2.0)
+    (found,) = extract_tests(recording(mute), only)
     assert found.test_id == BY_NAME["open"].id
     assert found.samples is not None
     np.testing.assert_array_equal(found.samples.spool, samples.spool[2000:7500])
@@ -148,7 +142,7 @@ def test_a_recording_that_ends_early_still_tells_its_beginning() -> None:
             )
         },
     )
-    (found,) = found_tests(recording(cut), SOUGHT)
+    (found,) = extract_tests(recording(cut), SOUGHT)
     assert found.start_ns == 300_000_000
     assert found.samples is not None
     assert np.isnan(found.samples.spool[4700:]).all()
@@ -158,7 +152,7 @@ def test_commands_out_of_place_are_left_out() -> None:
     samples = samples_of("open", 50, 50)
     command = samples.command.copy()
     command[[2600, 4700]] = command[[2598, 4702]]
-    (found,) = found_tests(recording(replace(samples, command=command)), SOUGHT)
+    (found,) = extract_tests(recording(replace(samples, command=command)), SOUGHT)
     assert found.samples is not None
     known = np.isfinite(found.samples.command)
     assert np.abs(found.samples.command - BY_NAME["open"].command())[known].max() < 2e-6

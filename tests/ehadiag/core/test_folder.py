@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from ehadiag.core import folder as folder_module
-from ehadiag.core.folder import CACHE_MODE, RESULT_MODE, Folder, create_file, reopen_file
+from firmware_iface import files as folder_module
+from firmware_iface.files import CACHE_MODE, RESULT_MODE, Folder, create_file, reopen_file
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links and permissions")
 

@@ -4,15 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from ehadiag.core.actuator import default_actuator, with_tolerance
-from ehadiag.core.channels import PRESSURE, SPOOL
-from ehadiag.core.stored_test import encode_test, load_test, resolve_test
-from ehadiag.design.play import play
-from ehadiag.design.propose import FORBIDDEN, Limits, propose
-from ehadiag.design.score import score, usual_effects
-from ehadiag.design.variant import space_of
-from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
-from ehadiag_sim.plant.simulator import simulate
+from ehadiag import default_actuator, load_test
+from ehadiag.core.actuator import with_tolerance
+from ehadiag.design.propose import PENALTY_BEYOND_LIMITS, MotionLimits, propose, variant_space
+from ehadiag.design.score import play_stored_test, score, typical_effects
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.simulation import simulate
+from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.stored_test import encode_test, resolve_test
 
 DEGRADED = (0.3, 0.3, 0.3)
 ACTUATOR = default_actuator()
@@ -20,16 +19,16 @@ ACTUATOR = default_actuator()
 
 def test_an_open_loop_test_is_played_as_the_detailed_simulator_does():
     test = resolve_test("open")
-    played = play(test, ACTUATOR, DEGRADED, {}).experiment
+    played = play_stored_test(test, ACTUATOR, DEGRADED, {}).experiment
     sensors = Sensors(noise_lsb=0.0)
     samples = simulate(ACTUATOR, test, Faults(*DEGRADED), Effects(), sensors, seed=0).samples
-    assert np.std(samples.spool - played.spool) < 0.5 * SPOOL.lsb
-    assert np.std(samples.pressure - played.pressure) < 0.5 * PRESSURE.lsb
+    assert np.std(samples.spool - played.spool) < 0.5 * SPOOL_CHANNEL.lsb
+    assert np.std(samples.pressure - played.pressure) < 0.5 * PRESSURE_CHANNEL.lsb
 
 
 def test_a_closed_loop_test_follows_its_command():
     test = resolve_test("closed")
-    played = play(test, ACTUATOR, DEGRADED, {})
+    played = play_stored_test(test, ACTUATOR, DEGRADED, {})
     assert played.travel == pytest.approx(10e-3, rel=0.05)
     held = slice(1500, 1690)  # 10 mm are held
     assert np.abs(played.experiment.position[held] - 10e-3).max() < 0.2e-3
@@ -65,7 +64,7 @@ def test_a_test_without_its_fast_part_does_not_show_the_filter():
 def test_the_middle_of_the_space_is_the_test_itself():
     for name in ("open", "closed"):
         test = resolve_test(name)
-        space = space_of(test, ACTUATOR.controller.IM)
+        space = variant_space(test, ACTUATOR.controller.IM)
         same = space.variant(np.zeros(len(space.lower)))
         np.testing.assert_allclose(same.command(), test.command(), atol=1e-12)
         for name_of_window in ("FDJ", "Kintas", "FSS", "refinement"):
@@ -77,7 +76,7 @@ def test_the_middle_of_the_space_is_the_test_itself():
 @pytest.mark.parametrize("seed", range(20))
 def test_every_variant_is_a_valid_test_file(seed, tmp_path):
     test = resolve_test(("open", "closed")[seed % 2])
-    space = space_of(test, ACTUATOR.controller.IM)
+    space = variant_space(test, ACTUATOR.controller.IM)
     point = np.random.default_rng(seed).uniform(space.lower, space.upper)
     variant = space.variant(point)
     file = tmp_path / "variant.toml"
@@ -90,9 +89,9 @@ def test_every_variant_is_a_valid_test_file(seed, tmp_path):
 def test_a_better_test_is_found_and_keeps_its_limits():
     test = resolve_test("open")
     now = score(test, ACTUATOR)
-    new = play(test, ACTUATOR, (0.0, 0.0, 0.0), usual_effects())
+    new = play_stored_test(test, ACTUATOR, (0.0, 0.0, 0.0), typical_effects())
     most = (max(now.travel, new.travel), max(now.rate, new.rate), max(now.pressure, new.pressure))
-    limits = Limits(*(1.001 * value for value in most), test.duration)
+    limits = MotionLimits(*(1.001 * value for value in most), test.duration)
     found = propose(test, ACTUATOR, limits, budget=25, seed=1)
     assert found is not None
     assert found.better
@@ -105,6 +104,6 @@ def test_a_better_test_is_found_and_keeps_its_limits():
 
 
 def test_limits_that_no_test_keeps_give_none():
-    tiny = Limits(travel=1e-6, rate=1e-6, pressure=1.0, duration=5.5)
+    tiny = MotionLimits(travel=1e-6, rate=1e-6, pressure=1.0, duration=5.5)
     assert propose(resolve_test("open"), ACTUATOR, tiny, budget=13) is None
-    assert tiny.excess(1.0, 1.0, 1.0, 1.0) * FORBIDDEN > FORBIDDEN
+    assert tiny.excess(1.0, 1.0, 1.0, 1.0) * PENALTY_BEYOND_LIMITS > PENALTY_BEYOND_LIMITS

@@ -6,12 +6,11 @@ import subprocess
 
 import pytest
 
-from ehadiag.export.archive import archive
-from ehadiag.export.arm_attributes import either_convention
+from ehadiag.export.targets import mark_either_convention, static_library
 
 
 def test_members_begin_at_even_places():
-    made = archive("odd.o", b"123", ["a", "bc"])
+    made = static_library("odd.o", b"123", ["a", "bc"])
     place = int.from_bytes(made[72:76], "big")
     assert made[:8] == b"!<arch>\n"
     assert place % 2 == 0
@@ -22,12 +21,12 @@ def test_members_begin_at_even_places():
 
 def test_name_too_long():
     with pytest.raises(ValueError, match="too long"):
-        archive("a_name_of_sixteen.o", b"", [])
+        static_library("a_name_of_sixteen.o", b"", [])
 
 
 @pytest.mark.skipif(shutil.which("ar") is None, reason="no ar here")
 def test_ar_lists_it(tmp_path):
-    (tmp_path / "x.a").write_bytes(archive("x.o", b"12345", ["symbol"]))
+    (tmp_path / "x.a").write_bytes(static_library("x.o", b"12345", ["symbol"]))
     listed = subprocess.run(["ar", "t", tmp_path / "x.a"], capture_output=True, check=True)
     assert listed.stdout == b"x.o\n"
 
@@ -40,14 +39,14 @@ def arm_object(attributes):
 
 
 def test_arm_object_is_marked_in_its_attributes_alone():
-    made = either_convention(arm_object(b"A\x26\x01\x0e\x00") + b"\x26\x01")
+    made = mark_either_convention(arm_object(b"A\x26\x01\x0e\x00") + b"\x26\x01")
     assert made.endswith(b"A\x1c\x03\x0e\x00\x26\x01")
 
 
 def test_arm_object_without_a_place_is_refused():
     with pytest.raises(ValueError, match="not found"):
-        either_convention(arm_object(b"A\x0e\x00"))
+        mark_either_convention(arm_object(b"A\x0e\x00"))
 
 
 def test_others_are_left():
-    assert either_convention(b"\x7fELF\x02\x01 and so on") == b"\x7fELF\x02\x01 and so on"
+    assert mark_either_convention(b"\x7fELF\x02\x01 and so on") == b"\x7fELF\x02\x01 and so on"

@@ -12,15 +12,13 @@ import numpy as np
 import pytest
 from places import LOGS
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.folder import RESULT_MODE, Folder
-from ehadiag.core.recording import CommandMode
+from ehadiag import CommandMode, ConfigurationError, Monitor, default_actuator
 from ehadiag.export.fmu import export_fmus
-from ehadiag.monitor import Monitor
-from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
-from ehadiag_sim.plant.simulator import Plant
+from ehadiag.monitor.monitor_memory import MONITOR_UNIT_FIELDS
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.simulation import Plant
 from ehadiag_tools.onboard.replay import ticks_of, unit_of
+from firmware_iface.files import RESULT_MODE, Folder
 from firmware_iface.logs.reader import read_recording
 
 fmpy = pytest.importorskip("fmpy")
@@ -116,8 +114,8 @@ def test_the_actuator_is_the_simulator(units, version, tmp_path):
 @pytest.mark.parametrize("version", [2, 3])
 def test_the_monitor_is_that_of_the_package(units, version, tmp_path):
     recording = read_recording(LOGS / "paper-closed-1.blf")
-    start = unit_of(recording, SEVERITIES)
-    unit = Running(str(units / f"eha_monitor_fmi{version}.fmu"), tmp_path, start._asdict())
+    start = dict(zip(MONITOR_UNIT_FIELDS, unit_of(recording, SEVERITIES), strict=True))
+    unit = Running(str(units / f"eha_monitor_fmi{version}.fmu"), tmp_path, start)
     monitor = Monitor(
         default_actuator(), SEVERITIES, recording.environment, mode=recording.samples.mode
     )

@@ -2,31 +2,35 @@
 
 import hashlib
 import json
+import platform
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from exported import Loaded, exported, object_of
 from places import LOGS, ROOT
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.export.firmware import SOURCES
-from ehadiag.export.library import export_library
-from ehadiag.export.targets import TARGETS, target
-from ehadiag.monitor import Monitor
-from ehadiag.monitor.layout import CUSUM, PREDICTED, SIZE
-from ehadiag.onboard.layout import SIZE as IDENTIFICATION
-from ehadiag_tools.onboard.emulators import EMULATED, missing
+from ehadiag import ConfigurationError, Monitor, default_actuator
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.export.library import FIRMWARE_C_FILES, export_library
+from ehadiag.export.plan import exported_unit, library_plan
+from ehadiag.export.targets import TARGETS, find_target
+from ehadiag.monitor.monitor_memory import MONITOR
+from ehadiag.monitor.plan import design_cusum
+from ehadiag.onboard.c_interface import ERRORS, HEALTH
+from ehadiag.onboard.onboard_memory import ONBOARD
+from ehadiag_tools.onboard.emulators import EMULATED, missing, run_program
 from ehadiag_tools.onboard.replay import identified, replayed, ticks_of, unit_of
-from ehadiag_tools.onboard.table import REFERENCE
+from ehadiag_tools.onboard.study import REFERENCE
 from firmware_iface.logs.reader import read_recording
 
 SEVERITIES = (0.3, 0.4, 0.2)
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 COMPILER = shutil.which("cc")
+MOST_INSTRUCTIONS_OF_A_SLICE = 2_000_000
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +43,11 @@ def loaded(place):
     return Loaded(object_of((exported("host", place) / "libeha.a").read_bytes()))
 
 
+PLAN = library_plan(default_actuator(), design_cusum(FALSE_ALARM_INTERVAL_H, 1e-3))
+
+
 def started(loaded, unit, numbers):
-    start = np.array(unit, dtype=np.float64)
+    start = exported_unit(unit, PLAN)
     return loaded.function("eha_monitor_init", 2)(numbers.ctypes.data, start.ctypes.data)
 
 
@@ -52,10 +59,10 @@ def test_the_host_is_the_monitor_of_the_package(loaded, log):
     monitor = Monitor(
         default_actuator(), SEVERITIES, recording.environment, mode=recording.samples.mode
     )
-    numbers = np.zeros(SIZE)
+    numbers = np.zeros(MONITOR.end)
     assert started(loaded, unit_of(recording, SEVERITIES), numbers) == 0
     push = loaded.function("eha_monitor_push", 2)
-    seen = numbers[PREDICTED : CUSUM + 4]
+    seen = numbers[MONITOR.predicted : MONITOR.cusum + 4]
     for tick in ticks:
         alarms = push(numbers.ctypes.data, tick.ctypes.data)
         reading = monitor.push(tuple(tick.tolist()))
@@ -69,21 +76,203 @@ def test_the_host_is_the_monitor_of_the_package(loaded, log):
 def test_a_number_that_cannot_be_is_refused_and_nothing_written(loaded, index, wrong):
     unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
     unit[index] = wrong
-    numbers = np.full(SIZE, 3.0)
-    assert started(loaded, unit, numbers) == 1
+    numbers = np.full(MONITOR.end, 3.0)
+    assert started(loaded, unit, numbers) == ERRORS.range
+    assert (numbers == 3.0).all()
+    job, start = np.full(ONBOARD.end, 3.0), exported_unit(unit, PLAN)
+    begin = loaded.function("eha_identify_begin", 2)
+    assert begin(job.ctypes.data, start.ctypes.data) == ERRORS.range
+    assert (job == 3.0).all()
+
+
+@pytest.mark.parametrize(
+    ("index", "wrong"),
+    [(0, -0.01), (1, 1.01), (3, 1.0), (4, 1e9), (5, 0.0), (5, 1e300), (5, 1e-3), (6, -1.0),
+     (6, 20.0), (6, 200.0), (6, 2900.0), (6, 1e300), (6, 5e-324)],
+)  # fmt: skip
+def test_a_number_out_of_its_range_is_refused(loaded, index, wrong):
+    """A viscosity of no oil, an offset beyond the converter, a supply in MPa, bar or psi."""
+    unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
+    unit[index] = wrong
+    numbers = np.full(MONITOR.end, 3.0)
+    assert started(loaded, unit, numbers) == ERRORS.range
     assert (numbers == 3.0).all()
 
 
-@pytest.mark.parametrize(("index", "wrong"), [(0, -0.01), (1, 1.01), (5, 0.0), (6, -1.0)])
-def test_a_number_out_of_its_range_is_refused(loaded, index, wrong):
-    unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
-    unit[index] = wrong
-    assert started(loaded, unit, np.zeros(SIZE)) == 1
+GOOD_UNIT = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
+
+
+def ready(loaded):
+    """Memory of a monitor that has begun."""
+    numbers = np.zeros(MONITOR.end)
+    assert started(loaded, GOOD_UNIT, numbers) == 0
+    return numbers
+
+
+def health(loaded, numbers):
+    return loaded.function("eha_monitor_health", 1)(numbers.ctypes.data)
+
+
+def pushed(loaded, numbers, tick, times=1):
+    given = np.array(tick, dtype=np.float64)
+    for _ in range(times):
+        last = loaded.function("eha_monitor_push", 2)(numbers.ctypes.data, given.ctypes.data)
+    return last
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("eha_unit_environment", 2), ("eha_monitor_init", 2), ("eha_monitor_reset", 2),
+     ("eha_monitor_push", 2), ("eha_identify_begin", 2), ("eha_identify_run", 3)],
+)  # fmt: skip
+def test_a_pointer_that_is_null_or_not_aligned_is_refused(loaded, name, count):
+    memory = np.full(ONBOARD.end, 3.0)
+    call = loaded.function(name, count)
+    for wrong in (0, memory.ctypes.data + 4):
+        for index in range(count):
+            pointers = [memory.ctypes.data] * count
+            pointers[index] = wrong
+            assert call(*pointers) == ERRORS.pointer
+    assert (memory == 3.0).all()
+    assert loaded.function("eha_monitor_health", 1)(0) == HEALTH.object
+
+
+@pytest.mark.parametrize("content", ["zeros", "noise", "NaN", "the other kind"])
+def test_an_object_that_was_never_begun_is_refused_and_as_it_was(loaded, content):
+    rng, size = np.random.default_rng(3), ONBOARD.end
+    memory = {
+        "zeros": np.zeros(size),
+        "noise": rng.integers(0, 2**63, size, dtype=np.uint64).view(np.float64),
+        "NaN": np.full(size, np.nan),
+        "the other kind": np.zeros(size),
+    }[content]
+    run = loaded.function("eha_identify_run", 3)
+    if content == "the other kind":
+        unit = exported_unit(GOOD_UNIT, PLAN)
+        begin = loaded.function("eha_identify_begin", 2)
+        assert begin(memory.ctypes.data, unit.ctypes.data) == 0
+        run = loaded.function("eha_monitor_push", 2)
+    before = memory.tobytes()
+    tick, spool = np.zeros(5), np.zeros(1)
+    push, reset = loaded.function("eha_monitor_push", 2), loaded.function("eha_monitor_reset", 2)
+    assert push(memory.ctypes.data, tick.ctypes.data) == ERRORS.object
+    assert reset(memory.ctypes.data, spool.ctypes.data) == ERRORS.object
+    assert health(loaded, memory) == HEALTH.object
+    if content != "the other kind":
+        slices = np.array([5500.0, 1.0])
+        recording = np.zeros((5500, 5))
+        pointers = memory.ctypes.data, recording.ctypes.data, slices.ctypes.data
+        assert run(*pointers) == ERRORS.object
+    assert memory.tobytes() == before
+
+
+@pytest.mark.parametrize(("member", "wrong"), [(8, 1.0), (9, 12345.0), (8, np.nan), (9, np.nan)])
+def test_another_library_s_header_is_noticed(loaded, member, wrong):
+    unit, numbers = exported_unit(GOOD_UNIT, PLAN), np.full(MONITOR.end, 3.0)
+    unit[member] = wrong
+    init = loaded.function("eha_monitor_init", 2)
+    assert init(numbers.ctypes.data, unit.ctypes.data) == ERRORS.library
+    assert (numbers == 3.0).all()
+
+
+def test_every_serial_number_runs_with_the_data_of_a_type(loaded):
+    unit, numbers = exported_unit(GOOD_UNIT, PLAN), np.zeros(MONITOR.end)
+    unit[10] = 4711.0
+    assert loaded.function("eha_monitor_init", 2)(numbers.ctypes.data, unit.ctypes.data) == 0
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_reset_to_no_number_is_refused(loaded, wrong):
+    numbers, spool = ready(loaded), np.array([wrong])
+    before = numbers.tobytes()
+    reset = loaded.function("eha_monitor_reset", 2)
+    assert reset(numbers.ctypes.data, spool.ctypes.data) == ERRORS.range
+    assert numbers.tobytes() == before
+
+
+@pytest.mark.parametrize("index", range(5))
+@pytest.mark.parametrize("wrong", [1e300, -1e300, np.inf, 5e3])
+def test_a_number_in_the_wrong_unit_counts_as_lost_and_shows_in_the_health(loaded, index, wrong):
+    """A command in mA, a spool in mm: the monitor is not spoilt by it."""
+    wrong *= 1e6 if index == 3 else 1.0
+    numbers, other = ready(loaded), ready(loaded)
+    tick = [2e-3, 2e-3, 1e-5, 1e5, 0.0]
+    bad, lost = list(tick), list(tick)
+    bad[index], lost[index] = wrong, np.nan
+    assert health(loaded, numbers) == 0
+    pushed(loaded, numbers, bad)
+    pushed(loaded, other, lost)
+    assert health(loaded, numbers) == HEALTH.beyond
+    assert numbers[MONITOR.predicted : MONITOR.plays].tobytes() == (
+        other[MONITOR.predicted : MONITOR.plays].tobytes()
+    )
+    pushed(loaded, numbers, tick)
+    assert health(loaded, numbers) == 0
+
+
+def test_a_monitor_without_samples_is_not_able_to_judge(loaded):
+    numbers = ready(loaded)
+    pushed(loaded, numbers, [np.nan] * 5, times=250)
+    assert health(loaded, numbers) == 0
+    pushed(loaded, numbers, [np.nan] * 5)
+    assert health(loaded, numbers) == HEALTH.spool + HEALTH.pressure + HEALTH.command
+    pushed(loaded, numbers, [0.0, np.nan, 0.0, 0.0, 0.0])
+    assert health(loaded, numbers) == 0
+
+
+def test_a_model_without_numbers_is_not_able_to_judge(loaded):
+    numbers = ready(loaded)
+    numbers[MONITOR.valve + 2] = np.nan
+    pushed(loaded, numbers, [0.0] * 5)
+    assert health(loaded, numbers) & HEALTH.model
+
+
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+FEWEST_KINDS = 250
+"""Of bad input that a target must hold against, 1; some have no other arithmetic to be set."""
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+@pytest.mark.parametrize("host", EMULATED[:2], ids=lambda item: item.target)
+@pytest.mark.parametrize("sane", [False, True])
+def test_bad_input_on_this_computer_and_without_floating_point_exceptions(
+    sane, host, place, tmp_path
+):
+    options = (*SANITIZERS, *host.options[1:]) if sane else host.options
+    assert_holds(replace(host, options=options), place, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4-single", "cortex-a53", "powerpc-e500mc"])
+def test_bad_input_on_a_target(name, place, tmp_path):
+    emulator = next(item for item in EMULATED if item.target == name)
+    if missing(emulator):
+        pytest.skip(f"not installed: {', '.join(missing(emulator))}")
+    assert_holds(emulator, place, tmp_path)
+
+
+def assert_holds(emulator, place, work):
+    """Each kind of bad input has the code, reason or health that it must have."""
+    said = run_program(emulator, exported(emulator.target, place), "misuse.c", work)
+    found = re.fullmatch(r"nothing wrong in (\d+) kinds of input\n", said)
+    assert found, said
+    assert int(found[1]) >= FEWEST_KINDS
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="not an x86-64")
+@pytest.mark.skipif(not shutil.which("objdump"), reason="no objdump here")
+def test_the_host_library_needs_no_more_than_x86_64(place):
+    """No register of AVX, which is 256 or 512 bits wide, and no rounding of SSE4.1."""
+    done = subprocess.run(
+        ["objdump", "-d", exported("host", place) / "libeha.a"], capture_output=True, check=True
+    )
+    assert b"mulsd" in done.stdout
+    assert not re.search(rb"%[yz]mm|\bv[a-z]+sd\b|\bround[sp]d\b", done.stdout)
 
 
 def test_reset_begins_anew(loaded):
     unit = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 20e6, 0.0]
-    one, two = np.zeros(SIZE), np.zeros(SIZE)
+    one, two = np.zeros(MONITOR.end), np.zeros(MONITOR.end)
     push, reset = (
         loaded.function("eha_monitor_push", 2),
         loaded.function("eha_monitor_reset", 2),
@@ -96,7 +285,7 @@ def test_reset_begins_anew(loaded):
     for numbers in (one, two):
         reset(numbers.ctypes.data, spool.ctypes.data)
         push(numbers.ctypes.data, tick.ctypes.data)
-    assert one[:CUSUM].tobytes() == two[:CUSUM].tobytes()
+    assert one[: MONITOR.cusum].tobytes() == two[: MONITOR.cusum].tobytes()
 
 
 def test_the_manifest_tells_what_was_written(place):
@@ -113,7 +302,7 @@ def test_the_manifest_tells_what_was_written(place):
 
 def test_an_unknown_target_is_named():
     with pytest.raises(ConfigurationError, match="'pdp11': need one of host"):
-        target("pdp11")
+        find_target("pdp11")
 
 
 def test_every_target_can_be_emulated():
@@ -128,7 +317,7 @@ def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
         pytest.skip(f"not installed: {', '.join(absent)}")
     recording = read_recording(LOGS / "paper-closed-1.blf")
     ticks, unit = ticks_of(recording)[:600], unit_of(recording, SEVERITIES)
-    name = REFERENCE[target(emulator.target).processor.single]
+    name = REFERENCE[find_target(emulator.target).processor.single]
     host = next(item for item in EMULATED if item.target == name)
     expected = replayed(host, exported(name, place), unit, ticks, tmp_path).lines
     replay = replayed(emulator, exported(emulator.target, place), unit, ticks, tmp_path)
@@ -146,13 +335,15 @@ def test_the_identification_has_the_digits_of_the_host_on_a_bare_target(place, t
     if absent:
         pytest.skip(f"not installed: {', '.join(absent)}")
     recording = read_recording(LOGS / "paper-open-1.blf")
-    ticks, unit = ticks_of(recording)[:150], unit_of(recording, (0.0, 0.0, 0.0))
-    expected = identified(host, exported("host", place), unit, ticks, tmp_path)
+    ticks, unit = ticks_of(recording)[2300:2700], unit_of(recording, (0.0, 0.0, 0.0))
+    expected = identified(host, exported("host", place, len(ticks)), unit, ticks, tmp_path)
     assert expected.bits.startswith("0 ")
-    found = identified(bare, exported("cortex-m7", place), unit, ticks, tmp_path)
+    assert expected.outcome.runs > 50.0
+    found = identified(bare, exported("cortex-m7", place, len(ticks)), unit, ticks, tmp_path)
     assert found.bits == expected.bits
     assert 0 < found.stack <= 4096
     assert found.millions > 0
+    assert 0 < found.longest <= MOST_INSTRUCTIONS_OF_A_SLICE
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
@@ -161,7 +352,8 @@ def test_the_example_is_compiled_without_a_warning_and_runs(place, tmp_path, opt
     out = exported("host", place)
     made = tmp_path / "example"
     subprocess.run(
-        [COMPILER, *WARNINGS, *options, out / "example.c", *(out / name for name in SOURCES),
+        [COMPILER, *WARNINGS, *options, out / "example.c",
+        *(out / name for name in FIRMWARE_C_FILES),
          out / "libeha.a", "-lm", "-o", made],
         check=True,
     )  # fmt: skip
@@ -177,7 +369,7 @@ def test_the_shared_library_is_found_by_pkg_config(place, tmp_path):
         capture_output=True, text=True, check=True, env={"PKG_CONFIG_PATH": str(out)},
     ).stdout.split()  # fmt: skip
     made = tmp_path / "example"
-    sources = (out / name for name in ("example.c", *SOURCES))
+    sources = (out / name for name in ("example.c", *FIRMWARE_C_FILES))
     subprocess.run([COMPILER, *sources, *flags, "-lm", "-o", made], check=True)
     done = subprocess.run(
         [made], capture_output=True, text=True, check=True, env={"LD_LIBRARY_PATH": str(out)}
@@ -187,8 +379,8 @@ def test_the_shared_library_is_found_by_pkg_config(place, tmp_path):
 
 def test_the_page_says_what_memory_they_take():
     page = (ROOT / "docs" / "how-to" / "export.md").read_text()
-    assert f"one `eha_monitor`\nof {8 * SIZE} bytes" in page
-    thousands, rest = divmod(8 * IDENTIFICATION, 1000)
+    assert f"one `eha_monitor`\nof {8 * MONITOR.end} bytes" in page
+    thousands, rest = divmod(8 * ONBOARD.end, 1000)
     assert f"`eha_identification` of {thousands} {rest:03} bytes" in page
 
 
@@ -197,6 +389,7 @@ def test_the_page_says_what_memory_they_take():
 def test_cppcheck_finds_nothing(place):
     out, ours = exported("host", place), ROOT / "firmware_iface" / "c"
     rest = [path for path in ours.glob("*.c") if not (out / path.name).exists()]
+    assert rest
     done = subprocess.run(
         ["cppcheck", "--std=c99", "--enable=warning,style,portability", "--error-exitcode=1",
          # A struct of FMI has members that a unit does not need.
@@ -236,7 +429,7 @@ def test_cmake_builds_the_export_with_the_target_s_compiler(place, tmp_path):
 
 def test_a_number_of_hours_that_no_threshold_gives(place):
     with pytest.raises(ConfigurationError, match="hours"):
-        export_library(default_actuator(), target("host"), None, hours=1e9)
+        export_library(default_actuator(), find_target("host"), None, hours=1e9)
 
 
 @pytest.mark.slow
@@ -264,7 +457,7 @@ def test_arm_code_hands_numbers_to_nobody(name, place):
 @pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck here")
 def test_every_deviation_from_misra_is_listed(place):
     out = exported("host", place)
-    sources = [name for name in SOURCES if name != "eha_fcc.c"]
+    sources = [name for name in FIRMWARE_C_FILES if name != "eha_fcc.c"]
     done = subprocess.run(
         ["cppcheck", "--addon=misra", "--std=c99", "--enable=style", "--quiet", f"-I{out}",
          *(out / name for name in ("example.c", *sources))],

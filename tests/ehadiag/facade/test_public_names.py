@@ -1,16 +1,33 @@
-"""What `import ehadiag` offers, to people, editors and type checkers, and what it loads for it."""
+"""What `import ehadiag` offers, to people, editors and type checkers, and what it loads for it.
+
+The Python page: every example runs and gives what the page says; every name is on it. A result
+shown: the picture, a notebook's cell, samples as a data frame.
+"""
 
 from __future__ import annotations
 
 import ast
+import doctest
+import re
+import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
 
+import msgspec
+import numpy as np
+import pandas as pd
 import pytest
-from places import ROOT
+from matplotlib.figure import Figure
+from places import LOGS, ROOT
+from printed_output import TolerantChecker, output_matches
 
 import ehadiag
+from ehadiag.cli.main import main
+from firmware_iface.errors import install_command
 
 HEAVY = {"numpy", "numba", "scipy", "can", "cantools", "matplotlib", "rich", "pandas", "msgspec"}
 
@@ -68,14 +85,141 @@ def test_the_import_alone_loads_nothing() -> None:
     [
         ("__version__", set()),
         ("EhadiagError", set()),
-        ("Levels", set()),
-        ("load_actuator", {"msgspec"}),
+        ("Levels", {"msgspec"}),
+        ("load_actuator", {"msgspec", "numpy"}),
         ("load_test", {"msgspec", "numpy"}),
         ("Recording", {"numpy"}),
         ("read", {"msgspec", "numpy"}),
         ("simulate", {"msgspec", "numpy"}),
         ("diagnose", {"msgspec", "numpy"}),
+        ("run_test", {"msgspec", "numpy"}),
     ],
 )
 def test_a_name_loads_only_what_it_is_made_of(name: str, allowed: set[str]) -> None:
     assert modules_after(f"import ehadiag; ehadiag.{name}") & HEAVY <= allowed
+
+
+TEXT_SUFFIXES = {".py", ".md", ".ipynb"}
+PAGE = ROOT / "docs" / "reference" / "python.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+
+
+def test_the_page_has_its_examples() -> None:
+    assert len(BLOCKS) == 10
+    assert all(block.startswith(">>> ") for block in BLOCKS)
+
+
+def test_every_example_gives_what_the_page_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("open", "closed"):
+        shutil.copy(LOGS / f"paper-{name}-4.blf", tmp_path / f"{name}.blf")
+    monkeypatch.chdir(tmp_path)
+    examples = doctest.DocTestParser().get_doctest("\n".join(BLOCKS), {}, "python.md", None, 0)
+    outcome = doctest.DocTestRunner(checker=TolerantChecker()).run(examples)
+    assert outcome.attempted == len(examples.examples) > 20
+    assert outcome.failed == 0, capsys.readouterr().out
+    assert (tmp_path / "closed.png").stat().st_size > 10_000
+
+
+def test_every_public_name_is_on_the_page() -> None:
+    table = TEXT.partition("## All names")[2]
+    assert set(re.findall(r"`(\w+)`", table)) == set(ehadiag.__all__)
+
+
+@pytest.mark.parametrize(
+    ("want", "got", "same"),
+    [
+        ("FSS 0.6000 … 0.7\n", "FSS 0.6004 … 0.7\n", True),
+        ("FSS 0.6000\n", "FSS 0.6100\n", False),
+        ("FSS 0.6000 0.5\n", "FSS 0.6000\n", False),
+        ("FSS 0.6\n", "FSS 0.6 0.7\n", False),
+        ("5500 ticks\n", "5501 ticks\n", False),
+        ("took ...\n", "took 0.123 s\n", True),
+    ],
+)
+def test_what_counts_output_matches(want: str, got: str, same: bool) -> None:
+    assert output_matches(want, got) is same
+
+
+@pytest.fixture(scope="module")
+def recording() -> ehadiag.Recording:
+    (found,) = ehadiag.read(LOGS / "lossy-open.blf")
+    return found
+
+
+@pytest.fixture(scope="module")
+def result(recording: ehadiag.Recording) -> ehadiag.Result:
+    return ehadiag.diagnose(recording)
+
+
+def test_the_plot_is_the_command_lines_picture(result: ehadiag.Result, tmp_path: Path) -> None:
+    assert main(["diagnose", "--out", str(tmp_path), result.source]) == int(result.verdict)
+    theirs = (tmp_path / "lossy-open.png").read_bytes()
+    figure = result.plot()
+    assert isinstance(figure, Figure)
+    figure.savefig(tmp_path / "ours.png", dpi=110)
+    assert (tmp_path / "ours.png").read_bytes() == theirs
+    assert result.plot()._repr_png_() == theirs  # type: ignore[attr-defined]
+
+
+def test_the_plot_leaves_pyplot_alone(result: ehadiag.Result) -> None:
+    from matplotlib import pyplot
+
+    before = pyplot.get_fignums()
+    result.plot()
+    assert pyplot.get_fignums() == before
+
+
+def test_a_notebook_shows_the_table(result: ehadiag.Result) -> None:
+    html = result._repr_html_()
+    text = unescape(re.sub(r"<style>.*?</style>|<[^>]*>", "", html, flags=re.DOTALL))
+    assert text.split()[0] == result.verdict.name
+    for item in result.severities.values():
+        assert item.meaning in text
+        assert f"{item.value:.5f}" in text
+
+
+def test_names_from_outside_are_text_only(recording: ehadiag.Recording) -> None:
+    name = "<script>alert(1)</script>[/red][bold]:warning:&amp;.blf"
+    actuator = msgspec.structs.replace(ehadiag.default_actuator(), name=name)
+    result = ehadiag.diagnose(replace(recording, source=name), actuator=actuator)
+    assert f"  recording {name}" in str(result).splitlines()
+    assert f"actuator {name}" in str(result)
+    html = result._repr_html_()
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;alert(1)&lt;/script&gt;[/red][bold]:warning:&amp;amp;") == 1
+
+
+def test_samples_as_a_data_frame(recording: ehadiag.Recording) -> None:
+    samples = recording.samples
+    assert samples is not None
+    frame = recording.to_frame()
+    assert list(frame.columns) == ["command", "current", "spool", "pressure", "position"]
+    assert frame.index.name == "time"
+    np.testing.assert_array_equal(frame.index, samples.time)
+    for name in frame.columns:
+        np.testing.assert_array_equal(frame[name], getattr(samples, name))
+    assert isinstance(frame, pd.DataFrame)
+    assert frame["spool"].isna().sum() == np.isnan(samples.spool).sum() > 0
+    assert samples.time[-1] == pytest.approx((samples.ticks - 1) * 1e-3)
+
+
+def test_without_pandas_it_is_said_how_to_get_it(
+    recording: ehadiag.Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"needs pandas: (uv )?pip install 'pandas"):
+        recording.to_frame()
+
+
+def test_no_hint_names_a_package_that_no_index_has() -> None:
+    """The package is on no index: hints name what is to be installed (`install_command`)."""
+    places = [ROOT / name for name in ("ehadiag", "firmware_iface", "docs", "examples")]
+    texts = [path for place in places for path in place.rglob("*") if path.suffix in TEXT_SUFFIXES]
+    assert len(texts) > 200
+    found = [path for path in texts if "install 'ehadiag[" in path.read_text(encoding="utf-8")]
+    assert found == []
+    for extra in ("mf4", "daq", "multicast", "dask", "parquet", "completion"):
+        assert re.fullmatch(r"(uv )?pip install('\S+'| )+|pipx .*", install_command(extra))

@@ -13,9 +13,9 @@ recordings = ehadiag.read("test.blf")
 assert_type(recordings, list[ehadiag.Recording])
 assert_type(ehadiag.simulate("open", FSS=0.3, oil_temperature=60.0), ehadiag.Recording)
 
-result = ehadiag.diagnose([*recordings, "other.blf"], levels=ehadiag.Levels(advisory=0.3))
+result = ehadiag.diagnose([*recordings, "other.blf"], advisory=0.3, nuisances="all")
 assert_type(result, ehadiag.Result)
-assert_type(result.faults["FSS"], ehadiag.Fault)
+assert_type(result.faults["FSS"], ehadiag.Severity)
 assert_type(result.faults["FSS"].value, float)
 assert_type(result.faults["FSS"].interval, tuple[float, float])
 assert_type(result.verdict, ehadiag.Verdict)
@@ -39,5 +39,5 @@ assert_type(monitor.push(ehadiag.Tick(0.0, 0.0, 0.0, 0.0, 0.0)), ehadiag.Reading
 ehadiag.diagnoze  # type: ignore[attr-defined]  # noqa: B018
 ehadiag.diagnose(3)  # type: ignore[arg-type]
 ehadiag.diagnose("test.blf", sead=1)  # type: ignore[call-arg]
-result.faults["FSS"].estimate  # type: ignore[attr-defined]  # noqa: B018
+result.faults["FSS"].estimated  # type: ignore[attr-defined]  # noqa: B018
 result.faults["FSS"].value = 0.3  # type: ignore[misc]

@@ -1,20 +1,39 @@
-"""The refinement finds the truth again, and says what it left out."""
+"""The refinement finds the truth again, and says what it left out.
+
+The last round of a refinement: what the vector kernels are off is taken out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from identify_cases import named, own_experiment, recorded
 
-from ehadiag.core.channels import PRESSURE, SPOOL
-from ehadiag.identify.refine.first_part import anchored_derivatives, residuals_at
-from ehadiag.identify.refine.least_squares import median_offsets, refine
-from ehadiag.identify.uncertainty import covariance
-from ehadiag.model.parameters import FAULT_NAMES
+from ehadiag.identify.estimates import estimate_covariance
+from ehadiag.identify.experiment import lay_out_spans, unknowns_of
+from ehadiag.identify.least_squares import (
+    last_round,
+    median_offsets,
+    refine_severities,
+    refined_with_day,
+    refinement_at,
+)
+from ehadiag.identify.linearisation import ParameterDensity, capped_cost, linearised_on_cross
+from ehadiag.identify.partial_refinement import anchored_derivatives, free_run_residuals
+from ehadiag.identify.posterior import cauchy_weights
+from ehadiag.model.registry import FAULT_NAMES, parameter
+from ehadiag.model.registry import FAULTS as SEVERITIES
+from ehadiag.model.residual_models import SimdModel
+from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
 
 CASES = ((0.3, 0.6, 0.3), (0.6, 0.2, 0.9), (0.1, 0.9, 0.5))
 
 
 def refined(experiment, start):
-    return refine(anchored_derivatives([experiment]), named(start))
+    return refine_severities(anchored_derivatives([experiment]), named(start))
 
 
 def severities(found):
@@ -24,7 +43,7 @@ def severities(found):
 def deviations(found):
     """Of the severities, by name."""
     names = [item.name for item in found.parameters]
-    std = np.sqrt(np.diag(covariance(found)))
+    std = np.sqrt(np.diag(estimate_covariance(found)))
     return np.array([std[names.index(name)] for name in FAULT_NAMES])
 
 
@@ -61,8 +80,8 @@ def test_constant_offsets_are_told_from_faults():
     experiment = own_experiment(faults, offsets_lsb=(3.0, -5.0))
     found = refined(experiment, faults)
     total = (
-        (experiment.spool_offset + found.values["spool_offset"]) / SPOOL.lsb,
-        (experiment.pressure_offset + found.values["pressure_offset"]) / PRESSURE.lsb,
+        (experiment.spool_offset + found.values["spool_offset"]) / SPOOL_CHANNEL.lsb,
+        (experiment.pressure_offset + found.values["pressure_offset"]) / PRESSURE_CHANNEL.lsb,
     )
     assert total == pytest.approx((3.0, -5.0), abs=0.05)
     np.testing.assert_allclose(severities(found), severities(clean), atol=4e-4)
@@ -74,7 +93,7 @@ def test_glitches_are_left_out():
     experiment = own_experiment(faults)
     whole = refined(experiment, faults)
     rows = np.random.default_rng(0).choice(experiment.ticks, 55, replace=False)
-    experiment.pressure[rows] += 40 * PRESSURE.lsb
+    experiment.pressure[rows] += 40 * PRESSURE_CHANNEL.lsb
     found = refined(experiment, faults)
     assert not found.used[1, rows].any()
     assert (np.abs(severities(found) - severities(whole)) < deviations(whole)).all()
@@ -82,8 +101,82 @@ def test_glitches_are_left_out():
 
 def test_median_offsets_are_those_of_the_sensors():
     experiment = own_experiment((0.4, 0.5, 0.6), offsets_lsb=(3.0, -5.0))
-    found = median_offsets(*residuals_at([experiment], None, named((0.4, 0.5, 0.6))))
+    found = median_offsets(*free_run_residuals([experiment], None, named((0.4, 0.5, 0.6))))
     spool = found["spool_offset"] + experiment.spool_offset
     pressure = found["pressure_offset"] + experiment.pressure_offset
-    assert spool / SPOOL.lsb == pytest.approx(3.0, abs=0.1)
-    assert pressure / PRESSURE.lsb == pytest.approx(-5.0, abs=0.1)
+    assert spool / SPOOL_CHANNEL.lsb == pytest.approx(3.0, abs=0.1)
+    assert pressure / PRESSURE_CHANNEL.lsb == pytest.approx(-5.0, abs=0.1)
+
+
+FAULTS = (0.3, 0.3, 0.3)
+
+
+VISCOSITY_STD = 2.3e-3
+"""Of oil at -20 °C by the bus's steps of 0.1 K."""
+
+
+@cache
+def exact():
+    """An experiment without noise whose oil is a deviation thicker than the bus says."""
+    noisy = replace(own_experiment(FAULTS), viscosity_std=VISCOSITY_STD)
+    batch = lay_out_spans([noisy])
+    model = SimdModel(batch, unknowns_of([noisy], (*SEVERITIES, parameter("oil_viscosity"))))
+    there = np.array([[*FAULTS, VISCOSITY_STD]])
+    spool, pressure = model.residuals(there)[0][0] / batch.weight
+    return replace(noisy, spool=noisy.spool - spool, pressure=noisy.pressure - pressure)
+
+
+@cache
+def whole():
+    return anchored_derivatives([exact()])
+
+
+@cache
+def by_the_rounds():
+    """Optimum of the vector kernels, and its deviations in units of the scales."""
+    found = refine_severities(whole(), named(FAULTS))
+    return found, np.sqrt(np.diag(np.linalg.inv(found.normal)))
+
+
+def error(found):
+    """Of the severities, in deviations."""
+    _, std = by_the_rounds()
+    return ((found.x * found.scale)[:3] - FAULTS) / (std * found.scale)[:3]
+
+
+def belief(shift=0.0):
+    before, std = by_the_rounds()
+    return ParameterDensity(before.x + shift * std, np.diag(2.0 * std[whole().curved]))
+
+
+def test_the_last_round_estimates_the_oil_of_the_day():
+    before, _ = by_the_rounds()
+    after, costs = last_round(whole(), belief(), True)
+    # The density of the oil holds back a little.
+    assert np.abs(error(before)).max() > 1.5
+    assert np.abs(error(after)).max() < 0.4 * np.abs(error(before)).max()
+    assert costs == [pytest.approx(capped_cost(whole().many(before.x[None])[0]))]
+    assert after.converged
+    assert not np.any(after.jacobian[:, ~after.used])
+    alone = estimate_covariance(replace(after, daily=after.daily[:0]))
+    assert estimate_covariance(after)[2, 2] > 1.02 * alone[2, 2]
+
+
+def test_costs_of_other_points_are_theirs():
+    before, std = by_the_rounds()
+    beside = before.x + std
+    _, costs = last_round(whole(), belief(), False, beside)
+    assert costs[1] == pytest.approx(np.minimum(whole().many(beside[None])[0] ** 2, 9.0).sum())
+    assert costs[1] > costs[0]
+
+
+def test_an_optimum_of_many_unknowns_moves_by_the_oil_of_the_day():
+    before, _ = by_the_rounds()
+    linear = linearised_on_cross(whole(), belief())
+    found = refinement_at(whole(), before.x, linear, settled=True)
+    after = refined_with_day(whole(), found, linear)
+    assert np.abs(error(after)).max() < 0.5 * np.abs(error(before)).max()
+    rows = linear.jacobian.reshape(len(found.x), -1)
+    held = 1e9 * (rows * cauchy_weights(linear).ravel()) @ rows.T
+    known = refined_with_day(whole(), replace(found, information=held), linear)
+    np.testing.assert_allclose(known.x, found.x, atol=1e-9)

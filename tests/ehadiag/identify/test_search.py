@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from identify_cases import recorded
 
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.identify.search import compact_ga
-from ehadiag.identify.search.objective import Objective
-from ehadiag.identify.search.solvers import CompactGa, PygadGa, make_solver
-from ehadiag.identify.spans import lay_out, unknowns_of
-from ehadiag.model.parameters import FAULTS
-from ehadiag.model.simd.model import SimdModel
+from ehadiag import ConfigurationError
+from ehadiag.identify import compact_ga
+from ehadiag.identify.experiment import lay_out_spans, unknowns_of
+from ehadiag.identify.solvers import CompactGa, Objective, PygadGa, make_solver
+from ehadiag.model.registry import FAULTS
+from ehadiag.model.residual_models import SimdModel
 
 TRUTH = np.array([0.6, 0.6, 0.3])
 START = TRUTH + np.array([0.01, -0.01, 0.01])
@@ -21,7 +20,7 @@ START = TRUTH + np.array([0.01, -0.01, 0.01])
 @pytest.fixture
 def objective():
     experiment = recorded("paper-open-3.blf", "open")
-    batch = lay_out([experiment], [experiment.test.windows.refinement], lead=0.1)
+    batch = lay_out_spans([experiment], [experiment.test.windows.refinement], lead=0.1)
     return Objective(SimdModel(batch, unknowns_of([experiment], FAULTS)))
 
 
@@ -74,14 +73,16 @@ def test_an_interrupt_stops_the_search(objective):
 def test_the_search_is_its_three_steps(objective):
     """A generation at a time, by hand: the digits of the solver, which holds nothing else."""
     solver = CompactGa(budget=320)
-    state = compact_ga.start(START, np.full(3, 0.02), 4)
+    state = compact_ga.initial_state(START, np.full(3, 0.02), 4)
     population = np.empty((solver.samples, 3))
     for generation in range(20):
-        compact_ga.draw(state, population)
+        compact_ga.draw_generation(state, population)
         if generation == 0:
             population[0] = START
         costs = objective(population)
-        compact_ga.learn(state, population, costs, solver.virtual_population, solver.tolerance)
+        compact_ga.update_state(
+            state, population, costs, solver.virtual_population, solver.tolerance, np.empty(3)
+        )
     found = solver.minimise(objective, START, 0.02, 4)
     np.testing.assert_array_equal(found.best, state.elite)
     assert (found.cost, found.generations, found.evaluations) == (state.best[0], 20, 320)
@@ -117,14 +118,14 @@ def test_a_budget_below_a_generation_leaves_the_start(objective):
 @given(st.integers(0, 2**63), st.integers(1, 6), st.integers(1, 20))
 def test_draws_stay_inside_and_the_elite_never_gets_worse(seed, genes, samples):
     rng = np.random.default_rng(seed % 1000)
-    state = compact_ga.start(rng.random(genes), rng.random(genes), seed)
+    state = compact_ga.initial_state(rng.random(genes), rng.random(genes), seed)
     population = np.empty((samples, genes))
     best = np.inf
     for _ in range(5):
-        compact_ga.draw(state, population)
+        compact_ga.draw_generation(state, population)
         assert ((population >= 0.0) & (population <= 1.0)).all()
         costs = rng.random(samples)
-        compact_ga.learn(state, population, costs, 40.0, 1e-6)
+        compact_ga.update_state(state, population, costs, 40.0, 1e-6, np.empty(genes))
         best = min(best, costs.min())
         assert state.best[0] == best
         assert ((state.mean >= 0.0) & (state.mean <= 1.0)).all()

@@ -1,24 +1,42 @@
-"""An identification that is fed while the test runs: the answer of the recording alone, sooner."""
+"""An identification that is fed while the test runs: the answer of the recording alone, sooner.
+
+The last part of a test, added to the optimum of the rest.
+"""
+
+from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from identify_cases import own_experiment, recorded
+from identify_cases import named, own_experiment, recorded
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import Samples
-from ehadiag.core.stored_test import resolve_test
+from ehadiag import Samples, default_actuator
+from ehadiag.identify.estimates import estimate_covariance
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.search.stages import STAGES, first_ends_at, stage_ends_at
-from ehadiag.identify.session import Session, identify
-from ehadiag_sim.plant.conditions import Faults
-from ehadiag_sim.plant.simulator import simulate
+from ehadiag.identify.identification_session import IdentificationSession, identify
+from ehadiag.identify.least_squares import refine_severities
+from ehadiag.identify.partial_refinement import (
+    add_last_part,
+    anchored_derivatives,
+    refine_first_part,
+)
+from ehadiag.identify.severity_estimate import first_part_ticks
+from ehadiag.identify.staged_search import (
+    STAGE_SHARES,
+    first_approximation_ready_at,
+    stage_ready_at,
+)
+from ehadiag.model.registry import FAULT_NAMES
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.simulation import simulate
+from firmware_iface.stored_test import resolve_test
 
 FAULTS = (0.4, 0.5, 0.6)
-STEPS = 1 + len(STAGES) + 1
+STEPS = 1 + len(STAGE_SHARES) + 1
 """First approximation, stages of the search, refinement but its last step."""
 
 
@@ -44,7 +62,7 @@ def experiment_after(recording, ticks=None):
     return build_experiment(samples, whole.environment, test, default_actuator())
 
 
-def said(result):
+def figures_of(result):
     """All numbers of an identification but the time it took."""
     return (
         [structs_of(item) for item in result.estimates],
@@ -69,37 +87,40 @@ def alone(recording):
 
 def test_fed_stage_by_stage_it_gives_the_digits_of_the_recording_alone(recording, alone):
     test, _ = recording
-    session = Session()
-    ends = [first_ends_at(test), *(stage_ends_at(test, i) for i in range(len(STAGES)))]
+    session = IdentificationSession()
+    ends = [
+        first_approximation_ready_at(test),
+        *(stage_ready_at(test, i) for i in range(len(STAGE_SHARES))),
+    ]
     for end in ends:
         session.feed([experiment_after(recording, round(end * test.rate) + 7)])
     before = session.reused
     ahead = session.finish([experiment_after(recording)])
     assert session.reused - before >= STEPS
-    assert said(ahead) == said(alone)
+    assert figures_of(ahead) == figures_of(alone)
 
 
 @settings(max_examples=6, deadline=None)
 @given(cuts=st.lists(st.integers(0, 5500), max_size=5))
 def test_fed_whenever_it_gives_the_digits_of_the_recording_alone(recording, alone, cuts):
     """At any instants, in any order, again and again: what is fed may change nothing."""
-    session = Session()
+    session = IdentificationSession()
     for ticks in cuts:
         if ticks:
             session.feed([experiment_after(recording, ticks)])
-    assert said(session.finish([experiment_after(recording)])) == said(alone)
+    assert figures_of(session.finish([experiment_after(recording)])) == figures_of(alone)
 
 
 def test_two_tests_are_fed_together():
     both = [recorded("paper-open-3.blf", "open"), recorded("paper-closed-3.blf", "closed")]
-    session = Session()
+    session = IdentificationSession()
     session.feed(both)
-    assert said(session.finish(both)) == said(identify(both))
+    assert figures_of(session.finish(both)) == figures_of(identify(both))
 
 
 def test_an_answer_is_given_again_without_work():
     experiment = own_experiment(FAULTS)
-    session = Session()
+    session = IdentificationSession()
     first = session.finish([experiment])
     before = session.reused
     assert session.finish([experiment]) is first
@@ -108,14 +129,14 @@ def test_an_answer_is_given_again_without_work():
 
 def test_stages_follow_the_second_part():
     test = resolve_test("open")
-    assert first_ends_at(test) == pytest.approx(3.5)
-    ends = [stage_ends_at(test, stage) for stage in range(len(STAGES))]
+    assert first_approximation_ready_at(test) == pytest.approx(3.5)
+    ends = [stage_ready_at(test, stage) for stage in range(len(STAGE_SHARES))]
     assert ends == pytest.approx([4.0, 4.5, 5.0])
 
 
 def test_other_samples_are_not_answered_from_memory():
     experiment = own_experiment(FAULTS)
-    session = Session()
+    session = IdentificationSession()
     session.feed([experiment])
     assert session.reused == 0
     experiment.spool[4200] += 1e-6  # after the first stage's window, in the others
@@ -123,7 +144,7 @@ def test_other_samples_are_not_answered_from_memory():
     assert session.reused == 2
     session.seed = 1
     session.feed([experiment])
-    assert session.reused == 3, "another seed searches anew; the first approximation needs none"
+    assert session.reused == 4, "another seed searches anew; first approximation and refinement not"
 
 
 def test_another_actuators_data_are_not_answered_from_memory():
@@ -131,17 +152,17 @@ def test_another_actuators_data_are_not_answered_from_memory():
     experiment = own_experiment(FAULTS)
     heavier = experiment.constants._replace(MJ=1.1 * experiment.constants.MJ)
     other = replace(experiment, constants=heavier)
-    session = Session()
+    session = IdentificationSession()
     session.feed([experiment])
     found = session.finish([other])
     assert session.reused == 0
-    assert said(found) == said(identify([other]))
+    assert figures_of(found) == figures_of(identify([other]))
 
 
 def test_too_little_is_left_alone():
     """Not even the first approximation has its windows: nothing is kept, and nothing fails."""
     short = own_experiment(FAULTS)
-    session = Session()
+    session = IdentificationSession()
     for ticks in (1, 300, 3400):
         session.feed([cut(short, ticks)])
     session.finish([short])
@@ -167,3 +188,110 @@ def test_a_search_that_ends_beside_the_optimum_it_began_at_is_begun_there():
     found = identify([experiment])
     assert not found.freed
     np.testing.assert_allclose([item.value for item in found.estimates], truth, atol=2e-3)
+
+
+def parts(experiments, faults=FAULTS):
+    until = [first_part_ticks(item) for item in experiments]
+    start = named(np.clip(np.array(faults) + 1e-4, 0.0, 1.0))
+    first = refine_first_part(experiments, until, start)
+    return until, first, first.judged(experiments)
+
+
+def severities(found):
+    return np.array([found.values[name] for name in FAULT_NAMES])
+
+
+def of_severities(found, values):
+    names = [item.name for item in found.parameters]
+    return np.array([values[names.index(name)] for name in FAULT_NAMES])
+
+
+def deviations(experiments):
+    """Distance of the last step's optimum, and of the first part's, from that of one descent."""
+    until, first, judged = parts(experiments)
+    whole = refine_severities(anchored_derivatives(judged), named(FAULTS))
+    std = of_severities(whole, np.sqrt(np.diag(estimate_covariance(whole))))
+    found = add_last_part(judged, until, first)
+    at = severities(whole)
+    return (severities(found) - at) / std, (severities(first.refined) - at) / std
+
+
+@pytest.mark.parametrize("seed", [4, 6])
+def test_one_step_leads_where_a_descent_on_the_whole_test_leads(seed):
+    step, without = deviations([own_experiment(FAULTS, seed=seed)])
+    assert np.abs(without).max() > 0.4
+    assert np.abs(step).max() < 0.2
+
+
+def test_so_it_does_for_two_tests_together():
+    step, without = deviations([own_experiment(FAULTS, seed=seed) for seed in (4, 6)])
+    assert np.abs(without).max() > 0.4
+    assert np.abs(step).max() < 0.2
+
+
+def test_the_last_part_adds_its_information_and_its_residuals():
+    (experiment,) = pair = [own_experiment(FAULTS)]
+    until, first, judged = parts(pair)
+    found = add_last_part(judged, until, first)
+    assert found.residuals.shape == (2, experiment.ticks)
+    # By a few break-aways more or less, which each round sees anew.
+    gained = np.diag(found.normal) / np.diag(first.refined.normal)
+    assert gained.min() > 0.9
+    assert gained.mean() > 1.05
+    assert found.used[:, until[0] :].mean() > 0.9
+    assert not np.any(found.jacobian[:, ~found.used])
+
+
+@pytest.mark.parametrize("bound", [0.0, 1.0])
+def test_a_severity_at_its_bound_stays_where_the_first_part_pulls_it_out(bound):
+    experiments = [own_experiment((0.5, bound, 0.5), seed=3)]
+    until, first, judged = parts(experiments, (0.5, bound, 0.5))
+    found = add_last_part(judged, until, first)
+    outward = 1.0 if bound else -1.0
+    refined = first.refined
+    place = [item.name for item in refined.parameters].index("FSS")
+    # A hundred times what the last part can say.
+    rows = refined.jacobian[place]
+    pulling = 100.0 * outward * rows / np.abs(rows).max()
+    x = refined.x.copy()
+    for k, item in enumerate(refined.parameters):
+        x[k] = named((0.5, bound, 0.5)).get(item.name, x[k] * refined.scale[k]) / refined.scale[k]
+    pulled = replace(refined, x=x, residuals=refined.residuals - pulling)
+    held = add_last_part(judged, until, replace(first, refined=pulled))
+    assert held is not None
+    assert held.values["FSS"] == bound
+    assert np.abs(severities(found) - (0.5, bound, 0.5)).max() < 1e-3
+
+
+def test_a_first_part_that_is_off_is_not_mended_by_one_step():
+    experiments = [own_experiment(FAULTS)]
+    until, first, judged = parts(experiments)
+    std = np.sqrt(np.diag(estimate_covariance(first.refined))) / first.refined.scale
+    severity = [item.name in FAULT_NAMES for item in first.refined.parameters]
+    off = replace(first.refined, x=first.refined.x + np.where(severity, 60.0 * std, 0.0))
+    assert add_last_part(judged, until, replace(first, refined=off)) is None
+
+
+def test_the_first_part_holds_all_windows_in_whatever_order():
+    experiment = own_experiment(FAULTS)
+    windows = msgspec.structs.replace(
+        experiment.test.windows, FSS=((4.2, 5.4),), refinement=((0.2, 1.2),)
+    )
+    test = msgspec.structs.replace(experiment.test, windows=windows)
+    assert first_part_ticks(experiment) == 5000
+    assert first_part_ticks(replace(experiment, test=test)) == 5400
+
+
+def test_a_recording_that_ends_early_has_no_last_part():
+    experiment = own_experiment(FAULTS)
+    short = replace(
+        experiment,
+        trace=replace(experiment.trace, current=experiment.trace.current[:4900]),
+        spool=experiment.spool[:4900],
+        pressure=experiment.pressure[:4900],
+    )
+    until, first, judged = parts([short])
+    found = add_last_part(judged, until, first)
+    std = of_severities(found, np.sqrt(np.diag(estimate_covariance(found))))
+    assert np.all(np.abs(severities(found) - severities(first.refined)) < 0.5 * std)
+    assert found.residuals.shape == first.refined.residuals.shape

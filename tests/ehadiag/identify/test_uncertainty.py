@@ -7,16 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ehadiag.identify.refine.least_squares import Refinement
-from ehadiag.identify.uncertainty import DISCREPANCY_STD, covariance, interval95
-from ehadiag.model.parameters import FAULTS, OFFSETS
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.identify.estimates import estimate_covariance, interval95
+from ehadiag.identify.least_squares import Refinement
+from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
 
 ROWS = 2
 N = 400
 TRUTH = np.array([0.4, 0.5, 0.6])
 
 
-PARAMETERS = (*FAULTS, *OFFSETS)
+PARAMETERS = (*FAULTS, *SENSOR_OFFSETS)
 K = len(PARAMETERS)
 SCALE = np.array([item.scale for item in PARAMETERS])
 
@@ -31,7 +32,7 @@ def linear_problem(seed, noise):
     used = np.ones((ROWS, N), dtype=np.bool_)
     return Refinement(
         parameters=PARAMETERS,
-        x=np.concatenate([TRUTH, np.zeros(len(OFFSETS))]) + step,
+        x=np.concatenate([TRUTH, np.zeros(len(SENSOR_OFFSETS))]) + step,
         scale=SCALE,
         cost=float((residuals**2).sum()),
         residuals=residuals,
@@ -51,7 +52,7 @@ def severities(fit):
 
 def deviations(fit):
     """Of the severities."""
-    return np.sqrt(np.diag(covariance(fit)))[: len(FAULTS)]
+    return np.sqrt(np.diag(estimate_covariance(fit)))[: len(FAULTS)]
 
 
 def white(rng):
@@ -90,7 +91,7 @@ def test_correlated_residuals_widen_what_correlates_with_them():
         step = np.linalg.solve(rows @ rows.T, rows @ noise.ravel())
         fit.residuals[:] = (noise.ravel() - step @ rows).reshape(ROWS, N)
         errors.append(step[0])
-        stds.append(np.sqrt(covariance(fit)[0, 0]))
+        stds.append(np.sqrt(estimate_covariance(fit)[0, 0]))
     real = np.std(errors)
     naive = 1.0 / np.sqrt(2 * (slow**2).sum())
     assert real > 2.0 * naive
@@ -100,17 +101,17 @@ def test_correlated_residuals_widen_what_correlates_with_them():
 def test_deviations_are_those_of_the_curvature_when_all_is_well():
     fit = linear_problem(0, white(np.random.default_rng(3)))
     curved = np.sqrt(np.diag(np.linalg.inv(fit.normal))) * fit.scale
-    stated = np.sqrt(np.diag(covariance(fit)))
+    stated = np.sqrt(np.diag(estimate_covariance(fit)))
     assert (stated >= 0.999 * curved).all()
     assert (stated < 1.5 * curved).all()
 
 
 def test_rows_left_out_carry_nothing():
     fit = linear_problem(0, white(np.random.default_rng(4)))
-    whole = covariance(fit)
+    whole = estimate_covariance(fit)
     fit.used[:, 100:] = False
     fit.jacobian[:, ~fit.used] = 0.0
-    assert (np.diag(covariance(fit)) > 2.0 * np.diag(whole)).all()
+    assert (np.diag(estimate_covariance(fit)) > 2.0 * np.diag(whole)).all()
 
 
 def test_what_the_test_does_not_show_is_uniform():
@@ -126,7 +127,7 @@ def test_what_is_considered_moves_the_estimate_in_proportion():
     fit = linear_problem(0, white(np.random.default_rng(6)))
     shift = np.array([2e-3, -1e-3, 5e-4, 0.0, 0.0])
     moving = replace(fit, considered=np.tensordot(shift, fit.jacobian, axes=1)[None])
-    added = covariance(moving) - covariance(fit)
+    added = estimate_covariance(moving) - estimate_covariance(fit)
     added /= np.outer(fit.scale, fit.scale)
     np.testing.assert_allclose(added, np.outer(shift, shift), rtol=0.01, atol=1e-9)
 
@@ -135,7 +136,9 @@ def test_no_estimate_is_surer_than_both_sides_integration():
     fit = linear_problem(0, 1e-6 * white(np.random.default_rng(7)))
     fit.jacobian[:] *= 1e6
     np.testing.assert_allclose(
-        np.sqrt(np.diag(covariance(fit))), DISCREPANCY_STD * fit.scale, rtol=1e-3
+        np.sqrt(np.diag(estimate_covariance(fit))),
+        ESTIMATION.discrepancy_std * fit.scale,
+        rtol=1e-3,
     )
 
 

@@ -19,11 +19,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ehadiag.core.actuator import default_actuator
+from ehadiag import default_actuator
 from ehadiag.model.laws import jack_law
-from ehadiag.model.orifice import orifice_rate, orifice_step
 from ehadiag.model.plant import plant_constants
-from ehadiag_sim.plant.conditions import Effects
+from ehadiag.model.second_stage import orifice_rate, orifice_step
+from ehadiag_sim.conditions import Effects
 
 BOTH = pytest.mark.parametrize("kind", list(MODELS))
 
@@ -45,12 +45,12 @@ def test_a_step_is_a_solvers(x):
 
     def rates(t, y):
         force = j.area * y[0] - j.viscosity * y[1] - load - j.friction
-        return [orifice_rate(j, x + rise * t, y[0], y[1]), j.by_mass * force]
+        return [orifice_rate(j, x + rise * t, y[0], y[1], j.oil), j.by_mass * force]
 
     start = [3e6, 0.02]
     fine = solve_ivp(rates, (0.0, h), start, rtol=1e-11, atol=1e-9).y[:, -1]
     path = (x, x + 0.5 * rise * h, x + rise * h)
-    pressure, velocity, travel = orifice_step(j, h, load, 1.0, *path, *start)
+    pressure, velocity, travel = orifice_step(j, h, load, j.oil, 1.0, *path, *start)
     assert pressure == pytest.approx(fine[0], abs=5.0)
     assert velocity == pytest.approx(fine[1], abs=1e-7)
     assert travel == pytest.approx(0.5 * h * (start[1] + velocity), rel=1e-2)
@@ -60,8 +60,8 @@ def test_near_null_the_pressure_gain_is_that_of_the_linear_stage():
     c = plant_constants(ORIFICE)
     j = jack_law(c)
     slopes = [
-        orifice_rate(j, 1e-9, 0.0, 0.0) / 1e-9,
-        -orifice_rate(j, 0.0, 1.0, 0.0) - j.oil * j.leak,
+        orifice_rate(j, 1e-9, 0.0, 0.0, j.oil) / 1e-9,
+        -orifice_rate(j, 0.0, 1.0, 0.0, j.oil) - j.oil * j.leak,
     ]
     assert slopes[0] / slopes[1] == pytest.approx(c.GP, rel=1e-3)
 
@@ -103,7 +103,7 @@ def test_the_jack_meets_its_bounds(kind):
 @BOTH
 def test_stiff_oil_rings_fast(kind):
     """Too fast for steps of all lanes: they go alone."""
-    actuator = with_orifices(volume=1.6e-7)
+    actuator = with_orifices(volume_of_one_chamber=1.6e-7)
     measured = simulated(actuator=actuator, current=CURRENT[500:800])
     here = residuals_of(kind, severities(), batch_of(measured, CURRENT[500:800]), actuator)
     assert (rms(here) < [0.05, 0.5, 0.05]).all()

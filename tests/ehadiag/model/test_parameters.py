@@ -1,24 +1,30 @@
-"""The registry of parameters: what can be estimated, and what it does to the physical constants."""
+"""The registry of parameters: what can be estimated, and what it does to the physical constants.
+
+The page of parameters says what the registry holds.
+"""
+
+from __future__ import annotations
 
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.model.batch import PRESSURE_ROW, SIGNALS, SPOOL_ROW
-from ehadiag.model.parameters import (
+from ehadiag import default_actuator
+from ehadiag.model.batch import PRESSURE_ROW, SIGNAL_ROWS, SPOOL_ROW
+from ehadiag.model.laws import plant_of
+from ehadiag.model.parameter import ParameterKind
+from ehadiag.model.plant import PLANT_FIELDS, PlantConstants, plant_constants, plant_row
+from ehadiag.model.registry import (
     FAULT_NAMES,
     FAULTS,
-    OFFSETS,
     REGISTRY,
-    Kind,
+    SENSOR_OFFSETS,
     Unknowns,
     parameter,
 )
-from ehadiag.model.plant import FIELDS, PlantConstants, plant_constants, plant_of, plant_row
 
 AS_NEW = plant_constants(default_actuator())
 NAMES = [item.name for item in REGISTRY]
@@ -42,11 +48,14 @@ def test_each_parameter_is_told_apart():
 
 def test_the_derived_lists_are_parts_of_the_registry():
     assert tuple(item.name for item in FAULTS) == FAULT_NAMES
-    assert {item.kind for item in FAULTS} == {Kind.FAULT}
-    assert {item.kind for item in REGISTRY if item not in FAULTS} <= {Kind.DATUM, Kind.NUISANCE}
-    assert [item.adds_to for item in OFFSETS] == [SPOOL_ROW, PRESSURE_ROW]
+    assert {item.kind for item in FAULTS} == {ParameterKind.FAULT}
+    assert {item.kind for item in REGISTRY if item not in FAULTS} <= {
+        ParameterKind.DATUM,
+        ParameterKind.NUISANCE,
+    }
+    assert [item.adds_to for item in SENSOR_OFFSETS] == [SPOOL_ROW, PRESSURE_ROW]
     adding = [item.adds_to for item in REGISTRY if item.adds_to is not None]
-    assert adding == list(range(SIGNALS))
+    assert adding == list(range(SIGNAL_ROWS))
 
 
 @pytest.mark.parametrize("item", REGISTRY, ids=NAMES)
@@ -54,7 +63,7 @@ def test_bounds_hold_what_they_should(item):
     assert item.lower <= 0.0 < item.upper, "0 means that nothing is wrong"
     assert item.scale > 0.0
     assert not (math.isfinite(item.lower) ^ math.isfinite(item.upper))
-    if item.kind is Kind.FAULT:
+    if item.kind is ParameterKind.FAULT:
         assert (item.lower, item.upper, item.unit) == (0.0, 1.0, "1")
 
 
@@ -65,6 +74,7 @@ def test_nothing_of_a_parameter_changes_nothing(item):
 
 
 @pytest.mark.parametrize("item", REGISTRY, ids=NAMES)
+@settings(max_examples=20)  # of up to five values each
 @given(data=st.data())
 def test_changes_are_pure_and_the_same_for_numbers_and_arrays(item, data):
     values = np.array(data.draw(st.lists(values_of(item), min_size=1, max_size=5)))
@@ -113,7 +123,7 @@ def test_a_candidate_is_the_constants_of_its_point(space):
     """Row by row the registry's changes, one after the other, on plain numbers."""
     unknowns, points = space
     rows = unknowns.candidates(points)
-    assert rows.shape == (len(points), len(unknowns.base), FIELDS)
+    assert rows.shape == (len(points), len(unknowns.base), PLANT_FIELDS)
     for i, point in enumerate(points):
         for test, base in enumerate(unknowns.base):
             values = dict(unknowns.held)
@@ -143,5 +153,5 @@ def test_what_is_held_is_as_if_it_were_free_there(space):
 
 def test_a_row_is_read_back_as_the_constants():
     """What kernels unpack is what was packed, field by field."""
-    distinct = PlantConstants(*(float(k + 1) for k in range(FIELDS)))
+    distinct = PlantConstants(*(float(k + 1) for k in range(PLANT_FIELDS)))
     assert PlantConstants(*plant_of(plant_row(distinct))) == distinct

@@ -1,4 +1,7 @@
-"""Sensors and load of the model: against the simulator, and one kernel against another."""
+"""Sensors and load of the model: against the simulator, and one kernel against another.
+
+Smooth curves of torque motor and spool sensor, and friction by direction, beside the plant's.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from ehadiag.model.anchor import Anchor
-from ehadiag.model.sensors import followed, following, through_ends, through_stages
-from ehadiag_sim.plant.conditions import Effects
+from ehadiag.model.batch import Anchor
+from ehadiag.model.sensors import (
+    cubic_through_ends,
+    cubic_through_stages,
+    filter_output,
+    filter_step,
+)
+from ehadiag_sim.conditions import Effects, UnmodelledEffects
+from firmware_iface.stored_test import resolve_test
 
 BOTH = pytest.mark.parametrize("kind", list(MODELS))
 SENSING = [
@@ -43,7 +52,7 @@ SENSING = [
 )
 def test_the_filter_follows_a_cubic_exactly(cubic, before, lag, share):
     span = 0.7
-    found = followed(following(lag, span, share * span), before, cubic)
+    found = filter_output(filter_step(lag, span, share * span), before, cubic)
 
     def shown(ago):
         # The output is the past, weighed by exp(-ago / lag) / lag.
@@ -59,13 +68,13 @@ def test_the_filter_follows_a_cubic_exactly(cubic, before, lag, share):
 
 def test_cubics_go_through_what_they_are_made_of():
     u = np.linspace(0.0, 1.0, 5)
-    ends = np.polyval(through_ends(1.0, -2.0, 3.0, 0.5)[::-1], u)
+    ends = np.polyval(cubic_through_ends(1.0, -2.0, 3.0, 0.5)[::-1], u)
     assert ends[[0, -1]] == pytest.approx([1.0, -2.0])
-    slopes = np.polyval(np.polyder(through_ends(1.0, -2.0, 3.0, 0.5)[::-1]), u)
+    slopes = np.polyval(np.polyder(cubic_through_ends(1.0, -2.0, 3.0, 0.5)[::-1]), u)
     assert slopes[[0, -1]] == pytest.approx([3.0, 0.5])
     stages = (1.0, 2.0, -1.0, 0.5)
     places = [0.0, (4.0 - 6.0**0.5) / 10.0, (4.0 + 6.0**0.5) / 10.0, 1.0]
-    assert np.polyval(through_stages(*stages)[::-1], places) == pytest.approx(stages)
+    assert np.polyval(cubic_through_stages(*stages)[::-1], places) == pytest.approx(stages)
 
 
 @BOTH
@@ -193,3 +202,92 @@ def test_vector_and_scalar_kernels_agree(values, neighbour):
 
 def test_units_of_the_weights_are_steps_of_the_converters():
     assert (batch_of(np.zeros((3, len(CURRENT)))).weight[:, 0] * LSB == 1.0).all()
+
+
+FAULTS = (0.3, 0.2, 0.4)
+HYSTERESIS = {"hysteresis": 0.03}
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("effects", "values"),
+    [
+        (Effects(unmodelled=UnmodelledEffects(torque_cubic=-0.05)), {"torque_odd": -0.05}),
+        (Effects(unmodelled=UnmodelledEffects(friction_asymmetry=0.05)), {"friction_way": 0.05}),
+        (Effects(unmodelled=UnmodelledEffects(land_shift=2e-6)), {"land_shift": 2e-6}),
+        (Effects(unmodelled=UnmodelledEffects(land_asymmetry=0.03)), {"land_even": 0.03}),
+    ],
+    ids=["torque", "friction", "shift", "asymmetry"],
+)
+def test_an_effect_is_the_simulators(kind, effects, values):
+    measured = simulated(FAULTS, effects)
+    here = residuals_of(kind, {**severities(FAULTS), **values}, batch_of(measured))
+    without = residuals_of(kind, severities(FAULTS), batch_of(measured))
+    # Where full current turns, a jack that turns within the tick makes one sample wrong.
+    assert (rms(np.clip(here, -3.0, 3.0)) < [0.05, 0.3, 0.05]).all()
+    assert np.mean(np.abs(without[1])) > 10.0 * np.mean(np.abs(here[1]))
+
+
+@BOTH
+def test_a_lag_of_the_driver_delays_the_spool(kind):
+    """Held over each tick is the mean of what flows, so that little of the lag is left."""
+    current = resolve_test("open").command()[:1500]
+    measured = simulated(
+        FAULTS, Effects(unmodelled=UnmodelledEffects(driver_lag=3e-4)), current=current
+    )
+    batch = batch_of(measured, current)
+    here = residuals_of(kind, {**severities(FAULTS), "driver_lag": 3e-4}, batch)
+    without = residuals_of(kind, severities(FAULTS), batch)
+    assert (rms(without) > 4.0 * rms(here))[[0, 2]].all()
+    assert np.mean(np.abs(here[1])) < 0.1
+
+
+@BOTH
+def test_lands_that_overlap_pass_less_near_the_middle(kind):
+    values = {**severities(FAULTS), "land_lap": 1e-6}
+    batch = batch_of(simulated(FAULTS))
+    overlap = residuals_of(kind, values, batch)[1]
+    assert rms(overlap[None])[0] > 0.7
+    # A small overlap is a smaller pressure gain in the middle, and less flow at any opening.
+    same = residuals_of(kind, {**values, "land_lap": 0.0}, batch)[1]
+    assert rms(same[None])[0] < 0.3
+
+
+@BOTH
+def test_a_bent_pressure_sensor_reads_a_cubic(kind):
+    supply = 20e6
+    straight = simulated(FAULTS)
+    share = straight[1] / supply
+    bent = straight.copy()
+    bent[1] *= 0.99 + 0.004 * share - 0.01 * share**2
+    gains = {"pressure_gain": -0.01, "pressure_bend": 0.004, "pressure_bow": -0.01}
+    here, plain = (
+        residuals_of(kind, {**severities(FAULTS), **values}, batch_of(bent))[1]
+        for values in (gains, {})
+    )
+    assert np.mean(np.abs(here)) < 0.02 * np.mean(np.abs(plain))
+
+
+@BOTH
+def test_wide_plays_may_count_less(kind):
+    effects = Effects(hysteresis=0.03, plays=8, unmodelled=UnmodelledEffects(play_skew=2.0))
+    batch = batch_of(simulated(FAULTS, effects))
+    values = {**severities(FAULTS), **HYSTERESIS}
+    plain, skewed = (
+        residuals_of(kind, {**values, "hysteresis_skew": skew}, batch, plays=8)
+        for skew in (0.0, 2.0)
+    )
+    assert rms(skewed)[0] < 0.05
+    assert rms(plain)[0] > 1.0
+
+
+@BOTH
+def test_a_bent_spool_sensor_reads_a_cubic(kind):
+    stop = 0.381e-3
+    straight = simulated(FAULTS)
+    share = straight[0] / stop
+    bent = straight.copy()
+    bent[0] *= 1.01 + 0.004 * share - 0.01 * share**2
+    values = {**severities(FAULTS), "spool_gain": 0.01, "spool_bend": 0.004, "spool_bow": -0.01}
+    here = residuals_of(kind, values, batch_of(bent))
+    assert rms(here)[0] < 0.05

@@ -1,4 +1,13 @@
-"""The vector kernels against the scalar ones, lane by lane."""
+"""The vector kernels against the scalar ones, lane by lane.
+
+The kernels as plain Python give what the compiled ones give.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -7,25 +16,21 @@ from hypothesis import strategies as st
 from other_actuator import with_data
 from places import LOGS
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.channels import PRESSURE, SPOOL
-from ehadiag.core.stored_test import resolve_test
-from ehadiag.identify.experiment import build_experiment
-from ehadiag.identify.spans import lay_out, unknowns_of
-from ehadiag.model.anchor import FREE_RUN
-from ehadiag.model.batch import Batch
-from ehadiag.model.parameters import FAULTS, OFFSETS, Unknowns, parameter
+from ehadiag import default_actuator
+from ehadiag.identify.experiment import build_experiment, lay_out_spans, unknowns_of
+from ehadiag.model.batch import NO_ANCHOR, Anchor, Batch
 from ehadiag.model.plant import plant_constants
-from ehadiag.model.scalar.residuals import ScalarModel
-from ehadiag.model.scalar.response import respond
-from ehadiag.model.simd.layout import LANES
-from ehadiag.model.simd.model import SimdModel
+from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, parameter
+from ehadiag.model.residual_models import ScalarModel, SimdModel, model_response
+from ehadiag.model.simd_layout import LANES
 from ehadiag_tools.damaged import damaged_unit
 from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.stored_test import resolve_test
 
 CORNERS = np.array(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0])).reshape(3, 8).T
 NO_CAP = 1e9
-ALL = (*FAULTS, *OFFSETS, parameter("sampling_lead"))
+ALL = (*FAULTS, *SENSOR_OFFSETS, parameter("sampling_lead"))
 
 
 def space(actuator=None, free=FAULTS, tests=1):
@@ -36,7 +41,7 @@ def own_batch(
     faults, current, *, channels=(True, True), offsets=(0.0, 0.0), tick=1e-3, actuator=None
 ):
     """Weights in LSB, the model's own answer as the measurement."""
-    truth = respond(damaged_unit(faults, actuator), current, tick)
+    truth = model_response(damaged_unit(faults, actuator), current, tick)
     n = len(current)
     return Batch(
         test=np.zeros(1, dtype=np.int64),
@@ -51,9 +56,12 @@ def own_batch(
         pressure=truth.pressure + offsets[1],
         position=truth.position,
         weight=np.vstack(
-            [np.full(n, channels[0] / SPOOL.lsb), np.full(n, channels[1] / PRESSURE.lsb)]
+            [
+                np.full(n, channels[0] / SPOOL_CHANNEL.lsb),
+                np.full(n, channels[1] / PRESSURE_CHANNEL.lsb),
+            ]
         ),
-        anchor=FREE_RUN.as_array()[None, :],
+        anchor=NO_ANCHOR.as_array()[None, :],
     )
 
 
@@ -74,7 +82,7 @@ def recorded_model(request):
         resolve_test(request.param),
         default_actuator(),
     )
-    return SimdModel(lay_out([experiment]), unknowns_of([experiment], FAULTS), threads=1)
+    return SimdModel(lay_out_spans([experiment]), unknowns_of([experiment], FAULTS), threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +152,7 @@ def test_stops_are_met():
     """Full current long enough for the flapper, the spool and the jack to strike their stops."""
     current = np.concatenate([np.full(600, 10e-3), np.full(900, -10e-3), np.zeros(100)])
     for faults in CORNERS:
-        truth = respond(damaged_unit(faults), current, 1e-3)
+        truth = model_response(damaged_unit(faults), current, 1e-3)
         assert np.abs(truth.position).max() == plant_constants(default_actuator()).XJM
         batch = own_batch(faults, current)
         off = np.sqrt(in_lanes(batch, faults[None], cap=1.0)[0] / len(current))
@@ -157,7 +165,7 @@ def test_the_jack_feels_a_spool_that_meets_its_stop(faults):
     stroke = default_actuator().servovalve.XSM
     actuator = with_data({"XSM": stroke / 4.0})
     current, finer = 10e-3 * np.sin(2.0 * np.pi * 20e-3 * np.arange(120)), 16
-    fine = respond(damaged_unit(faults, actuator), np.repeat(current, finer), 1e-3 / finer)
+    fine = model_response(damaged_unit(faults, actuator), np.repeat(current, finer), 1e-3 / finer)
     assert np.mean(np.abs(fine.spool) == stroke / 4.0) > 0.3
     batch = own_batch(faults, current, actuator=actuator)
     batch = batch._replace(pressure=fine.pressure[finer - 1 :: finer])
@@ -171,7 +179,7 @@ def test_offsets_and_missing_samples_count_as_in_the_scalar_kernel():
     batch.spool[50:60] = np.nan
     batch.pressure[100:140] = np.nan
     batch.weight[0, 200:220] = 0.0
-    unknowns = space(free=(*FAULTS, *OFFSETS))
+    unknowns = space(free=(*FAULTS, *SENSOR_OFFSETS))
     rows = np.array([(0.4, 0.2, 0.5, 3e-7, 2e4), (0.5, 0.3, 0.4, 3e-7, 2e4)])
     here, there = (run(batch, rows, 25.0, unknowns) for run in (in_lanes, one_by_one))
     assert here[0] < 10.0  # an offset or dropout taken wrongly makes hundreds
@@ -188,15 +196,15 @@ def test_the_sampling_instant_is_that_of_finer_ticks(lead):
     """A spool read before the end of the tick: both kernels look back along their own path."""
     current, finer = 3e-3 * np.sin(np.arange(400) * 0.05), 20
     faults = (0.3, 0.6, 0.3)
-    fine = respond(damaged_unit(faults), np.repeat(current, finer), 1e-3 / finer).spool
+    fine = model_response(damaged_unit(faults), np.repeat(current, finer), 1e-3 / finer).spool
     expected = fine[finer - 1 - round(lead * finer / 1e-3) :: finer]
     batch = own_batch(faults, current, channels=(True, False))
     unknowns = space(free=(*FAULTS, parameter("sampling_lead")))
     for kind in (SimdModel, ScalarModel):
         residuals, _ = kind(batch, unknowns).residuals(np.array([(*faults, lead)]))
-        seen = batch.spool - residuals[0, 0] * SPOOL.lsb
-        assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * SPOOL.lsb
-        assert np.abs(seen - expected).max() < 0.3 * SPOOL.lsb
+        seen = batch.spool - residuals[0, 0] * SPOOL_CHANNEL.lsb
+        assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * SPOOL_CHANNEL.lsb
+        assert np.abs(seen - expected).max() < 0.3 * SPOOL_CHANNEL.lsb
 
 
 def test_spans_start_from_their_own_origin():
@@ -292,5 +300,50 @@ def test_evaluations_are_counted(kind):
 def test_unbounded_unknowns_do_not_coarsen_the_jack():
     """Offsets have no bounds to scatter candidates in: the jack's steps are those of the faults."""
     batch = own_batch((0.3, 0.3, 0.3), 8e-3 * np.sin(np.arange(250) * 0.2))
-    plain, more = (SimdModel(batch, space(free=free)) for free in (FAULTS, (*FAULTS, *OFFSETS)))
+    plain, more = (
+        SimdModel(batch, space(free=free)) for free in (FAULTS, (*FAULTS, *SENSOR_OFFSETS))
+    )
     np.testing.assert_array_equal(plain.levels, more.levels)
+
+
+SCRIPT = """
+import sys
+import numba, numpy as np
+from ehadiag.model.batch import Anchor
+from ehadiag.model.residual_models import model_response
+from ehadiag.model.plant import PlantConstants
+
+assert numba.config.DISABLE_JIT
+current, measured = np.loadtxt(sys.stdin)
+constants = PlantConstants(*map(float, sys.argv[1:]))
+anchor = Anchor(0.3, 3e-7, 1.5e-6)
+answer = model_response(constants, current, 1e-3, measured=measured, anchor=anchor)
+for row in (answer.spool, answer.pressure, answer.position, [answer.anchored]):
+    print(*[float(x).hex() for x in row])
+"""
+
+
+def test_plain_python_gives_the_compiled_answer():
+    """Steps, slow motion and a sample that re-anchors, over 60 ticks."""
+    current = np.concatenate([np.zeros(2), np.full(8, 8e-3), 1.5e-3 * np.sin(np.arange(50) * 0.4)])
+    constants = damaged_unit([0.3, 0.6, 0.3])
+    measured = model_response(constants, current, 1e-3).spool + 0.1e-6
+    measured[30:] += 3e-6
+    compiled = model_response(
+        constants, current, 1e-3, measured=measured, anchor=Anchor(0.3, 3e-7, 1.5e-6)
+    )
+    text = "\n".join(" ".join(f"{x:.17g}" for x in row) for row in (current, measured))
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, *map(repr, constants)],
+        input=text,
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+    )
+    rows = [[float.fromhex(x) for x in line.split()] for line in done.stdout.splitlines()]
+    assert compiled.anchored == rows[3][0] >= 1
+    # The compiler may join a product and a sum into one rounding.
+    np.testing.assert_allclose(rows[0], compiled.spool, atol=1e-14)
+    np.testing.assert_allclose(rows[1], compiled.pressure, atol=1e-2)
+    np.testing.assert_allclose(rows[2], compiled.position, atol=1e-13)

@@ -1,8 +1,14 @@
-"""The streaming monitor against the model run on whole records, and what it does with defects."""
+"""The streaming monitor against the model run on whole records, and what it does with defects.
+
+The examples of the monitor's page run and print what the page says.
+"""
+
+from __future__ import annotations
 
 import copy
 import os
 import pickle
+import re
 import sys
 import threading
 import tracemalloc
@@ -14,19 +20,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from places import LOGS
+from places import LOGS, ROOT
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.channels import PRESSURE, SPOOL
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.recording import CommandMode
-from ehadiag.core.stored_test import resolve_test
+from ehadiag import CommandMode, ConfigurationError, Monitor, Tick, default_actuator
 from ehadiag.identify.experiment import build_experiment
-from ehadiag.model.anchor import FREE_RUN, Anchor
-from ehadiag.model.scalar.response import respond
-from ehadiag.monitor import Monitor, Tick
+from ehadiag.model.batch import NO_ANCHOR, Anchor
+from ehadiag.model.residual_models import model_response
 from ehadiag_tools.damaged import damaged, damaged_unit
 from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.stored_test import resolve_test
 
 MATCHED = {
     "healthy-open.blf": (0.0, 0.0, 0.0),
@@ -37,7 +40,7 @@ MATCHED = {
     "hot-worn-closed.asc": (0.2, 0.5, 0.1),
 }
 """Reference recordings (PHY-41) and their true severities (truth.csv)."""
-ANCHOR = Anchor(0.3, 1.3 * SPOOL.lsb, 6.0 * SPOOL.lsb)
+ANCHOR = Anchor(0.3, 1.3 * SPOOL_CHANNEL.lsb, 6.0 * SPOOL_CHANNEL.lsb)
 NAN = float("nan")
 NOTHING = Tick(NAN, NAN, NAN, NAN, NAN)
 
@@ -71,7 +74,7 @@ def run(monitor, ticks):
 FIELDS = ("predicted", "residual", "alarmed")
 
 
-@pytest.mark.parametrize("anchor", [FREE_RUN, ANCHOR], ids=["free", "anchored"])
+@pytest.mark.parametrize("anchor", [NO_ANCHOR, ANCHOR], ids=["free", "anchored"])
 @pytest.mark.parametrize("file", sorted(MATCHED))
 def test_tick_by_tick_equals_the_whole_record(file, anchor):
     """With constants that are off, so that the model is re-anchored, and sticks elsewhere."""
@@ -82,7 +85,7 @@ def test_tick_by_tick_equals_the_whole_record(file, anchor):
     experiment = build_experiment(
         recording.samples, recording.environment, resolve_test(name), default_actuator()
     )
-    whole = respond(
+    whole = model_response(
         damaged(experiment.constants, faults),
         experiment.trace.current,
         experiment.tick,
@@ -94,7 +97,7 @@ def test_tick_by_tick_equals_the_whole_record(file, anchor):
     for column, values in enumerate((whole.spool, whole.pressure, whole.position)):
         scale = np.abs(values).max()
         np.testing.assert_allclose(predicted[:, column], values, rtol=0.0, atol=1e-12 * scale)
-    noise = np.sqrt(0.5**2 + 1 / 12) * np.array([SPOOL.lsb, PRESSURE.lsb])
+    noise = np.sqrt(0.5**2 + 1 / 12) * np.array([SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb])
     seen = np.column_stack([recording.samples.spool, recording.samples.pressure])
     np.testing.assert_allclose(residual, (seen - predicted[:, :2]) / noise, atol=1e-9)
 
@@ -117,10 +120,10 @@ def test_the_control_law_has_integral_and_derivative():
         if wanted == out or (wanted - out) * error < 0.0:
             integral = trial
         currents.append(out)
-    monitor = Monitor(actuator, (0, 0, 0), mode=CommandMode.POSITION, anchor=FREE_RUN)
+    monitor = Monitor(actuator, (0, 0, 0), mode=CommandMode.POSITION, anchor=NO_ANCHOR)
     ticks = [Tick(c, NAN, NAN, NAN, x) for c, x in zip(command, place, strict=True)]
     predicted, _, _ = run(monitor, ticks)
-    whole = respond(damaged_unit(np.zeros(3), actuator), np.array(currents), 1e-3)
+    whole = model_response(damaged_unit(np.zeros(3), actuator), np.array(currents), 1e-3)
     assert 0.1 < np.mean(np.abs(currents) == law.IM) < 0.9
     np.testing.assert_allclose(predicted[:, 0], whole.spool, atol=1e-15)
 
@@ -298,11 +301,11 @@ def test_what_float_takes_is_a_number():
 def test_a_reset_puts_the_spool_at_rest_there(place):
     """Near its centre friction holds it, further out the feedback wire takes it away."""
     actuator, faults = default_actuator(), (0.2, 0.4, 0.6)
-    monitor = Monitor(actuator, faults, anchor=FREE_RUN)
+    monitor = Monitor(actuator, faults, anchor=NO_ANCHOR)
     monitor.reset(place)
     predicted, _, _ = run(monitor, [Tick(0.0, 0.0, NAN, NAN, NAN)] * 100)
     origin = min(place, actuator.servovalve.XSM)
-    whole = respond(damaged_unit(faults, actuator), np.zeros(100), 1e-3, origin=origin)
+    whole = model_response(damaged_unit(faults, actuator), np.zeros(100), 1e-3, origin=origin)
     assert (np.ptp(whole.spool) > 0.0) == (abs(place) > 1.5e-5)
     np.testing.assert_allclose(predicted[:, 0], whole.spool, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose(predicted[:, 1], whole.pressure, rtol=1e-9, atol=1.0)
@@ -350,3 +353,19 @@ def test_the_mode_can_change_between_two_ticks():
     monitor.follow(CommandMode.POSITION)
     monitor.push(Tick(0.0, NAN, NAN, NAN, 0.0))
     assert monitor.push(Tick(0.0, NAN, NAN, NAN, 0.0)).predicted[0] < ours.predicted[0]
+
+
+PAGE = ROOT / "docs" / "how-to" / "monitor.md"
+EXAMPLES = re.findall(
+    r"```python\n(.*?)```.*?```\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+)
+
+
+def test_the_page_has_its_examples():
+    assert len(EXAMPLES) == 2
+
+
+@pytest.mark.parametrize(("example", "expected"), EXAMPLES, ids=["pushed", "received"])
+def test_example_prints_what_the_page_says(example, expected, capsys):
+    exec(compile(example, str(PAGE), "exec"), {})
+    assert capsys.readouterr().out == expected

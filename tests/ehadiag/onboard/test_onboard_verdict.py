@@ -1,40 +1,68 @@
-"""The verdict on board against the rule of `ehadiag diagnose` at its default levels."""
+"""The verdict on board against the rule of `ehadiag diagnose` at its default levels.
+
+Recordings that carry no verdict: what the host refuses, on board too.
+"""
+
+from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from places import LOGS
 
+from ehadiag import Verdict, bundled_tests, default_actuator
 from ehadiag.assess import acceptance, verdict
-from ehadiag.core.actuator import default_actuator
-from ehadiag.export.library import rules
-from ehadiag.identify.estimates import NOT_SHOWN_STD
-from ehadiag.identify.uncertainty import DISCREPANCY_STD, EXPECTED_CAPPED
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.core.criteria import FIT
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.export.plan import library_plan
+from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.model.plant import relative_viscosity
-from ehadiag.onboard import conclude
-from ehadiag.onboard.environment import set_environment
-from ehadiag.onboard.layout import GENES, PARAMETERS, SIZE, Outcome
-from ehadiag.onboard.rules import PLAN_SIZE, Rules, with_rules
+from ehadiag.monitor.plan import design_cusum
+from ehadiag.onboard import onboard_verdict
+from ehadiag.onboard.onboard_identification import (
+    begin_identification,
+    continue_identification,
+)
+from ehadiag.onboard.onboard_memory import (
+    ONBOARD,
+    ONBOARD_GENES,
+    ONBOARD_PARAMETERS,
+    ONBOARD_VERDICT,
+    PHASES,
+    PROGRESS,
+    REASONS,
+    UNIT_SUPPLY,
+    OnboardOutcome,
+    set_environment,
+)
+from ehadiag_tools.onboard.replay import surrounded, ticks_of
+from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
 
 LEVELS = verdict.Levels()
-PLAN = with_rules(np.zeros(PLAN_SIZE - len(Rules._fields)), rules(default_actuator()))
+ACTUATOR = default_actuator()
+PLAN = library_plan(ACTUATOR, design_cusum(100.0, 1e-3))
 EDGE = 1e-5
 """Of a chance: the normal distribution on board is one to 1e-7."""
+NOT_TESTED = 30.0
 NAMES = ("Kintas", "FSS", "FDJ")
 
 
-def on_board(values, stds, outliers=0.0, complete=True, rms=1.0):
+def on_board(values, stds, outliers=0.0, rms=1.0):
     """Outcome of an identification that has come to these estimates."""
-    memory = np.zeros(SIZE)
-    known = Outcome(*values, *stds, *(0.0,) * 10)._replace(
+    memory = np.zeros(ONBOARD.end)
+    known = OnboardOutcome(*values, *stds, *(0.0,) * 11)._replace(
         samples=1000.0, outliers=outliers, spool_rms=rms, pressure_rms=1.0
     )
     memory[: len(known)] = known
-    assert conclude.judge(memory.ctypes.data, PLAN, complete) == 0
-    return Outcome(*memory[: len(known)].tolist())
+    assert onboard_verdict.write_verdict(memory.ctypes.data, PLAN) == 0
+    return OnboardOutcome(*memory[: len(known)].tolist())
 
 
 def judged(values, stds):
@@ -45,22 +73,34 @@ def judged(values, stds):
         )
         for name, value, std in zip(NAMES, values, stds, strict=True)
     ]
-    return verdict.judge(SimpleNamespace(estimates=estimates), LEVELS)[0], estimates
+    return verdict.judge(SimpleNamespace(estimates=estimates, nuisances={}), LEVELS)[0], estimates
 
 
 def test_the_deviations_are_those_of_the_package():
     """Normal matrix, covariance of the gradient, shift and fit in; deviations out."""
     rng = np.random.default_rng(5)
-    rows = rng.standard_normal((PARAMETERS, 400)) * 1e3
-    normal, meat, shift = rows @ rows.T, 3.0 * rows @ rows.T, rng.standard_normal(PARAMETERS)
-    memory = np.zeros(SIZE)
-    assert conclude.deviate(memory.ctypes.data, normal.copy(), meat, shift, 1.3) == 0
-    inverse = np.linalg.inv(normal + np.diag([12.0] * GENES + [0.0] * 2))
+    rows = rng.standard_normal((ONBOARD_PARAMETERS, 400)) * 1e3
+    normal, meat, shift = (
+        rows @ rows.T,
+        3.0 * rows @ rows.T,
+        rng.standard_normal(ONBOARD_PARAMETERS),
+    )
+    directions, believed = rng.standard_normal((2, ONBOARD_PARAMETERS)), np.array([0.0, 0.0, 1e-4])
+    memory = np.zeros(ONBOARD.end)
+    for place, numbers in (
+        (ONBOARD.normal, normal), (ONBOARD.normal + normal.size, shift), (ONBOARD.meat, meat),
+        (ONBOARD.considered, directions), (ONBOARD.believed, believed),
+    ):  # fmt: skip
+        memory[place : place + numbers.size] = numbers.ravel()
+    assert onboard_verdict.write_deviations(memory.ctypes.data, PLAN, 2, 1.3) == 0
+    inverse = np.linalg.inv(normal + np.diag([12.0] * ONBOARD_GENES + [0.0] * 2))
     sandwich = inverse @ meat @ inverse
-    curved = inverse * 1.3 / EXPECTED_CAPPED
-    variance = np.maximum(np.diag(curved), np.diag(sandwich)) + (inverse @ shift) ** 2
-    expected = np.sqrt(variance + DISCREPANCY_STD**2)[:GENES]
-    assert memory[GENES : 2 * GENES] == pytest.approx(expected, rel=1e-9)
+    curved = inverse * 1.3 / ESTIMATION.capped_variance
+    variance = np.maximum(np.diag(curved), np.diag(sandwich))[:ONBOARD_GENES]
+    moved = inverse @ np.vstack([shift, directions]).T
+    variance = np.maximum(variance, believed) + (moved**2).sum(axis=1)[:ONBOARD_GENES]
+    expected = np.sqrt(variance + ESTIMATION.discrepancy_std**2)
+    assert memory[ONBOARD_GENES : 2 * ONBOARD_GENES] == pytest.approx(expected, rel=1e-9)
 
 
 @given(
@@ -71,26 +111,30 @@ def test_the_verdict_is_that_of_the_package(values, stds):
     expected, estimates = judged(values, stds)
     above = [verdict.chance_above(item, LEVELS.advisory) for item in estimates]
     limits = [verdict.chance_above(item, LEVELS.limit) for item in estimates]
-    assume(max(stds) < NOT_SHOWN_STD)
-    assume(abs(sum(above) - verdict.FALSE_HEALTHY) > EDGE)
-    assume(all(abs(chance - verdict.FAULT_CHANCE) > EDGE for chance in limits))
+    assume(max(stds) < FIT.max_shown_std)
+    assume(abs(sum(above) - verdict.VERDICT.max_chance_false_healthy) > EDGE)
+    assume(all(abs(chance - verdict.VERDICT.min_chance_fault) > EDGE for chance in limits))
     found = on_board(values, stds)
     assert found.verdict == float(expected)
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"outliers": acceptance.MOST_OUTLIERS + 1e-3}, {"outliers": math.nan}, {"complete": False},
-     {"rms": acceptance.MOST_RMS + 1e-3}, {"rms": math.nan}],
+    [{"outliers": acceptance.FIT.max_outlier_share + 1e-3}, {"outliers": math.nan},
+     {"rms": acceptance.FIT.max_rms + 1e-3}, {"rms": math.nan}],
     ids=str,
 )  # fmt: skip
 def test_what_the_model_does_not_explain_is_not_tested(wrong):
     assert on_board((0.1, 0.1, 0.1), (0.01,) * 3).verdict == 0.0
-    assert on_board((0.1, 0.1, 0.1), (0.01,) * 3, **wrong).verdict == 30.0
+    found = on_board((0.1, 0.1, 0.1), (0.01,) * 3, **wrong)
+    assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.unexplained)
+    assert all(math.isnan(value) for value in found[:8])
 
 
 def test_a_severity_that_the_test_does_not_show_is_not_tested():
-    assert on_board((0.1, 0.1, 0.5), (0.01, 0.01, 0.11)).verdict == 30.0
+    found = on_board((0.1, 0.1, 0.5), (0.01, 0.01, 0.11))
+    assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.hidden)
+    assert math.isnan(found.FDJ)
 
 
 @pytest.mark.parametrize("oil", [-60.0, -20.0, 0.0, 40.0, 85.3, 100.0, 200.0])
@@ -110,3 +154,90 @@ def test_surroundings_that_cannot_be_are_refused(around):
     unit = np.full(8, 3.0)
     assert set_environment(unit.ctypes.data, around) == 1
     assert (unit == 3.0).all()
+
+
+RECORDING = read_recording(LOGS / "paper-open-1.blf")
+
+
+def frozen(values):
+    return np.where(np.isfinite(values), values[100], np.nan)
+
+
+def dead(values):
+    return np.full_like(values, np.nan)
+
+
+DAMAGES = {
+    "spool frozen": {"spool": frozen},
+    "pressure frozen": {"pressure": frozen},
+    "spool dead": {"spool": dead},
+    "pressure dead": {"pressure": dead},
+    "spool at its converter's end": {"spool": lambda v: np.where(v > 0.2e-3, 1.0, v)},
+    "pressure at its converter's end": {"pressure": lambda v: np.where(v > 1e5, 1e9, v)},
+    "position at its converter's end": {"position": lambda v: np.where(v > 1e-3, 1.0, v)},
+    "spool stuck half-way": {"spool": lambda v: np.where(np.arange(len(v)) < 2500, v, v[2500])},
+    "pressure of the other sign": {"pressure": np.negative},
+}
+
+
+def damaged(damage):
+    """Recording with a damaged channel, at its converter's ends where it is beyond them."""
+    samples = RECORDING.samples
+    changed = {name: work(getattr(samples, name)) for name, work in damage.items()}
+    saturated = np.array(samples.saturated)
+    for channel in (SPOOL_CHANNEL, PRESSURE_CHANNEL):
+        if channel.name in changed:
+            top = channel.full_scale - channel.lsb
+            row = ("current", "spool", "pressure", "position").index(channel.name)
+            saturated[row] |= np.abs(np.nan_to_num(changed[channel.name])) >= top
+            changed[channel.name] = np.clip(changed[channel.name], -channel.full_scale, top)
+    if "position" in changed:
+        saturated[3] |= np.nan_to_num(changed["position"]) >= 1.0
+    return replace(RECORDING, samples=replace(samples, saturated=saturated, **changed))
+
+
+def carried(ticks, supply=2e7):
+    """Whether ticks of the reference unit carry a verdict on board."""
+    memory, ticks = np.zeros(ONBOARD.end), np.ascontiguousarray(ticks)
+    unit = np.array(surrounded(RECORDING))
+    unit[UNIT_SUPPLY] = supply
+    places = memory.ctypes.data, PLAN.ctypes.data
+    assert begin_identification(*places, unit.ctypes.data) == 0
+    continue_identification(*places, ticks.ctypes.data, (float(len(ticks)), 1.5 * len(ticks)))
+    return bool(memory[PROGRESS.phase] == PHASES.grids)
+
+
+def test_a_sound_recording_carries_a_verdict():
+    assert carried(ticks_of(RECORDING))
+
+
+@pytest.mark.parametrize("name", list(DAMAGES)[:-2])
+def test_a_damaged_channel_carries_none(name):
+    assert not carried(ticks_of(damaged(DAMAGES[name])))
+
+
+def test_a_few_samples_at_the_end_do_no_harm():
+    ticks = ticks_of(RECORDING)
+    ticks[:100, 2] = SPOOL_CHANNEL.full_scale
+    assert carried(ticks)
+    ticks[:120, 2] = SPOOL_CHANNEL.full_scale
+    assert not carried(ticks)
+
+
+@pytest.mark.parametrize(("share", "carries"), [(0.51, True), (0.49, False)])
+def test_without_half_the_supply_nothing_is_judged(share, carries):
+    assert carried(ticks_of(RECORDING), share * ACTUATOR.servovalve.PSR) is carries
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DAMAGES)
+def test_what_the_host_does_not_test_the_board_does_not_either(name):
+    recording = damaged(DAMAGES[name])
+    found = diagnose([recording], ACTUATOR, bundled_tests().values(), nuisances=NuisanceMode.NONE)
+    assert found.verdict is Verdict.NOT_TESTED
+    ticks = np.ascontiguousarray(ticks_of(recording))
+    memory, unit = np.zeros(ONBOARD.end), np.array(surrounded(recording), dtype=np.float64)
+    places = memory.ctypes.data, PLAN.ctypes.data
+    assert begin_identification(*places, unit.ctypes.data) == 0
+    assert continue_identification(*places, ticks.ctypes.data, (float(len(ticks)), 1e9)) == 0
+    assert memory[ONBOARD_VERDICT] == NOT_TESTED

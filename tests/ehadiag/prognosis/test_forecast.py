@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from history_cases import an_entry, an_event
 
-from ehadiag.prognosis.forecast import Forecast, forecast, learn_fleet
+from ehadiag.prognosis.averaging import learn_fleet
+from ehadiag.prognosis.forecast import Forecast, forecast
 from ehadiag.prognosis.lives import Life
-from ehadiag.prognosis.unit import prognosis_of
+from ehadiag.prognosis.units import prognosis_of
 
 RATE = 2.5e-4
 NOISE = 2e-4
@@ -55,14 +56,6 @@ def test_a_fleet_narrows_the_interval() -> None:
     assert widths[0] < widths[1]
 
 
-def test_steady_growth_without_a_fall_is_told_from_a_wandering_one() -> None:
-    assert of(worn(1)).process == "gamma"
-    age = 100.0 * np.arange(1.0, 31.0)
-    rng = np.random.default_rng(3)
-    path = np.cumsum(RATE * 100 + 0.03 * rng.standard_normal(30))
-    assert of(Life(1, age, path, np.full(30, NOISE), 0.0), ALONE).process == "Wiener"
-
-
 def test_the_same_seed_gives_the_same_digits() -> None:
     assert of(worn(1)) == of(worn(1))
 
@@ -70,7 +63,7 @@ def test_the_same_seed_gives_the_same_digits() -> None:
 @pytest.mark.parametrize(
     ("life", "why"),
     [
-        (worn(1, 2), "2 diagnoses of the unit, needs 3"),
+        (worn(1, 1), "1 diagnosis of the unit, needs 2"),
         (worn(1, 0), "no diagnoses of the unit"),
         (worn(1, 20, rate=1e-9), "show no growth beyond their noise"),
     ],
@@ -84,8 +77,8 @@ def test_what_cannot_carry_a_number_gets_none_and_a_reason(life: Life, why: str)
 @pytest.mark.parametrize("fleet", [FLEET, ALONE], ids=["fleet", "alone"])
 def test_a_jump_is_an_alarm(fleet) -> None:  # type: ignore[no-untyped-def]
     found = of(worn(1, 20, jump=0.4), fleet, (0.95,))
-    assert "between 1000 and 1100 hours: no wear explains such a change" in found.alarm
-    assert found.remaining[0].median is None
+    assert "between 1000 and 1100 hours" in found.alarm
+    assert "99.9% of diagnoses" in found.alarm
 
 
 def test_a_fall_without_an_event_is_an_alarm() -> None:
@@ -146,8 +139,7 @@ def test_one_units_jump_does_not_change_the_forecasts_of_the_others() -> None:
     jumped = Life(last.serial, last.age, value, last.std, last.born)
     sound = of(life, learn_fleet([*others, last], 2000.0)).remaining[1].median
     beside = learn_fleet([*others, jumped], 2000.0)
-    assert beside.lives == len(others)
-    assert of(life, beside).remaining[1].median == pytest.approx(sound, rel=0.1)
+    assert of(life, beside).remaining[1].median == pytest.approx(sound, rel=0.15)
 
 
 def test_a_steady_fall_is_an_alarm() -> None:
@@ -157,3 +149,58 @@ def test_a_steady_fall_is_an_alarm() -> None:
         found = of(life, fleet)
         assert "no wear falls" in found.alarm
         assert all(left.median is None for left in found.remaining if left.level > 0.3)
+
+
+def test_many_lives_are_drawn_from_evenly_not_by_their_diagnoses() -> None:
+    """A cap that kept the lives with most diagnoses kept the slow ones."""
+    lives = [worn(serial, 10 + serial % 40) for serial in range(10, 210)]
+    seen = [len(life.age) for life in learn_fleet(lives, 2000.0).seen]
+    assert np.mean(seen) == pytest.approx(
+        np.mean([min(len(life.age), 32) for life in lives]), rel=0.15
+    )
+
+
+def test_hours_since_the_last_diagnosis_shorten_what_is_left() -> None:
+    life = worn(1)
+    whole = forecast("FSS", "hours", life, FLEET, (0.75,)).remaining[0]
+    later = forecast("FSS", "hours", life, FLEET, (0.75,), elapsed=200.0).remaining[0]
+    assert whole.median is not None
+    assert later.median is not None
+    assert whole.median - 210.0 < later.median < whole.median
+
+
+def test_the_chance_within_a_time_is_that_of_the_quantiles() -> None:
+    left = of(worn(1)).remaining[1]
+    assert left.median is not None
+    assert left.high is not None
+    assert left.chance_within(left.median) == pytest.approx(0.5, abs=0.01)
+    assert left.chance_within(left.high) == pytest.approx(0.9, abs=0.01)
+    assert left.chance_within(0.0) == 0.0
+
+
+def test_what_no_life_has_shown_is_called_extrapolated() -> None:
+    young = [worn(serial, 8) for serial in range(10, 22)]
+    found = of(worn(1, 6), learn_fleet(young, 2000.0), (0.95,))
+    assert "0.95 is extrapolated" in found.note
+    assert of(worn(1, 6)).note == ""
+
+
+def test_a_cover_of_fleets_own_lives() -> None:
+    """Eighty per cent, give or take what forty lives allow."""
+    inside = []
+    for serial in range(300, 340):
+        life = worn(serial, 34)
+        now = Life(1, life.age[:12], life.value[:12], life.std[:12], 0.0)
+        left = of(now, FLEET, (0.6,)).remaining[0]
+        end = float(np.interp(0.6, np.maximum.accumulate(life.value), life.age)) - now.age[-1]
+        assert left.low is not None
+        assert left.high is not None
+        inside.append(left.low <= end <= left.high)
+    assert 0.65 < np.mean(inside) < 0.98
+
+
+def test_sentences_have_the_names_of_the_registry() -> None:
+    from ehadiag.model.registry import FAULTS
+    from ehadiag.report.prognosis_tables import SHORT_NAMES
+
+    assert {item.name: item.short for item in FAULTS} == SHORT_NAMES

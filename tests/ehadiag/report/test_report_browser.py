@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 from browser_pages import MODES, browser, objections, opened, overflow, show
 from places import LOGS
-from test_calibrated_pages import NOW, learned, worn
+from test_report_page import NOW, learned, worn_unit
 
 import ehadiag
-from ehadiag.assess.verdict import Levels
-from ehadiag.cli.report_page import report_of
-from ehadiag.report.calibration_page import calibration_page
+from ehadiag import Levels
+from ehadiag.records import result_of
+from ehadiag.report.rendering import diagnosis_html_page
+from ehadiag.report.report_pages import calibration_page
 
 __all__ = ["browser"]
 pytestmark = pytest.mark.slow
@@ -27,7 +28,7 @@ PLOT = ".bk-Figure, .bk-Column"
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     strict = Levels(0.1, 0.3)
-    failed = ehadiag.diagnose(LOGS / "paper-open-4.blf", levels=strict)
+    failed = ehadiag.diagnose(LOGS / "paper-open-4.blf", advisory=0.1, limit=0.3)
     results = {
         "healthy": ehadiag.diagnose(LOGS / "healthy-open.blf"),
         "failed": failed,
@@ -36,10 +37,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     out = {}
     for name, result in results.items():
         levels = strict if name == "failed" else Levels()
-        diagnosis = worn() if result is None else result.diagnosis
-        line = (ehadiag.Result(diagnosis) if result is None else result).to_json()
+        shown = result_of(worn_unit()) if result is None else result
         out[name] = folder / f"{name}.html"
-        out[name].write_bytes(report_of(line, levels, None, diagnosis))
+        out[name].write_bytes(diagnosis_html_page(shown, levels, None))
     out["calibration"] = folder / "calibration.html"
     out["calibration"].write_text(calibration_page(learned(), "1", NOW))
     return out
@@ -54,7 +54,7 @@ def test_pages_open_without_errors_requests_or_overflow(
                 show(page, *mode)
                 assert overflow(page) == 0
                 assert objections(page) == []
-            assert page.evaluate("document.querySelectorAll('.plot').length") >= 2
+            assert page.evaluate("document.querySelectorAll('[role=img]').length") >= 2
         assert wrong == []
         assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
 

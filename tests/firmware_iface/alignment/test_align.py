@@ -22,7 +22,8 @@ from bus_synth import (
     tick_of,
 )
 
-from ehadiag.core.recording import BitReason, BitState, CommandMode
+from ehadiag import CommandMode
+from firmware_iface.recording import BitReason, BitState
 from firmware_iface.transport.frames import Frame
 
 TICKS = 900

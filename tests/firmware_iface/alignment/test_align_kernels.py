@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ehadiag.core.recording import CommandMode
+from ehadiag import CommandMode
 from firmware_iface.alignment import align
 from firmware_iface.alignment import grid as grid_module
-from firmware_iface.alignment.align import STUCK_FRAMES
-from firmware_iface.alignment.bounds import Bounds
-from firmware_iface.alignment.grid import FROZEN_TICKS, Filled, Grid, samples_of
+from firmware_iface.alignment.align import MIN_STUCK_FRAMES
+from firmware_iface.alignment.grid import (
+    MIN_FROZEN_TICKS,
+    GridColumn,
+    RowBounds,
+    TickGrid,
+    samples_of,
+)
 from firmware_iface.alignment.ticks import TickAxis
+from firmware_iface.bus_map import default_map
 
 MS = 1_000_000
 NAN = float("nan")
@@ -54,7 +61,7 @@ def test_a_test_reaches_from_its_neighbour_before_to_its_neighbour_after() -> No
             begin = row[hits[0] - 1] + 1
         if hits and hits[-1] + 1 < count:
             end = row[hits[-1] + 1]
-        bounds = Bounds.of(axis_of(row, tick))
+        bounds = RowBounds.of(axis_of(row, tick))
         assert bounds.rows(span(first, length), 70) == (begin, end)
         ended = int(rng.integers(0, 70))
         if hits:
@@ -63,12 +70,12 @@ def test_a_test_reaches_from_its_neighbour_before_to_its_neighbour_after() -> No
 
 
 def test_the_bounds_of_an_axis_are_running_extremes() -> None:
-    bounds = Bounds.of(axis_of([0, 1, 2, 3], [5, 3, 8, 7]))
+    bounds = RowBounds.of(axis_of([0, 1, 2, 3], [5, 3, 8, 7]))
     assert bounds.highest.tolist() == [5, 5, 8, 8]
     assert bounds.lowest.tolist() == [3, 3, 7, 7]
 
 
-def grid(tick: list[int], value: list[float], **other: Any) -> Grid:
+def grid(tick: list[int], value: list[float], **other: Any) -> TickGrid:
     """A test of four ticks from tick 10 on; frames of message M in every second row."""
     count = len(tick)
     item = SimpleNamespace(
@@ -78,7 +85,7 @@ def grid(tick: list[int], value: list[float], **other: Any) -> Grid:
         saturated=other.get("saturated", {}),
     )
     known = {"channels.spool": (SimpleNamespace(name="M"), None)}
-    return Grid(
+    return TickGrid(
         episode=span(10, 4),
         decoded=SimpleNamespace(messages={"M": item}),
         axis=axis_of([], [], other.get("ticks", {"M": tick})),
@@ -134,13 +141,13 @@ def stretch(before: int, still: int, after: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("before", "still", "after", "found"),
     [
-        (60, FROZEN_TICKS, 60, FROZEN_TICKS),
-        (60, FROZEN_TICKS - 1, 60, 0),
-        (1, FROZEN_TICKS + 5, FROZEN_TICKS + 1, FROZEN_TICKS + 5),
-        (FROZEN_TICKS + 2, FROZEN_TICKS + 5, 0, FROZEN_TICKS + 5),
-        (FROZEN_TICKS + 1, FROZEN_TICKS, 0, 0),
-        (1, FROZEN_TICKS, FROZEN_TICKS, 0),
-        (1, FROZEN_TICKS, FROZEN_TICKS + 1, FROZEN_TICKS),
+        (60, MIN_FROZEN_TICKS, 60, MIN_FROZEN_TICKS),
+        (60, MIN_FROZEN_TICKS - 1, 60, 0),
+        (1, MIN_FROZEN_TICKS + 5, MIN_FROZEN_TICKS + 1, MIN_FROZEN_TICKS + 5),
+        (MIN_FROZEN_TICKS + 2, MIN_FROZEN_TICKS + 5, 0, MIN_FROZEN_TICKS + 5),
+        (MIN_FROZEN_TICKS + 1, MIN_FROZEN_TICKS, 0, 0),
+        (1, MIN_FROZEN_TICKS, MIN_FROZEN_TICKS, 0),
+        (1, MIN_FROZEN_TICKS, MIN_FROZEN_TICKS + 1, MIN_FROZEN_TICKS),
     ],
 )
 def test_a_channel_that_stands_still_and_moves_elsewhere(
@@ -225,11 +232,11 @@ def test_a_test_without_commands_says_so() -> None:
 @pytest.mark.parametrize(
     ("frames", "still", "wait_ms", "noted"),
     [
-        (STUCK_FRAMES + 1, STUCK_FRAMES, 1.0, STUCK_FRAMES),
-        (STUCK_FRAMES + 10, STUCK_FRAMES, 1.0, STUCK_FRAMES),
-        (STUCK_FRAMES + 10, STUCK_FRAMES - 1, 1.0, 0),
-        (STUCK_FRAMES + 10, STUCK_FRAMES, 0.5, 0),
-        (STUCK_FRAMES + 10, STUCK_FRAMES, 0.6, STUCK_FRAMES),
+        (MIN_STUCK_FRAMES + 1, MIN_STUCK_FRAMES, 1.0, MIN_STUCK_FRAMES),
+        (MIN_STUCK_FRAMES + 10, MIN_STUCK_FRAMES, 1.0, MIN_STUCK_FRAMES),
+        (MIN_STUCK_FRAMES + 10, MIN_STUCK_FRAMES - 1, 1.0, 0),
+        (MIN_STUCK_FRAMES + 10, MIN_STUCK_FRAMES, 0.5, 0),
+        (MIN_STUCK_FRAMES + 10, MIN_STUCK_FRAMES, 0.6, MIN_STUCK_FRAMES),
     ],
 )
 def test_a_counter_that_often_stands_still_is_noted(
@@ -252,18 +259,24 @@ def test_a_counter_that_often_stands_still_is_noted(
 
 def test_the_environment_is_the_median_over_the_test() -> None:
     first = SimpleNamespace(row=np.arange(3), values={"channels.spool": np.ones(3)})
+    row = np.array([1, 3, 5, 7, 9])
     second = SimpleNamespace(
-        row=np.array([1, 3, 5, 7, 9]),
+        message=default_map().messages["Environment"],
+        row=row,
+        time_ns=100_000_000 * row,
+        data=np.arange(40, dtype=np.uint8).reshape(5, 8),
+        counter=None,
+        stream=np.zeros(5, dtype=np.int64),
         values={
             "environment.supply_pressure": np.array([1.0, 20.0, 30.0, NAN, 90.0]),
             "environment.oil_temperature": np.array([5.0, NAN, NAN, NAN, 6.0]),
         },
     )
     decoded: Any = SimpleNamespace(messages={"first": first, "second": second})
-    inner = align._environment(decoded, 3, 9)
+    inner, _ = align._environment(decoded, 3, 9, 0)
     assert (inner.supply_pressure, inner.return_pressure) == (25.0, None)
     assert inner.oil_temperature is None
-    whole = align._environment(decoded, 0, 10)
+    whole, _ = align._environment(decoded, 0, 10, 0)
     assert (whole.supply_pressure, whole.oil_temperature) == (25.0, 5.5)
 
 
@@ -275,7 +288,7 @@ def partial(roles: dict[str, list[float]], saturated: list[bool]) -> Any:
         if role not in roles:
             return None
         host = 50 + np.arange(count)
-        return Filled(np.array(roles[role]), np.array(saturated), host)
+        return GridColumn(np.array(roles[role]), np.array(saturated), host)
 
     bus_map = SimpleNamespace(tick_ns=2 * MS, fixed_mode=CommandMode.CURRENT, modes={}, stated=())
     return SimpleNamespace(fill=fill, episode=span(0, count), bus_map=bus_map)
@@ -314,21 +327,17 @@ def test_a_frozen_channel_is_noted_with_its_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "gain", "bias", "std"),
-    [
-        (0.1, 1.0, 0.0, 0.0),  # the computer's own
-        (0.1, 1.0, -273.15, 0.05),  # kelvin: 40 °C lies midway between two steps
-        (0.1, 1.0, -273.2, 0.0),
-        (1.0, 1.0, 0.0, 0.5),
-        (0.1, 5.0 / 9.0, -160.0 / 9.0, 0.25 / 9.0),  # °F
-    ],
+    ("scale", "gain", "std"),
+    [(0.1, 1.0, 0.1 / math.sqrt(12.0)), (0.1, 5.0 / 9.0, 0.5 / 9.0 / math.sqrt(12.0))],  # °C, °F
 )
-def test_a_temperature_on_another_scale_is_rounded_anew(
-    scale: float, gain: float, bias: float, std: float
-) -> None:
+def test_steps_of_the_bus_are_a_standard_deviation(scale: float, gain: float, std: float) -> None:
     signal = SimpleNamespace(is_float=False, scale=scale, offset=0.0)
-    role = SimpleNamespace(signal=signal, gain=gain, bias=bias)
+    role = SimpleNamespace(signal=signal, gain=gain, bias=0.0)
     bus_map: Any = SimpleNamespace(find=lambda _: (None, role))
-    assert align._rounding(bus_map) == pytest.approx(std)
+    assert align._rounding_std(bus_map, "oil_temperature") == pytest.approx(std)
+    both = align._rounding_std(bus_map, "supply_pressure", "return_pressure")
+    assert both == pytest.approx(math.sqrt(2.0) * std)
+    signal.is_float = True
+    assert align._rounding_std(bus_map, "oil_temperature") == 0.0
     nothing: Any = SimpleNamespace(find=lambda _: None)
-    assert align._rounding(nothing) == 0.0
+    assert align._rounding_std(nothing, "oil_temperature") == 0.0

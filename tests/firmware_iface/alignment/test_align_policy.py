@@ -1,4 +1,8 @@
-"""What a recording says of itself, and what the policies refuse."""
+"""What a recording says of itself, and what the policies refuse.
+
+Policies: which counts refuse a recording, which are noted, and the wording. Serial number, test
+number, state and time base must be one through a test.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +13,22 @@ import numpy as np
 import pytest
 from bus_synth import (
     START,
+    STATUS,
     TELEMETRY,
     TICK,
     flip,
     make_truth,
     one,
     play,
+    recordings,
     tick_of,
 )
 
 from firmware_iface.alignment.align import assemble
-from firmware_iface.mapping.file import Policy, PolicyLimits
+from firmware_iface.alignment.frame_faults import judge_frames
+from firmware_iface.codec import Encoder
+from firmware_iface.mapping_file import Policy, PolicyLimits
+from firmware_iface.recording import BitState, MessageCounts
 from firmware_iface.transport.frames import FrameTable
 
 TICKS = 500
@@ -158,3 +167,191 @@ def test_a_test_of_one_tick(encoder, bus_map):
     assert recording.samples.ticks == 1
     assert np.isfinite(recording.samples.spool).all()
     assert recording.quality.messages["ServoTelemetry"].received == 1
+
+
+KINDS = {
+    "crc": ("crc_errors", "frames with a wrong check sum"),
+    "range": ("range_errors", "frames with values outside their range"),
+    "length": ("length_errors", "frames of a wrong length"),
+    "lost": ("lost", "frames lost"),
+    "repeated": ("repeated", "frames repeated"),
+    "out_of_order": ("out_of_order", "frames out of order"),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_is_refused_where_its_own_policy_says_so(kind):
+    """The share is that of all frames sent, as far as is known: those received and those lost."""
+    count, words = KINDS[kind]
+    counts = {"A": MessageCounts(**{"received": 100, "lost": 60, count: 40}), "B": MessageCounts()}
+    frames = 140 if kind == "lost" else 160
+    limit = 40 / frames
+    assert judge_frames(Policy(), counts) == ((), ())
+    refused, notes = judge_frames(Policy(**{kind: "refuse"}), counts)
+    assert refused == (f"A: 40 of {frames} {words} (the mapping's policy allows 0)",)
+    assert notes == ()
+    at = Policy(**{kind: "refuse"}, limits=PolicyLimits(**{kind: limit}))
+    assert judge_frames(at, counts) == ((), ())
+    below = Policy(**{kind: "refuse"}, limits=PolicyLimits(**{kind: limit - 1e-6}))
+    assert judge_frames(below, counts)[0] == (
+        f"A: 40 of {frames} {words} (the mapping's policy allows {limit:.3g})",
+    )
+
+
+@pytest.mark.parametrize("kind", ["crc", "range"])
+def test_faulty_frames_that_are_used_are_noted(kind):
+    count, words = KINDS[kind]
+    counts = {"A": MessageCounts(received=9), "B": MessageCounts(**{"received": 9, count: 1})}
+    refused, notes = judge_frames(Policy(**{kind: "flag"}), counts)
+    assert refused == ()
+    assert notes == (f"B: 1 {words}, used as the mapping's policy says",)
+
+
+@pytest.mark.parametrize("kind", ["lost", "out_of_order"])
+def test_gaps_and_lateness_are_counted_anyway_and_need_no_note(kind):
+    counts = {"A": MessageCounts(**{"received": 9, KINDS[kind][0]: 4})}
+    assert judge_frames(Policy(**{kind: "flag"}), counts) == ((), ())
+
+
+def test_every_message_and_every_kind_is_judged():
+    """A sound message, or a kind within its share, ends nothing."""
+    counts = {
+        "A": MessageCounts(received=100, crc_errors=1, repeated=2, lost=1),
+        "B": MessageCounts(received=100),
+        "C": MessageCounts(received=10, crc_errors=1, length_errors=3),
+    }
+    policy = Policy(
+        crc="refuse",
+        range="flag",
+        length="refuse",
+        repeated="refuse",
+        limits=PolicyLimits(crc=0.05, repeated=0.5),
+    )
+    refused, notes = judge_frames(policy, counts)
+    assert [why.split(" (")[0] for why in refused] == [
+        "C: 1 of 10 frames with a wrong check sum",
+        "C: 3 of 10 frames of a wrong length",
+    ]
+    assert notes == ()
+
+
+def test_no_frames_at_all_are_no_fault():
+    policy = Policy(**dict.fromkeys(KINDS, "refuse"))
+    assert judge_frames(policy, {"A": MessageCounts()}) == ((), ())
+    assert judge_frames(policy, {}) == ((), ())
+
+
+LENGTH = 1000
+
+
+@pytest.fixture
+def session(encoder):
+    return play(encoder, make_truth(LENGTH), idle_before=100, idle_after=100)
+
+
+def restated(session, chosen, **changes):
+    """Status frames of the test, some of them told anew with other content."""
+    encoder, out, number = Encoder(), [], 0
+    for frame in session:
+        if frame.can_id == STATUS and frame.data[0] not in (2, 3):
+            out += encoder.status(0, 0, 0, 0.0, 77, frame.time_ns)
+        elif frame.can_id == STATUS:
+            tick = (frame.time_ns - START) // TICK - 100
+            said = {"state": frame.data[0], "test": 1, "elapsed": tick * 1e-3, "serial": 77}
+            if chosen(number, tick):
+                said |= changes
+            number += 1
+            out += encoder.status(
+                said["state"], 0, said["test"], said["elapsed"], said["serial"], frame.time_ns
+            )
+        else:
+            out.append(frame)
+    return out
+
+
+def why(session, bus_map):
+    return "; ".join(one(session, bus_map).quality.refused)
+
+
+def test_a_sound_test_has_no_contradiction(session, bus_map):
+    assert why(restated(session, lambda *_: False), bus_map) == ""
+
+
+def test_a_serial_number_that_changes_is_refused(session, bus_map):
+    told = restated(session, lambda _, tick: tick > 700, serial=78)
+    assert "the serial number changes within the test: 77 and 78" in why(told, bus_map)
+
+
+def test_a_serial_number_that_changes_with_the_last_word_is_refused(session, bus_map):
+    told = restated(session, lambda _, tick: tick >= LENGTH, serial=78)
+    assert "the serial number changes within the test: 77 and 78" in why(told, bus_map)
+
+
+def test_two_serial_numbers_in_turn_are_a_second_sender(session, bus_map):
+    told = restated(session, lambda number, _: number % 2 == 1, serial=78)
+    assert "in turn: a second sender of the status" in why(told, bus_map)
+
+
+def test_one_odd_serial_number_is_a_note(session, bus_map):
+    (recording,) = recordings(restated(session, lambda number, _: number == 9, serial=99), bus_map)
+    assert recording.quality.refused == ()
+    assert recording.serial == 77
+    assert "one status frame says serial number 99, all others 77" in recording.quality.notes
+
+
+def test_the_status_of_another_test_is_refused(session, bus_map):
+    told = restated(session, lambda *_: True, test=2)
+    assert "commands say test number 1, the status 2" in why(told, bus_map)
+
+
+def test_idle_amidst_a_test_is_refused(session, bus_map):
+    told = restated(session, lambda _, tick: 400 < tick < 480, state=0, elapsed=0.0, test=0)
+    assert "the status says idle 3 times amidst the test" in why(told, bus_map)
+
+
+def test_a_test_that_runs_after_its_end_is_refused(session, bus_map):
+    told = restated(session, lambda _, tick: tick == 600, state=3)
+    assert "the status says that the test runs after it was complete" in why(told, bus_map)
+
+
+def test_two_time_bases_are_a_second_sender(session, bus_map):
+    second, extra = Encoder(), []
+    for _ in range(128):  # far from the counters of the first
+        second.status(0, 0, 0, 0.0, 77, 0)
+    for frame in session:
+        if frame.can_id == STATUS and frame.data[0] == 2:
+            tick = (frame.time_ns - START) // TICK - 100
+            late = frame.time_ns + 7 * TICK
+            extra += second.status(BitState.RUNNING, 0, 1, (tick + 357) * 1e-3, 77, late)
+    told = sorted([*session, *extra], key=lambda item: item.time_ns)
+    assert "two time bases in turn" in why(told, bus_map)
+
+
+def test_a_test_without_status_says_so(encoder, bus_map):
+    recording = one(play(encoder, make_truth(300), status=False), bus_map)
+    assert "no status frames: nothing says how the test ended" in recording.quality.notes
+
+
+def test_a_test_without_its_last_word_says_so(session, bus_map):
+    kept = [item for item in session if item.can_id != STATUS or item.data[0] == 2]
+    recording = one(kept, bus_map)
+    assert "the status frame that tells of the test's end is missing" in recording.quality.notes
+
+
+def test_a_refused_request_is_told_beside_a_test(session, encoder, bus_map):
+    later = session[-1].time_ns + TICK
+    asked = [encoder.status(5, 3, 2, 0.0, 77, later + k * 20 * TICK)[0] for k in range(4)]
+    found = recordings([*session, *asked], bus_map)
+    assert [item.outcome.state for item in found] == [BitState.COMPLETE, BitState.REFUSED]
+    assert found[1].test_id == 2
+    assert found[1].samples is None
+
+
+def test_counts_and_serial_survive_without_a_serial_on_the_bus(session, bus_map):
+    messages = dict(bus_map.messages)
+    status = messages["BitStatus"]
+    roles = tuple(role for role in status.roles if role.name != "status.serial")
+    messages["BitStatus"] = replace(status, roles=roles)
+    recording = one(session, replace(bus_map, messages=messages))
+    assert recording.serial is None
+    assert recording.quality.refused == ()

@@ -10,8 +10,14 @@ from bus_synth import ENVIRONMENT, START, TICK, flip, make_truth, play, recordin
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ehadiag.core.recording import MessageCounts
-from firmware_iface.alignment.counts import _expected, _late, _sequence, count_frames, within
+from firmware_iface.alignment.frame_faults import (
+    _expected,
+    _late,
+    _sequence,
+    count_frames,
+    count_within,
+)
+from firmware_iface.recording import MessageCounts
 from firmware_iface.transport.frames import Frame
 
 
@@ -55,9 +61,20 @@ def test_expected_frames_of_two_streams():
     assert _expected(at[:3], stream[:3], 9, 2) == 5 + 4
 
 
+def test_expected_frames_of_a_slow_page_beside_a_fast_one():
+    """A page of 10 Hz was expected at every tick: thousands of lost frames, and none was."""
+    slow, fast = np.arange(7, 5500, 100), np.arange(5500)
+    at = np.sort(np.concatenate([fast, slow]), kind="stable")
+    stream = np.zeros(len(at), dtype=np.int64)
+    stream[np.searchsorted(at, slow)] = 1
+    assert _expected(at, stream, 5500, 1) == len(at)
+    kept = np.delete(np.arange(len(at)), [40, np.flatnonzero(stream)[9]])
+    assert _expected(at[kept], stream[kept], 5500, 1) == len(at)
+
+
 def test_within():
     rows = np.array([2, 5, 9])
-    assert [within(rows, a, b) for a, b in ((0, 10), (2, 9), (3, 5), (5, 6))] == [3, 2, 0, 1]
+    assert [count_within(rows, a, b) for a, b in ((0, 10), (2, 9), (3, 5), (5, 6))] == [3, 2, 0, 1]
 
 
 def test_environment_frames_lost_repeated_late_and_damaged(encoder, bus_map):

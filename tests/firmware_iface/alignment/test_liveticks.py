@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.recording import CommandMode
-from firmware_iface.alignment.live_ticks import LiveTick, LiveTicks
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.mapping.bus_map import default_map, load_map
+from ehadiag import CommandMode, ConfigurationError
+from firmware_iface.bus_map import default_map, load_map
+from firmware_iface.codec import Encoder
+from firmware_iface.live_decode import LiveTick, LiveTicks
+from firmware_iface.recording import CHANNELS
 
 MAP = default_map()
 TELEMETRY = MAP.messages["ServoTelemetry"].can_id

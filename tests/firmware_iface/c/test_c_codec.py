@@ -18,14 +18,12 @@ from c_side import SOURCES
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from ehadiag.core.recording import BitReason, BitState, CommandMode
-from ehadiag.core.stored_test import bundled_tests
-from firmware_iface.codec.decode import decode
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.codec.live_decode import LiveDecoder, Request
-from firmware_iface.codec.protection import crc8
-from firmware_iface.mapping.bus_map import default_map
-from firmware_iface.session.handshake import BitStatus
+from ehadiag import CommandMode, bundled_tests
+from firmware_iface.bus_map import default_map
+from firmware_iface.codec import Encoder, decode
+from firmware_iface.live_decode import BitRequest, BitStatus, LiveDecoder
+from firmware_iface.protection import crc8
+from firmware_iface.recording import BitReason, BitState
 from firmware_iface.transport.frames import Frame, FrameTable
 from firmware_iface.transport.serial_link import Framer, packet_of
 
@@ -122,7 +120,7 @@ def test_request(library: Any, code: int, test_id: int, counter: int) -> None:
     assert (raw.code, raw.test_id) == (code, test_id)
     heard = LiveDecoder(BUS).decode(Frame(0, frame.id, bytes(frame.data)))
     names = {1: "start", 2: "abort"}
-    assert heard == Request(names.get(code, ""), test_id)
+    assert heard == BitRequest(names.get(code, ""), test_id)
 
 
 PHYSICAL = {

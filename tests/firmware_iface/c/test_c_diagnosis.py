@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import math
 import shutil
 import subprocess
 
@@ -11,18 +12,19 @@ import pytest
 from exported import exported
 from live_ends import cable
 from onboard_frames import DATABASE
+from onboard_node import bare_node, build_bare_node, build_node, write_played
 from places import LOGS
 
 from ehadiag.cli.main import main
-from ehadiag.core.recording import OnboardState
 from ehadiag_tools.onboard.emulators import EMULATED, missing
-from ehadiag_tools.onboard.node import bare_node, build_bare_node, build_node, write_played
 from ehadiag_tools.onboard.replay import identified, surrounded, ticks_of
 from firmware_iface.logs.reader import read_recording
+from firmware_iface.recording import OnboardState
 from firmware_iface.transport.frames import Frame
 
 NOTHING, RECORDING, IDENTIFYING, DONE, GIVEN_UP = OnboardState
 TICKS = 5500
+NOT_TESTED = 30.0
 STAND_IN = r"""
 #include "diagnosis.h"
 static struct fcc_node node;
@@ -50,8 +52,8 @@ int32_t eha_identify_begin(eha_identification *job, const eha_unit *unit)
 int32_t eha_identify_run(eha_identification *job, const eha_tick *recording,
                          const eha_slice *slice)
 {
-    job->runs += slice->runs;
-    runs_asked = slice->runs;
+    job->runs += slice->work;
+    runs_asked = slice->work;
     seen_ticks = slice->ticks;
     first = recording[0];
     job->kintas = 0.25;
@@ -152,13 +154,20 @@ class Node:
         }
 
 
+FILLED_IN = {
+    "supply": "2e7", "before": "1", "behind": "1", "own": "3",
+    "library": "2000.0", "plan": "1.0", "serial": "0.0",
+    "severities": "double kintas; double fss; double fdj;", "zeros": "0.0, 0.0, 0.0",
+}  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def library(c_build, tmp_path_factory):
     work = tmp_path_factory.mktemp("stand-in")
     folder = c_side.SOURCES.parents[1] / "ehadiag" / "data" / "export"
     for name in ("eha_monitor", "eha_identify"):
         text = (folder / f"{name}.h.in").read_text()
-        for key, value in {"supply": "2e7", "before": "1", "behind": "1", "own": "3"}.items():
+        for key, value in FILLED_IN.items():
             text = text.replace(f"${key}", value)
         (work / f"{name}.h").write_text(text)
     (work / "stand_in.c").write_text(STAND_IN)
@@ -273,7 +282,7 @@ def place(tmp_path_factory):
 
 def told_by(line, out):
     """The `onboard` object that `ehadiag bit` gives of a node on a line."""
-    command = ["bit", "--test", "open", "--serial", line, "--out", str(out), "--no-picture",
+    command = ["bit", "--test", "open", "--port", line, "--out", str(out), "--no-picture",
                "--onboard-wait", "120"]  # fmt: skip
     assert main(command) == 10
     (path,) = out.glob("*.json")
@@ -287,11 +296,16 @@ def check(told, heard, expected):
     assert told["quality"]["lost"] == 0
     onboard = recording["onboard"]
     for name, value in heard.onboard.severities.items():
+        if expected.verdict == NOT_TESTED:
+            assert math.isnan(getattr(expected, name))
+            assert math.isnan(value)
+            assert onboard["faults"][name] == {"estimate": None, "std": None}
+            continue
         assert onboard["faults"][name] == {"estimate": value, "std": heard.onboard.std[name]}
         assert round(value * 1e7) == int(getattr(expected, name) * 1e7 + 0.5)
         std = getattr(expected, f"std_{name}")
         assert round(heard.onboard.std[name] * 1e7) == int(min(std, 1.6777215) * 1e7 + 0.5)
-    assert onboard["evaluations"] == expected.runs
+    assert onboard["evaluations"] == int(expected.runs)
 
 
 @pytest.mark.slow
@@ -303,6 +317,7 @@ def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place
         pytest.skip(f"not installed: {', '.join(absent) or 'make'}")
     write_played(read_recording(LOGS / "paper-open-1.blf"), tmp_path)
     option, out = f"-DFCC_DIAGNOSIS_TICKS={ticks}u", tmp_path / "out"
+    short = 0 if ticks == TICKS else ticks
     bits = None
     if target == "host":
         program = build_node(
@@ -314,15 +329,16 @@ def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place
             finally:
                 node.terminate()
     else:
-        with bare_node(build_bare_node(exported(target, place), tmp_path, option)) as node:
+        with bare_node(build_bare_node(exported(target, place, short), tmp_path, option)) as node:
             told, heard = told_by(node.line, out)
             bits = node.found
-    found = identified(
-        EMULATED[0], exported("host", place), surrounded(heard), ticks_of(heard)[:ticks], tmp_path
-    ).outcome
+    library, recorded = exported("host", place, short), ticks_of(heard)[:ticks]
+    found = identified(EMULATED[0], library, surrounded(heard), recorded, tmp_path).outcome
     check(told, heard, found)
     if ticks == TICKS:
         for name, own in told["faults"].items():
-            assert abs(getattr(found, name) - own["estimate"]) < 0.1 * own["std"]
+            # The package estimates oil and supply within the bus's steps (ADR 20), the board holds
+            # them: 0.43 deviations of FDJ.
+            assert abs(getattr(found, name) - own["estimate"]) < 0.6 * own["std"]
     if bits is not None:
         assert np.array(found[: len(bits)]).tobytes() == np.array(bits).tobytes()

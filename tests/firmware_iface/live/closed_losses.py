@@ -2,7 +2,7 @@
 
 python tests/firmware_iface/live/closed_losses.py 20
 
-The limit on guessed positions (`ehadiag.assess.acceptance.MOST_GUESSED`) is lifted here, so
+The limit on guessed positions (`ehadiag.core.criteria.LOSSES`) is lifted here, so
 that the table shows what it keeps out.
 """
 
@@ -14,14 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from fault_cases import Case, run
 
-from ehadiag.assess import acceptance, diagnosis
-from ehadiag.assess.verdict import Verdict
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import Recording
-from ehadiag.core.stored_test import bundled_tests
-from ehadiag_sim.plant.conditions import Faults
+from ehadiag import Recording, Verdict, bundled_tests, default_actuator
+from ehadiag.assess import diagnosis, lost_samples
+from ehadiag.core.criteria import LOSSES as LOSSES_BORNE
+from ehadiag_sim.conditions import Faults
 from firmware_iface.alignment.align import assemble
-from firmware_iface.mapping.bus_map import default_map
+from firmware_iface.bus_map import default_map
 from firmware_iface.transport.frames import Frame, FrameTable
 
 PAPER = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))
@@ -92,11 +90,11 @@ def row(name: str, outcomes: list[Outcome]) -> str:
     )
 
 
-LIMIT = acceptance.MOST_GUESSED
+LIMIT = LOSSES_BORNE.max_guessed_share
 
 
 def main(seeds: int) -> None:
-    acceptance.MOST_GUESSED = 1.0
+    lost_samples.LOSSES = LOSSES_BORNE._replace(max_guessed_share=1.0)
     found: dict[str, list[Outcome]] = {}
     for seed in range(seeds):
         truth = PAPER[seed % len(PAPER)]

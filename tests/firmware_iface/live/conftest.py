@@ -9,10 +9,9 @@ import fault_cases
 import pytest
 from live_ends import cable
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.stored_test import StoredTest
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.plant.conditions import Faults
+from ehadiag import StoredTest, default_actuator
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.emulator import FccCore
 
 CoreFactory = Callable[..., FccCore]
 

@@ -10,19 +10,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import Recording
-from ehadiag.core.stored_test import Line, StoredTest, Windows
-from ehadiag_sim.faults import harness as bf
-from ehadiag_sim.faults.faulty_bus import FaultyTransport
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import EmulatorTransport
-from ehadiag_sim.plant.conditions import Effects, Faults
+from ehadiag import Recording, StoredTest, default_actuator
+from ehadiag_sim import faulty_bus as bf
+from ehadiag_sim.conditions import Effects, Faults
+from ehadiag_sim.emulator import EmulatorTransport, FccCore
+from ehadiag_sim.faulty_bus import FaultyTransport
+from firmware_iface import tester
 from firmware_iface.alignment.align import assemble
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.mapping.bus_map import default_map
-from firmware_iface.session import tester
-from firmware_iface.session.limits import Limits
+from firmware_iface.bus_map import default_map
+from firmware_iface.codec import Encoder
+from firmware_iface.handshake import ChannelLimits
+from firmware_iface.stored_test import Line, SearchWindows
 from firmware_iface.transport.frames import Frame, FrameTable
 
 TELEMETRY, COMMAND, ENVIRONMENT, STATUS = 0x110, 0x111, 0x120, 0x201
@@ -31,11 +29,11 @@ MIDDLE = 0.3
 """s after the first frame: the test has run for some 0.14 s."""
 
 
-Faulting = Callable[[float], Sequence[bf.Fault]]
+Faulting = Callable[[float], Sequence[bf.HarnessFault]]
 """Faults for a run; the argument is the time when those strike that strike once."""
 
 
-def nothing(_: float) -> Sequence[bf.Fault]:
+def nothing(_: float) -> Sequence[bf.HarnessFault]:
     """A sound harness."""
     return ()
 
@@ -55,7 +53,7 @@ class Case:
     received: Faulting = nothing
     sent: Faulting = nothing
     core: dict[str, object] = field(default_factory=dict)
-    limits: Limits = field(default_factory=Limits)
+    limits: ChannelLimits = field(default_factory=ChannelLimits)
     restart: bool = False
     why: str = ""
     unfit: str = ""
@@ -68,7 +66,7 @@ class Case:
 class Run:
     """What came of a case."""
 
-    outcome: tester.TesterOutcome
+    outcome: tester.RequestOutcome
     recording: Recording
     simulated_s: float
     frames: list[Frame]
@@ -106,7 +104,7 @@ def short_test() -> StoredTest:
         mode="current",
         unit="mA",
         segment=(Line(points=points),),
-        windows=Windows(FDJ=span, Kintas=span, FSS=span, refinement=span),
+        windows=SearchWindows(FDJ=span, Kintas=span, FSS=span, refinement=span),
     )
 
 
@@ -164,21 +162,23 @@ def foreign_status() -> Frame:
 LOST = ("lost",)
 CASES = (
     Case("sound bus"),
-    Case("loss of 1 %", lambda _: [bf.Loss(0.01)], least=0.97, counts=LOST),
-    Case("loss of 5 %", lambda _: [bf.Loss(0.05)], least=0.92, counts=LOST),
-    Case("loss of 10 %", lambda _: [bf.Loss(0.1)], least=0.86, counts=LOST),
-    Case("loss of 20 %", lambda _: [bf.Loss(0.2)], least=0.74, counts=LOST),
-    Case("loss of telemetry alone, 10 %", lambda _: [bf.Loss(0.1, TELEMETRY)], least=0.86),
-    Case("loss in bursts of 20 frames", lambda _: [bf.Bursts(20, 300.0)], least=0.85, counts=LOST),
+    Case("loss of 1 %", lambda _: [bf.FrameLoss(0.01)], least=0.97, counts=LOST),
+    Case("loss of 5 %", lambda _: [bf.FrameLoss(0.05)], least=0.92, counts=LOST),
+    Case("loss of 10 %", lambda _: [bf.FrameLoss(0.1)], least=0.86, counts=LOST),
+    Case("loss of 20 %", lambda _: [bf.FrameLoss(0.2)], least=0.74, counts=LOST),
+    Case("loss of telemetry alone, 10 %", lambda _: [bf.FrameLoss(0.1, TELEMETRY)], least=0.86),
+    Case(
+        "loss in bursts of 20 frames", lambda _: [bf.LossBursts(20, 300.0)], least=0.85, counts=LOST
+    ),
     Case(
         "loss in bursts of 200 frames",
-        lambda _: [bf.Bursts(200, 400.0)],
+        lambda _: [bf.LossBursts(200, 400.0)],
         least=0.4,
         counts=LOST,
         unfit="samples are missing",
     ),
-    Case("frames twice, 10 %", lambda _: [bf.Duplicates(0.1)], counts=("repeated",)),
-    Case("all frames twice", lambda _: [bf.Duplicates(1.0)], counts=("repeated",)),
+    Case("frames twice, 10 %", lambda _: [bf.DuplicateFrames(0.1)], counts=("repeated",)),
+    Case("all frames twice", lambda _: [bf.DuplicateFrames(1.0)], counts=("repeated",)),
     Case("frames 4 places late, 5 %", lambda _: [bf.Reordering(0.05, 4)], counts=("out_of_order",)),
     Case("frames 40 places late, 5 %", lambda _: [bf.Reordering(0.05, 40)], least=0.9),
     Case("bit flips, 1 %", lambda _: [bf.BitFlips(0.01)], least=0.97, counts=("crc_errors",)),
@@ -193,12 +193,16 @@ CASES = (
     Case(
         "wrong length, 5 %", lambda _: [bf.WrongLength(0.05)], least=0.92, counts=("length_errors",)
     ),
-    Case("foreign frames, 5 beside each of ours", lambda _: [bf.Foreign(5)]),
-    Case("foreign frames at full load, 50 beside each of ours", lambda _: [bf.Foreign(50)]),
-    Case("foreign frames and loss of 5 %", lambda _: [bf.Loss(0.05), bf.Foreign(3)], least=0.92),
+    Case("foreign frames, 5 beside each of ours", lambda _: [bf.ForeignFrames(5)]),
+    Case("foreign frames at full load, 50 beside each of ours", lambda _: [bf.ForeignFrames(50)]),
+    Case(
+        "foreign frames and loss of 5 %",
+        lambda _: [bf.FrameLoss(0.05), bf.ForeignFrames(3)],
+        least=0.92,
+    ),
     Case(
         "noise under our identifiers, 5 beside each of ours",
-        lambda _: [bf.Noise(5)],
+        lambda _: [bf.NoiseFrames(5)],
         counts=("crc_errors",),
     ),
     Case("error frames, 10 %", lambda _: [bf.ErrorFrames(0.1)]),
@@ -225,47 +229,53 @@ CASES = (
     Case("host clock set back by 2 s", lambda at: [bf.ClockStep(at, -2.0)]),
     Case("host clock set forward by 2 s", lambda at: [bf.ClockStep(at, 2.0)]),
     Case("host clock set back by 0.1 s", lambda at: [bf.ClockStep(at, -0.1)]),
-    Case("stamps late by up to 50 ms", lambda _: [bf.Jitter(50e-3)]),
-    Case("stamps late by up to 5 ms", lambda _: [bf.Jitter(5e-3)]),
-    Case("pause of 0.1 s, frames lost", lambda at: [bf.Pause(at, 0.1)], least=0.7, counts=LOST),
-    Case("pause of 0.1 s, frames in a burst", lambda at: [bf.Pause(at, 0.1, True)]),
-    Case("pause of 0.3 s", lambda _: [bf.Pause(0.2, 0.3)], why="telemetry lost for 0.25 s"),
-    Case("pause of 1 s", lambda at: [bf.Pause(at, 1.0)], why="telemetry lost for 0.25 s"),
+    Case("stamps late by up to 50 ms", lambda _: [bf.StampJitter(50e-3)]),
+    Case("stamps late by up to 5 ms", lambda _: [bf.StampJitter(5e-3)]),
+    Case("pause of 0.1 s, frames lost", lambda at: [bf.BusPause(at, 0.1)], least=0.7, counts=LOST),
+    Case("pause of 0.1 s, frames in a burst", lambda at: [bf.BusPause(at, 0.1, True)]),
+    Case("pause of 0.3 s", lambda _: [bf.BusPause(0.2, 0.3)], why="telemetry lost for 0.25 s"),
+    Case("pause of 1 s", lambda at: [bf.BusPause(at, 1.0)], why="telemetry lost for 0.25 s"),
     Case(
         "pause of 0.3 s, frames in a burst",
-        lambda _: [bf.Pause(0.2, 0.3, True)],
+        lambda _: [bf.BusPause(0.2, 0.3, True)],
         why="telemetry lost for 0.25 s",
     ),
-    Case("pause of 5 s", lambda at: [bf.Pause(at, 5.0)], why="telemetry lost for 0.25 s"),
-    Case("telemetry never comes", lambda _: [bf.Silence(TELEMETRY)], why="telemetry lost"),
-    Case("telemetry without command", lambda _: [bf.Silence(COMMAND)]),
-    Case("no environment", lambda _: [bf.Silence(ENVIRONMENT)]),
-    Case("status never comes", lambda _: [bf.Silence(STATUS)], why="no answer within 1 s"),
-    Case("status ends while running", lambda at: [bf.Silence(STATUS, at)], why="not complete 1 s"),
-    Case("bus off", lambda at: [bf.Failure(at, "bus off")], why="bus lost: .*bus off"),
+    Case("pause of 5 s", lambda at: [bf.BusPause(at, 5.0)], why="telemetry lost for 0.25 s"),
+    Case("telemetry never comes", lambda _: [bf.MessageSilence(TELEMETRY)], why="telemetry lost"),
+    Case("telemetry without command", lambda _: [bf.MessageSilence(COMMAND)]),
+    Case("no environment", lambda _: [bf.MessageSilence(ENVIRONMENT)]),
+    Case("status never comes", lambda _: [bf.MessageSilence(STATUS)], why="no answer within 1 s"),
     Case(
-        "adapter unplugged", lambda _: [bf.Failure(0.02, "unplugged")], why="bus lost: .*unplugged"
+        "status ends while running",
+        lambda at: [bf.MessageSilence(STATUS, at)],
+        why="not complete 1 s",
     ),
-    Case("request lost", sent=lambda _: [bf.Loss(1.0)], why="no answer within 1 s"),
+    Case("bus off", lambda at: [bf.BusFailure(at, "bus off")], why="bus lost: .*bus off"),
+    Case(
+        "adapter unplugged",
+        lambda _: [bf.BusFailure(0.02, "unplugged")],
+        why="bus lost: .*unplugged",
+    ),
+    Case("request lost", sent=lambda _: [bf.FrameLoss(1.0)], why="no answer within 1 s"),
     Case(
         "first abort lost",
-        sent=lambda _: [bf.Pause(0.1, 0.3)],
-        limits=Limits(current=1.5e-3),
+        sent=lambda _: [bf.BusPause(0.1, 0.3)],
+        limits=ChannelLimits(current=1.5e-3),
         why="current .*beyond its limit .*mA$",
     ),
     Case(
         "second tester before the request",
-        lambda _: [bf.Inserted(0.02, [foreign_request()])],
+        lambda _: [bf.InsertedFrames(0.02, [foreign_request()])],
         why="another tester is on the bus",
     ),
     Case(
         "second tester while the test runs",
-        lambda at: [bf.Inserted(at, [foreign_request()])],
+        lambda at: [bf.InsertedFrames(at, [foreign_request()])],
         why="another tester is on the bus",
     ),
     Case(
         "status of another test",
-        lambda at: [bf.Inserted(at, [foreign_status()])],
+        lambda at: [bf.InsertedFrames(at, [foreign_status()])],
         why="changed to test 3",
     ),
     Case("computer restarts", restart=True, why="fell back to idle"),
@@ -280,7 +290,7 @@ CASES = (
         why="supply pressure low",
     ),
     Case("no telemetry while idle", core={"idle_telemetry": False}),
-    Case("limit exceeded", limits=Limits(pressure=1e3), why="pressure .*beyond its limit"),
+    Case("limit exceeded", limits=ChannelLimits(pressure=1e3), why="pressure .*beyond its limit"),
 )
 
 
@@ -289,21 +299,19 @@ def stated(case: Case) -> str:
     if case.why:
         reason = case.why.replace(".*", " … ").rstrip("$").strip()
         return f"NOT TESTED: {reason}"
-    parts = [
-        f"complete; {'all' if case.least == 1.0 else f'at least {case.least:.0%} of the'} samples"
-    ]
+    parts = [f"complete; {'all' if case.least == 1.0 else f'{case.least:.0%} of the'} samples"]
     if case.counts:
         parts.append("counted as " + ", ".join(item.replace("_", " ") for item in case.counts))
     if case.wrong:
-        parts.append(f"up to {case.wrong:.1%} of the samples wrong, unseen")
+        parts.append(f"up to {case.wrong:.1%} wrong, unseen")
     return "; ".join(parts)
 
 
 def concluded(case: Case) -> str:
     """The outcome of a whole stored test in words."""
     if case.why:
-        return "NOT TESTED, for that reason"
-    return f"NOT TESTED: {case.unfit}" if case.unfit else "same estimates, same verdict"
+        return "NOT TESTED"
+    return f"NOT TESTED: {case.unfit}" if case.unfit else "same"
 
 
 CLOSED_LOSSES = """\
@@ -334,25 +342,30 @@ Its frames are dropped and counted as conflicts, or the answer is NOT TESTED and
 """
 
 
+def by_outcome(lines: list[tuple[str, ...]]) -> str:
+    """Rows of a table: an outcome with the names of its cases."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, *outcome in lines:
+        names.setdefault(tuple(outcome), []).append(name)
+    return "".join(f"| {' | '.join(['; '.join(cases), *key])} |\n" for key, cases in names.items())
+
+
 def table() -> str:
     """The tables of the docs."""
     from fault_logs import LOG_CASES  # builds upon this module
 
-    rows = "".join(f"| {item.name} | {stated(item)} | {concluded(item)} |\n" for item in CASES)
-    logs = "".join(f"| {item.name} | {item.stated} |\n" for item in LOG_CASES)
+    rows = by_outcome([(item.name, stated(item), concluded(item)) for item in CASES])
+    logs = by_outcome([(item.name, item.stated) for item in LOG_CASES])
     return f"""# What a damaged harness does to a test
 
-Each fault is injected between the emulated computer and the tester
-(`tests/firmware_iface/live/fault_cases.py`, from which these tables are printed by
-`python tests/firmware_iface/live/fault_cases.py`).
+Each fault is injected between the emulated computer and the tester. The tables are printed by
+`python tests/firmware_iface/live/fault_cases.py`, and `test_live_faults.py` checks each line.
 
-*Handshake and samples*: a test of 0.4 s, each line checked by `test_live_faults.py`. Every
-sample that arrives equals that of the sound bus to the last bit; none is ever invented.
-
-*Diagnosis*: the whole stored test `open` from its request to the verdict, each line checked by
-`test_live_diagnosis.py`; a fault that occurs once occurs during the steps, which show the filter.
-“Same” means the verdict of the sound bus, and each estimate within twice its stated error (95 %
-interval) of that of the sound bus.
+- *Handshake and samples*: a test of 0.4 s, and the least share of samples that arrive. Each
+  equals that of the sound bus to the last bit.
+- *Diagnosis*: the complete stored test `open`. A fault that occurs once occurs during the steps,
+  which show the filter. “Same” means the verdict of the sound bus, and each estimate within its
+  95 % interval of that of the sound bus.
 
 | fault | handshake and samples | diagnosis |
 | --- | --- | --- |
@@ -361,26 +374,21 @@ interval) of that of the sound bus.
 
 Losses of 1, 5 and 10 %, late frames, a pause of 0.1 s and damaged frames with a valid CRC give
 the outcomes above in closed loop too. There the servovalve current is rebuilt from the jack
-positions that the control law worked on. A lost position follows exactly from the current
-measured in the next tick. Where that is lost too, the position can only be interpolated; the
-noise of that sample, which the control law turned into current, remains unknown and is not part
-of the stated error.
+positions. A lost position follows from the current measured in the next tick. Where that is lost
+too, the position is interpolated, and the noise of that sample is unknown:
 
 {CLOSED_LOSSES}
-*Interpolated* is the share of ticks whose position was interpolated, at most 50 in one dropout;
-*accepted* are the runs whose fit is accepted. *From whole* and *from truth* are the largest
-distances of an accepted estimate, in stated standard deviations, from that of the whole recording
-and from the truth. With 20 % lost and the positions restored, no estimate was more than 1.1
-deviations off, so interpolation is the cause. Hence **a closed-loop recording with more than
-1.5 % of its positions interpolated** (last column) **has a verdict only where [the response tells
-them](../how-to/bare-bus.md#what-cannot-be-observed)**, up to 10 %; the table was made before that
-was done. NOT TESTED is every recording from a controller with an integral or derivative part that
-lost more than 1.5 % of its positions: there each lost position is interpolated.
+*Interpolated*: share of ticks with an interpolated position. *Accepted*: runs with an accepted
+fit. *From whole*, *from truth*: largest distance of an accepted estimate, in stated standard
+deviations, from that of the whole recording and from the truth. So **above 1.5 % interpolated
+there is a verdict only where [the response shows the
+positions](../explanation/frames-to-ticks.md#what-cannot-be-observed)**, up to 10 % (not in this
+table), and none for a controller with an integral or derivative part.
 
 ## What a damaged log does to a diagnosis
 
-The recording of the same test, damaged, and read as `ehadiag diagnose` reads it
-(`tests/firmware_iface/live/fault_logs.py`, checked by `test_live_diagnosis.py`).
+The recording of the same test, damaged, and read by `ehadiag diagnose`
+(`tests/firmware_iface/live/fault_logs.py`).
 
 | log | diagnosis |
 | --- | --- |

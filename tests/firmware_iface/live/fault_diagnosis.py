@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from fault_cases import Case, Run, run
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose, not_tested
-from ehadiag.assess.verdict import Verdict
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import Recording
-from ehadiag.core.stored_test import StoredTest, bundled_tests
+from ehadiag import Diagnosis, Recording, StoredTest, Verdict, bundled_tests, default_actuator
+from ehadiag.assess.diagnosis import diagnose, not_tested
 
 STRIKE = 2.6
 """s after the first frame: 2.44 s into the test, amidst the steps that show the filter."""

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ehadiag.core.recording import Recording
-from ehadiag_sim.faults.harness import Foreign, Moment
+from ehadiag import Recording
+from ehadiag_sim.faulty_bus import ForeignFrames, FrameMoment
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.logs.recorder import Recorder
-from firmware_iface.session.assembler import Assembler
+from firmware_iface.tester import Assembler
 from firmware_iface.transport.frames import Frame
 
 MIDDLE_OF_ALL = 0.5
@@ -35,7 +35,7 @@ class LogCase:
     @property
     def stated(self) -> str:
         """The outcome in words."""
-        return f"NOT TESTED: {self.why}" if self.why else "same estimates, same verdict"
+        return f"NOT TESTED: {self.why}" if self.why else "same"
 
 
 def half(frames: list[Frame], _begun: float, folder: Path) -> Recording:
@@ -67,7 +67,7 @@ def collected(frames: Iterator[Frame], kept: int = 4_000_000) -> Recording:
 
 def noise(count: int, time_ns: int) -> Iterator[Frame]:
     """Foreign frames without end, none of them kept here."""
-    foreign, at = Foreign(1), Moment(0.0, np.random.default_rng(7))
+    foreign, at = ForeignFrames(1), FrameMoment(0.0, np.random.default_rng(7))
     carrier = Frame(time_ns, 0x110, bytes(8))
     for _ in range(count):
         yield next(iter(foreign(carrier, at)))

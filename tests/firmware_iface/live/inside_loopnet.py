@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import multiprocessing
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import pytest
+from fault_cases import DURATION, NUMBER, short_test
 from test_live_contract import FRAMES, TwoWay, collect, content
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.stored_test import bundled_tests
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import run_emulator
+from ehadiag import default_actuator
+from ehadiag_sim.emulator import FccCore, run_emulator
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.logs.recorder import Recorder
-from firmware_iface.logs.replay import play
-from firmware_iface.session.tester import run_test
-from firmware_iface.transport.frames import FrameTable
-from firmware_iface.transport.interface import Transport, TransportState
-from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from firmware_iface.tester import run_test
+from firmware_iface.transport.adapters import BusOptions
+from firmware_iface.transport.base import Transport, TransportState
+from firmware_iface.transport.python_can import PythonCanTransport
 
 
 class TestMulticast(TwoWay):
-    speed = 2.0
-
     @pytest.fixture
     def options(self) -> BusOptions:
         return BusOptions("udp_multicast")
@@ -41,15 +37,6 @@ class TestMulticast(TwoWay):
         with PythonCanTransport(options) as transport:
             yield transport
 
-    @pytest.fixture
-    def feed(self, other: Transport) -> Callable[[], None]:
-        def send() -> None:
-            # A paced log: a multicast socket drops what its reader has no room for.
-            table = FrameTable.from_frames(FRAMES)
-            play(table, other, speed=2.0)
-
-        return send
-
     def test_what_is_no_frame_degrades_and_does_not_end_the_bus(
         self, receiving: Transport, other: Transport
     ) -> None:
@@ -63,7 +50,7 @@ class TestMulticast(TwoWay):
 
 def node(stop: Event, ready: Event) -> None:
     with PythonCanTransport(BusOptions("udp_multicast"), transmit=True) as bus:
-        core = FccCore(default_actuator(), bundled_tests().values(), serial=4711)
+        core = FccCore(default_actuator(), [short_test()], serial=4711)
         core.step()  # compiles
         ready.set()
         run_emulator(core, bus, stop)
@@ -75,18 +62,18 @@ def test_a_test_between_two_processes_loses_no_sample(tmp_path: Path) -> None:
     process = context.Process(target=node, args=(stop, ready))
     process.start()
     try:
-        assert ready.wait(60)
+        assert ready.wait(100)
         with PythonCanTransport(BusOptions("udp_multicast"), transmit=True) as bus:
             outcome = run_test(
                 bus,
-                test_id=1,
-                duration=5.5,
+                test_id=NUMBER,
+                duration=DURATION,
                 transmit=True,
                 recorder=Recorder(tmp_path / "live.blf"),
             )
     finally:
         stop.set()
-        process.join(10)
+        process.join()
     assert outcome.why == ""
     assert outcome.serial == 4711
     assert outcome.dropped == 0
@@ -94,17 +81,17 @@ def test_a_test_between_two_processes_loses_no_sample(tmp_path: Path) -> None:
     recording = read_recording(tmp_path / "live.blf")
     assert recording.quality.total("lost") == 0
     assert recording.samples is not None
-    assert recording.samples.ticks == 5500
+    assert recording.samples.ticks == short_test().ticks
 
 
 def test_a_soak_accounts_for_every_frame(tmp_path: Path) -> None:
-    from ehadiag_tools.soak.bus import soak
+    from ehadiag_tools.soak import soak
 
     result = soak(BusOptions("udp_multicast"), 2.0, 0.4, tmp_path)
-    assert result.sent > 0
-    assert result.sent == result.received + result.own_lost + result.foreign_lost
-    assert result.recorded == result.received + result.dropped_by_queue
-    assert result.dropped_by_kernel is not None
-    assert result.own_lost + result.foreign_lost <= result.dropped_by_kernel
-    assert 0.0 < result.age_p50 <= result.age_p99
-    assert result.rss_end > 0
+    assert result["sent"] > 0
+    assert result["sent"] == result["received"] + result["own_lost"] + result["foreign_lost"]
+    assert result["recorded"] == result["received"] + result["dropped_by_queue"]
+    assert result["dropped_by_kernel"] is not None
+    assert result["own_lost"] + result["foreign_lost"] <= result["dropped_by_kernel"]
+    assert 0.0 < result["age_p50"] <= result["age_p99"]
+    assert result["rss_end"] > 0

@@ -9,20 +9,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.recording import BitReason, BitState, CommandMode
-from ehadiag.core.stored_test import StoredTest, bundled_tests
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import EmulatorTransport, run_emulator
-from ehadiag_sim.plant.conditions import Effects
+from ehadiag import CommandMode, ConfigurationError, StoredTest, bundled_tests, default_actuator
+from ehadiag_sim.conditions import Effects
+from ehadiag_sim.emulator import EmulatorTransport, FccCore, run_emulator
 from firmware_iface.alignment.align import assemble
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.codec.live_decode import LiveDecoder
-from firmware_iface.codec.live_messages import BitStatus, Sample
-from firmware_iface.mapping.bus_map import default_map
+from firmware_iface.bus_map import default_map
+from firmware_iface.codec import Encoder
+from firmware_iface.live_decode import BitStatus, LiveDecoder, Sample
+from firmware_iface.recording import BitReason, BitState
+from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.frames import Frame, FrameTable
-from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from firmware_iface.transport.python_can import PythonCanTransport
 
 CoreFactory = Callable[..., FccCore]
 TELEMETRY, COMMAND, ENVIRONMENT, STATUS = 0x110, 0x111, 0x120, 0x201

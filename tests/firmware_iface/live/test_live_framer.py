@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ehadiag.core.errors import ConfigurationError
+from ehadiag import ConfigurationError
 from firmware_iface.transport.frames import Frame
-from firmware_iface.transport.serial_link import LONGEST_CODED, Framer, packet_of
+from firmware_iface.transport.serial_link import MAX_CODED_BYTES, Framer, packet_of
 
 frames = st.builds(
     lambda can_id, us, data: Frame(us * 1000, can_id, data),
@@ -77,7 +77,7 @@ def test_no_single_bit_flip_gets_through(frame: Frame, at: int, bit: int) -> Non
 def test_memory_stays_bounded_and_nothing_raises(noise: bytes) -> None:
     framer = Framer()
     framer.feed(noise.replace(b"\0", b"\1"))
-    assert len(framer._partial) <= LONGEST_CODED
+    assert len(framer._partial) <= MAX_CODED_BYTES
     assert framer.bytes_seen == len(noise)
 
 

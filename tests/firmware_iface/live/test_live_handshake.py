@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ehadiag.core.recording import BitReason, BitState
-from firmware_iface.codec.live_messages import BitStatus, Sample
-from firmware_iface.session.handshake import Action, Handshake, Phase, TimeLimits
-from firmware_iface.session.limits import Limits
+from firmware_iface.handshake import ChannelLimits, Handshake, HandshakeAction, Phase, TimeLimits
+from firmware_iface.live_decode import BitStatus, Sample
+from firmware_iface.recording import BitReason, BitState
 
 MS = 1_000_000
 QUIET = Sample(0.0, 0.0, 0.0, 0.0)
@@ -28,7 +27,7 @@ class Driver:
 
     def __init__(self, *, transmit: bool = True, test_id: int | None = 1, **options: object):
         self.now = 1_000_000 * MS
-        self.sent: list[Action] = []
+        self.sent: list[HandshakeAction] = []
         self.machine = Handshake(
             test_id=test_id, duration=1.0, transmit=transmit, now=self.now, **options
         )
@@ -52,7 +51,7 @@ class Driver:
 
     def requested(self) -> Driver:
         self.hear(IDLE).wait(0.1)
-        assert self.sent == [Action.START]
+        assert self.sent == [HandshakeAction.START]
         return self
 
     def running(self) -> Driver:
@@ -61,6 +60,8 @@ class Driver:
         return self
 
     def ended(self) -> str:
+        if self.machine.phase in (Phase.CLOSING, Phase.ABORTING):
+            self.wait(TimeLimits().quiet, telemetry=False)
         assert self.machine.phase is Phase.DONE
         assert self.machine.verdict is not None
         assert self.machine.verdict.complete == (self.machine.verdict.why == "")
@@ -70,7 +71,7 @@ class Driver:
 def test_a_test_that_goes_well_is_complete_and_sends_one_start() -> None:
     driver = Driver().running().wait(1.0).hear(status(BitState.COMPLETE)).wait(0.1)
     assert driver.ended() == ""
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
 
 
 def test_nothing_is_sent_before_the_bus_was_listened_to() -> None:
@@ -97,7 +98,7 @@ def test_a_refusal_ends_with_its_reason(reason: BitReason) -> None:
     driver = Driver().requested().hear(status(BitState.REFUSED, reason=reason))
     assert driver.ended().startswith("refused: ")
     assert driver.machine.verdict.status.reason is reason
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
 
 
 def test_each_refusal_reads_differently() -> None:
@@ -124,7 +125,7 @@ def test_an_end_from_before_the_request_is_not_taken_for_an_answer() -> None:
 
 def test_no_answer_asks_for_an_abort() -> None:
     driver = Driver().requested().wait(1.0)
-    assert Action.ABORT in driver.sent
+    assert HandshakeAction.ABORT in driver.sent
     driver.hear(IDLE)
     assert driver.ended() == "no answer within 1 s of the request"
     assert driver.machine.verdict.abort_confirmed is True
@@ -134,18 +135,18 @@ def test_an_abort_is_repeated_until_its_time_limit() -> None:
     driver = Driver().requested().wait(3.0)
     assert driver.ended().endswith("the abort was not confirmed")
     assert driver.machine.verdict.abort_confirmed is False
-    assert 5 <= driver.sent.count(Action.ABORT) <= 11
+    assert 5 <= driver.sent.count(HandshakeAction.ABORT) <= 11
 
 
 def test_arming_for_ever_is_aborted() -> None:
     driver = Driver().requested().hear(status(BitState.ARMING)).wait(10.1)
-    assert Action.ABORT in driver.sent
+    assert HandshakeAction.ABORT in driver.sent
     assert driver.hear(IDLE).ended() == "still arming after 10 s"
 
 
 def test_lost_telemetry_is_aborted() -> None:
     driver = Driver().running().wait(0.3, telemetry=False)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     assert driver.hear(status(BitState.ABORTED)).ended() == "telemetry lost for 0.25 s"
 
 
@@ -160,19 +161,19 @@ def test_time_in_which_the_reader_did_not_run_is_no_silence() -> None:
     driver.machine.excuse(400 * MS)
     driver.sent += driver.machine.on_time(driver.now)
     assert driver.machine.phase is Phase.RUNNING
-    assert driver.wait(0.3, telemetry=False).sent == [Action.START, Action.ABORT]
+    assert driver.wait(0.3, telemetry=False).sent == [HandshakeAction.START, HandshakeAction.ABORT]
 
 
 def test_a_test_that_never_ends_is_aborted() -> None:
     driver = Driver().running().wait(2.05)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     assert "not complete 1 s after its 1 s" in driver.hear(IDLE).ended()
 
 
 def test_an_abort_by_the_computer_ends_the_test() -> None:
     driver = Driver().running().hear(status(BitState.ABORTED))
     assert driver.ended() == "aborted by the flight-control computer"
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
 
 
 def test_a_restart_of_the_computer_ends_the_test() -> None:
@@ -181,7 +182,7 @@ def test_a_restart_of_the_computer_ends_the_test() -> None:
 
 def test_a_test_that_begins_anew_is_aborted() -> None:
     driver = Driver().running().hear(status(BitState.ARMING))
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     assert driver.hear(IDLE).ended() == "the test began anew"
 
 
@@ -199,7 +200,7 @@ def test_someone_elses_running_test_is_left_alone() -> None:
 def test_an_answer_with_another_number_is_someone_elses() -> None:
     driver = Driver().requested().hear(status(BitState.ARMING, test_id=2))
     assert "another tester" in driver.ended()
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
 
 
 def test_a_change_of_the_tests_number_while_it_runs_ends_it() -> None:
@@ -210,71 +211,79 @@ def test_a_foreign_request_before_the_answer_ends_without_an_abort_that_could_hi
     driver = Driver().requested()
     driver.sent += driver.machine.on_foreign_request(driver.now)
     assert driver.ended() == "another tester is on the bus"
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
 
 
 def test_a_foreign_request_while_our_test_runs_aborts_it() -> None:
     driver = Driver().running()
     driver.sent += driver.machine.on_foreign_request(driver.now)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     assert driver.hear(status(BitState.ABORTED)).ended() == "another tester is on the bus"
 
 
 def test_a_foreign_request_seen_only_by_its_refusal_aborts_too() -> None:
     driver = Driver().running().hear(status(BitState.REFUSED, 2, BitReason.ALREADY_RUNNING))
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
 
 
 @pytest.mark.parametrize(
     ("limits", "sample", "why"),
     [
         (
-            Limits(position=0.01),
+            ChannelLimits(position=0.01),
             Sample(0, 0, 0, -0.02531),
             "position -25.31 mm beyond its limit ±10 mm",
         ),
-        (Limits(pressure=1e6), Sample(0, 0, 2e6, 0), "pressure 2 MPa beyond its limit ±1 MPa"),
-        (Limits(current=1e-3), Sample(-2e-3, 0, 0, 0), "current -2 mA beyond its limit ±1 mA"),
+        (
+            ChannelLimits(pressure=1e6),
+            Sample(0, 0, 2e6, 0),
+            "pressure 2 MPa beyond its limit ±1 MPa",
+        ),
+        (
+            ChannelLimits(current=1e-3),
+            Sample(-2e-3, 0, 0, 0),
+            "current -2 mA beyond its limit ±1 mA",
+        ),
     ],
 )
 def test_a_limit_is_exceeded_at_the_third_successive_sample(
-    limits: Limits, sample: Sample, why: str
+    limits: ChannelLimits, sample: Sample, why: str
 ) -> None:
     driver = Driver(limits=limits).running()
     driver.sample(sample).sample(sample).sample(QUIET).sample(sample).sample(sample)
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
     driver.sample(sample)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     assert driver.hear(IDLE).ended() == why
 
 
 def test_messages_of_other_channels_neither_add_to_a_count_nor_end_it() -> None:
     beyond = Sample(0, 0, 0, 0.02, frozenset({"position"}))
     other = replace(beyond, brought=frozenset({"spool"}))
-    driver = Driver(limits=Limits(position=0.01)).running()
+    driver = Driver(limits=ChannelLimits(position=0.01)).running()
     for _ in range(2):
         driver.sample(beyond).sample(other).sample(other)
-    assert driver.sent == [Action.START]  # two samples of the position, six messages
+    assert driver.sent == [HandshakeAction.START]  # two samples of the position, six messages
     driver.sample(beyond)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
 
 
 @pytest.mark.parametrize("position", [math.nan, 0.0])
 def test_a_watched_channel_that_ends_is_lost_telemetry(position: float) -> None:
     """The others go on; a number that is none is no sample either."""
-    driver = Driver(limits=Limits(position=0.01)).running()
+    driver = Driver(limits=ChannelLimits(position=0.01)).running()
     brought = {"position"} if math.isnan(position) else {"current", "spool"}
     for _ in range(24):
         driver.wait(0.01, telemetry=False).sample(Sample(0, 0, 0, position, frozenset(brought)))
-    assert driver.sent == [Action.START]
+    assert driver.sent == [HandshakeAction.START]
     driver.wait(0.01, telemetry=False)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     why = "telemetry lost: no position for 0.25 s, and its limit is watched"
     assert driver.hear(status(BitState.ABORTED)).ended() == why
 
 
 def test_a_channel_that_ends_is_let_go_where_nobody_watches_it() -> None:
-    driver = Driver(limits=Limits(current=0.01)).running()
+    driver = Driver(limits=ChannelLimits(current=0.01)).running()
     for _ in range(40):
         sample = Sample(0, 0, 0, math.nan, frozenset({"current", "spool", "pressure"}))
         driver.wait(0.01, telemetry=False).sample(sample)
@@ -283,13 +292,13 @@ def test_a_channel_that_ends_is_let_go_where_nobody_watches_it() -> None:
 
 def test_one_number_that_is_none_does_not_begin_the_count_anew() -> None:
     beyond = Sample(0, 0, 0, 0.02)
-    driver = Driver(limits=Limits(position=0.01)).running()
+    driver = Driver(limits=ChannelLimits(position=0.01)).running()
     driver.sample(beyond).sample(beyond).sample(replace(beyond, position=math.nan)).sample(beyond)
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
 
 
 def test_a_reader_that_did_not_run_has_not_lost_a_watched_channel() -> None:
-    driver = Driver(limits=Limits(position=0.01)).running().wait(0.1)
+    driver = Driver(limits=ChannelLimits(position=0.01)).running().wait(0.1)
     driver.now += 400 * MS
     driver.machine.excuse(400 * MS)
     driver.sent += driver.machine.on_time(driver.now)
@@ -297,7 +306,7 @@ def test_a_reader_that_did_not_run_has_not_lost_a_watched_channel() -> None:
 
 
 def test_limits_do_not_count_at_their_very_value() -> None:
-    driver = Driver(limits=Limits(position=0.01)).running()
+    driver = Driver(limits=ChannelLimits(position=0.01)).running()
     for _ in range(5):
         driver.sample(Sample(0, 0, 0, 0.01))
     assert driver.machine.phase is Phase.RUNNING
@@ -314,7 +323,7 @@ def test_a_stop_while_running_is_aborted_once() -> None:
     driver = Driver().running()
     for _ in range(3):
         driver.sent += driver.machine.stop(driver.now, "stopped")
-    assert driver.sent == [Action.START, Action.ABORT]
+    assert driver.sent == [HandshakeAction.START, HandshakeAction.ABORT]
     assert driver.hear(status(BitState.ABORTED)).ended() == "stopped"
 
 
@@ -403,6 +412,6 @@ def test_whatever_comes_the_machine_ends_in_time_and_never_sends_when_listening(
     driver.wait(25.0, telemetry=False)
     driver.ended()
     assert transmit or driver.sent == []
-    assert driver.sent.count(Action.START) <= 1
-    if Action.ABORT in driver.sent:
-        assert driver.sent[0] is Action.START, "an abort without a request"
+    assert driver.sent.count(HandshakeAction.START) <= 1
+    if HandshakeAction.ABORT in driver.sent:
+        assert driver.sent[0] is HandshakeAction.START, "an abort without a request"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
+from ehadiag import ConfigurationError, InputOutputError
 from firmware_iface.logs import recorder as recorder_module
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder

@@ -9,16 +9,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 
 import pytest
 from serial import rfc2217, serial_for_url
 
-from ehadiag.core.errors import BusLostError
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import run_emulator
-from firmware_iface.session.tester import run_test
+from ehadiag import BusLostError
+from ehadiag_sim.emulator import FccCore, run_emulator
+from firmware_iface.tester import run_test
+from firmware_iface.transport import serial_link
+from firmware_iface.transport.base import Transport, TransportState
 from firmware_iface.transport.frames import Frame
-from firmware_iface.transport.interface import Transport, TransportState
 from firmware_iface.transport.serial_link import Framer, SerialTransport
 
 tty = pytest.importorskip("tty", reason="no pseudo-terminals here")
@@ -43,11 +44,12 @@ def unread() -> Iterator[tuple[int, str]]:
         os.close(item)
 
 
-def emptied(descriptor: int, framer: Framer) -> list[Frame]:
-    """Read all that waits."""
+def emptied(descriptor: int, framer: Framer, least: int) -> list[Frame]:
+    """Read so many frames, and all else that waits: a busy kernel hands it over late."""
     frames: list[Frame] = []
-    while select.select([descriptor], [], [], 0.05)[0]:
-        frames += framer.feed(os.read(descriptor, 4096))
+    while select.select([descriptor], [], [], 0.05)[0] or len(frames) < least:
+        if select.select([descriptor], [], [], 1.0)[0]:
+            frames += framer.feed(os.read(descriptor, 4096))
     return frames
 
 
@@ -59,18 +61,19 @@ def test_frames_that_nobody_reads_are_dropped_and_counted(unread: tuple[int, str
         for k in range(5000):
             bus.send(frame(k))
         assert bus.state is TransportState.DEGRADED
-        waited = numbers(emptied(far, framer))
-        # What did go out is the beginning, whole and in order; at most the last packet is cut.
-        assert waited == list(range(len(waited)))
-        # pyserial's time-out does not tell whether the packet went out after all, and a busy
-        # machine gives some of them.
-        assert bus.unsent - (5000 - len(waited)) in range(5)
-        assert f"{bus.unsent} frames not sent" in bus.detail
         unsent = bus.unsent
+        assert f"{unsent} frames not sent" in bus.detail
+        waited = numbers(emptied(far, framer, 5000 - unsent))
         for k in range(5000, 5050):
             bus.send(frame(k))
-        assert numbers(emptied(far, framer)) == list(range(5000, 5050))
+        waited += numbers(emptied(far, framer, 50))
         assert bus.unsent == unsent
+        # What did go out is the beginning, whole and in order; at most the last packet is cut.
+        count = len(waited) - 50
+        assert waited == [*range(count), *range(5000, 5050)]
+        # pyserial's time-out does not tell whether the packet went out after all, and a busy
+        # machine gives some of them.
+        assert unsent - (5000 - count) in range(5)
         assert framer.bad <= 1
         assert bus.state is TransportState.DEGRADED
 
@@ -91,24 +94,28 @@ def test_a_port_that_cannot_be_asked_for_room_drops_as_well(
     unread: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     far, name = unread
-    framer = Framer()
+    framer, now = Framer(), 100.0
 
     def refuse() -> int:
         raise OSError("no descriptor")
 
+    # A port is tried again after a while: by a clock that a busy machine does not move on.
+    clock = SimpleNamespace(monotonic=lambda: now, time_ns=time.time_ns)
+    monkeypatch.setattr(serial_link, "time", clock)
     with SerialTransport(name, transmit=True) as bus:
         monkeypatch.setattr(bus._port, "fileno", refuse)
         for k in range(5000):
             bus.send(frame(k))
         assert bus.unsent
-        waited = numbers(emptied(far, framer))
+        waited = numbers(emptied(far, framer, 5000 - bus.unsent))
         assert waited == list(range(len(waited)))
-        deadline = time.monotonic() + 5.0
-        got: list[int] = []
-        while not got and time.monotonic() < deadline:
-            bus.send(frame(7000))
-            got = numbers(emptied(far, framer))
-        assert got == [7000]
+        unsent = bus.unsent
+        bus.send(frame(6000))
+        assert bus.unsent == unsent + 1
+        now += serial_link.PORT_TIMES.retry
+        bus.send(frame(7000))
+        assert numbers(emptied(far, framer, 1)) == [7000]
+        assert bus.unsent == unsent + 1
         assert framer.bad <= 1
 
 
@@ -131,15 +138,13 @@ def test_a_computer_without_a_reader_serves_the_tester_that_comes_later(
             stack.callback(os.close, item)
         bus = stack.enter_context(SerialTransport(os.ttyname(a_end), transmit=True))
         node = threading.Thread(
-            target=run_emulator, args=(core, bus, stop), kwargs={"tell": told.append}
+            target=run_emulator, args=(core, bus, stop), kwargs={"on_degraded": told.append}
         )
         joint = threading.Thread(target=join)
         node.start()
         try:
-            deadline = time.monotonic() + 10.0
             while bus.unsent < 1000:
                 assert node.is_alive()
-                assert time.monotonic() < deadline
                 time.sleep(0.01)
             ours = stack.enter_context(SerialTransport(os.ttyname(b_end), transmit=True))
             joint.start()
@@ -158,7 +163,7 @@ def test_a_computer_without_a_reader_serves_the_tester_that_comes_later(
 def accepting(count: int, serve: Callable[[list[socket.socket]], None]) -> Iterator[int]:
     """A server on the loopback interface for `count` connections; gives its port."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(10.0)
+        server.settimeout(60.0)
 
         def work() -> None:
             with ExitStack() as stack:
@@ -175,7 +180,7 @@ def accepting(count: int, serve: Callable[[list[socket.socket]], None]) -> Itera
 def joined(ends: list[socket.socket]) -> None:
     """Hand over bytes from one connection to the other until one is closed."""
     while True:
-        for source in select.select(ends, [], [], 10.0)[0]:
+        for source in select.select(ends, [], [], 60.0)[0]:
             chunk = source.recv(4096)
             if not chunk:
                 return
@@ -184,9 +189,8 @@ def joined(ends: list[socket.socket]) -> None:
 
 def received(bus: Transport, count: int) -> list[int]:
     got: list[Frame] = []
-    deadline = time.monotonic() + 10.0
-    while len(got) < count and time.monotonic() < deadline:
-        item = bus.receive(0.1)
+    while len(got) < count:
+        item = bus.receive(1.0)
         if item is not None:
             got.append(item)
     return numbers(got)
@@ -206,7 +210,7 @@ def test_a_network_port_that_nobody_reads_drops_as_well() -> None:
     release = threading.Event()
 
     def deaf(_: list[socket.socket]) -> None:
-        release.wait(30.0)
+        release.wait()
 
     with accepting(1, deaf) as port:
         try:
@@ -247,7 +251,7 @@ def test_a_port_behind_rfc2217_carries_frames() -> None:
         (end,) = ends
         port = serial_for_url("loop://", timeout=0)
         manager = rfc2217.PortManager(port, _Telnet(end))
-        while select.select([end], [], [], 10.0)[0]:
+        while select.select([end], [], [], 60.0)[0]:
             chunk = end.recv(4096)
             if not chunk:
                 break

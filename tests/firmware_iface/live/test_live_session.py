@@ -18,26 +18,22 @@ import numpy as np
 import pytest
 from live_ends import computer_on
 
-from ehadiag.core.errors import ConfigurationError, InputOutputError
-from ehadiag.core.recording import BitReason, BitState, CommandMode
-from ehadiag.core.stored_test import StoredTest
-from ehadiag_sim.faults.faulty_bus import FaultyTransport
-from ehadiag_sim.faults.harness import Failure
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.fcc.emulator import EmulatorTransport
+from ehadiag import CommandMode, ConfigurationError, InputOutputError, StoredTest
+from ehadiag_sim.emulator import EmulatorTransport, FccCore
+from ehadiag_sim.faulty_bus import BusFailure, FaultyTransport
+from firmware_iface import tester
 from firmware_iface.alignment.align import assemble
-from firmware_iface.codec.encode import Encoder
+from firmware_iface.bus_map import default_map
+from firmware_iface.codec import Encoder
+from firmware_iface.handshake import ChannelLimits, Phase, TimeLimits
 from firmware_iface.logs.reader import read_frames, read_recording
-from firmware_iface.logs.recorder import Recorder
-from firmware_iface.logs.replay import ReplayTransport
-from firmware_iface.mapping.bus_map import default_map
-from firmware_iface.session import tester
-from firmware_iface.session.handshake import Phase, TimeLimits
-from firmware_iface.session.limits import Limits
-from firmware_iface.session.tester import Progress, run_test
+from firmware_iface.logs.recorder import Recorder, ReplayTransport
+from firmware_iface.recording import BitReason, BitState
+from firmware_iface.tester import BitProgress, run_test
+from firmware_iface.transport.adapters import BusOptions
+from firmware_iface.transport.base import Transport
 from firmware_iface.transport.frames import Frame, FrameTable
-from firmware_iface.transport.interface import Transport
-from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from firmware_iface.transport.python_can import PythonCanTransport
 from firmware_iface.transport.serial_link import SerialTransport
 
 CoreFactory = Callable[..., FccCore]
@@ -47,7 +43,7 @@ def test_live_frames_and_their_recording_give_the_same_samples(
     make_core: CoreFactory, tmp_path: Path
 ) -> None:
     live: list[Frame] = []
-    seen: list[Progress] = []
+    seen: list[BitProgress] = []
     recorder = Recorder(tmp_path / "live.blf")
     with EmulatorTransport(make_core(start_ns=1_700_000_000_000_000_000)) as transport:
         outcome = run_test(
@@ -59,7 +55,7 @@ def test_live_frames_and_their_recording_give_the_same_samples(
             on_frame=live.append,
             progress=seen.append,
         )
-    assert outcome == tester.TesterOutcome(
+    assert outcome == tester.RequestOutcome(
         complete=True,
         why="",
         outcome=outcome.outcome,
@@ -136,7 +132,7 @@ def test_an_exceeded_limit_aborts_and_the_current_is_gone(make_core: CoreFactory
     core = make_core()
     with EmulatorTransport(core) as transport:
         outcome = run_test(
-            transport, test_id=9, duration=0.4, transmit=True, limits=Limits(current=1.5e-3)
+            transport, test_id=9, duration=0.4, transmit=True, limits=ChannelLimits(current=1.5e-3)
         )
     assert re.fullmatch(r"current 1\.5\d+ mA beyond its limit ±1\.5 mA", outcome.why)
     assert outcome.abort_confirmed is True
@@ -148,7 +144,7 @@ def test_a_stop_aborts_and_closes_the_recording(make_core: CoreFactory, tmp_path
     stop = threading.Event()
     core = make_core()
 
-    def watch(progress: Progress) -> None:
+    def watch(progress: BitProgress) -> None:
         if progress.elapsed > 0.1:
             stop.set()
 
@@ -173,7 +169,7 @@ def test_a_lost_bus_is_an_outcome_and_closes_the_recording(
     make_core: CoreFactory, tmp_path: Path
 ) -> None:
     inner = EmulatorTransport(make_core())
-    with FaultyTransport(inner, [Failure(0.3, "adapter unplugged")]) as transport:
+    with FaultyTransport(inner, [BusFailure(0.3, "adapter unplugged")]) as transport:
         outcome = run_test(
             transport, test_id=9, duration=0.4, transmit=True, recorder=Recorder(tmp_path / "x.blf")
         )
@@ -254,24 +250,32 @@ def virtual(channel: str, *, transmit: bool) -> Transport:
     return PythonCanTransport(BusOptions("virtual", channel=channel), transmit=transmit)
 
 
-def recorded_test(ours: Transport, path: Path) -> tester.TesterOutcome:
+LOADED_MACHINE = TimeLimits(
+    wait=100.0, status=100.0, arming=100.0, telemetry=100.0, finish=100.0, abort=100.0
+)
+"""Time limits where the computer is a thread of a machine that other work shares."""
+
+
+def recorded_test(ours: Transport, path: Path) -> tester.RequestOutcome:
     """Request the short test and record it."""
-    return run_test(ours, test_id=9, duration=0.4, transmit=True, recorder=Recorder(path))
+    recorder = Recorder(path)
+    return run_test(
+        ours, test_id=9, duration=0.4, transmit=True, recorder=recorder, times=LOADED_MACHINE
+    )
 
 
 def session_on(
     options: BusOptions, core: FccCore, path: Path
-) -> tuple[tester.TesterOutcome, tester.TesterOutcome]:
+) -> tuple[tester.RequestOutcome, tester.RequestOutcome]:
     """Run the short test in real time, the computer and a listener in threads beside it."""
-    heard: list[tester.TesterOutcome] = []
+    heard: list[tester.RequestOutcome] = []
     with ExitStack() as stack:
         bus = stack.enter_context(PythonCanTransport(options, transmit=True))
         ours = stack.enter_context(PythonCanTransport(options, transmit=True))
         third = stack.enter_context(PythonCanTransport(options))
 
         def listen() -> None:
-            times = TimeLimits(wait=10.0)
-            heard.append(run_test(third, test_id=None, duration=0.4, times=times))
+            heard.append(run_test(third, test_id=None, duration=0.4, times=LOADED_MACHINE))
 
         stack.enter_context(computer_on(bus, core))
         listener = threading.Thread(target=listen)
@@ -367,13 +371,15 @@ def test_a_signal_in_another_process_aborts_and_leaves_a_whole_recording(tmp_pat
     code = f"""
         import signal, sys, threading
         from ehadiag.core.actuator import default_actuator
-        from ehadiag.core.stored_test import bundled_tests
-        from ehadiag_sim.fcc.emulator import run_emulator
-        from ehadiag_sim.fcc.computer import FccCore
+        from firmware_iface.stored_test import bundled_tests
+        from ehadiag_sim.emulator import run_emulator
+        from ehadiag_sim.emulator import FccCore
         from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
         from firmware_iface.logs.recorder import Recorder
-        from firmware_iface.session.tester import run_test
+        from firmware_iface.handshake import TimeLimits
+        from firmware_iface.tester import run_test
 
+        times = TimeLimits(status=100, arming=100, telemetry=100, finish=100, abort=100)
         stop, end = threading.Event(), threading.Event()
         signal.signal(signal.SIGTERM, lambda *_: stop.set())
         core = FccCore(default_actuator(), bundled_tests().values())
@@ -387,7 +393,7 @@ def test_a_signal_in_another_process_aborts_and_leaves_a_whole_recording(tmp_pat
                     print("running", flush=True)
             with PythonCanTransport(options, transmit=True) as ours:
                 outcome = run_test(ours, test_id=1, duration=5.5, transmit=True, stop=stop,
-                                   recorder=Recorder({str(path)!r}), progress=show)
+                                   times=times, recorder=Recorder({str(path)!r}), progress=show)
             end.set()
             node.join()
         print(outcome.why, outcome.abort_confirmed, flush=True)
@@ -398,7 +404,7 @@ def test_a_signal_in_another_process_aborts_and_leaves_a_whole_recording(tmp_pat
     assert process.stdout is not None
     assert process.stdout.readline() == "running\n"
     process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=30)
+    output, _ = process.communicate(timeout=120)
     assert output.splitlines()[-1] == "stopped by the user True"
     recording = read_recording(path)
     assert recording.outcome.state is BitState.ABORTED

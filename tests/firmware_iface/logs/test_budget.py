@@ -13,22 +13,20 @@ import pytest
 from bus_synth import START, make_truth, play
 from long_logs import write_bomb, write_repeated
 
-from ehadiag.core.actuator import load_actuator
-from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
-from ehadiag.core.stored_test import resolve_test
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.logs.blocks import SUFFIXES
-from firmware_iface.logs.budget import Budget
+from ehadiag import ConfigurationError, EhadiagError, InputOutputError, load_actuator
+from firmware_iface.bus_map import load_map
+from firmware_iface.codec import Encoder
+from firmware_iface.dbc import MAX_MESSAGE_SIGNALS, MAX_SIGNALS, parse_dbc
+from firmware_iface.logs.log_files import FRAME_READERS, Budget
 from firmware_iface.logs.reader import iterate_recordings, read_frames, read_recording
 from firmware_iface.logs.recorder import Recorder
-from firmware_iface.mapping.bus_map import load_map
-from firmware_iface.mapping.dbc import MAX_MESSAGE_SIGNALS, MAX_SIGNALS, parse_dbc
 from firmware_iface.signals.columns import ColumnMap
 from firmware_iface.signals.tables import read_signals
+from firmware_iface.stored_test import resolve_test
 from firmware_iface.transport.frames import Frame
 
 SECRET = "root:x:0:0:topsecret:/root:/bin/sh\n"
-KINDS = [item for item in SUFFIXES if item != ".mf4"]
+KINDS = [item for item in FRAME_READERS if item != ".mf4"]
 ONE = Frame(START, 0x123, bytes(8))
 
 
@@ -51,7 +49,7 @@ def one_line(error: pytest.ExceptionInfo[EhadiagError]) -> str:
 
 
 @pytest.mark.filterwarnings("default")  # asammdf's own
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", FRAME_READERS)
 @pytest.mark.parametrize(
     ("budget", "says"),
     [
@@ -87,8 +85,8 @@ def test_what_a_container_unpacks_to_is_counted_while_it_unpacks(tmp_path: Path)
 
 PEAK = """
 import re, sys
-from ehadiag.core.errors import InputOutputError
-from firmware_iface.logs.budget import Budget
+from firmware_iface.errors import InputOutputError
+from firmware_iface.logs.log_files import Budget
 from firmware_iface.logs.reader import read_recording
 try:
     recording = read_recording(sys.argv[1], budget=Budget(frames=int(sys.argv[2])))
@@ -178,7 +176,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "dbc": lambda path: load_map(path.parent / "map.toml", path),
     "actuator": load_actuator,
     "test": lambda path: resolve_test(str(path)),
-    **dict.fromkeys(SUFFIXES, read_recording),
+    **dict.fromkeys(FRAME_READERS, read_recording),
     **dict.fromkeys([f"{suffix}.gz" for suffix in (".blf", ".log")], read_recording),
     ".parquet": read_table,
     ".parquet.gz": read_table,

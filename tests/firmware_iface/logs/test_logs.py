@@ -17,11 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from places import LOGS
 
-from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
-from ehadiag.core.recording import BitState, CommandMode
-from ehadiag.core.stored_test import bundled_tests
+from ehadiag import CommandMode, ConfigurationError, EhadiagError, InputOutputError, bundled_tests
 from firmware_iface.logs.reader import read_frames, read_recording, read_recordings
-from firmware_iface.session.assembler import Assembler
+from firmware_iface.recording import BitState
+from firmware_iface.tester import Assembler
 from firmware_iface.transport.frames import Frame, FrameTable
 
 TRUTH = {row["file"]: row for row in csv.DictReader((LOGS / "truth.csv").read_text().splitlines())}

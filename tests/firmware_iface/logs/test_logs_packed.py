@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from places import LOGS
 
-from ehadiag.core.errors import InputOutputError
-from firmware_iface.logs.packed import unpacked
+from ehadiag import InputOutputError
+from firmware_iface.logs.log_files import unpacked_log
 from firmware_iface.logs.reader import read_frames, read_recording
 
 LOG = LOGS / "paper-open-1.blf"
@@ -77,6 +77,6 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path, temporary: Path) -> None:
     path = tmp_path / "bomb.log.gz"
     path.write_bytes(gzip.compress(bytes(40 << 20)))
     why = r"bomb\.log\.gz: unpacks to more than 4 MiB"
-    with pytest.raises(InputOutputError, match=why), unpacked(path, 4 << 20):
+    with pytest.raises(InputOutputError, match=why), unpacked_log(path, 4 << 20):
         pass
     assert list(temporary.iterdir()) == []

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from places import ROOT
 
-from ehadiag.core.toml_file import decode_toml
-from firmware_iface.mapping import dbc
-from firmware_iface.mapping.bus_map import default_map, load_map, resolve
-from firmware_iface.mapping.dbc import parse_dbc, recall_dbc
-from firmware_iface.mapping.file import MappingFile
+from firmware_iface import dbc
+from firmware_iface.bus_map import default_map, load_map, resolve
+from firmware_iface.dbc import cached_dbc, parse_dbc
+from firmware_iface.files import decode_toml
+from firmware_iface.mapping_file import MappingFile
 
 DATA = resources.files("firmware_iface").joinpath("data")
 TEXT = DATA.joinpath("eha_fcc.dbc").read_bytes()
@@ -37,10 +37,10 @@ def no_parser(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_second_reading_is_the_first(folder: Path, no_parser) -> None:
-    first = recall_dbc(TEXT, "a")
+    first = cached_dbc(TEXT, "a")
     assert first == parse_dbc(TEXT, "a")
     no_parser()
-    assert recall_dbc(TEXT, "b") == first
+    assert cached_dbc(TEXT, "b") == first
     assert len(list(folder.iterdir())) == 1
 
 
@@ -55,15 +55,15 @@ def test_maps_from_the_cache_are_the_same(folder: Path, no_parser) -> None:
 
 def test_another_file_is_another_entry(folder: Path) -> None:
     one, two = (PLAIN.format(scale=scale).encode() for scale in ("1", "2"))
-    assert recall_dbc(one, "one")["M"].signals[0].scale == 1.0
-    assert recall_dbc(two, "two")["M"].signals[0].scale == 2.0
-    assert recall_dbc(one, "one")["M"].signals[0].scale == 1.0
+    assert cached_dbc(one, "one")["M"].signals[0].scale == 1.0
+    assert cached_dbc(two, "two")["M"].signals[0].scale == 2.0
+    assert cached_dbc(one, "one")["M"].signals[0].scale == 1.0
 
 
 def test_another_cantools_is_another_entry(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recall_dbc(TEXT, "a")
+    cached_dbc(TEXT, "a")
     monkeypatch.setattr(dbc, "version", lambda _: "0.0")
-    recall_dbc(TEXT, "a")
+    cached_dbc(TEXT, "a")
     assert len(list(folder.iterdir())) == 2
 
 
@@ -73,57 +73,57 @@ def test_another_cantools_is_another_entry(folder: Path, monkeypatch: pytest.Mon
 def test_a_damaged_entry_is_read_from_the_file(
     folder: Path, damage: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    first = recall_dbc(TEXT, "a")
+    first = cached_dbc(TEXT, "a")
     (entry,) = folder.iterdir()
     entry.write_bytes(damage)
-    assert recall_dbc(TEXT, "a") == first
+    assert cached_dbc(TEXT, "a") == first
     assert entry.read_bytes() != damage
     assert caplog.text.count("\n") == 1
 
 
 def test_without_a_folder_it_parses(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dbc, "private_folder", lambda _: None)
-    assert recall_dbc(TEXT, "a") == parse_dbc(TEXT, "a")
+    assert cached_dbc(TEXT, "a") == parse_dbc(TEXT, "a")
     assert not folder.exists()
 
 
 def test_what_cannot_be_written_is_not_kept(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    first = recall_dbc(TEXT, "a")
+    first = cached_dbc(TEXT, "a")
     (entry,) = folder.iterdir()
     entry.unlink()
     entry.mkdir()
-    assert recall_dbc(TEXT, "a") == first
+    assert cached_dbc(TEXT, "a") == first
     assert [item.name for item in folder.iterdir()] == [entry.name]
     assert "the DBC is not kept" in caplog.text
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links")
 def test_a_planted_link_is_neither_read_nor_followed(folder: Path) -> None:
-    first = recall_dbc(TEXT, "a")
+    first = cached_dbc(TEXT, "a")
     (entry,) = folder.iterdir()
     elsewhere = folder.parent / "elsewhere"
     elsewhere.write_bytes(b"{}")
     entry.unlink()
     entry.symlink_to(elsewhere)
-    assert recall_dbc(TEXT, "a") == first
+    assert cached_dbc(TEXT, "a") == first
     assert elsewhere.read_bytes() == b"{}"
     assert not entry.is_symlink()
 
 
 def test_numbers_without_end_are_not_kept(folder: Path) -> None:
     text = PLAIN.format(scale="1e999").encode()
-    assert recall_dbc(text, "a")["M"].signals[0].scale == float("inf")
+    assert cached_dbc(text, "a")["M"].signals[0].scale == float("inf")
     assert list(folder.iterdir()) == []
 
 
 def test_the_oldest_entries_go(folder: Path) -> None:
-    texts = [PLAIN.format(scale=number + 1).encode() for number in range(dbc.MAX_KEPT + 3)]
-    recall_dbc(texts[0], "a")
+    texts = [PLAIN.format(scale=number + 1).encode() for number in range(dbc.MAX_CACHED_FILES + 3)]
+    cached_dbc(texts[0], "a")
     (first,) = folder.iterdir()
     os.utime(first, (0, 0))
     for text in texts[1:]:
-        recall_dbc(text, "a")
-    assert len(list(folder.iterdir())) == dbc.MAX_KEPT
+        cached_dbc(text, "a")
+    assert len(list(folder.iterdir())) == dbc.MAX_CACHED_FILES
     assert not first.exists()
 
 

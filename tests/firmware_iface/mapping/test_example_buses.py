@@ -10,12 +10,12 @@ import pytest
 from bus_synth import START, TICK, assert_truthful, flip, make_truth
 from places import ROOT
 
-from ehadiag.core.recording import BitState, CommandMode
+from ehadiag import CommandMode
 from firmware_iface.alignment.align import assemble
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.codec.live_decode import LiveDecoder
-from firmware_iface.codec.live_messages import Sample
-from firmware_iface.mapping.bus_map import load_map
+from firmware_iface.bus_map import load_map
+from firmware_iface.codec import Encoder
+from firmware_iface.live_decode import LiveDecoder, Sample
+from firmware_iface.recording import BitState
 from firmware_iface.transport.frames import Frame, FrameTable
 
 FOLDER = ROOT / "docs" / "examples" / "buses"

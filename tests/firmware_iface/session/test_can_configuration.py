@@ -7,9 +7,8 @@ from pathlib import Path
 import can.util
 import pytest
 
-from ehadiag.core.errors import ConfigurationError
-from firmware_iface.transport.adapters import BusOptions
-from firmware_iface.transport.configuration import configured, configures_a_bus
+from ehadiag import ConfigurationError
+from firmware_iface.transport.adapters import BusOptions, configures_a_bus, with_configuration
 
 FILE = """
 [default]
@@ -38,14 +37,14 @@ def conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_default_section_names_the_bus(conf: Path) -> None:
     conf.write_text(FILE)
-    found = configured(BusOptions(""), None)
+    found = with_configuration(BusOptions(""), None)
     assert found == BusOptions("virtual", "rig", 500_000)
     assert configures_a_bus()
 
 
 def test_a_context_comes_before_the_default_section_and_inherits_from_it(conf: Path) -> None:
     conf.write_text(FILE)
-    found = configured(BusOptions("", bitrate=250_000), "HS")
+    found = with_configuration(BusOptions("", bitrate=250_000), "HS")
     assert (found.interface, found.channel, found.bitrate) == ("virtual", "high", 250_000)
     assert (found.data_bitrate, found.fd) == (2_000_000, True)
     assert found.extra == {"receive_timeout": 3}
@@ -58,13 +57,13 @@ def test_variables_of_a_context_come_before_plain_ones_and_the_file(
     monkeypatch.setenv("CAN_CHANNEL", "plain")
     monkeypatch.setenv("CAN_CHANNEL_MS", "slow")
     monkeypatch.setenv("CAN_CONFIG_MS", '{"bitrate": 125000}')
-    found = configured(BusOptions("", channel="plain"), "MS")
+    found = with_configuration(BusOptions("", channel="plain"), "MS")
     assert (found.interface, found.channel, found.bitrate) == ("virtual", "slow", 125_000)
 
 
 def test_what_is_given_comes_first(conf: Path) -> None:
     conf.write_text(FILE)
-    found = configured(BusOptions("udp_multicast", "224.0.0.9"), "HS")
+    found = with_configuration(BusOptions("udp_multicast", "224.0.0.9"), "HS")
     assert (found.interface, found.channel) == ("udp_multicast", "224.0.0.9")
 
 
@@ -91,7 +90,7 @@ def test_a_configuration_that_names_no_bus_is_refused(
 
     def ask() -> None:
         if not configures_a_bus() or context:
-            configured(BusOptions(""), context)
+            with_configuration(BusOptions(""), context)
 
     with pytest.raises(ConfigurationError, match=why):
         ask()

@@ -14,12 +14,13 @@ from pathlib import Path
 import pytest
 from live_ends import computer_on
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.stored_test import Line, StoredTest, Windows
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.plant.conditions import Faults
-from firmware_iface.transport.interface import Transport
-from firmware_iface.transport.python_can import BusOptions, PythonCanTransport
+from ehadiag import StoredTest, default_actuator
+from ehadiag_sim.conditions import Faults
+from ehadiag_sim.emulator import FccCore
+from firmware_iface.stored_test import Line, SearchWindows
+from firmware_iface.transport.adapters import BusOptions
+from firmware_iface.transport.base import Transport
+from firmware_iface.transport.python_can import PythonCanTransport
 
 CHANNEL = "vcan0"
 DURATION = 0.4
@@ -44,7 +45,7 @@ def test_of_9() -> StoredTest:
         mode="current",
         unit="mA",
         segment=(Line(points=points),),
-        windows=Windows(FDJ=span, Kintas=span, FSS=span, refinement=span),
+        windows=SearchWindows(FDJ=span, Kintas=span, FSS=span, refinement=span),
     )
 
 

@@ -24,10 +24,10 @@ from bus_synth import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ehadiag.core.recording import BitState
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.codec.protection import crc8
-from firmware_iface.mapping.bus_map import default_map
+from firmware_iface.bus_map import default_map
+from firmware_iface.codec import Encoder
+from firmware_iface.protection import crc8
+from firmware_iface.recording import BitState
 from firmware_iface.transport.frames import Frame, FrameTable
 
 TICKS = 700

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.errors import ConfigurationError
-from ehadiag.core.stored_test import bundled_tests
-from ehadiag_sim.faults import sensing
-from ehadiag_sim.faults.hardware import KINDS, Hardware, break_hardware, broken
-from ehadiag_sim.fcc.computer import FccCore
-from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
-from ehadiag_sim.plant.simulator import simulate
+from ehadiag import ConfigurationError, bundled_tests, default_actuator
+from ehadiag_sim import sensing
+from ehadiag_sim.broken_hardware import HARDWARE_FAULTS, Hardware, break_hardware, simulate_broken
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.emulator import FccCore
+from ehadiag_sim.simulation import simulate
+from firmware_iface.recording import CHANNELS
 
 ACTUATOR = default_actuator()
 TESTS = bundled_tests()
@@ -38,15 +36,18 @@ def whole():
 
 
 def test_there_are_kinds_enough():
-    assert len(KINDS) >= 22
-    assert sum(item.hidden for item in KINDS.values()) <= len(KINDS) // 4
+    assert len(HARDWARE_FAULTS) >= 22
+    assert sum(item.hidden for item in HARDWARE_FAULTS.values()) <= len(HARDWARE_FAULTS) // 4
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", HARDWARE_FAULTS)
 def test_every_kind_shows_unless_it_may_be_hidden(kind, whole):
-    gap = rows(broken(kind, np.random.default_rng(5), ACTUATOR, TESTS["open"], step=COARSE)) - whole
+    gap = (
+        rows(simulate_broken(kind, np.random.default_rng(5), ACTUATOR, TESTS["open"], step=COARSE))
+        - whole
+    )
     rms = np.sqrt((gap**2).mean(axis=1))
-    if not KINDS[kind].hidden:
+    if not HARDWARE_FAULTS[kind].hidden:
         assert rms.max() > 1.3 * np.sqrt(2.0) * FLOOR
     if not of_plant(kind):
         struck = [index for index, c in enumerate(CHANNELS) if c.name in kind.split("-")]
@@ -58,7 +59,7 @@ def test_every_kind_shows_unless_it_may_be_hidden(kind, whole):
 def test_same_generator_same_damage(kind):
     def once(seed):
         rng = np.random.default_rng(seed)
-        return rows(broken(kind, rng, ACTUATOR, TESTS["open"], step=COARSE))
+        return rows(simulate_broken(kind, rng, ACTUATOR, TESTS["open"], step=COARSE))
 
     np.testing.assert_array_equal(once(3), once(3))
     assert (once(3) != once(4)).any()
@@ -70,7 +71,7 @@ def test_a_dead_jack_sensor_drives_the_surface_to_its_stop():
         TESTS["closed"],
         sensors=Sensors(noise_lsb=0.0),
         step=COARSE,
-        channel_faults=[sensing.Constant(3, 0.0)],
+        channel_faults=[sensing.DeadSensor(3, 0.0)],
     )
     assert np.abs(run.position).max() == ACTUATOR.jack.XJM
     assert (run.codes[3] == 2048).all()
@@ -93,12 +94,12 @@ def test_the_units_own_effects_stay():
 
 def test_each_test_of_the_computer_begins_with_fresh_damage():
     """A sensor that freezes after 0.3 s does so in the second test too."""
-    frozen = sensing.Frozen(1, 300)
+    frozen = sensing.FrozenSensor(1, 300)
     core = FccCore(
         ACTUATOR, TESTS.values(), channel_faults=[frozen], sensors=Sensors(noise_lsb=0.0)
     )
     first, second = core._fresh_plant(), core._fresh_plant()
-    from ehadiag.core.recording import CommandMode
+    from ehadiag import CommandMode
 
     for plant in (first, second):
         codes = [int(plant.tick(8e-3, CommandMode.CURRENT)[1]) for _ in range(8)]
@@ -122,19 +123,19 @@ RAMP = np.outer([0.001, 0.002, 0.003, 0.004], np.arange(200))
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        (sensing.Constant(1, -1.0), np.full(200, -1.0)),
-        (sensing.Scaled(1, -1.0), -RAMP[1]),
-        (sensing.Drift(1, 0.01), RAMP[1] + 0.01 * np.arange(200)),
-        (sensing.Frozen(1, 50), np.minimum(RAMP[1], RAMP[1, 50])),
-        (sensing.Late(1, 10), np.maximum(RAMP[1] - 0.02, 0.0)),
+        (sensing.DeadSensor(1, -1.0), np.full(200, -1.0)),
+        (sensing.ScaledSensor(1, -1.0), -RAMP[1]),
+        (sensing.DriftingSensor(1, 0.01), RAMP[1] + 0.01 * np.arange(200)),
+        (sensing.FrozenSensor(1, 50), np.minimum(RAMP[1], RAMP[1, 50])),
+        (sensing.LateSensor(1, 10), np.maximum(RAMP[1] - 0.02, 0.0)),
         (sensing.LooseContact(1, 20, 5), np.where(np.arange(200) % 20 < 5, 0.0, RAMP[1])),
         (
-            sensing.Spikes(1, 100, 0.5),
+            sensing.SpikingSensor(1, 100, 0.5),
             RAMP[1]
             + np.where(np.arange(200) == 99, -0.5, 0)
             + np.where(np.arange(200) == 199, 0.5, 0),
         ),
-        (sensing.Hum(1, 0.05, 0.1), RAMP[1] + 0.1 * np.sin(0.1 * np.pi * np.arange(200))),
+        (sensing.MainsHum(1, 0.05, 0.1), RAMP[1] + 0.1 * np.sin(0.1 * np.pi * np.arange(200))),
     ],
 )
 def test_each_damage_does_what_its_name_says(fault, expected):
@@ -144,19 +145,19 @@ def test_each_damage_does_what_its_name_says(fault, expected):
 
 
 def test_swapped_wires_exchange_shares_of_range():
-    got = channel_after(sensing.Swapped(1, 3))
+    got = channel_after(sensing.SwappedWires(1, 3))
     np.testing.assert_allclose(got, RAMP[[0, 3, 2, 1]], atol=1e-12)
 
 
 def test_lost_bits_round():
-    got = channel_after(sensing.Stepped(2, 64))[2]
+    got = channel_after(sensing.LostLowBits(2, 64))[2]
     np.testing.assert_allclose(got * 32.0, np.round(got * 32.0), atol=1e-9)
     assert np.abs(got - RAMP[2]).max() <= 1.0 / 64.0 + 1e-9
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if of_plant(kind)])
+@pytest.mark.parametrize("kind", [kind for kind in HARDWARE_FAULTS if of_plant(kind)])
 def test_damage_goes_with_any_wear_and_loop(kind):
-    recording = broken(
+    recording = simulate_broken(
         kind, np.random.default_rng(8), ACTUATOR, TESTS["closed"], Faults(0.5, 0.5, 0.5), step=20e-6
     )
     assert np.isfinite(rows(recording)).all()
@@ -172,7 +173,7 @@ def test_every_kind_is_documented():
         for name in line.split("|")[1].split(",")
     }
     found = {}
-    for kind, item in KINDS.items():
+    for kind, item in HARDWARE_FAULTS.items():
         pattern = kind if of_plant(kind) or "swapped" in kind else kind.split("-")[0] + "-CHANNEL"
         assert rows[pattern] == item.hidden, kind
         found[pattern] = True

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import Environment
-from ehadiag.core.stored_test import bundled_tests
-from ehadiag_sim.plant.conditions import Effects, Faults
-from ehadiag_sim.plant.simulator import simulate
-from ehadiag_tools.simulator import compare_logs, convergence
-from ehadiag_tools.simulator.replay import replay
+from ehadiag import bundled_tests, default_actuator
+from ehadiag_sim.conditions import Effects, Faults
+from ehadiag_sim.simulation import simulate
+from ehadiag_tools.main import main
+from ehadiag_tools.simulator import compare_logs
+from ehadiag_tools.simulator.compare_logs import replay
+from firmware_iface.recording import Environment
 
 ACTUATOR = default_actuator()
 TESTS = bundled_tests()
@@ -84,35 +84,8 @@ def test_environment_becomes_effects():
 def test_bad_folder_is_one_line_on_stderr(tmp_path, capsys, text, code, words):
     if text is not None:
         (tmp_path / "truth.csv").write_text(text)
-    assert compare_logs.main([str(tmp_path)]) == code
+    kept = str(tmp_path / "kept.jsonl")
+    assert main(["recordings", str(tmp_path), "--jobs", "1", "--resume", kept]) == code
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert words in error
-
-
-def test_convergence_prints_a_table(capsys):
-    assert convergence.main(["--test", "open", "--ticks", "450", "--steps", "8", "4"]) == 0
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    assert [row.split("|")[1].strip() for row in rows] == ["step, µs", "---", "8", "4"]
-
-
-@pytest.mark.slow
-def test_convergence_of_units_falls_with_the_step(capsys):
-    words = "--units 1 --test open --ticks 500 --steps 16 2"
-    assert convergence.main(words.split()) == 0
-    stages = ("| linear |", "| orifice |")
-    lines = capsys.readouterr().out.splitlines()
-    rows = [line.split("|") for line in lines if line.startswith(stages)]
-    cells = [([part.strip() for part in row[1:4]], float(row[4].split()[0])) for row in rows]
-    kinds = [(a, b) for a in ("linear", "orifice") for b in ("Coulomb", "Stribeck")]
-    assert [cell[0] for cell in cells] == [[*kind, step] for kind in kinds for step in ("16", "2")]
-    for coarse, fine in zip(cells[::2], cells[1::2], strict=True):
-        assert fine[1] < 0.3 * coarse[1]
-
-
-@pytest.mark.parametrize(
-    ("options", "words"), [(["--faults", "2", "0", "0"], "Kintas"), (["--ticks", "0"], "--ticks")]
-)
-def test_convergence_refuses_impossible_options(capsys, options, words):
-    assert convergence.main(options) == 2
-    assert words in capsys.readouterr().err

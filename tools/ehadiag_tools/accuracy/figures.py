@@ -1,65 +1,50 @@
-"""Statistics of many identifications with known truth, in percent of full damage."""
+"""Figures of identifications with known truth, in percent of full damage, and their bound."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.model.parameters import FAULT_NAMES
+from ehadiag.assess.diagnosis import Diagnosis
+from ehadiag.identify.experiment import Experiment
+from ehadiag.model.registry import FAULT_NAMES, FAULTS
+from ehadiag.model.residual_models import model_response
+from ehadiag_sim.conditions import Sensors
+from ehadiag_tools.damaged import damaged
+from ehadiag_tools.study import Record
+from firmware_iface.errors import EhadiagError
+from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
 
-__all__ = [
-    "Figures",
-    "figures_of",
-    "holds_truth",
-    "percent_errors",
-    "percent_widths",
-    "print_figures",
-]
-
-SAME = 1e-12
-"""An estimate on the bound is told as such; the last digit of a sum must not decide."""
-
-Record = Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """Of n identifications; lists have one entry for each of Kintas, FSS, FDJ."""
-
-    runs: int
-    bias: list[float]
-    """Mean error."""
-    mean: list[float]
-    """Mean absolute error."""
-    rms: list[float]
-    maximum: list[float]
-    """Largest absolute error."""
-    coverage: list[float]
-    """Share of 95 % intervals that hold the truth, %."""
-    bound_ratio: list[float]
-    """Rms error in units of each run's own Cramér–Rao bound, truths inside the bounds only."""
-    first_mean: float
-    """Mean absolute error of the first approximation, all constants."""
-    mean_all: float
-    """Mean absolute error, all constants."""
-    p95_case: float
-    """95th percentile of the mean of the three absolute errors of a run."""
-    worst_case: float
-    """Largest mean of the three absolute errors of a run."""
-    coverage_all: float
-    coverage_inside: float
-    """The same of truths that are neither 0 nor 1."""
-    rescued: int
-    not_converged: int
-    most_outliers: float
-    """Largest share of residuals beyond three deviations, %."""
+Array = NDArray[np.float64]
+ROUNDING = 1e-12
+"""Rounding of a severity, 1; an interval that ends at the truth holds it."""
+STEPS = (2e-5, 5e-6)
+"""Half-widths of the differences for derivatives, 1; the wide and the narrow one."""
+AGREEMENT = 0.2
+"""Largest relative difference of derivatives by both widths, 1; others are left out."""
+SEVERITY_HEADINGS = (
+    "test", "severity", "runs", "bias", "mean", "rms", "maximum", "coverage of 95 %, %",
+    "rms / Cramér–Rao bound",
+)  # fmt: skip
 
 
-def percent_errors(records: Sequence[Record], stage: str = "value") -> NDArray[np.float64]:
+def outcome(found: Diagnosis | EhadiagError) -> Record:
+    """Verdict, estimates, reasons and notes of a diagnosis, or why there is none."""
+    if isinstance(found, EhadiagError):
+        return {"verdict": "error", "value": [], "why": str(found), "notes": []}
+    estimates = found.identification.estimates if found.identification else ()
+    return {
+        "verdict": found.verdict.name,
+        "value": [item.value for item in estimates],
+        "interval95": [list(item.interval95) for item in estimates],
+        "why": "; ".join(found.reasons),
+        "notes": [note for item in found.recordings for note in item.quality.notes],
+    }
+
+
+def percent_errors(records: Sequence[Record], stage: str = "value") -> Array:
     """Estimate less truth in percent, shape (n, 3), after a stage: first, search, value."""
     estimate = np.array([record[stage] for record in records])
     truth = np.array([record["faults"] for record in records])
@@ -70,86 +55,82 @@ def holds_truth(records: Sequence[Record]) -> NDArray[np.bool_]:
     """Whether the 95 % interval of each severity holds the truth, shape (n, 3)."""
     low, high = _ends(records)
     truth = np.array([record["faults"] for record in records])
-    return np.asarray((low <= truth + SAME) & (truth - SAME <= high))
+    return np.asarray((low <= truth + ROUNDING) & (truth - ROUNDING <= high))
 
 
-def percent_widths(records: Sequence[Record]) -> NDArray[np.float64]:
+def percent_widths(records: Sequence[Record]) -> Array:
     """Width of the 95 % interval of each severity in percent, shape (n, 3)."""
     low, high = _ends(records)
     return 100.0 * (high - low)
 
 
-def _ends(records: Sequence[Record]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ends(records: Sequence[Record]) -> tuple[Array, Array]:
     interval = np.array([record["interval95"] for record in records])
     return interval[..., 0], interval[..., 1]
 
 
-def figures_of(records: Sequence[Record]) -> Figures:
-    """Figures of a non-empty list of records of `ehadiag_tools.accuracy.runs.perform`."""
-    error = percent_errors(records)
-    case = np.abs(error).mean(axis=1)
+def rms(values: Array) -> float:
+    """Root of the mean square of what is finite; NaN where nothing is."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
+
+
+def severity_rows(test: str, records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+    """Rows of a table with `SEVERITY_HEADINGS`; the bound's ratio is of truths inside 0 … 1."""
+    error, held = percent_errors(records), holds_truth(records)
     truth = np.array([record["faults"] for record in records])
-    inside = (truth > 0.0) & (truth < 1.0)
-    held = holds_truth(records)
-    bound = 100.0 * np.array([record["bound"] for record in records])
-    ratio = np.where(inside, error / bound, np.nan)
-    return Figures(
-        runs=len(records),
-        bias=_listed(error.mean(axis=0)),
-        mean=_listed(np.abs(error).mean(axis=0)),
-        rms=_listed(np.sqrt((error**2).mean(axis=0))),
-        maximum=_listed(np.abs(error).max(axis=0)),
-        coverage=_listed(100.0 * held.mean(axis=0)),
-        bound_ratio=[_rms(column[np.isfinite(column)]) for column in ratio.T],
-        first_mean=float(np.abs(percent_errors(records, "first")).mean()),
-        mean_all=float(case.mean()),
-        p95_case=float(np.percentile(case, 95.0)),
-        worst_case=float(case.max()),
-        coverage_all=float(100.0 * held.mean()),
-        coverage_inside=float(100.0 * held[inside].mean()) if inside.any() else float("nan"),
-        rescued=sum(bool(record["rescued"]) for record in records),
-        not_converged=sum(not record["converged"] for record in records),
-        most_outliers=100.0 * max(record["outliers"] for record in records),
-    )
-
-
-def print_figures(title: str, figures: Figures) -> None:
-    """Two tables: per constant, and over all."""
-    print(f"{title}: {figures.runs} runs, errors in percent\n")
-    print("| | bias | mean | rms | maximum | coverage of 95 %, % | rms / Cramér–Rao bound |")
-    print("| --- |" + " --- |" * 6)
+    bound = 100.0 * np.array([record["bound"] for record in records], dtype=np.float64)
+    ratio = np.where((truth > 0.0) & (truth < 1.0), error / bound, np.nan)
     for j, name in enumerate(FAULT_NAMES):
-        print(
-            f"| {name} | {figures.bias[j]:+.4f} | {figures.mean[j]:.4f} | {figures.rms[j]:.4f} "
-            f"| {figures.maximum[j]:.4f} | {figures.coverage[j]:.1f} "
-            f"| {figures.bound_ratio[j]:.2f} |"
-        )
-    print()
-    rows = {
-        "mean of all constants": f"{figures.mean_all:.4f}",
-        "95th percentile of the case mean": f"{figures.p95_case:.4f}",
-        "worst case mean": f"{figures.worst_case:.4f}",
-        "maximum of any constant": f"{max(figures.maximum):.4f}",
-        "mean after the first approximation": f"{figures.first_mean:.3f}",
-        "coverage of 95 %, all": f"{figures.coverage_all:.1f} %",
-        "coverage of 95 %, truths inside the cube": f"{figures.coverage_inside:.1f} %",
-        "sent back to the whole cube": f"{figures.rescued} ({_share(figures.rescued, figures)})",
-        "not converged": f"{figures.not_converged} ({_share(figures.not_converged, figures)})",
-        "largest share of outliers": f"{figures.most_outliers:.2f} %",
-    }
-    print("| | |\n| --- | --- |")
-    for name, value in rows.items():
-        print(f"| {name} | {value} |")
-    print(flush=True)
+        part = error[:, j]
+        yield (
+            test, name, len(records), f"{part.mean():+.4f}", f"{np.abs(part).mean():.4f}",
+            f"{rms(part):.4f}", f"{np.abs(part).max():.4f}", f"{100.0 * held[:, j].mean():.1f}",
+            f"{rms(ratio[:, j]):.2f}",
+        )  # fmt: skip
 
 
-def _share(count: int, figures: Figures) -> str:
-    return f"{100.0 * count / figures.runs:.1f} %"
+def cramer_rao(experiments: Sequence[Experiment], faults: Sequence[float]) -> Array:
+    """Deviations of all severities at the truth, sensor offsets known to be zero, shape (k,).
+
+    The smallest that any unbiased estimate can have. Noise of the converters as in PHY-21 and
+    PHY-22: 0.5 LSB rms and rounding, taken as Gaussian of variance 0.25 + 1/12 LSB². Ticks at
+    which a break-away tips between both sides of a difference are left out: there the response has
+    no derivative. NaN for a severity that shows in no recording.
+    """
+    total = sum((_information(item, faults) for item in experiments), np.zeros((len(FAULTS),) * 2))
+    out = np.full(len(FAULTS), np.nan)
+    shown = np.diag(total) > 0.0
+    inverse = np.linalg.inv(total[np.ix_(shown, shown)])
+    out[shown] = np.sqrt(np.diag(inverse))
+    return out
 
 
-def _listed(values: NDArray[np.float64]) -> list[float]:
-    return [float(value) for value in values]
+def _information(experiment: Experiment, faults: Sequence[float]) -> Array:
+    """Fisher information of one test, shape (k, k)."""
+    truth = np.asarray(faults, dtype=np.float64)
+    wide, narrow = (_derivatives(experiment, truth, step) for step in STEPS)
+    scale = np.sqrt(np.mean(narrow**2, axis=2, keepdims=True))
+    smooth = (np.abs(wide - narrow) <= AGREEMENT * (np.abs(narrow) + scale)).all(axis=0)
+    measured = np.vstack([np.isfinite(experiment.spool), np.isfinite(experiment.pressure)])
+    rows = narrow[:, smooth & measured]
+    return np.asarray(rows @ rows.T)
 
 
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+def _derivatives(experiment: Experiment, truth: Array, step: float) -> Array:
+    """Derivatives of spool and pressure in units of their noise, shape (k, 2, n)."""
+    noise = np.sqrt(Sensors().noise_lsb ** 2 + 1.0 / 12.0) * np.array(
+        [SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb]
+    )
+    out = np.empty((len(FAULTS), len(noise), experiment.ticks))
+    for j in range(len(FAULTS)):
+        sides = []
+        for sign in (1.0, -1.0):
+            x = truth.copy()
+            x[j] = min(max(x[j] + sign * step, 0.0), 1.0)
+            constants = damaged(experiment.constants, x)
+            answer = model_response(constants, experiment.trace.current, experiment.tick)
+            sides.append((x[j], np.vstack([answer.spool, answer.pressure])))
+        (high, above), (low, below) = sides
+        out[j] = (above - below) / (high - low) / noise[:, None]
+    return out

@@ -1,179 +1,214 @@
-"""Pictures of an identification: parity, residuals over time, objective along each severity."""
+"""Pictures of the documentation: what faults do, why they are found, intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+import ehadiag
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.refine.derivatives import CAP
-from ehadiag.identify.search.objective import SEARCH_CAP, Objective
-from ehadiag.identify.search.stages import LEAD_S
-from ehadiag.identify.spans import ANCHOR_LSB, lay_out, unknowns_of
-from ehadiag.model.batch import Batch
-from ehadiag.model.parameters import FAULT_NAMES, FAULTS
-from ehadiag.model.scalar.response import respond
-from ehadiag.model.simd.model import SimdModel
-from ehadiag_tools.accuracy.figures import percent_errors
-from ehadiag_tools.accuracy.runs import Run, experiments_of
-from ehadiag_tools.damaged import damaged
+from ehadiag.model.registry import FAULTS, Unknowns
+from ehadiag.report.response_signals import sensed_response
+from ehadiag_sim.conditions import Faults
+from ehadiag_tools.study import Options, Record, Study
 
-__all__ = ["draw_all"]
-
-Record = Mapping[str, Any]
-WIDE = np.linspace(0.0, 1.0, 201)
-CLOSE = 2e-3
-"""Half-width of the slices close to the optimum."""
-SHAPES = {"open": "o", "closed": "s"}
-HUES = {"open": "#0b6fa4", "closed": "#c45a10"}
+COLOURS = ("#0072b2", "#d55e00", "#009e73")
+"""Okabe and Ito's, which colour-blind people tell apart; the dashes differ too."""
+DASHES = ("-", "--", "-.")
+WORN_UNIT = Faults(Kintas=0.4, FSS=0.3, FDJ=0.5)
+SIGNAL_OF = {"Kintas": 0, "FSS": 0, "FDJ": 1}
+"""Signal that the search for each fault compares: 0, spool; 1, pressure (method.md)."""
 
 
-def draw_all(
-    runs: Sequence[Run], records: Sequence[Record], folder: Path, prefix: str
-) -> list[Path]:
-    """Write the pictures as PNG; returns their paths. Residuals and slices: one run a test."""
-    mpl.use("Agg")
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [_save(_parity(records), folder / f"{prefix}-parity.png")]
-    for test in SHAPES:
-        # The last of the paper's cases has all three faults.
-        chosen = [i for i, run in enumerate(runs) if run.test == test and set(run.faults) == {0.6}]
-        chosen = chosen or [i for i, run in enumerate(runs) if run.test == test]
-        if chosen:
-            run, record = runs[chosen[0]], records[chosen[0]]
-            (experiment,) = experiments_of(run)
-            value = np.array(record["value"])
-            paths.append(
-                _save(_residuals(run, experiment, value), folder / f"{prefix}-gaps-{test}.png")
-            )
-            drawn = _slices(run, experiment, value)
-            paths.append(_save(drawn, folder / f"{prefix}-slices-{test}.png"))
-    return paths
+@dataclass(frozen=True, slots=True)
+class PictureCase:
+    """One picture by its name, and the folder for it."""
+
+    picture: str
+    folder: str
+
+
+def draw_method(case: PictureCase) -> Record:
+    """Draw a picture of the method."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    METHOD_PICTURES[case.picture](figure)
+    return {"path": str(_save(figure, Path(case.folder) / f"method-{case.picture}.png"))}
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path, dpi=110)
+    mpl.use("Agg")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
     return path
 
 
-def _parity(records: Sequence[Record]) -> Figure:
-    """Estimate over truth, and error over truth with 95 % intervals."""
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    axes = figure.subplots(2, len(FAULTS), sharex="col", height_ratios=(1.6, 1.0))
-    for j, name in enumerate(FAULT_NAMES):
-        upper, lower = axes[0, j], axes[1, j]
-        upper.plot([0, 1], [0, 1], color="0.7", lw=1, label="estimate = truth")
-        lower.axhline(0.0, color="0.7", lw=1)
-        for shift, test in zip((-0.008, 0.008), SHAPES, strict=True):
-            mine = [record for record in records if record["test"] == test]
-            if not mine:
-                continue
-            truth = np.array([record["faults"][j] for record in mine])
-            style: dict[str, Any] = {"color": HUES[test], "ls": "", "alpha": 0.75}
-            first = [record["first"][j] for record in mine]
-            upper.plot(
-                truth, first, marker="x", ms=7, label=f"{test}: first approximation", **style
+def _spool_friction(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    for current, spool, _, _, style, label in _responses("FSS"):
+        window = slice(0, 2300)
+        left.plot(_time(window), 1e3 * spool[window], **style, label=label)
+        right.plot(1e3 * current[window], 1e3 * spool[window], **style)
+    left.set(xlabel="time, s", ylabel="spool position, mm", title="slow ramps of current")
+    right.set(xlabel="current, mA", ylabel="spool position, mm", title="the same over the current")
+    left.legend(title="FSS")
+
+
+def _filter_clogging(figure: Figure) -> None:
+    axes = figure.subplots(1, 2)
+    for _, spool, _, place, style, label in _responses("Kintas"):
+        near, far = slice(2395, 2440), slice(2350, 3000)
+        axes[0].plot(_time(near), 1e3 * spool[near], **style, marker=".", label=label)
+        axes[1].plot(_time(far), 1e3 * place[far], **style)
+    axes[0].set(xlabel="time, s", ylabel="spool position, mm", title="step of current at 2.4 s")
+    axes[1].set(xlabel="time, s", ylabel="jack position, mm", title="what the jack makes of it")
+    axes[0].legend(title="Kintas")
+
+
+def _jack_friction(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    for _, _, pressure, place, style, label in _responses("FDJ"):
+        window = slice(0, 2300)
+        left.plot(_time(window), 1e-6 * pressure[window], **style, label=label)
+        right.plot(_time(window), 1e3 * place[window], **style)
+    left.set(xlabel="time, s", ylabel="differential pressure, MPa", title="slow ramps of current")
+    right.set(xlabel="time, s", ylabel="jack position, mm", title="the jack meanwhile")
+    left.legend(title="FDJ")
+
+
+class _Response(NamedTuple):
+    """An open-loop test, SI, and how to draw it."""
+
+    current: NDArray[np.float64]
+    spool: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    place: NDArray[np.float64]
+    style: dict[str, Any]
+    label: str
+
+
+def _responses(name: str) -> list[_Response]:
+    """One for each severity of a fault alone."""
+    out = []
+    for value, colour, dash in zip((0.0, 0.5, 1.0), COLOURS, DASHES, strict=True):
+        samples = ehadiag.simulate("open", faults=Faults(**{name: value}), noise_lsb=0.0).samples
+        assert samples is not None
+        style = {"color": colour, "ls": dash, "lw": 1.3}
+        out.append(
+            _Response(
+                samples.current,
+                samples.spool,
+                samples.pressure,
+                samples.position,
+                style,
+                f"{value:g}",
             )
-            value = [record["value"][j] for record in mine]
-            upper.plot(truth, value, marker=SHAPES[test], ms=5, mfc="none", label=test, **style)
-            error = percent_errors(mine)[:, j]
-            low, high = 100.0 * np.array([record["interval95"][j] for record in mine]).T
-            bars = np.abs(np.vstack([low, high]) - 100.0 * np.array(value))
-            spread = shift + 0.012 * np.linspace(-0.5, 0.5, len(truth))
-            lower.errorbar(
-                truth + spread, error, bars, fmt=SHAPES[test], ms=3, lw=0.8, color=HUES[test],
-                label=f"{test}, 95 % interval",
+        )
+    return out
+
+
+def _time(window: slice) -> NDArray[np.float64]:
+    return np.arange(window.start, window.stop) * 1e-3
+
+
+def _searches(figure: Figure) -> None:
+    experiment = worn_experiment()
+    axes, candidates = figure.subplots(1, len(FAULTS), sharey=True), np.linspace(0.0, 1.0, 81)
+    for index, (axis, fault) in enumerate(zip(axes, FAULTS, strict=True)):
+        name = fault.name
+        gaps = [
+            gap_of(experiment, replace(WORN_UNIT, **{name: value}), name)
+            for value in candidates.tolist()
+        ]
+        axis.semilogy(candidates, gaps, color=COLOURS[index], ls=DASHES[index])
+        truth = getattr(WORN_UNIT, name)
+        axis.axvline(truth, color="#333333", ls=":", label=f"truth {truth:g}")
+        axis.set(xlabel=f"candidate {name}", title=_part(experiment, name))
+        axis.legend()
+    axes[0].set_ylabel("rms gap to the measured, in noise")
+
+
+def _part(experiment: Experiment, name: str) -> str:
+    start, end = getattr(experiment.test.windows, name)[0]
+    return f"{('spool', 'pressure')[SIGNAL_OF[name]]}, {start:g} … {end:g} s"
+
+
+def worn_experiment() -> Experiment:
+    """Open-loop test of the worn unit of the pictures."""
+    recording = ehadiag.simulate("open", faults=WORN_UNIT, seed=1)
+    (experiment,) = ehadiag.diagnose(recording).diagnosis.experiments
+    return experiment
+
+
+def gap_of(experiment: Experiment, severities: Faults, name: str) -> float:
+    """Rms difference of model and measured in the part of a fault's search, over the noise."""
+    unknowns = Unknowns(tuple(FAULTS), (experiment.constants,), {})
+    constants = unknowns.constants(np.array([getattr(severities, item.name) for item in FAULTS]))
+    modelled = sensed_response(experiment, constants)[SIGNAL_OF[name]]
+    measured = (experiment.spool, experiment.pressure)[SIGNAL_OF[name]]
+    start, end = (round(t / experiment.tick) for t in getattr(experiment.test.windows, name)[0])
+    gap = (measured - modelled)[start:end]
+    return float(np.sqrt(np.nanmean(gap**2)) / experiment.noise[SIGNAL_OF[name]])
+
+
+def _intervals(figure: Figure) -> None:
+    axes: Sequence[Axes] = figure.subplots(1, len(FAULTS))
+    found = [
+        ehadiag.diagnose(ehadiag.simulate("closed", faults=WORN_UNIT, seed=100 + number)).faults
+        for number in range(20)
+    ]
+    for axis, fault in zip(axes, FAULTS, strict=True):
+        truth = getattr(WORN_UNIT, fault.name)
+        for number, faults in enumerate(found):
+            item = faults[fault.name]
+            inside = item.interval[0] <= truth <= item.interval[1]
+            value = 100.0 * (item.value - truth)
+            low, high = (100.0 * (end - truth) for end in item.interval)
+            axis.errorbar(
+                number + 1, value, yerr=[[value - low], [high - value]],
+                fmt="o" if inside else "s", color=COLOURS[0] if inside else COLOURS[1], ms=4,
             )  # fmt: skip
-        upper.set(title=name, xlim=(-0.04, 1.04), ylim=(-0.04, 1.04))
-        lower.set(xlabel=f"true {name} (1 = limit of damage)")
-        upper.grid(alpha=0.25)
-        lower.grid(alpha=0.25)
-    axes[0, 0].set(ylabel="estimate (1 = limit of damage)")
-    axes[1, 0].set(ylabel="error, % of full damage")
-    axes[0, 0].legend(fontsize=8)
-    axes[1, 0].legend(fontsize=8)
-    return figure
+        axis.axhline(0.0, color="#333333", ls=":")
+        axis.set(xlabel="test of the same unit", title=f"{fault.name} = {truth:g}")
+    axes[0].set_ylabel("estimate less truth, % of full damage")
 
 
-def _residuals(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figure:
-    """Measured signals and what the model leaves of them, in units of noise."""
-    current = experiment.trace.current
-    answer = respond(damaged(experiment.constants, value), current, experiment.tick)
-    time = np.arange(1, experiment.ticks + 1) * experiment.tick
-    rows = (
-        ("spool, mm", experiment.spool * 1e3, answer.spool * 1e3, experiment.spool_noise * 1e3),
-        (
-            "pressure, MPa",
-            experiment.pressure * 1e-6,
-            answer.pressure * 1e-6,
-            experiment.pressure_noise * 1e-6,
-        ),
-    )
-    figure = Figure(figsize=(11, 8), layout="constrained")
-    axes = figure.subplots(4, 1, sharex=True, height_ratios=(1.4, 1.0, 1.4, 1.0))
-    for index, (label, measured, modelled, noise) in enumerate(rows):
-        upper, lower = axes[2 * index], axes[2 * index + 1]
-        upper.plot(time, measured, lw=2.0, color="0.65", label="measured")
-        upper.plot(time, modelled, lw=0.7, color="#a4140b", label="model at the estimate")
-        upper.set(ylabel=label)
-        upper.legend(fontsize=8, loc="upper left", ncols=2)
-        residual = (measured - modelled) / noise
-        lower.plot(time, residual, ".", ms=1.5, color=HUES[run.test])
-        reach = max(5.0, float(np.nanmax(np.abs(residual))) * 1.1)
-        lower.set(ylabel="residual / noise", ylim=(-reach, reach))
-        for level in (-3.0, 3.0):
-            lower.axhline(level, color="0.5", lw=0.7, ls="--")
-    for axis in axes:
-        axis.grid(alpha=0.25)
-    axes[-1].set(xlabel="time, s", xlim=(0.0, time[-1]))
-    truth = ", ".join(f"{v:g}" for v in run.faults)
-    axes[0].set(title=f"{run.test} loop, true Kintas, FSS, FDJ = {truth}; dashed: 3 deviations")
-    return figure
+METHOD_PICTURES: dict[str, Callable[[Figure], None]] = {
+    "FSS": _spool_friction,
+    "Kintas": _filter_clogging,
+    "FDJ": _jack_friction,
+    "searches": _searches,
+    "intervals": _intervals,
+}
+"""By name."""
 
 
-def _slices(run: Run, experiment: Experiment, value: NDArray[np.float64]) -> Figure:
-    """Objective of search and refinement along each severity through the estimate."""
-    windows = [experiment.test.windows.refinement]
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--folder", type=Path, default=Path("docs/img"), help="for the PNG files (%(default)s)")
+    add("--only", choices=list(METHOD_PICTURES), help="one of them (all)")
 
-    def objective_of(batch: Batch, cap: float) -> Objective:
-        return Objective(SimdModel(batch, unknowns_of([experiment], FAULTS)), cap)
 
-    objectives = {
-        "search (second part, runs free)": (
-            objective_of(lay_out([experiment], windows, lead=LEAD_S), SEARCH_CAP), "#0b6fa4", "-",
-        ),
-        "refinement (all of the test, re-anchored)": (
-            objective_of(lay_out([experiment], anchor_lsb=ANCHOR_LSB), CAP), "#c45a10", "--",
-        ),
-    }  # fmt: skip
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    axes = figure.subplots(2, len(FAULTS))
-    for j, name in enumerate(FAULT_NAMES):
-        near = np.linspace(max(0.0, value[j] - CLOSE), min(1.0, value[j] + CLOSE), 81)
-        for axis, grid, scale in ((axes[0, j], WIDE, 1.0), (axes[1, j], near, 100.0)):
-            rows = np.tile(value, (len(grid), 1))
-            rows[:, j] = grid
-            for label, (objective, hue, line) in objectives.items():
-                samples = np.count_nonzero(objective.model.batch.weight)
-                cost = objective(rows)
-                shown = cost / samples if scale == 1.0 else cost - cost.min()
-                axis.plot(scale * grid, shown, color=hue, ls=line, lw=1.3, label=label)
-            axis.axvline(scale * run.faults[j], color="0.3", lw=0.9, ls=":", label="truth")
-            axis.plot(
-                [scale * value[j]], [axis.get_ylim()[0]], "^", color="k", ms=6, clip_on=False,
-                label="estimate",
-            )  # fmt: skip
-            axis.grid(alpha=0.25)
-        axes[0, j].set(title=name, xlabel=f"{name} (1 = limit of damage)", yscale="log")
-        axes[1, j].set(xlabel=f"{name}, % of full damage")
-    axes[0, 0].set(ylabel="capped squared residual, a sample")
-    axes[1, 0].set(ylabel="objective above its lowest value")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
-    return figure
+def _cases(options: Options) -> list[PictureCase]:
+    names = list(METHOD_PICTURES) if options.only is None else [options.only]
+    return [PictureCase(name, str(options.folder)) for name in names]
+
+
+def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
+    for record in records:
+        yield f"wrote {record['path']}"
+
+
+PICTURES = Study(
+    "pictures",
+    "Draws the pictures of docs/explanation/method.md: what faults do, why they are found.",
+    _cases, draw_method, _report, _options, count=None, measures_time=True,
+)  # fmt: skip

@@ -1,242 +1,215 @@
-"""False alarms of the monitor in hours of random motion, and how soon it finds a fault that grew.
+"""Study of the monitor on free motion: false alarms, delays and names of changes, thresholds.
 
-    tools/free_motion --motion-hours 12 --jobs 2
-    tools/free_motion --delays --jobs 2
-
-The monitored unit is the detailed simulator, moved at random in current and in position mode from
-rest, a minute at a time. False alarms: its severities are drawn anew for each minute, and the
-monitor knows them. Delays: one severity is more than the monitor knows. An interval of a rate is
-Garwood's (Biometrika 28, 1936), 95 %.
+The monitored unit is the detailed simulator, from rest, for some minutes a piece, in current and in
+position mode by turns. Oil is -20 … 100 degC and drifts, the supply ripples by up to 0.3 MPa, both
+are told with noise and a probe's error; the severities that the monitor has are off by some 0.003.
+An interval of a rate is Garwood's (Biometrika 28, 1936), 95 %.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import joblib
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, gumbel_r
 
-from ehadiag.cli.watch.persistence import Persistence
-from ehadiag.cli.watch.watcher import QUIET_S
 from ehadiag.core.actuator import default_actuator
-from ehadiag.core.recording import CommandMode
-from ehadiag.monitor import FreeMotionMonitor, Monitor, undecided_spool
-from ehadiag_sim.plant.conditions import Faults
-from ehadiag_tools.free_motion.motion import STEP, free_motion
+from ehadiag.monitor.change_test import (
+    BLOCK_S,
+    CAUSES,
+    PIECE_H,
+    SPANS,
+    STRIDE,
+    ChangeTest,
+)
+from ehadiag.monitor.score_bank import BANK_NAMES, ScoreBank
+from ehadiag_tools.free_motion.motion import KINDS, Motion, changed, free_motion, random_motion
+from ehadiag_tools.study import Options, Record, Study, markdown
+from firmware_iface.recording import CommandMode
 
-__all__ = ["Case", "Outcome", "garwood", "main", "watch"]
-
-MINUTE_S = 60.0
-WORST = 0.7
-"""Severities of the false-alarm study are drawn evenly from 0 … this."""
-BASE = 0.3
-"""Severities that the monitor knows in the study of delays."""
-GROWTHS = (0.05, 0.1, 0.2)
-NAMES = ("Kintas", "FSS", "FDJ")
-SIGNALS = ("spool above", "spool below", "pressure above", "pressure below")
+SEVERITY_ERROR = 0.003
+"""Standard deviation of the severities that the monitor has from the true ones, 1."""
+CHANGED_PIECE_S = 180.0
+CHANGE_S = 60.0
+"""Length of a piece with a change, and time of the change, s."""
+CHANGES = (
+    ("Kintas", 0.05), ("Kintas", 0.1), ("Kintas", 0.2), ("FSS", 0.05), ("FSS", 0.1), ("FSS", 0.2),
+    ("FDJ", 0.05), ("FDJ", 0.1), ("FDJ", 0.2), ("spool_offset", 2e-6), ("spool_offset", 5e-6),
+    ("spool_gain", 0.02), ("pressure_offset", 0.3e6), ("pressure_gain", 0.03),
+    ("current_offset", 1e-4), ("current_gain", 0.02), ("position_gain", 0.03), ("supply", -2e6),
+    ("supply", -4e6), ("oil", 15.0), ("oil", -15.0), ("load", 400.0),
+)  # fmt: skip
+"""Changes and their sizes, SI."""
+SPREAD_SHARE = 0.97
+"""Share of healthy values below a cause's spread."""
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """One minute of motion."""
+class MotionCase:
+    """A piece of motion, and the monitor's hours between false alarms."""
 
-    mode: CommandMode
-    known: tuple[float, float, float]
-    """Severities that the monitor is told."""
-    true: tuple[float, float, float]
-    seed: int
+    motion: Motion
     hours: float
-    """Between false alarms, as asked of the monitor."""
-    seconds: float = MINUTE_S
-    step: float = STEP
-    """Of the simulator, s."""
+    calibrates: bool = False
+    """Whether all values are recorded, not alarms alone."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What the monitor said in one minute."""
+def perform(case: MotionCase) -> Record:
+    """Move the simulated unit, and test its motion for changes.
 
-    alarms: tuple[tuple[int, int], ...]
-    """Tick and sum (see `SIGNALS`) of each alarm of the sums."""
-    lasting: tuple[int, ...]
-    """Ticks of the alarms that `ehadiag monitor` raises: of what lasts, ten seconds apart."""
-    resting: float
-    """Share of ticks in which the pressure said nothing."""
-    cost_s: float
-    """Processor time."""
-
-
-def watch(case: Case) -> Outcome:
-    """Move the simulated unit for a minute and push all of it into a monitor.
-
-    Parameters
-    ----------
-    case : Case
-        Which minute.
-
-    Returns
-    -------
-    Outcome
-        Its alarms.
+    `alarms`: time (s) and causes (name, size, standard error) of each that repeats none.
     """
-    began = time.process_time()
-    actuator = default_actuator()
-    faults = Faults(*case.true)
-    rows = free_motion(actuator, faults, case.mode, case.seconds, case.seed, case.step)
-    inner = Monitor(actuator, case.known, mode=case.mode, hours=case.hours)
-    monitor = FreeMotionMonitor(inner, undecided_spool(actuator, case.known[2]))
-    alarms, resting, persistence = [], 0, Persistence(actuator.controller.rate)
-    lasting: list[int] = []
-    for tick, row in enumerate(rows.tolist()):
-        reading = monitor.push(tuple(row))
-        resting += bool(np.isnan(reading.residual[1]))
-        if monitor.settled and reading.alarmed.any():
-            alarms += [(tick, int(item)) for item in np.flatnonzero(reading.alarmed)]
-            apart = not lasting or tick - lasting[-1] >= QUIET_S * actuator.controller.rate
-            if persistence.take(tick) and apart:
-                lasting.append(tick)
-    cost = time.process_time() - began
-    return Outcome(tuple(alarms), tuple(lasting), resting / len(rows), cost)
+    begin = time.process_time()
+    actuator, motion = default_actuator(), case.motion
+    record = free_motion(actuator, motion)
+    error = np.random.default_rng(motion.seed).normal(0.0, SEVERITY_ERROR, 3)
+    given = np.clip(np.add(motion.faults, error), 0.0, 1.0).tolist()
+    rate, mode = actuator.controller.rate, CommandMode[motion.mode.upper()]
+    test = ChangeTest(ScoreBank(actuator, tuple(given), mode=mode), rate, case.hours)
+    alarms, values = [], []
+    block = round(BLOCK_S * rate)
+    for tick, row in enumerate(record.rows.tolist()):
+        if tick % block == 0:
+            test.tune(record.mean_environment(tick, tick + block))
+        found = test.push(tuple(row))
+        if found is not None and not found.repeated:
+            causes = [(item.name, item.size, item.stderr) for item in found.causes]
+            alarms.append((tick / rate, causes))
+        if case.calibrates and (tick + 1) % (block * STRIDE) == 0:
+            values.append(np.abs(test.values).round(2).tolist())
+    spent = time.process_time() - begin
+    return {"alarms": alarms, "values": values, "processor_s": spent}
 
 
 def garwood(count: int) -> tuple[float, float]:
-    """Return the exact 95 % interval of a Poisson mean of which so many were seen."""
+    """Return the exact 95 % interval of a Poisson mean of which so many were counted."""
     low = 0.0 if count == 0 else float(chi2.ppf(0.025, 2 * count)) / 2.0
     return low, float(chi2.ppf(0.975, 2 * count + 2)) / 2.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="free_motion", description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument(
-        "--motion-hours", type=float, default=0.2, metavar="H", help="of motion (default 0.2)"
-    )
-    parser.add_argument(
-        "--hours", type=float, default=0.5, metavar="H", help="between false alarms (default 0.5)"
-    )
-    parser.add_argument("--delays", action="store_true", help="study delays instead")
-    parser.add_argument(
-        "--pieces", type=int, default=2, metavar="N", help="of motion, for each delay (default 2)"
-    )
-    parser.add_argument(
-        "--piece", type=float, default=MINUTE_S, metavar="S", help="length of one (default 60)"
-    )
-    parser.add_argument("--seed", type=int, default=1, metavar="N")
-    parser.add_argument(
-        "--step",
-        type=float,
-        default=STEP * 1e6,
-        metavar="US",
-        help="of the simulator, µs (%(default)g)",
-    )
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
-    arguments = parser.parse_args(argv)
-    if arguments.delays:
-        _delays(arguments)
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--hours", type=float, default=10.0, metavar="H", help="between false alarms (%(default)g)")
+    add("--changes", action="store_true", help="study changes instead, --cases rounds of all")
+    add("--calibrate", action="store_true", help="find the monitor's spreads and threshold instead")
+    add("--piece", type=float, default=3600.0 * PIECE_H, metavar="S",
+        help="length of a healthy piece (%(default)g)")  # fmt: skip
+
+
+def _cases(options: Options) -> list[MotionCase]:
+    if options.changes:
+        return [
+            MotionCase(_changed(options.seed, *item), options.hours)
+            for item in itertools.product(
+                range(1, options.cases + 1), range(len(CHANGES)), range(len(CommandMode))
+            )
+        ]
+    return [
+        MotionCase(
+            random_motion(
+                np.random.default_rng((options.seed, number)), number, options.piece,
+                options.seed + number,
+            ),
+            options.hours,
+            options.calibrate,
+        )
+        for number in range(options.cases)
+    ]  # fmt: skip
+
+
+def _changed(seed: int, turn: int, number: int, mode: int) -> Motion:
+    rng = np.random.default_rng((seed, turn, number, mode))
+    kind = (7 * turn + 3 * number + 5 * mode) % len(KINDS)
+    own = seed + 1000 * turn + 10 * number + mode
+    motion = random_motion(rng, 2 * kind + mode, CHANGED_PIECE_S, own)
+    return changed(motion, *CHANGES[number], CHANGE_S)
+
+
+def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
+    if options.calibrate:
+        yield from _calibration(records)
+    elif options.changes:
+        yield from _changes(records)
     else:
-        _false_alarms(arguments)
-    return 0
+        yield from _false_alarms(records, options)
+    spent = sum(item["processor_s"] for item in records)
+    hours = sum(item["motion"]["seconds"] for item in records) / 3600.0
+    yield f"\nprocessor time {spent:.0f} s, {spent / hours:.0f} s an hour of motion"
 
 
-def _false_alarms(arguments: argparse.Namespace) -> None:
-    minutes = max(round(arguments.motion_hours * 3600.0 / arguments.piece), 1)
-    rng = np.random.default_rng(arguments.seed)
-    cases = []
-    for number in range(minutes):
-        known = tuple(float(value) for value in rng.uniform(0.0, WORST, 3))
-        mode = CommandMode.POSITION if number % 2 else CommandMode.CURRENT
-        severities = (known[0], known[1], known[2])
-        seed = arguments.seed + number
-        cases.append(
-            Case(
-                mode,
-                severities,
-                severities,
-                seed,
-                arguments.hours,
-                arguments.piece,
-                arguments.step / 1e6,
-            )
-        )
-    found = _run(cases, arguments.jobs)
-    for mode in (*CommandMode, None):
-        chosen = [b for a, b in zip(cases, found, strict=True) if mode in (None, a.mode)]
-        if chosen:
-            hours = len(chosen) * arguments.piece / 3600.0
-            _tell(mode.name.lower() if mode else "both", chosen, hours, arguments.hours)
-    spent = sum(item.cost_s for item in found)
-    each = spent / minutes * 3600.0 / arguments.piece
-    print(f"seed {arguments.seed}; processor time {spent:.0f} s, {each:.0f} s an hour of motion")
-    for case, outcome in zip(cases, found, strict=True):
-        if outcome.alarms:
-            told = ", ".join(f"{value:.2f}" for value in case.known)
-            sums = ", ".join(sorted({SIGNALS[which] for _, which in outcome.alarms}))
-            spans = f"{outcome.alarms[0][0]} … {outcome.alarms[-1][0]}"
-            print(f"  seed {case.seed} {case.mode.name.lower()} ({told}): {sums}; ticks {spans}")
+def _false_alarms(records: Sequence[Record], options: Options) -> Iterator[str]:
+    rows = []
+    for name in ("current", "position", "both"):
+        part = [item for item in records if name in ("both", item["motion"]["mode"])]
+        if part:
+            hours = sum(item["motion"]["seconds"] for item in part) / 3600.0
+            alarms = sum(len(item["alarms"]) for item in part)
+            low, high = garwood(alarms)
+            interval = f"{low / hours:.2f} … {high / hours:.2f}"
+            rows.append((name, f"{hours:.2f}", str(alarms), f"{alarms / hours:.2f}", interval))
+    yield f"stated {1.0 / options.hours:.2f}/h, seed {options.seed}\n"
+    yield from markdown(("mode", "hours", "alarms", "an hour", "95 % interval"), rows)
+    for item in records:
+        motion = item["motion"]
+        for when, causes in item["alarms"]:
+            piece = f"seed {motion['seed']} {motion['kind']} {motion['mode']}"
+            yield f"- {piece}: {when:.0f} s, {causes}"
 
 
-def _tell(label: str, found: Sequence[Outcome], length: float, hours: float) -> None:
-    alarms = sum(len(item.lasting) for item in found)
-    pieces = sum(bool(item.alarms) for item in found)
-    low, high = garwood(alarms)
-    resting = float(np.mean([item.resting for item in found]))
-    print(
-        f"{label:8s} {length:6.2f} h: {alarms} alarms, {alarms / length:.2f}/h"
-        f" [{low / length:.2f}, {high / length:.2f}], stated {1.0 / hours:.2f}/h;"
-        f" sums alarm in {pieces} of {len(found)} pieces; pressure rests {resting:.0%}"
-    )
+def _changes(records: Sequence[Record]) -> Iterator[str]:
+    """Delays and names; a piece that alarms before its change counts as a false alarm."""
+    rows = []
+    counts = [0, 0, 0, 0]
+    for change, size in CHANGES:
+        for mode in ("current", "position"):
+            part = [
+                item for item in records
+                if (item["motion"]["change"], item["motion"]["size"], item["motion"]["mode"])
+                == (change, size, mode)
+            ]  # fmt: skip
+            delays, names = [], []
+            for item in part:
+                counts[0] += 1
+                after = [found for found in item["alarms"] if found[0] > CHANGE_S]
+                counts[3] += len(item["alarms"]) - len(after)
+                kind = item["motion"]["kind"]
+                delays.append(f"{after[0][0] - CHANGE_S:.0f} ({kind})" if after else f"- ({kind})")
+                if after:
+                    likely = [name for name, _, _ in after[0][1]]
+                    counts[1] += 1
+                    counts[2] += likely[0] == change
+                    names.append(" or ".join(likely))
+            cells = ", ".join(delays), "; ".join(names)
+            rows.append((change, f"{size:g}", mode, *cells))
+    yield from markdown(("change", "size", "mode", "found after, s (motion)", "named"), rows)
+    total, found, right, early = counts
+    named = f"{right} of {found} with the right name first"
+    yield f"\n{found} of {total} found, {named}; {early} alarms before"
 
 
-def _delays(arguments: argparse.Namespace) -> None:
-    kinds = list(itertools.product(CommandMode, range(len(NAMES)), GROWTHS))
-    cases = []
-    for mode, fault, growth in kinds:
-        for number in range(arguments.pieces):
-            true = [BASE] * len(NAMES)
-            true[fault] += growth
-            cases.append(
-                Case(
-                    mode,
-                    (BASE, BASE, BASE),
-                    (true[0], true[1], true[2]),
-                    arguments.seed + number,
-                    arguments.hours,
-                    arguments.piece,
-                    arguments.step / 1e6,
-                )
-            )
-    found = _run(cases, arguments.jobs)
-    length = f"{arguments.pieces} × {arguments.piece:g} s"
-    print(f"s to the first alarm of a sum; to that of what lasts; {length} of motion each")
-    for place, (mode, fault, growth) in enumerate(kinds):
-        part = found[place * arguments.pieces : (place + 1) * arguments.pieces]
-        sums = [_first(item.alarms[0][0] if item.alarms else None) for item in part]
-        raised = [_first(item.lasting[0] if item.lasting else None) for item in part]
-        print(
-            f"{mode.name.lower():8s} {NAMES[fault]:6s} +{growth:.2f}:"
-            f" {', '.join(sums)}; {', '.join(raised)}"
-        )
-    spent = sum(item.cost_s for item in found)
-    print(f"seed {arguments.seed}; processor time {spent:.0f} s")
+def _calibration(records: Sequence[Record]) -> Iterator[str]:
+    values = [np.array(item["values"]) for item in records]
+    spreads = np.maximum(np.quantile(np.concatenate(values), SPREAD_SHARE, axis=0), 1.0)
+    spreads = np.ceil(10.0 * spreads) / 10.0
+    names = [BANK_NAMES[place] for place in CAUSES]
+    rows = [
+        (name, *(f"{value:.1f}" for value in column))
+        for name, column in zip(names, spreads.T, strict=True)
+    ]
+    yield from markdown(("cause", *(f"{span * BLOCK_S:g} s" for span in SPANS)), rows)
+    largest = np.array([(item / spreads).max() for item in values])
+    location, scale = gumbel_r.fit(largest)
+    yield f"\nlargest of each of {len(largest)} pieces: Gumbel's law, {location:.2f}, {scale:.2f}"
+    yield "largest of all: " + ", ".join(f"{value:.2f}" for value in np.sort(largest)[::-1][:10])
 
 
-def _first(tick: int | None) -> str:
-    return "none" if tick is None else f"{tick / 1e3:.2f}"
-
-
-def _run(cases: Sequence[Case], jobs: int) -> list[Outcome]:
-    work = joblib.Parallel(n_jobs=jobs, return_as="generator")
-    found: list[Outcome] = []
-    for outcome in work(joblib.delayed(watch)(case) for case in cases):
-        found.append(outcome)
-        raised = sum(len(item.lasting) for item in found)
-        print(f"\r{len(found)} of {len(cases)} pieces, {raised} alarms", end="", file=sys.stderr)
-    print(file=sys.stderr)
-    return found
+FREE_MOTION = Study(
+    "free-motion",
+    "The monitor's false alarms in free motion; --changes: delays and names; --calibrate.",
+    _cases, perform, _report, _options, count=24,
+    counted="pieces of motion; with --changes rounds of all changes",
+)  # fmt: skip

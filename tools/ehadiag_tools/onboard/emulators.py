@@ -8,15 +8,13 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from ehadiag.export.targets import Target, target
-
-__all__ = ["EMULATED", "Emulator", "missing", "run_program"]
+from ehadiag.export.targets import Target, find_target
 
 HERE = Path(__file__).parent
 FIRMWARE = HERE.parents[2] / "firmware_iface" / "c"
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2")
-MOST_S = 3600.0
-"""An emulated identification takes minutes."""
+TIMEOUT_S = 3600.0
+"""Longest time of a program, s; an emulated identification takes minutes."""
 BARE = ("--specs=rdimon.specs", "-Wl,--no-warn-execstack", "-Wl,--no-warn-rwx-segments")
 
 
@@ -24,18 +22,8 @@ BARE = ("--specs=rdimon.specs", "-Wl,--no-warn-execstack", "-Wl,--no-warn-rwx-se
 class Emulator:
     """How programs for a target are built and run here.
 
-    Attributes
-    ----------
-    target : str
-        Name of the target.
-    compiler : str
-        Cross compiler.
-    options : tuple[str, ...]
-        For it, beside those of the target.
-    command : tuple[str, ...]
-        What runs a program, its name behind.
-    extra : tuple[str, ...]
-        C sources that belong to every program.
+    Options for the cross compiler are beside those of the target; `command` runs a program, its
+    name behind; `extra` C sources belong to every program.
     """
 
     target: str
@@ -45,40 +33,24 @@ class Emulator:
     extra: tuple[str, ...] = ()
 
 
-MPS2 = (
-    "qemu-system-arm", "-M", "mps2-an500", "-nographic", "-monitor", "none", "-serial", "null",
-    "-semihosting-config", "enable=on,target=native", "-icount", "shift=0", "-kernel",
-)  # fmt: skip
+def _mps2(name: str, machine: str) -> Emulator:
+    """Bare Cortex-M of a board whose instructions QEMU counts."""
+    command = (
+        "qemu-system-arm", "-M", machine, "-nographic", "-monitor", "none", "-serial", "null",
+        "-semihosting-config", "enable=on,target=native", "-icount", "shift=0", "-kernel",
+    )  # fmt: skip
+    options = (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld"))
+    extra = (str(FIRMWARE / "mps2.c"),)
+    return Emulator(name, "arm-none-eabi-gcc", options, command, extra)
 
-M4 = (
-    "qemu-system-arm", "-M", "mps2-an386", "-nographic", "-monitor", "none", "-serial", "null",
-    "-semihosting-config", "enable=on,target=native", "-icount", "shift=0", "-kernel",
-)  # fmt: skip
 
 EMULATED: tuple[Emulator, ...] = (
-    Emulator("host", "cc"),
-    Emulator("host-single", "cc"),
-    Emulator(
-        "cortex-m7",
-        "arm-none-eabi-gcc",
-        (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
-        MPS2,
-        (str(FIRMWARE / "mps2.c"),),
-    ),
-    Emulator(
-        "cortex-m4",
-        "arm-none-eabi-gcc",
-        (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
-        M4,
-        (str(FIRMWARE / "mps2.c"),),
-    ),
-    Emulator(
-        "cortex-m4-single",
-        "arm-none-eabi-gcc",
-        (*BARE, "-DCOUNTED", "-T", str(FIRMWARE / "mps2.ld")),
-        M4,
-        (str(FIRMWARE / "mps2.c"),),
-    ),
+    # Static: a linker at run time binds a function in its first call, on the stack of that call.
+    Emulator("host", "cc", ("-static",)),
+    Emulator("host-single", "cc", ("-static", "-DEHA_SINGLE_HOST")),
+    _mps2("cortex-m7", "mps2-an500"),
+    _mps2("cortex-m4", "mps2-an386"),
+    _mps2("cortex-m4-single", "mps2-an386"),
     Emulator("cortex-r5", "arm-none-eabi-gcc", BARE, ("qemu-arm", "-cpu", "max")),
     Emulator("cortex-a53", "aarch64-linux-gnu-gcc", ("-static",), ("qemu-aarch64",)),
     Emulator("riscv64", "riscv64-linux-gnu-gcc", ("-static",), ("qemu-riscv64",)),
@@ -89,42 +61,17 @@ EMULATED: tuple[Emulator, ...] = (
 
 
 def missing(emulator: Emulator) -> list[str]:
-    """Programs that are not installed, of those that it takes.
-
-    Parameters
-    ----------
-    emulator : Emulator
-        The target's.
-
-    Returns
-    -------
-    list[str]
-        Their names.
-    """
+    """Names of the programs of an emulator that are not installed."""
     needed = [emulator.compiler, *emulator.command[:1]]
     return [name for name in needed if shutil.which(name) is None]
 
 
 def run_program(emulator: Emulator, export: Path, program: str, work: Path) -> str:
-    """Compile a program of this folder against an export, run it and return what it prints.
+    """Compile a C source of this folder against an export, run it, return its standard output.
 
-    Parameters
-    ----------
-    emulator : Emulator
-        The target's.
-    export : Path
-        Folder that `ehadiag export` has written.
-    program : str
-        C source in this folder.
-    work : Path
-        Folder for what is made; headers of the program may lie there.
-
-    Returns
-    -------
-    str
-        Its standard output.
+    Headers of the program may lie in `work`, where what is made goes.
     """
-    kind: Target = target(emulator.target)
+    kind: Target = find_target(emulator.target)
     made = work / f"{program}.elf"
     sources = [str(HERE / name) for name in (program, *emulator.extra)]
     subprocess.run(
@@ -133,6 +80,10 @@ def run_program(emulator: Emulator, export: Path, program: str, work: Path) -> s
         check=True, stderr=sys.stderr,
     )  # fmt: skip
     done = subprocess.run(
-        [*emulator.command, str(made)], check=True, capture_output=True, text=True, timeout=MOST_S
+        [*emulator.command, str(made)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
     )
     return done.stdout

@@ -15,12 +15,12 @@ static double number(uint64_t bits)
 
 int main(void)
 {
-    eha_unit unit;
+    eha_unit unit = EHA_UNIT_DEFAULT;
     size_t deepest = 0;
     uint64_t total = 0u;
     uint64_t worst = 0u;
 
-    (void)memcpy(&unit, unit_bits, sizeof unit);
+    (void)memcpy(&unit, unit_bits, sizeof unit_bits);
     (void)stack_paint(0);
     if (eha_monitor_init(&monitor, &unit) != 0) {
         return 1;

@@ -10,40 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, default_actuator
-from ehadiag.core.recording import CommandMode, Recording
 from ehadiag.model.plant import plant_constants, relative_viscosity
-from ehadiag.monitor.prepare import Unit
-from ehadiag.onboard.environment import set_environment
-from ehadiag.onboard.layout import Outcome
+from ehadiag.model.registry import FAULTS
+from ehadiag.onboard.onboard_memory import OnboardOutcome, set_environment
 from ehadiag_tools.onboard.emulators import Emulator, run_program
-
-__all__ = [
-    "Identified",
-    "Replay",
-    "identified",
-    "replayed",
-    "surrounded",
-    "ticks_of",
-    "unit_of",
-]
+from firmware_iface.recording import CommandMode, Recording
 
 
 @dataclass(frozen=True, slots=True)
-class Replay:
-    """What an exported monitor printed.
+class MonitorReplay:
+    """What an exported monitor printed: alarms and numbers of each tick.
 
-    Attributes
-    ----------
-    lines : list[str]
-        Alarms and numbers of each tick.
-    init_stack : int
-        Bytes of stack that its start took.
-    push_stack : int
-        The most that a push took.
-    mean_push : int
-        Instructions of a push in the mean, to within some dozens; 0 where they are not counted.
-    worst_push : int
-        The most of one push.
+    Stacks of its start and of its deepest push, bytes; instructions of a push in the mean, to
+    within some dozens, and at most; 0 where they are not counted.
     """
 
     lines: list[str]
@@ -55,42 +34,26 @@ class Replay:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """What an exported identification printed.
+    """What an exported identification printed: what it returned, and its results in bits.
 
-    Attributes
-    ----------
-    bits : str
-        What it returned, and its results in bits.
-    stack : int
-        Bytes of stack that its calls took at most.
-    millions : int
-        Instructions, in millions; 0 where they are not counted.
+    Deepest stack of its calls, bytes; millions of instructions, and those of the longest slice, 0
+    where they are not counted.
     """
 
     bits: str
     stack: int
     millions: int
+    longest: int
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> OnboardOutcome:
         """The results as numbers."""
         words = np.array([int(word, 16) for word in self.bits.split()[1:]], dtype=np.uint64)
-        return Outcome(*words.view(np.float64).tolist())
+        return OnboardOutcome(*words.view(np.float64).tolist())
 
 
 def ticks_of(recording: Recording) -> NDArray[np.float64]:
-    """Ticks of a recording as a monitor takes them.
-
-    Parameters
-    ----------
-    recording : Recording
-        With samples.
-
-    Returns
-    -------
-    NDArray[np.float64]
-        Shape (n, 5).
-    """
+    """Ticks of a recording as a monitor takes them, shape (n, 5)."""
     s = recording.samples
     assert s is not None
     return np.column_stack([s.command, s.current, s.spool, s.pressure, s.position])
@@ -98,90 +61,52 @@ def ticks_of(recording: Recording) -> NDArray[np.float64]:
 
 def unit_of(
     recording: Recording, faults: Sequence[float], actuator: Actuator | None = None
-) -> Unit:
-    """Return what a monitor is told of the unit on a recording; None: the reference actuator."""
+) -> tuple[float, ...]:
+    """Return what a monitor gets of the unit on a recording; None: the reference actuator."""
     environment, samples = recording.environment, recording.samples
     constants = plant_constants(actuator or default_actuator(), environment)
     degc = None if environment is None else environment.oil_temperature
     closed = samples is not None and samples.mode is CommandMode.POSITION
     viscosity = 1.0 if degc is None else relative_viscosity(degc)
-    a, b, c = faults
-    return Unit(a, b, c, 0.0, 0.0, viscosity, constants.PSR, float(closed))
+    return (*faults, 0.0, 0.0, viscosity, float(constants.PSR), float(closed))
 
 
-def surrounded(recording: Recording, actuator: Actuator | None = None) -> Unit:
+def surrounded(recording: Recording, actuator: Actuator | None = None) -> tuple[float, ...]:
     """Return what a computer that identifies by itself makes of a recording's surroundings."""
     around = recording.environment
-    numbers = np.array(unit_of(recording, (0.0, 0.0, 0.0), actuator), dtype=np.float64)
+    numbers = np.array(unit_of(recording, [0.0] * len(FAULTS), actuator), dtype=np.float64)
     oil, supply, back = around.oil_temperature, around.supply_pressure, around.return_pressure
     if oil is not None and supply is not None and back is not None:
         set_environment(numbers.ctypes.data, (oil, supply, back))
-    return Unit(*numbers.tolist())
+    return tuple(numbers.tolist())
 
 
 def replayed(
-    emulator: Emulator, export: Path, unit: Unit, ticks: NDArray[np.float64], work: Path
-) -> Replay:
-    """Replay ticks through an export on its target.
-
-    Parameters
-    ----------
-    emulator : Emulator
-        The target's.
-    export : Path
-        Folder of the export.
-    unit : Unit
-        What the monitor is told.
-    ticks : NDArray[np.float64]
-        Shape (n, 5).
-    work : Path
-        Folder for what is made.
-
-    Returns
-    -------
-    Replay
-        What was printed.
-    """
+    emulator: Emulator, export: Path, unit: Sequence[float], ticks: NDArray[np.float64], work: Path
+) -> MonitorReplay:
+    """Replay ticks, shape (n, 5), through an export on its target; `work`: folder for files."""
     _write_ticks(unit, ticks, work)
-    said = run_program(emulator, export, "replay.c", work).splitlines()
-    lines = [line.removeprefix("tick ").strip() for line in said if line.startswith("tick ")]
-    stacks = {line.split()[0]: int(line.split()[-1]) for line in said if " stack " in line}
-    counts = {line.split()[0]: int(line.split()[-1]) for line in said if " count " in line}
-    return Replay(lines, stacks["init"], stacks["push"], counts["mean"], counts["worst"])
+    output = run_program(emulator, export, "replay.c", work).splitlines()
+    lines = [line.removeprefix("tick ").strip() for line in output if line.startswith("tick ")]
+    stacks = {line.split()[0]: int(line.split()[-1]) for line in output if " stack " in line}
+    counts = {line.split()[0]: int(line.split()[-1]) for line in output if " count " in line}
+    return MonitorReplay(lines, stacks["init"], stacks["push"], counts["mean"], counts["worst"])
 
 
 def identified(
-    emulator: Emulator, export: Path, unit: Unit, ticks: NDArray[np.float64], work: Path
+    emulator: Emulator, export: Path, unit: Sequence[float], ticks: NDArray[np.float64], work: Path
 ) -> Identified:
-    """Identify ticks by an export on its target.
-
-    Parameters
-    ----------
-    emulator : Emulator
-        The target's.
-    export : Path
-        Folder of the export.
-    unit : Unit
-        What the identification is told.
-    ticks : NDArray[np.float64]
-        Shape (n, 5).
-    work : Path
-        Folder for what is made.
-
-    Returns
-    -------
-    Identified
-        What was printed.
-    """
+    """Identify ticks, shape (n, 5), by an export on its target; `work`: folder for files."""
     _write_ticks(unit, ticks, work)
-    said = dict(
+    output = dict(
         line.split(maxsplit=1)
         for line in run_program(emulator, export, "identify.c", work).splitlines()
     )
-    return Identified(said["outcome"], int(said["stack"]), int(said["millions"]))
+    counts = (int(output[name]) for name in ("stack", "millions", "longest"))
+    return Identified(output["outcome"], *counts)
 
 
-def _write_ticks(unit: Unit, ticks: NDArray[np.float64], work: Path) -> None:
+def _write_ticks(unit: Sequence[float], ticks: NDArray[np.float64], work: Path) -> None:
     """Write the header that the programs of this folder read."""
     rows = ",\n".join("{" + _words(row) + "}" for row in ticks)
     text = (

@@ -1,231 +1,189 @@
-"""Measures the prognosis of remaining life on simulated units, beside its rivals."""
+"""Study of the prognosis of remaining life on simulated units, against its rivals."""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.prognosis.forecast import Fleet, forecast, learn_fleet
+from ehadiag.prognosis.averaging import Fleet, learn_fleet
+from ehadiag.prognosis.forecast import forecast
 from ehadiag.prognosis.lives import Life, lives_of
-from ehadiag_tools.prognosis.noise import TABLE, measure, read_table
-from ehadiag_tools.prognosis.rivals import Guess, Rival, bayesian_line, line, particle_filter
-from ehadiag_tools.prognosis.units import LAWS, LIMIT, Unit, make_unit
+from ehadiag_tools.prognosis.laws import HELD_OUT, LAWS, TUNED
+from ehadiag_tools.prognosis.rivals import QUANTILES, age_alone, similar_lives
+from ehadiag_tools.prognosis.units import LIMIT, WornUnit, read_noise, simulate_unit
+from ehadiag_tools.study import Options, Record, Study, markdown
 
-__all__ = ["main"]
-
-Array = NDArray[np.float64]
+SHARES = (0.3, 0.5, 0.7, 0.9)
+"""Shares of the last life at which remaining life is forecast, 1."""
+SETS = {"tuned": tuple(TUNED), "held-out": tuple(HELD_OUT), "all": tuple(LAWS)}
+CENSORED_SHARE = (0.3, 0.8)
+"""Shares of its last life at which a unit of a censored fleet is taken out, 1."""
+RIVALS = {"similar lives": similar_lives, "age alone": age_alone}
 OURS = "ehadiag"
-SHARES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Of the last life, at which remaining life is asked for."""
-LAMBDA, ALPHA = 0.5, 0.2
-TRAINING = 20
-"""Units of a fleet whose whole lives are known; none of those that are judged."""
-FIRST_TRAINING = 10_000
-BOOTSTRAPS = 2000
-NOMINAL = 0.8
-KEYS = ("near", "horizon", "error")
+REPLICATES = 1000
+"""Number of resamples of the units, for the interval of a difference."""
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
-    """One method on one unit."""
+class LifeCase:
+    """A simulated unit, its law of wear, its fleet, seed of all."""
 
-    covered: tuple[bool | None, ...]
-    """At each share of the life; None: no number."""
-    error: float
-    """Mean of the median's error, of the life; 1 where there is no number."""
-    near: bool
-    """Within alpha of the true remaining life at lambda."""
-    horizon: float
-    """Share of the life before its end from which the median stays within alpha of the life."""
+    unit: int
+    law: str
+    fleet: int
+    censored: bool
+    seed: int
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables, in Markdown."""
-    parser = argparse.ArgumentParser(prog="tools/prognosis", description=__doc__)
-    parser.add_argument("--units", type=int, default=200, metavar="N")
-    parser.add_argument("--seed", type=int, default=1, metavar="N")
-    parser.add_argument(
-        "--measure-noise", type=int, metavar="N", help="diagnose N simulated tests, write the table"
-    )
-    given = parser.parse_args(arguments)
-    if given.measure_noise:
-        rows = list(measure(given.measure_noise, given.seed))
-        with TABLE.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        print(f"wrote {TABLE}")
-        return 0
-    _print(study(given.units, given.seed), given)
-    return 0
+def perform(case: LifeCase) -> Record:
+    """Forecast a unit's remaining life at each of `SHARES`.
 
-
-def study(number: int, seed: int) -> dict[str, dict[str, list[Score]]]:
-    """Score each method on each unit: by law, then by method."""
-    noise = read_table()
-    rivals: dict[str, Rival] = {"straight line": line, "Bayesian line": bayesian_line}
-    particles = particle_filter()
-    if particles is None:
-        print("progpy is not installed: left out", file=sys.stderr)
-    else:
-        rivals["progpy particle filter"] = particles
-    out: dict[str, dict[str, list[Score]]] = {}
-    for index, law in enumerate(LAWS):
-        trained = [_lives(make_unit(law, FIRST_TRAINING + i, noise, seed)) for i in range(TRAINING)]
-        lives = [life for unit in trained for life in unit if len(life.age) > 1]
-        fleet = learn_fleet(lives, float(np.median([life.age[-1] for life in lives])), seed)
-        units = [make_unit(law, i, noise, seed) for i in range(index, number, len(LAWS))]
-        out[law] = {OURS: [_ours(unit, fleet, seed) for unit in units]}
-        for name, rival in rivals.items():
-            out[law][name] = [_theirs(unit, rival, lives, seed) for unit in units]
+    For each method the quantiles of the remaining life over the life's length, None where there is
+    no number, beside the true one; and whether the forecast's check raised an alarm.
+    """
+    unit = simulate_unit(case.law, case.unit, read_noise(), case.seed)
+    lives, fleet = _fleet(case.law, case.fleet, case.censored, case.seed)
+    length = unit.end - unit.born
+    out: Record = {"true": [], "alarm": [], OURS: [], **{name: [] for name in RIVALS}}
+    for share in SHARES:
+        life, earlier = _lives_until(unit, share)
+        if len(life.age) < 2:
+            continue
+        own = learn_fleet([*lives, *earlier], fleet.scale, case.seed) if earlier else fleet
+        found = forecast(unit.name, "hours", life, own, (LIMIT,), case.seed)
+        (left,) = found.remaining
+        numbers = None if left.median is None else [left.low, left.median, left.high]
+        out["true"].append((unit.end - life.born - life.age[-1]) / length)
+        out["alarm"].append(bool(found.alarm))
+        out[OURS].append(None if numbers is None else (np.array(numbers) / length).tolist())
+        for name, rival in RIVALS.items():
+            guess = rival(life, [*lives, *earlier], LIMIT)
+            out[name].append(None if guess is None else (guess / length).tolist())
     return out
 
 
-def _lives(unit: Unit) -> list[Life]:
-    (found,) = lives_of(unit.entries, unit.events, unit.name, "hours").values()
-    return found
+@cache
+def _fleet(law: str, size: int, censored: bool, seed: int) -> tuple[list[Life], Fleet]:
+    """Lives of further units of a law, and what is learned from them."""
+    noise, lives = read_noise(), []
+    for number in range(size):
+        unit = simulate_unit(law, 10_000 + number, noise, seed)
+        share = np.random.default_rng((seed, number)).uniform(*CENSORED_SHARE) if censored else 1.0
+        life, earlier = _lives_until(unit, float(share))
+        lives += [item for item in (*earlier, life) if len(item.age) > 1]
+    scale = float(np.median([life.age[-1] for life in lives])) if lives else 1000.0
+    return lives, learn_fleet(lives, scale, seed)
 
 
-def _until(unit: Unit, share: float) -> Life:
-    """Return the last life as the history says it at a share of it."""
+def _lives_until(unit: WornUnit, share: float) -> tuple[Life, list[Life]]:
+    """Last life as the history has it at a share of it, and the earlier ones."""
     now = unit.born + share * (unit.end - unit.born)
     entries = [item for item in unit.entries if (item.usage.hours or 0.0) <= now]
-    (found,) = lives_of(entries, unit.events, unit.name, "hours").values()
-    return found[-1]
+    found = lives_of(entries, unit.events, unit.name, "hours").values()
+    none = np.empty(0)
+    lives = next(iter(found), [Life(0, none, none, none, 0.0)])
+    return lives[-1], lives[:-1]
 
 
-def _ours(unit: Unit, fleet: Fleet, seed: int) -> Score:
-    def guess(life: Life) -> Guess | None:
-        (left,) = forecast(unit.name, "hours", life, fleet, (LIMIT,), seed).remaining
-        if left.low is None or left.median is None or left.high is None:
-            return None
-        return Guess(left.low, left.median, left.high)
-
-    return _score(unit, [(_until(unit, share), guess) for share in SHARES])
+def _cases(options: Options) -> list[LifeCase]:
+    laws = SETS[options.laws]
+    return [
+        LifeCase(unit, laws[unit % len(laws)], options.fleet, options.censored, options.seed)
+        for unit in range(options.cases)
+    ]
 
 
-def _theirs(unit: Unit, rival: Rival, fleet: Sequence[Life], seed: int) -> Score:
-    rng = np.random.default_rng((seed, 1))
-
-    def guess(life: Life) -> Guess | None:
-        return rival(life, fleet, LIMIT, rng) if len(life.age) else None
-
-    return _score(unit, [(_until(unit, share), guess) for share in SHARES])
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--laws", choices=SETS, default="all", help="(%(default)s)")
+    parser.add_argument("--fleet", type=int, default=20, help="units of the fleet (%(default)d)")
+    parser.add_argument("--censored", action="store_true", help="taken out before the limit")
 
 
-def _score(unit: Unit, asked: Sequence[tuple[Life, object]]) -> Score:
-    whole = unit.end - unit.born
-    covered: list[bool | None] = []
-    errors, within = [], []
-    near = False
-    for share, (life, guess) in zip(SHARES, asked, strict=True):
-        assert callable(guess)
-        found = guess(life)
-        if found is None:
-            covered.append(None)
-            errors.append(1.0)
-            within.append(False)
-            continue
-        true = unit.end - life.born - life.age[-1]
-        covered.append(bool(found.low <= true <= found.high))
-        off = abs(found.median - true)
-        errors.append(min(off / whole, 1.0))
-        within.append(off <= ALPHA * whole)
-        near |= share == LAMBDA and off <= ALPHA * true
-    steady = 0
-    while steady < len(within) and within[-1 - steady]:
-        steady += 1
-    horizon = 1.0 - SHARES[-steady] if steady else 0.0
-    return Score(tuple(covered), float(np.mean(errors)), near, horizon)
+def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
+    fleet = f"{options.fleet}{' taken out early' if options.censored else ''}"
+    yield f"{options.cases} units, laws {options.laws}, seed {options.seed}, fleet of {fleet}\n"
+    heads = ("", "questions", "answered", "covered", "too late", "score", "alarms")
+    rows: list[tuple[str, ...]] = [("all", *_cells(records, OURS))]
+    for law in SETS[options.laws]:
+        part = [item for item in records if item["law"] == law]
+        rows += [(law, *_cells(part, OURS))] if part else []
+    for index, share in enumerate(SHARES):
+        rows.append((f"{share:.0%} of the life", *_cells(records, OURS, index)))
+    rows += [(name, *_cells(records, name)) for name in RIVALS]
+    yield from markdown(heads, rows)
+    yield ""
+    shown = ("rival", "its score less ours", "95 %", "questions that both answer")
+    yield from markdown(shown, ((name, *_paired(records, name)) for name in RIVALS))
 
 
-def _print(found: dict[str, dict[str, list[Score]]], given: argparse.Namespace) -> None:
-    print(f"{given.units} units, seed {given.seed}; fleet of {TRAINING} further units a law\n")
-    print("| law | method | numbers | coverage | coverage at λ | α-λ | horizon | error |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    methods = list(next(iter(found.values())))
-    whole = {name: [score for law in found.values() for score in law[name]] for name in methods}
-    for law, scores in (*found.items(), ("all", whole)):
-        for name in methods:
-            print(f"| {law} | {name} | {' | '.join(_cells(scores[name]))} |")
-    print("\nDifference of the units' mean, ours less the other's, with its 95 % interval:\n")
-    print("| law | other | coverage off 80 % | α-λ | horizon | error |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for law, scores in (*found.items(), ("all", whole)):
-        for name in methods[1:]:
-            cells = [_difference(scores, name, COVERAGE)]
-            cells += [_difference(scores, name, _mean_of(key)) for key in KEYS]
-            print(f"| {law} | {name} | {' | '.join(cells)} |")
+def _questions(
+    records: Sequence[Record], method: str, place: int | None = None
+) -> list[tuple[float, NDArray[np.float64] | None]]:
+    out = []
+    for record in records:
+        first = len(SHARES) - len(record["true"])
+        for index, (true, found) in enumerate(zip(record["true"], record[method], strict=True)):
+            if place in (None, index + first):
+                out.append((true, None if found is None else np.array(found)))
+    return out
 
 
-def _cells(scores: Sequence[Score]) -> tuple[str, ...]:
-    told = [item for score in scores for item in score.covered if item is not None]
-    at = [score.covered[SHARES.index(LAMBDA)] for score in scores]
-    halfway = [item for item in at if item is not None]
-    return (
-        f"{len(told) / (len(scores) * len(SHARES)):.1%}",
-        f"{np.mean(told):.1%}",
-        f"{np.mean(halfway):.1%}",
-        f"{np.mean([score.near for score in scores]):.1%}",
-        f"{np.mean([score.horizon for score in scores]):.3f}",
-        f"{np.mean([score.error for score in scores]):.4f}",
+def _cells(records: Sequence[Record], method: str, place: int | None = None) -> tuple[str, ...]:
+    asked = _questions(records, method, place)
+    given = [(true, found) for true, found in asked if found is not None]
+    if not given:
+        return (str(len(asked)), "0.0%", "–", "–", "–", "–")
+    covered = np.mean([found[0] <= true <= found[2] for true, found in given])
+    late = np.mean([true < found[0] for true, found in given])
+    score = np.mean([quantile_score(true, found) for true, found in given])
+    alarms = np.mean(
+        [
+            alarm
+            for record in records
+            for index, alarm in enumerate(record["alarm"], len(SHARES) - len(record["alarm"]))
+            if place in (None, index)
+        ]
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A figure of many units: numerator and denominator of each, and what their ratio tells."""
-
-    parts: Callable[[Sequence[Score]], Array]
-    told: Callable[[Array], Array]
-
-
-def _mean_of(key: str) -> Figure:
-    def mean(scores: Sequence[Score]) -> Array:
-        values = np.array([float(getattr(score, key)) for score in scores])
-        return np.column_stack([values, np.ones_like(values)])
-
-    return Figure(mean, lambda shares: shares)
-
-
-def _counts(scores: Sequence[Score]) -> Array:
-    return np.array(
-        [(sum(map(bool, item.covered)), len(item.covered) - item.covered.count(None))
-         for item in scores],
-        dtype=np.float64,
+    return (
+        str(len(asked)), f"{len(given) / len(asked):.1%}", f"{covered:.3f}", f"{late:.3f}",
+        f"{score:.4f}", f"{alarms:.1%}" if method == OURS else "–",
     )  # fmt: skip
 
 
-COVERAGE = Figure(_counts, lambda shares: np.abs(shares - NOMINAL))
-"""How far the share of intervals that hold the truth is from what they claim."""
+def quantile_score(true: float, found: NDArray[np.float64]) -> float:
+    """Continuous ranked probability score by three quantiles: twice their mean pinball loss."""
+    levels = np.array(QUANTILES)
+    return float(2.0 * np.mean(np.maximum(levels * (true - found), (levels - 1) * (true - found))))
 
 
-def _difference(scores: Mapping[str, Sequence[Score]], other: str, figure: Figure) -> str:
-    """Ours less the other's, with its 95 % interval by bootstrap over units."""
-    ours, theirs = (figure.parts(scores[name]) for name in (OURS, other))
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(len(ours), size=(BOOTSTRAPS, len(ours)))
+def _paired(records: Sequence[Record], rival: str) -> tuple[str, ...]:
+    """Mean difference of scores, and its interval by resampling units."""
+    each, number = [], 0
+    for record in records:
+        pairs = zip(_questions([record], OURS), _questions([record], rival), strict=True)
+        off = [
+            quantile_score(true, theirs) - quantile_score(true, ours)
+            for (true, ours), (_, theirs) in pairs
+            if ours is not None and theirs is not None
+        ]
+        number += len(off)
+        each += [off] if off else []
+    if not each:
+        return ("–", "–", "0")
+    sums, counts = np.array([sum(off) for off in each]), np.array([len(off) for off in each])
+    picks = np.random.default_rng(0).integers(0, len(each), (REPLICATES, len(each)))
+    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return (f"{sums.sum() / number:+.4f}", f"{low:+.4f} … {high:+.4f}", str(number))
 
-    def gap(chosen: NDArray[np.intp]) -> Array:
-        a, b = (figure.told(_ratio(part[chosen])) for part in (ours, theirs))
-        return a - b
 
-    found = float(gap(np.arange(len(ours))[None, :])[0])
-    low, high = np.quantile(gap(drawn), (0.025, 0.975))
-    return f"{found:+.3f} ({low:+.3f} … {high:+.3f})"
-
-
-def _ratio(parts: Array) -> Array:
-    sums: Array = parts.sum(axis=1)
-    return sums[:, 0] / np.maximum(sums[:, 1], 1.0)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+PROGNOSIS = Study(
+    "prognosis",
+    "Remaining life of simulated units that wear by laws unknown to the forecast, and rivals.",
+    _cases, perform, _report, add_options=_add_options, counted="units",
+)  # fmt: skip

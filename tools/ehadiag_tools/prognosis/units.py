@@ -1,85 +1,82 @@
-"""Simulated units that wear by three laws, diagnosed with the noise of real diagnoses."""
+"""Simulated units that wear by a law, diagnosed with the noise of real diagnoses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.history.records import Entry, Event, Severity, Source, Usage
-from ehadiag_tools.prognosis.noise import Noise
-
-__all__ = ["LAWS", "LIMIT", "Unit", "make_unit"]
+from ehadiag.estimate import Severity
+from ehadiag.history.records import Entry, MaintenanceEvent, SourceRecord, Usage
+from ehadiag.model.registry import FAULT_NAMES
+from ehadiag_tools.prognosis.laws import GRID_H, LAWS, LONGEST_H
 
 Array = NDArray[np.float64]
-GRID_H = 2.0
-LONGEST_H = 20_000.0
+TABLE = Path(__file__).with_name("noise.csv")
+"""Truth, estimate and stated deviation of 67 diagnoses of simulated tests."""
 LIMIT = 0.75
-CALM = 1.0 / 3000.0
-"""Growth of a steady unit, of the way to 1, per hour."""
+"""Severity at which a life ends, 1."""
 INTERVAL_H = (50.0, 150.0)
-"""Between two diagnoses."""
+"""Shortest and longest time between two diagnoses, h."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unit:
-    """One unit: what its history says, and when its severity truly reaches the limit."""
+class Noise:
+    """Diagnoses with known truth, of one severity; shape (diagnoses,) each."""
+
+    truth: NDArray[np.float64]
+    error: NDArray[np.float64]
+    std: NDArray[np.float64]
+
+    def draw(self, severity: float, rng: np.random.Generator) -> tuple[float, float]:
+        """Return error and stated deviation of a diagnosis near a severity: one of the table's."""
+        near = np.argsort(np.abs(self.truth - severity))[:12]
+        index = int(rng.choice(near))
+        return float(self.error[index] * rng.choice((-1.0, 1.0))), float(self.std[index])
+
+
+def read_noise() -> dict[str, Noise]:
+    """Read the table, by severity."""
+    with TABLE.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    out = {}
+    for name in FAULT_NAMES:
+        mine = [row for row in rows if row["severity"] == name]
+        truth, value, std = (
+            np.array([float(row[key]) for row in mine]) for key in ("truth", "estimate", "std")
+        )
+        out[name] = Noise(truth, value - truth, std)
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WornUnit:
+    """One unit: its history, and when its severity truly is at the limit.
+
+    Its last life lasts from `born` to `end`, hours.
+    """
 
     law: str
     name: str
-    """Of the severity."""
     entries: tuple[Entry, ...]
-    events: tuple[Event, ...]
+    events: tuple[MaintenanceEvent, ...]
     born: float
-    """Hours at which its last life began."""
     end: float
-    """Hours at which the severity reaches the limit in it."""
 
 
-def steady(rng: np.random.Generator) -> Array:
-    """Wiener process with drift; drifts differ by a lognormal factor."""
-    rate = CALM * 0.8 * np.exp(0.3 * rng.standard_normal())
-    steps = int(LONGEST_H / GRID_H)
-    growth = rate * GRID_H + 0.1 * np.sqrt(CALM * GRID_H) * rng.standard_normal(steps)
-    return np.cumsum(growth)
+def simulate_unit(law: str, serial: int, noise: dict[str, Noise], seed: int) -> WornUnit:
+    """Simulate a unit from new until a severity is at the limit in its last life.
 
-
-def speeding_up(rng: np.random.Generator) -> Array:
-    """Gamma process whose mean grows by the 1.5th power of the hours; scales differ."""
-    clock = np.diff((np.arange(LONGEST_H / GRID_H + 1) * GRID_H * CALM) ** 1.5)
-    spread = 0.12
-    rate = 0.6 * np.exp(0.25 * rng.standard_normal())
-    return np.cumsum(rng.gamma(clock / spread**2, rate * spread**2))
-
-
-def clogging(rng: np.random.Generator) -> Array:
-    """Growth in proportion to what is there, with a rate that wanders: none of the model's laws."""
-    rate = 1.5 * CALM * np.exp(0.2 * rng.standard_normal())
-    steps = int(LONGEST_H / GRID_H)
-    wander = 0.08 * np.sqrt(CALM * GRID_H) * rng.standard_normal(steps)
-    exponent = np.minimum(np.cumsum(rate * GRID_H + wander), 9.0)
-    return 0.1 * np.expm1(np.maximum.accumulate(exponent))
-
-
-LAWS: dict[str, tuple[str, Callable[[np.random.Generator], Array]]] = {
-    "steady": ("FSS", steady),
-    "speeding up": ("FDJ", speeding_up),
-    "clogging, filter changed": ("Kintas", clogging),
-}
-"""Severity and law."""
-
-
-def make_unit(law: str, serial: int, noise: dict[str, Noise], seed: int) -> Unit:
-    """Simulate a unit from new until a severity reaches the limit in its last life.
-
-    law: one of `LAWS`; units of the last one have their filter changed once or twice before.
+    Units with a filter have it changed once or twice before; half of the events do not name what
+    they renewed. Units of `gaps` miss a third of their life's diagnoses in a row.
     """
     rng = np.random.default_rng((seed, serial, list(LAWS).index(law)))
     name, path_of = LAWS[law]
     entries: list[Entry] = []
-    events: list[Event] = []
+    events: list[MaintenanceEvent] = []
     born = 0.0
     changes = int(rng.integers(1, 3)) if name == "Kintas" else 0
     for number in range(changes + 1):
@@ -87,14 +84,18 @@ def make_unit(law: str, serial: int, noise: dict[str, Noise], seed: int) -> Unit
         stop = rng.uniform(0.4, 0.7) if number < changes else LIMIT
         age = _crossing(path, stop)
         at = rng.uniform(*INTERVAL_H)
+        gap = rng.uniform(0.1, 0.6) * age if law == "gaps" else np.inf
         while at < age:
+            if gap < at < gap + age / 3.0:
+                at = gap + age / 3.0
+                continue
             entries.append(_entry(serial, name, born + at, _level(path, at), noise[name], rng))
             at += rng.uniform(*INTERVAL_H)
         if number < changes:
             born += age
             resets = ("Kintas",) if rng.random() < 0.5 else ()
             events.append(_event(serial, born, resets))
-    return Unit(law, name, tuple(entries), tuple(events), born, born + age)
+    return WornUnit(law, name, tuple(entries), tuple(events), born, born + age)
 
 
 def _crossing(path: Array, level: float) -> float:
@@ -116,14 +117,16 @@ def _entry(
 ) -> Entry:
     error, std = noise.draw(level, rng)
     value = min(max(level + error, 0.0), 1.0)
-    severity = Severity(name, value, std, value - 2 * std, value + 2 * std, False, True)
+    severity = Severity(
+        name=name, estimate=value, std=std, interval95=(value - 2 * std, value + 2 * std)
+    )
     return Entry(
         appended="", tested=None, actuator="reference-31", serial=serial, test="open",
-        verdict="HEALTHY", reasons=(), usage=Usage(hours), sources=(Source("", None, None),),
+        verdict="HEALTHY", reasons=(), usage=Usage(hours), sources=(SourceRecord("", None, None),),
         severities=(severity,), covariance=((std**2,),), effects=(), version="", simulated=True,
         result="{}",
     )  # fmt: skip
 
 
-def _event(serial: int, hours: float, resets: tuple[str, ...]) -> Event:
-    return Event("", "", serial, None, Usage(hours), "filter changed", resets)
+def _event(serial: int, hours: float, resets: tuple[str, ...]) -> MaintenanceEvent:
+    return MaintenanceEvent("", "", serial, None, Usage(hours), "filter changed", resets)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ehadiag.core.toml_file import decode_toml
-from firmware_iface.mapping.bus_map import BusMap, resolve
-from firmware_iface.mapping.dbc import parse_dbc
-from firmware_iface.mapping.file import MappingFile
-
-__all__ = ["BUSES", "ForeignBus"]
+from firmware_iface.bus_map import BusMap, resolve
+from firmware_iface.dbc import parse_dbc
+from firmware_iface.files import decode_toml
+from firmware_iface.mapping_file import MappingFile
 
 TICK_MS = 1.0
 
@@ -99,41 +97,12 @@ class ForeignBus:
 
 
 FRAME_FORMATS = (
-    "StandardCAN",
-    "ExtendedCAN",
-    *("reserved",) * 12,
-    "StandardCAN_FD",
-    "ExtendedCAN_FD",
-)
+    "StandardCAN", "ExtendedCAN", *("reserved",) * 12, "StandardCAN_FD", "ExtendedCAN_FD"
+)  # fmt: skip
 
 
 def _name(signal: Signal) -> str:
     return "".join(part.capitalize() for part in signal.role.replace(".", "_").split("_"))
-
-
-def _both_commands(*, big_endian: bool = False) -> tuple[Signal, ...]:
-    starts = (7, 23, 39) if big_endian else (0, 16, 32)
-    return (
-        Signal("command.position", starts[0], 16, 0.002, "mm", big_endian),
-        Signal("command.current", starts[1], 16, 0.0005, "mA", big_endian),
-        Signal("command.mode", starts[2], 8, 1, "", big_endian, signed=False),
-    )
-
-
-def _environment(can_id: int, *, extended: bool = False, unit: str = "bar") -> Message:
-    scale = 0.01 if unit == "bar" else 0.1
-    return Message(
-        can_id,
-        6,
-        (
-            Signal("environment.supply_pressure", 0, 16, scale, unit, signed=False),
-            Signal("environment.return_pressure", 16, 16, scale, unit, signed=False),
-            Signal("environment.oil_temperature", 32, 16, 0.1, "K", signed=False),
-        ),
-        every=100,
-        at=0.1,
-        extended=extended,
-    )
 
 
 CURRENT, SPOOL, POSITION = (24 / 4096, 1 / 4096, 120 / 4096)
@@ -141,100 +110,92 @@ CURRENT, SPOOL, POSITION = (24 / 4096, 1 / 4096, 120 / 4096)
 PRESSURE = 50 / 4096
 """MPa."""
 
-_FOUR = (
-    Signal("channels.current", 0, 16, CURRENT, "mA"),
-    Signal("channels.spool", 16, 16, SPOOL, "mm"),
-    Signal("channels.pressure", 32, 16, PRESSURE, "MPa"),
-    Signal("channels.position", 48, 16, POSITION, "mm"),
-)
+
+def _signals(text: str, *, big_endian: bool = False) -> tuple[Signal, ...]:
+    """Signals of lines `role start bits step unit`; unsigned where there is a + behind the bits."""
+    out = []
+    for line in text.strip().splitlines():
+        role, start, bits, step, *unit = line.split()
+        signed, size = not bits.endswith("+"), int(bits.rstrip("+"))
+        name = "".join(unit)
+        out.append(Signal(role, int(start), size, float(step), name, big_endian, signed=signed))
+    return tuple(out)
+
+
+def _environment(can_id: int, unit: str = "bar", step: float = 0.01, **kind: bool) -> Message:
+    text = f"""environment.supply_pressure 0 16+ {step} {unit}
+        environment.return_pressure 16 16+ {step} {unit}
+        environment.oil_temperature 32 16+ 0.1 K"""
+    return Message(can_id, 6, _signals(text), every=100, at=0.1, **kind)
+
+
+COMMAND = """command.position 0 16 0.002 mm
+    command.current 16 16 0.0005 mA
+    command.mode 32 8+ 1"""
+SAMPLE = f"""channels.current 0 16 {CURRENT} mA
+    channels.spool 16 16 {SPOOL} mm
+    channels.pressure 32 16 {PRESSURE} MPa
+    channels.position 48 16 {POSITION} mm"""
+
+
+def _psi29() -> ForeignBus:
+    command = """command.position 7 16 0.002 mm
+        command.current 23 16 0.0005 mA
+        command.mode 39 8+ 1"""
+    valve = """channels.current 7 16 0.0005 mA
+        channels.spool 23 16 0.00002 mm"""
+    jack = """channels.pressure 7 16 0.12 psi
+        channels.position 23 16 0.002 mm"""
+    first, texts = 0x18FF0101, {"Command": (5, command, 0.3), "Valve": (4, valve, 0.5)}
+    texts["Jack"] = (4, jack, 0.63)
+    messages = {
+        name: Message(first + k, size, _signals(text, big_endian=True), at=at, extended=True)
+        for k, (name, (size, text, at)) in enumerate(texts.items())
+    }
+    messages["Oil"] = _environment(first + 3, "psi", 0.1, extended=True)
+    about = "29-bit identifiers, big-endian, psi, the sample in two messages"
+    return ForeignBus("psi29", about, messages)
+
+
+def _single() -> ForeignBus:
+    messages = {}
+    for k, line in enumerate(SAMPLE.splitlines()):
+        role, _, *rest = line.split()
+        name, every = role.partition(".")[2], 2 if "position" in role else 1
+        signals = _signals(" ".join((role, "0", *rest)))
+        at = (5 + k) / 10
+        messages[name.capitalize()] = Message(0x301 + k, 2, signals, every=every, at=at)
+    messages["Command"] = Message(0x305, 5, _signals(COMMAND), every=2, at=0.3)
+    messages["Oil"] = _environment(0x306)
+    about = "one channel a message; position and command each second tick"
+    return ForeignBus("single", about, messages)
+
+
+def _canfd() -> ForeignBus:
+    lines = [line.split() for line in f"{SAMPLE}\n{COMMAND}".splitlines()]
+    text = "\n".join(
+        f"{role} {32 * k} 32 1e-6 {unit}" for k, (role, *_, unit) in enumerate(lines[:6])
+    )
+    signals = _signals(f"{text}\ncommand.mode 192 8+ 1")
+    messages = {"Everything": Message(0x410, 48, signals, fd=True), "Oil": _environment(0x411)}
+    return ForeignBus("canfd", "CAN FD, command and sample in one message of micro-units", messages)
+
+
+STATE = """status.state 0 8+ 1
+    status.test_id 8 8+ 1
+    status.elapsed 16 16+ 0.001 s
+    status.serial 32 16+ 1"""
 
 BUSES: tuple[ForeignBus, ...] = (
-    ForeignBus(
-        "psi29",
-        "29-bit identifiers, big-endian, psi, the sample in two messages",
-        {
-            "Command": Message(
-                0x18FF0101, 5, _both_commands(big_endian=True), at=0.3, extended=True
-            ),
-            "Valve": Message(
-                0x18FF0102,
-                4,
-                (
-                    Signal("channels.current", 7, 16, 0.0005, "mA", big_endian=True),
-                    Signal("channels.spool", 23, 16, 0.00002, "mm", big_endian=True),
-                ),
-                at=0.5,
-                extended=True,
-            ),
-            "Jack": Message(
-                0x18FF0103,
-                4,
-                (
-                    Signal("channels.pressure", 7, 16, 0.12, "psi", big_endian=True),
-                    Signal("channels.position", 23, 16, 0.002, "mm", big_endian=True),
-                ),
-                at=0.63,
-                extended=True,
-            ),
-            "Oil": _environment(0x18FF0104, extended=True, unit="psi"),
-        },
-    ),
-    ForeignBus(
-        "single",
-        "one channel a message; position and command each second tick",
-        {
-            "Current": Message(
-                0x301, 2, (Signal("channels.current", 0, 16, CURRENT, "mA"),), at=0.5
-            ),
-            "Spool": Message(0x302, 2, (Signal("channels.spool", 0, 16, SPOOL, "mm"),), at=0.6),
-            "Pressure": Message(
-                0x303, 2, (Signal("channels.pressure", 0, 16, PRESSURE, "MPa"),), at=0.7
-            ),
-            "Position": Message(
-                0x304, 2, (Signal("channels.position", 0, 16, POSITION, "mm"),), every=2, at=0.8
-            ),
-            "Command": Message(0x305, 5, _both_commands(), every=2, at=0.3),
-            "Oil": _environment(0x306),
-        },
-    ),
-    ForeignBus(
-        "canfd",
-        "CAN FD, command and sample in one message of micro-units",
-        {
-            "Everything": Message(
-                0x410,
-                48,
-                (
-                    Signal("channels.current", 0, 32, 1e-6, "mA"),
-                    Signal("channels.spool", 32, 32, 1e-6, "mm"),
-                    Signal("channels.pressure", 64, 32, 1e-6, "MPa"),
-                    Signal("channels.position", 96, 32, 1e-6, "mm"),
-                    Signal("command.position", 128, 32, 1e-6, "mm"),
-                    Signal("command.current", 160, 32, 1e-6, "mA"),
-                    Signal("command.mode", 192, 8, 1, "", signed=False),
-                ),
-                fd=True,
-            ),
-            "Oil": _environment(0x411),
-        },
-    ),
+    _psi29(),
+    _single(),
+    _canfd(),
     ForeignBus(
         "status",
         "the sample and the state of the test, no command",
         {
-            "Sample": Message(0x210, 8, _FOUR),
-            "State": Message(
-                0x211,
-                6,
-                (
-                    Signal("status.state", 0, 8, 1, "", signed=False),
-                    Signal("status.test_id", 8, 8, 1, "", signed=False),
-                    Signal("status.elapsed", 16, 16, 0.001, "s", signed=False),
-                    Signal("status.serial", 32, 16, 1, "", signed=False),
-                ),
-                every=20,
-                at=0.05,
-            ),
+            "Sample": Message(0x210, 8, _signals(SAMPLE)),
+            "State": Message(0x211, 6, _signals(STATE), every=20, at=0.05),
             "Oil": _environment(0x212),
         },
     ),
@@ -242,8 +203,8 @@ BUSES: tuple[ForeignBus, ...] = (
         "command",
         "the sample and the command, nothing that names the test",
         {
-            "Command": Message(0x110, 5, _both_commands(), at=0.4),
-            "Sample": Message(0x111, 8, _FOUR, at=0.53),
+            "Command": Message(0x110, 5, _signals(COMMAND), at=0.4),
+            "Sample": Message(0x111, 8, _signals(SAMPLE), at=0.53),
             "Oil": _environment(0x112),
         },
     ),

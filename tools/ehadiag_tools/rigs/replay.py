@@ -1,62 +1,53 @@
-"""Diagnoses a recording that was played again on a foreign bus, and compares with the truth."""
+"""Study of recordings played again on foreign buses, beside the default one."""
 
 from __future__ import annotations
 
+import argparse
+import itertools
 import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
-from ehadiag.core.errors import EhadiagError
-from ehadiag.core.find_test import Sought
-from ehadiag.core.recording import Recording, Samples
-from ehadiag.core.stored_test import StoredTest, bundled_tests
-from ehadiag.model.parameters import FAULT_NAMES
+from ehadiag.model.registry import FAULT_NAMES
+from ehadiag_tools.accuracy.figures import holds_truth, outcome, percent_errors
 from ehadiag_tools.rigs.buses import BUSES, ForeignBus
 from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, logged, played
-from firmware_iface.alignment.windows import recordings_of
-from firmware_iface.logs.any_recording import Meaning, recorded_tests
-from firmware_iface.logs.reader import choose, read_recording
-from firmware_iface.mapping.bus_map import default_map
-
-__all__ = ["DAQ", "DEFAULT", "Replay", "as_sent", "on_bus", "on_daq", "perform_replay"]
+from ehadiag_tools.simulator.compare_logs import read_rows
+from ehadiag_tools.study import Options, Record, Study, markdown
+from firmware_iface.alignment.align import windowed_recordings
+from firmware_iface.bus_map import default_map
+from firmware_iface.errors import EhadiagError
+from firmware_iface.find_test import CandidateTests
+from firmware_iface.logs.reader import choose_recording, read_recording
+from firmware_iface.recording import Recording, Samples
+from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.stored_test import StoredTest, bundled_tests
 
 DAQ = "daq"
-"""Decoded signals."""
+"""Name of the decoded signals."""
 DEFAULT = "default"
-"""The recording as it is."""
+"""Name of the recording as it is."""
+NAMES = (*(item.name for item in BUSES), DAQ)
 
 
 @dataclass(frozen=True, slots=True)
-class Replay:
-    """Settings of one diagnosis; what it gives depends on nothing else but code and files.
+class BusReplay:
+    """One diagnosis of a recording on the default bus, played on another, with its true severities.
 
-    Attributes
-    ----------
-    recording : str
-        Path of a recording on the default bus.
-    severities : tuple[float, float, float]
-        Truth, in the order of `FAULT_NAMES`.
-    actuator : str
-        Path of the unit's file; empty for the reference actuator.
-    bus : str
-        Name of one of `BUSES`, `DAQ` or `DEFAULT`.
-    how : Disturbance
-        Of the time stamps.
-    rate : float
-        Of the decoded signals, Hz.
-    seed : int
-        Of the delays.
+    Actuator: path of a file, empty for the reference one. Rate: of the decoded signals, Hz.
     """
 
     recording: str
-    severities: tuple[float, float, float]
+    faults: tuple[float, float, float]
     actuator: str
     bus: str
     how: Disturbance
@@ -64,44 +55,24 @@ class Replay:
     seed: int
 
 
-def perform_replay(run: Replay) -> dict[str, Any]:
-    """Play, read, diagnose: verdict, largest error (fraction of 1), intervals that hold, why."""
-    actuator, recording = _actuator(run.actuator), read_recording(Path(run.recording))
+def perform(case: BusReplay) -> Record:
+    """Play, read, diagnose: verdict, estimates, why."""
+    actuator, recording = _actuator(case.actuator), read_recording(Path(case.recording))
     try:
-        return _compared(diagnose([_played(run, recording, actuator)], actuator, _tests()), run)
+        found = diagnose([_played(case, recording, actuator)], actuator, _tests())
     except EhadiagError as error:
-        return {"verdict": "error", "error": None, "covered": [], "why": str(error), "notes": []}
+        return outcome(error)
+    return outcome(found)
 
 
-def _compared(result: Diagnosis, run: Replay) -> dict[str, Any]:
-    out: dict[str, Any] = {
-        "verdict": result.verdict.name,
-        "error": None,
-        "covered": [],
-        "why": "; ".join(result.reasons),
-        "notes": [note for item in result.recordings for note in item.quality.notes],
-    }
-    if result.identification is not None:
-        found = {item.name: item for item in result.identification.estimates}
-        pairs = [
-            (found[name], value) for name, value in zip(FAULT_NAMES, run.severities, strict=True)
-        ]
-        out["error"] = max(abs(item.value - value) for item, value in pairs)
-        out["covered"] = [
-            bool(item.interval95[0] <= value <= item.interval95[1]) for item, value in pairs
-        ]
-        out["found"] = [[item.value, item.std] for item, _ in pairs]
-    return out
-
-
-def _played(run: Replay, recording: Recording, actuator: Actuator) -> Recording:
-    if run.bus == DEFAULT:
+def _played(case: BusReplay, recording: Recording, actuator: Actuator) -> Recording:
+    if case.bus == DEFAULT:
         return recording
     test = next(item for item in _tests() if item.id == recording.test_id)
-    if run.bus == DAQ:
-        return on_daq(recording, test, run.how, actuator, run.seed, run.rate)
-    bus = next(item for item in BUSES if item.name == run.bus)
-    return on_bus(bus, recording, test, run.how, actuator, run.seed)
+    if case.bus == DAQ:
+        return on_daq(recording, test, case.how, actuator, case.seed, case.rate)
+    bus = next(item for item in BUSES if item.name == case.bus)
+    return on_bus(bus, recording, test, case.how, actuator, case.seed)
 
 
 @cache
@@ -125,9 +96,11 @@ def on_bus(
     """Play a recording on a bus, and read it there as a log of that bus is read."""
     this = played(_samples_of(recording), as_sent(test), how.lead_in_s)
     table, bus_map = frames_on(bus, recording, this, how, seed)
-    sought = Sought(_tests(), actuator.controller)
+    candidates = CandidateTests(_tests(), actuator.controller)
     name = f"{Path(recording.source).stem} on {bus.name}"
-    return choose(recordings_of([table], bus_map, name, len(table) + 1, sought=sought))
+    return choose_recording(
+        windowed_recordings([table], bus_map, name, len(table) + 1, candidates=candidates)
+    )
 
 
 def on_daq(
@@ -139,19 +112,19 @@ def on_daq(
     rate: float,
 ) -> Recording:
     """Write a recording as a decoded CSV at a rate (Hz), and read it as `diagnose` does."""
-    import pandas  # noqa: PLC0415 - optional, and slow
-
     samples = _samples_of(recording)
     this = played(samples, as_sent(test), how.lead_in_s)
     columns = logged(this, how, rate, samples.period_ns, seed)
-    known = recording.environment
+    around = recording.environment
     for name in ("supply_pressure", "return_pressure", "oil_temperature"):
-        columns[name] = np.full(len(columns["time"]), getattr(known, name))
-    sought = Sought(_tests(), actuator.controller)
+        columns[name] = np.full(len(columns["time"]), getattr(around, name))
+    candidates = CandidateTests(_tests(), actuator.controller)
     with tempfile.TemporaryDirectory(prefix="ehadiag-") as folder:
         path = Path(folder) / f"{Path(recording.source).stem}.csv"
         pandas.DataFrame(columns).to_csv(path, index=False, float_format="%.9g")
-        return choose(recorded_tests([path], Meaning(default_map(), None, sought)))
+        return choose_recording(
+            recorded_tests([path], Interpretation(default_map(), None, candidates))
+        )
 
 
 def _samples_of(recording: Recording) -> Samples:
@@ -164,3 +137,94 @@ def as_sent(test: StoredTest) -> NDArray[np.float64]:
     """Command of a test as the default bus's frames carry it, A or m."""
     step = 2e-6 if test.closed_loop else 0.5e-6
     return np.asarray(np.round(test.command() / step) * step)
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("folder", type=Path, nargs="+", help="recordings on the default bus, and truth.csv with"
+        " the columns file, Kintas, FSS, FDJ, and unit for units that are calibrated")  # fmt: skip
+    add("--calibrated", type=Path, metavar="FOLDER", help="of actuator files X.toml of the units,"
+        " made by `ehadiag calibrate`; recordings X-new-… are left out")  # fmt: skip
+    add("--only", action="append", metavar="NAME", help="one recording, by name")
+    add("--bus", action="append", choices=NAMES, help="may be repeated (all)")
+    add("--jitter", action="append", type=float, metavar="MS", help="half-normal (0 0.2 0.5 1)")
+    add("--lead-in", type=float, metavar="S", help="instead of one drawn from 0 … 10 s for each")
+    add("--drift", type=float, default=100.0, help="ppm (%(default)g)")
+    add("--batch", type=float, default=0.0, help="ms (%(default)g)")
+    add("--lost", type=float, default=0.0, help="share of the frames")
+    add("--unordered", action="store_true", help="log sorted by its stamps")
+    add("--rate", type=float, default=2000.0, help="of the decoded signals, Hz (%(default)g)")
+
+
+def _cases(options: Options) -> list[BusReplay]:
+    """Those of the default bus, then the others in any order: a part of them is a sample."""
+    usual = [case for folder in options.folder for case in _usual_cases(folder, options)]
+    others = [case for item in usual for case in _foreign_cases(item, options)]
+    order = np.random.default_rng(options.seed).permutation(len(others)).tolist()
+    return (usual + [others[place] for place in order])[: options.cases]
+
+
+def _usual_cases(folder: Path, options: Options) -> Iterator[BusReplay]:
+    """Recordings of a folder as they are; without those of units that are not calibrated."""
+    for row in read_rows(folder / "truth.csv"):
+        path, actuator = folder / row["file"], ""
+        if options.only and path.stem not in options.only:
+            continue
+        if row.get("unit"):
+            unit = options.calibrated / f"{row['unit']}.toml" if options.calibrated else None
+            if unit is None or not unit.is_file() or "-new-" in path.name:
+                continue
+            actuator = str(unit)
+        a, b, c = (float(row[name]) for name in FAULT_NAMES)
+        how = Disturbance()
+        yield BusReplay(str(path), (a, b, c), actuator, DEFAULT, how, options.rate, options.seed)
+
+
+def _foreign_cases(case: BusReplay, options: Options) -> Iterator[BusReplay]:
+    """One recording on each bus with each jitter."""
+    name = [*Path(case.recording).stem.encode()]
+    jitters = options.jitter or (0.0, 0.2, 0.5, 1.0)
+    for bus, jitter in itertools.product(options.bus or NAMES, jitters):
+        rng = np.random.default_rng([options.seed, *name, *bus.encode(), round(1e3 * jitter)])
+        drawn = round(float(rng.uniform(0.0, 10.0)), 3)
+        lead_in = drawn if options.lead_in is None else options.lead_in
+        ordered = not options.unordered
+        how = Disturbance(jitter, lead_in, options.drift, options.batch, options.lost, kept=ordered)
+        seed = int(rng.integers(1 << 31))
+        yield BusReplay(case.recording, case.faults, case.actuator, bus, how, case.rate, seed)
+
+
+def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
+    """One line for each bus and jitter; errors and coverage are of what has a verdict."""
+    usual = {item["recording"]: item["verdict"] for item in records if item["bus"] == DEFAULT}
+    groups: dict[tuple[str, float], list[Record]] = {}
+    for item in records:
+        groups.setdefault((item["bus"], item["how"]["jitter_ms"]), []).append(item)
+    order = sorted(groups, key=lambda key: ((DEFAULT, *NAMES).index(key[0]), key[1]))
+    yield from markdown(
+        ("bus", "jitter", "verdicts", "wrong", "mean", "largest", "intervals that hold"),
+        ((bus, f"{jitter:g} ms", *_cells(groups[bus, jitter], usual)) for bus, jitter in order),
+    )
+
+
+def _cells(records: Sequence[Record], usual: dict[str, str]) -> list[str]:
+    """Verdicts that agree with the default bus, wrong ones, mean and largest error, coverage."""
+    stated = [
+        item for item in records if item["verdict"] != Verdict.NOT_TESTED.name and item["value"]
+    ]
+    same = sum(item["verdict"] == usual[item["recording"]] for item in records)
+    wrong = sum(item["verdict"] != usual[item["recording"]] for item in stated)
+    counts = [f"{same} of {len(records)}", str(wrong)]
+    if not stated:
+        return [*counts, "", "", "0 of 0"]
+    largest, held = np.abs(percent_errors(stated)).max(axis=1), holds_truth(stated)
+    sizes = [f"{largest.mean():.3f} %", f"{largest.max():.3f} %"]
+    return [*counts, *sizes, f"{held.sum()} of {held.size}"]
+
+
+FOREIGN_BUSES = Study(
+    "foreign-buses",
+    "Recordings played again on foreign buses: verdicts and errors beside the default bus.",
+    _cases, perform, _report, _options, count=100_000,
+    counted="those on the default bus, then a sample of the others",
+)  # fmt: skip

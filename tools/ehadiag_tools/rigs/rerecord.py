@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.recording import BitState, CommandMode, Recording, Samples
 from ehadiag_tools.rigs.buses import ForeignBus
-from firmware_iface.codec.encode import Encoder
-from firmware_iface.mapping.bus_map import BusMap, default_map
+from firmware_iface.bus_map import BusMap, default_map
+from firmware_iface.codec import Encoder
+from firmware_iface.recording import CHANNELS, BitState, CommandMode, Recording, Samples
 from firmware_iface.transport.frames import Frame, FrameTable
-
-__all__ = ["Disturbance", "Played", "frames_on", "logged", "played"]
 
 START_NS = 1_700_000_000_000_000_000
 REST_S = 0.15
@@ -26,21 +23,9 @@ REST_S = 0.15
 class Disturbance:
     """What the bus, its adapter and the host's clock do to the time stamps.
 
-    Attributes
-    ----------
-    jitter_ms : float
-        Deviation of a half-normal delay of each frame; a message's frames keep their order.
-    lead_in_s : float
-        Idle time before the test.
-    drift_ppm : float
-        Rate by which the host's clock is fast.
-    batch_ms : float
-        Period at whose end an adapter stamps all that came; 0: each frame alone.
-    lost : float
-        Share of the frames that are lost.
-    kept : bool
-        Whether the log keeps the order of arrival; False: it is sorted by the stamps, which
-        then are each late by themselves.
+    `jitter_ms`: deviation of a half-normal delay of each frame; `batch_ms`: period at whose end an
+    adapter stamps all that came, 0: each frame alone; `lost`: share of the frames; `kept`: the log
+    keeps the order of arrival, otherwise it is sorted by stamps that are each late by themselves.
     """
 
     jitter_ms: float = 0.0
@@ -53,20 +38,10 @@ class Disturbance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """A recording with idle time about it.
+    """A recording with idle time before `begin` and from `end` on, ticks.
 
-    Attributes
-    ----------
-    channels : NDArray[np.float64]
-        Current, spool, pressure, position, SI, NaN where lost, shape (4, ticks).
-    command : NDArray[np.float64]
-        A or m, shape (ticks,).
-    mode : CommandMode
-        What the command is.
-    begin : int
-        First tick of the test.
-    end : int
-        One past its last tick.
+    Channels: current, spool, pressure, position, SI, NaN where lost, shape (4, ticks); commands in
+    A or m, shape (ticks,).
     """
 
     channels: NDArray[np.float64]
@@ -189,23 +164,8 @@ def logged(
 ) -> dict[str, NDArray[np.float64]]:
     """What a data-acquisition system with a clock of its own writes of the bus's values.
 
-    Parameters
-    ----------
-    this : Played
-        The recording.
-    how : Disturbance
-        Of the frames on their way to it; its clock is fast by the drift.
-    rate : float
-        Hz.
-    tick_ns : int
-        Control period, ns.
-    seed : int
-        Of the delays.
-
-    Returns
-    -------
-    dict[str, NDArray[np.float64]]
-        Columns: time in s, channels and command in SI, each value held until the next comes.
+    Its clock is fast by the drift, its rate in Hz. Columns: time in s, channels and command in SI,
+    each value held until the next comes.
     """
     rng = np.random.default_rng(seed)
     ticks = this.channels.shape[1]

@@ -1,43 +1,52 @@
-"""Simulator against recordings with known faults: residuals per file and channel, in LSB.
+"""Simulator against recordings with known faults: a study, and the replay that it is made of.
 
-Where `truth-effects.csv` lies beside `truth.csv` the units have those effects besides; units of
-`truth.csv` that it does not name are left out.
+Free-running loops with different noise part ways, so in closed loop the control law of the replay
+gets the *recorded* (digitised) jack position. What was not recorded follows from the next current.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import copy
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.errors import ConfigurationError, EhadiagError, InputOutputError
-from ehadiag.core.recording import Environment, Samples
-from ehadiag.core.stored_test import StoredTest, resolve_test
-from ehadiag_sim.plant.conditions import Effects, Faults, Sensors
-from ehadiag_sim.plant.dynamics import DEFAULT_STEP
-from ehadiag_sim.plant.simulator import bus_command
-from ehadiag_tools.simulator.recorded_units import read_rows, read_units
-from ehadiag_tools.simulator.replay import replay
+from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag_sim.conditions import DataErrors, Effects, Faults, Sensors
+from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S, PlantDynamics
+from ehadiag_sim.plant_laws import PositionController
+from ehadiag_sim.sensing import SimulatedConverters
+from ehadiag_sim.simulation import bus_command
 from ehadiag_tools.simulator.units import Unit
+from ehadiag_tools.study import Options, Record, Study, markdown
+from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.logs.reader import read_recording
-
-__all__ = ["main"]
+from firmware_iface.recording import (
+    CHANNELS,
+    CURRENT_CHANNEL,
+    POSITION_CHANNEL,
+    CommandMode,
+    Environment,
+    Samples,
+)
+from firmware_iface.stored_test import resolve_test
 
 EFFECTS = "truth-effects.csv"
-FLOOR = float(np.sqrt(0.5**2 + 1.0 / 12.0))
-"""LSB rms of a perfect simulator: electrical noise and quantisation."""
+NEIGHBOURS = 4
+"""Codes on either side of the simulated position that a missing sample may have had, 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """One row of truth.csv."""
+    """One row of truth.csv: file, stored test, severities, unit."""
 
     file: str
     test: str
@@ -45,63 +54,73 @@ class Truth:
     unit: str = ""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table; exit code 0, or that of the error."""
-    parser = argparse.ArgumentParser(prog="compare_logs", description=__doc__)
-    parser.add_argument("folder", type=Path, help="recordings and their truth.csv")
-    parser.add_argument("--actuator", type=Path, help="actuator file (default: the bundled one)")
-    parser.add_argument(
-        "--step", type=float, default=DEFAULT_STEP * 1e6, help="integration step, µs (%(default)g)"
+@dataclass(frozen=True, slots=True)
+class RecordedCase:
+    """Folder and file of a recording, and whether commands are exact."""
+
+    folder: str
+    file: str
+    exact_command: bool
+
+
+def _options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("folder", type=Path, help="recordings and their truth.csv; where truth-effects.csv lies"
+        " beside it the units have those effects, others are left out")  # fmt: skip
+    add("--exact-command", action="store_true",
+        help="do not round the command to the bus's resolution")  # fmt: skip
+
+
+def _cases(options: Options) -> list[RecordedCase]:
+    rows = read_truth(options.folder / "truth.csv")
+    units = _units(options.folder)
+    return [
+        RecordedCase(str(options.folder), row.file, options.exact_command)
+        for row in rows
+        if row.unit in units
+    ]
+
+
+def _units(folder: Path) -> dict[str, Unit]:
+    if (folder / EFFECTS).exists():
+        return read_units(folder / EFFECTS, default_actuator())
+    return {row.unit: Unit() for row in read_truth(folder / "truth.csv")}
+
+
+def perform(case: RecordedCase) -> Record:
+    """Replay one recording on the simulator; residuals in LSB."""
+    folder = Path(case.folder)
+    row = next(item for item in read_truth(folder / "truth.csv") if item.file == case.file)
+    recording = read_recording(folder / row.file)
+    if recording.samples is None:
+        raise InputOutputError(f"log {row.file}: no telemetry of a test in it")
+    test, unit = resolve_test(row.test), _units(folder)[row.unit]
+    command = test.command() if case.exact_command else bus_command(test)
+    if recording.samples.ticks != test.ticks:
+        raise InputOutputError(f"log {row.file}: not as long as test {test.name!r}")
+    effects = effects_of(recording.environment, unit.effects)
+    gap = residuals(
+        unit.actuator, recording.samples, command, row.faults, effects, DEFAULT_STEP_S, unit.sensors
     )
-    parser.add_argument(
-        "--exact-command",
-        action="store_true",
-        help="do not round the command to the bus's resolution, to show what that does",
-    )
-    options = parser.parse_args(argv)
-    try:
-        actuator = load_actuator(options.actuator) if options.actuator else default_actuator()
-        rows = read_truth(options.folder / "truth.csv")
-        units = {"": Unit(actuator)}
-        if (options.folder / EFFECTS).exists():
-            units = read_units(options.folder / EFFECTS, actuator)
-            rows = [row for row in rows if row.unit in units]
-        print(f"Residual recording - simulator, LSB rms (largest); noise floor {FLOOR:.3f}\n")
-        print("| file | samples | " + " | ".join(channel.name for channel in CHANNELS) + " |")
-        print("| --- | --- |" + " --- |" * len(CHANNELS))
-        for row in rows:
-            recording = read_recording(options.folder / row.file)
-            if recording.samples is None:
-                raise InputOutputError(f"log {row.file}: no telemetry of a test in it")
-            test = resolve_test(row.test)
-            command = test.command() if options.exact_command else bus_command(test)
-            unit = units[row.unit]
-            gap = residuals(
-                unit.actuator,
-                recording.samples,
-                _fitting(row.file, test, recording.samples, command),
-                row.faults,
-                effects_of(recording.environment, unit.effects),
-                options.step * 1e-6,
-                unit.sensors,
-            )
-            good = np.isfinite(gap).all(axis=0)
-            cells = [f"{_rms(part):.3f} ({np.abs(part).max():.1f})" for part in gap[:, good]]
-            print(f"| {row.file} | {good.sum()} | {' | '.join(cells)} |", flush=True)
-    except EhadiagError as error:
-        print(f"compare_logs: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+    good = np.isfinite(gap).all(axis=0)
+    rms = np.sqrt(np.mean(gap[:, good] ** 2, axis=1))
+    largest = np.abs(gap[:, good]).max(axis=1)
+    return {"samples": int(good.sum()), "rms": rms.tolist(), "largest": largest.tolist()}
+
+
+def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
+    floor = np.sqrt(Sensors().noise_lsb ** 2 + 1.0 / 12.0)
+    yield f"Residual recording - simulator, LSB rms (largest); noise floor {floor:.3f}\n"
+    rows = []
+    for item in records:
+        pairs = zip(item["rms"], item["largest"], strict=True)
+        cells = [f"{rms:.3f} ({largest:.1f})" for rms, largest in pairs]
+        rows.append((item["file"], item["samples"], *cells))
+    yield from markdown(("file", "samples", *(channel.name for channel in CHANNELS)), rows)
 
 
 def read_truth(path: Path) -> list[Truth]:
-    """Read file names, tests and severities.
-
-    Raises
-    ------
-    InputOutputError: no such file.
-    ConfigurationError: a column is missing, a value is not a number from 0 to 1.
-    """
+    """Read file names, tests and severities of truth.csv."""
     found = []
     for number, row in enumerate(read_rows(path), start=2):
         try:
@@ -118,14 +137,14 @@ def effects_of(environment: Environment, effects: Effects | None = None) -> Effe
     """Effects under the oil and pressures of a recording; as they are where the bus did not say."""
     default = effects or Effects()
 
-    def known(value: float | None, otherwise: float) -> float:
+    def value_of(value: float | None, otherwise: float) -> float:
         return otherwise if value is None else value
 
     return replace(
         default,
-        oil_temperature=known(environment.oil_temperature, default.oil_temperature),
-        supply_pressure=known(environment.supply_pressure, default.supply_pressure),
-        return_pressure=known(environment.return_pressure, default.return_pressure),
+        oil_temperature=value_of(environment.oil_temperature, default.oil_temperature),
+        supply_pressure=value_of(environment.supply_pressure, default.supply_pressure),
+        return_pressure=value_of(environment.return_pressure, default.return_pressure),
     )
 
 
@@ -145,19 +164,130 @@ def residuals(
     return gap
 
 
-def _fitting(
-    file: str, test: StoredTest, samples: Samples, command: NDArray[np.float64]
+def replay(
+    actuator: Actuator,
+    samples: Samples,
+    command: NDArray[np.float64],
+    faults: Faults,
+    effects: Effects,
+    step: float = DEFAULT_STEP_S,
+    sensors: Sensors | None = None,
 ) -> NDArray[np.float64]:
-    if samples.ticks != test.ticks:
-        raise InputOutputError(
-            f"log {file}: {samples.ticks} ticks, test {test.name!r} has {test.ticks}"
+    """Drive the simulated plant with commands in A or m, as the control computer had them.
+
+    A missing jack sample (also the one before the test) is the code near the simulated position
+    whose current is nearest to the recorded one; without that either, the code of the simulated
+    position. Sensors err as they say, but for noise. Returns current (A), spool (m), pressure (Pa),
+    jack (m) as read without noise, shape (4, ticks).
+    """
+    sensors = sensors or Sensors()
+    plant = PlantDynamics(
+        actuator, faults, effects, step, filter_time=sensors.filter_time, early=sensors.early
+    )
+    electronics = SimulatedConverters(actuator, sensors, effects.unmodelled, seed=0)
+    law = PositionController(actuator.controller)
+    truth = np.empty((4, samples.ticks))
+    measured = math.nan
+    # Readings at rest: of the current by its offset alone, of the jack before the test.
+    zero, _, _, shown = electronics.read(plant.seen).tolist()
+    for tick, wanted in enumerate(command.tolist()):
+        if samples.mode is CommandMode.POSITION and math.isnan(measured):
+            measured = _missing(law, wanted, float(samples.current[tick]) - zero, shown)
+        plant.advance(law.current(wanted, samples.mode, measured))
+        truth[:, tick] = electronics.read(plant.seen)
+        shown = float(truth[3, tick])
+        measured = float(samples.position[tick])
+    return truth
+
+
+def _missing(law: PositionController, command: float, current: float, simulated: float) -> float:
+    """Jack position that the converter may have shown, m."""
+    nearest = round(simulated / POSITION_CHANNEL.lsb)
+    if math.isnan(current):
+        return nearest * POSITION_CHANNEL.lsb
+
+    def misfit(code: int) -> tuple[int, int]:
+        trial = copy.copy(law).current(command, CommandMode.POSITION, code * POSITION_CHANNEL.lsb)
+        # In saturation many codes give one current: take the nearest position then.
+        return round(abs(trial - current) / CURRENT_CHANNEL.lsb), abs(code - nearest)
+
+    codes = range(nearest - NEIGHBOURS, nearest + NEIGHBOURS + 1)
+    return min(codes, key=misfit) * POSITION_CHANNEL.lsb
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Read a table of comma-separated text with a head line."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise InputOutputError(f"{path}: {reason_of(error)}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigurationError(f"{path}: not a table of comma-separated text: {error}") from None
+
+
+def read_units(path: Path, actuator: Actuator) -> dict[str, Unit]:
+    """Read `truth-effects.csv`, columns unit, effect, value: units of an actuator by name."""
+    units: dict[str, Unit] = {}
+    for number, row in enumerate(read_rows(path), start=2):
+        where = f"{path} line {number}"
+        try:
+            name, effect, value = row["unit"], row["effect"], float(row["value"])
+        except KeyError as error:
+            raise ConfigurationError(f"{path}: column {error} is missing") from None
+        except (TypeError, ValueError):
+            raise ConfigurationError(f"{where}: {row['value']!r} is not a number") from None
+        if not math.isfinite(value):
+            raise ConfigurationError(f"{where}: {value} is not a finite number")
+        changed = _with_effect(units.get(name, Unit(actuator)), effect, value)
+        if changed is None:
+            raise ConfigurationError(f"{where}: effect {effect!r} is not known")
+        units[name] = changed
+    return units
+
+
+def _with_effect(unit: Unit, effect: str, value: float) -> Unit | None:
+    """Give a unit one effect of the table; None where it is not known."""
+    effects, sensors, actuator = unit.effects, unit.sensors, unit.actuator
+    changes: dict[str, tuple[str, Any]] = {
+        "torque motor gain": ("gain_change", value - 1.0),
+        "hysteresis": ("hysteresis", value),
+        "backlash half-width": ("backlash", value),
+        "null bias": ("null_bias", value * 1e-3),
+        "number of plays": ("plays", round(value)),
+        "Stribeck velocity spool": ("spool_stribeck", value),
+        "Stribeck velocity jack": ("jack_stribeck", value),
+    }
+    stages: dict[str, tuple[str, Any]] = {
+        "second stage": ("kind", "orifice" if value == 2.0 else "linear"),
+        "bulk modulus": ("beta", value),
+    }
+    offsets = [f"{channel.name} offset" for channel in CHANNELS]
+    if effect in changes:
+        name, size = changes[effect]
+        return replace(unit, effects=replace(effects, **{name: size}))
+    if effect in {item.name for item in fields(DataErrors)}:
+        part = actuator.jack if hasattr(actuator.jack, effect) else actuator.servovalve
+        share = value / getattr(part, effect) - 1.0
+        return replace(
+            unit, effects=replace(effects, data=replace(effects.data, **{effect: share}))
         )
-    known = np.isfinite(samples.command)
-    off = np.abs(samples.command[known] - command[known])
-    if off.size and off.max() > 1e-3 * np.abs(command).max():
-        raise InputOutputError(f"log {file}: its command is not that of test {test.name!r}")
-    return command
+    if effect in offsets:
+        channel, codes = CHANNELS[offsets.index(effect)], list(sensors.offsets_lsb)
+        codes[offsets.index(effect)] = value * channel.per_unit / channel.lsb
+        a, b, c, d = codes
+        return replace(unit, sensors=replace(sensors, offsets_lsb=(a, b, c, d)))
+    if effect in stages:
+        name, content = stages[effect]
+        stage = msgspec.structs.replace(actuator.second_stage, **{name: content})
+        return replace(unit, actuator=msgspec.structs.replace(actuator, second_stage=stage))
+    if effect == "analogue filter time constant":
+        return replace(unit, sensors=replace(sensors, filter_time=value))
+    return None
 
 
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+RECORDINGS = Study(
+    "recordings",
+    "The simulator against recordings with known faults: residuals of each channel.",
+    _cases, perform, _report, _options, count=None,
+)  # fmt: skip

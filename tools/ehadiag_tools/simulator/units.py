@@ -12,40 +12,27 @@ from __future__ import annotations
 import argparse
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from ehadiag.core.actuator import Actuator, default_actuator
-from ehadiag.core.channels import CHANNELS
-from ehadiag.core.recording import Recording
-from ehadiag.core.stored_test import StoredTest
-from ehadiag_sim.plant.conditions import DataErrors, Effects, Faults, Sensors, Strangers
-from ehadiag_sim.plant.dynamics import DEFAULT_STEP
-from ehadiag_sim.plant.simulator import simulate
-
-__all__ = ["COARSE_STEP", "GROUPS", "Unit", "add_group", "random_unit", "record", "unit_with"]
+from ehadiag_sim.conditions import DataErrors, Effects, Faults, Sensors, UnmodelledEffects
+from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S
+from ehadiag_sim.simulation import simulate
+from firmware_iface.recording import CHANNELS, Recording
+from firmware_iface.stored_test import StoredTest
 
 COARSE_STEP = 1e-6
-"""Four times as fast as the default; its error beside the noise: docs, detailed-model.md."""
+"""Integration step of studies, s; four times as fast as the default, errors below the noise."""
 GROUPS = ("sensing", "friction", "orifice", "strangers")
 """Of effects beside the data's errors, see `random_unit`."""
-HALF_RANGE_CODES = 2048
-RATED_BIAS = 0.02
-"""Of rated current."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One actuator on a bench.
-
-    Attributes
-    ----------
-    actuator: the data that the simulator has, the class of its second stage among them.
-    effects: what the unit keeps over its life.
-    sensors: how its converters and probes err.
-    serial: number on its plate.
-    """
+    """One actuator on a bench; effects and errors of its sensors are kept over its life."""
 
     actuator: Actuator = field(default_factory=default_actuator)
     effects: Effects = field(default_factory=Effects)
@@ -67,30 +54,22 @@ def random_unit(
     """Draw a unit, each effect evenly within its usual size (PHY-28 to 39).
 
     Always: offsets ±1 % of range, gain ±5 %, null bias ±2 % of rated current, hysteresis 0 to 4 %
-    by one play, backlash 0 to 5 µm. Each group has a stream of its own: switching one on does not
-    change what the others draw.
-
-    Parameters
-    ----------
-    rng: is advanced by one `spawn`.
-    actuator: data to begin with; default the reference actuator.
-    data: ten data-sheet values ±5 %.
-    sensing: gains ±0.5 %, filter and sampling instant 0 to 0.2 ms, probes ±2 K and ±0.1 MPa.
-    friction: Stribeck velocities 1 to 50 mm/s (evenly in the logarithm), hysteresis of 1 to 16
-        plays, load ±50 N.
-    orifice: the second stage has orifices, its oil 6 to 9·10⁸ Pa.
-    strangers: each effect that the identification does not know, by even chance; see `Strangers`.
-    serial: number on the unit's plate.
+    by one play, backlash 0 to 5 µm. `data`: ten data-sheet values ±5 %. `sensing`: gains ±0.5 %,
+    filter and sampling instant 0 to 0.2 ms, probes ±2 K and ±0.1 MPa. `friction`: Stribeck
+    velocities 1 to 50 mm/s (evenly in the logarithm), hysteresis of 1 to 16 plays, load ±50 N.
+    `orifice`: as second stage, oil of 6 to 9·10⁸ Pa. `strangers`: each effect that the
+    identification does not know, by even chance. Each group has a stream of its own: switching one
+    on does not change what the others draw. The generator is advanced by one `spawn`.
     """
     base, second, third, fourth, fifth, sixth = rng.spawn(6)
     actuator = actuator or default_actuator()
     effects = Effects(
-        null_bias=_even(base, RATED_BIAS) * actuator.controller.IM,
+        null_bias=_even(base, 0.02) * actuator.controller.IM,
         hysteresis=float(base.uniform(0.0, 0.04)),
         gain_change=_even(base, 0.05),
         backlash=float(base.uniform(0.0, 5e-6)),
     )
-    a, b, c, d = (0.01 * HALF_RANGE_CODES * base.uniform(-1.0, 1.0, len(CHANNELS))).tolist()
+    a, b, c, d = (0.01 * 2048 * base.uniform(-1.0, 1.0, len(CHANNELS))).tolist()
     sensors = Sensors(offsets_lsb=(a, b, c, d))
     if data:
         errors = {item.name: _even(second, 0.05) for item in fields(DataErrors)}
@@ -118,25 +97,20 @@ def random_unit(
         )
         actuator = msgspec.structs.replace(actuator, second_stage=stage)
     if strangers:
-        effects = replace(effects, plays=8, strangers=_random_strangers(sixth))
+        effects = replace(effects, plays=8, unmodelled=_random_strangers(sixth))
     return Unit(actuator, effects, sensors, serial)
 
 
-def unit_with(rng: np.random.Generator, groups: Collection[str], serial: int) -> Unit:
-    """Draw a unit with errors of its data and groups of effects by name, see `random_unit`."""
-    return random_unit(
-        rng,
-        data=True,
-        sensing="sensing" in groups,
-        friction="friction" in groups,
-        orifice="orifice" in groups,
-        strangers="strangers" in groups,
-        serial=serial,
-    )
+def unit_with(
+    rng: np.random.Generator, groups: Collection[str], serial: int, *, data: bool = True
+) -> Unit:
+    """Draw a unit with errors of its data, and groups of effects by name, see `random_unit`."""
+    chosen = {name: name in groups for name in GROUPS}
+    return random_unit(rng, None, data=data, serial=serial, **chosen)
 
 
 def add_group(parser: argparse.ArgumentParser) -> None:
-    """Let a tool's command line ask for groups of effects, see `random_unit`."""
+    """Add an option for groups of effects, see `random_unit`."""
     parser.add_argument(
         "--group",
         action="append",
@@ -152,23 +126,14 @@ def record(
     faults: Faults | None = None,
     *,
     seed: int = 0,
-    step: float = DEFAULT_STEP,
+    step: float = DEFAULT_STEP_S,
     oil_temperature: float | None = None,
     supply_pressure: float | None = None,
 ) -> Recording:
     """Record a stored test of a unit as an acquisition without a fault would deliver it.
 
-    Parameters
-    ----------
-    unit, test, faults: what runs.
-    seed: of the noise.
-    step: longest integration step, s.
-    oil_temperature: degC, of this recording; default that of the unit's effects.
-    supply_pressure: Pa, of this recording; default that of the unit's effects.
-
-    Raises
-    ------
-    ConfigurationError: a value out of range; test and controller at different rates.
+    The step is the longest of the integration, s; oil temperature (degC) and supply pressure (Pa)
+    are those of the unit's effects unless given.
     """
     effects = unit.effects
     if oil_temperature is not None:
@@ -193,16 +158,16 @@ STRANGE_SIZES = {
     "friction_asymmetry": 0.05,
     "spool_friction_slope": 0.05,
 }
-"""Largest size of each stranger in a random unit."""
+"""Largest sizes of the strangers in a random unit, each as its field of `UnmodelledEffects`."""
 
 
-def _random_strangers(rng: np.random.Generator) -> Strangers:
-    drawn = {}
+def _random_strangers(rng: np.random.Generator) -> UnmodelledEffects:
+    drawn: dict[str, Any] = {}
     for name, size in STRANGE_SIZES.items():
         there, value = rng.random() < 0.5, _even(rng, size)
         if there:
             drawn[name] = abs(value) if name == "driver_lag" else value
-    return Strangers(**drawn)
+    return UnmodelledEffects(**drawn)
 
 
 def _even(rng: np.random.Generator, size: float) -> float:

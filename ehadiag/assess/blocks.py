@@ -1,0 +1,234 @@
+"""What a model leaves unexplained, by the block of the actuator, and what the spool's steps say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.identify.experiment import Experiment
+from ehadiag.identify.least_squares import Refinement
+from ehadiag.identify.prior import FAULT_OF_DATUM, severity_of_datum
+from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
+from ehadiag.model.residual_models import ModelResponse
+
+BLOCKS = ("torque", "spool", "pressure", "jack")
+"""Torque motor and first stage; spool with its friction; second stage; jack."""
+
+
+SIGNS = {"GQF": -1.0}
+"""Sign of the severity that does what more of a datum does, where it is not +1."""
+
+
+class BlockRules(NamedTuple):
+    """Which sample is of which block."""
+
+    slew_share: float = 0.1
+    """Least speed of a slewing spool, as a share of its stroke a tick, 1: it is the first stage
+    that limits it, not friction."""
+    jack_ticks: int = 20
+    """Ticks over which the jack's travel is looked at, 1."""
+    jack_lsb: float = 4.0
+    """Least travel of a moving jack meanwhile, LSB."""
+
+
+RULES = BlockRules()
+
+
+def block_masks(experiments: Sequence[Experiment]) -> dict[str, NDArray[np.bool_]]:
+    """Samples of each block, shape (2, N): rows of spool and pressure.
+
+    Parameters
+    ----------
+    experiments : Sequence[Experiment]
+        One behind the other.
+
+    Returns
+    -------
+    dict[str, NDArray[np.bool_]]
+        By the name of the block; each sample is of one.
+    """
+    slews, moves = [], []
+    for item in experiments:
+        speed = np.abs(np.gradient(np.nan_to_num(item.spool)))
+        slews.append(speed > RULES.slew_share * item.constants.XSM)
+        place = np.nan_to_num(item.position)
+        ahead = np.roll(place, -RULES.jack_ticks // 2) - np.roll(place, RULES.jack_ticks // 2)
+        moves.append(np.abs(ahead) > RULES.jack_lsb * item.channels.position.lsb)
+    slew, move = np.concatenate(slews), np.concatenate(moves)
+    out = {}
+    for name, row, ticks in (
+        ("torque", SPOOL_ROW, slew),
+        ("spool", SPOOL_ROW, ~slew),
+        ("pressure", PRESSURE_ROW, ~move),
+        ("jack", PRESSURE_ROW, move),
+    ):
+        out[name] = np.zeros((2, len(ticks)), dtype=bool)
+        out[name][row] = ticks
+    return out
+
+
+def unexplained_block(experiments: Sequence[Experiment], modelled: Sequence[ModelResponse]) -> str:
+    """Name the block of which most is unexplained, by Cauchy's cost.
+
+    Parameters
+    ----------
+    experiments : Sequence[Experiment]
+        What was identified from.
+    modelled : Sequence[ModelResponse]
+        Their responses as identified.
+
+    Returns
+    -------
+    str
+        One of `BLOCKS`.
+    """
+    residuals = [
+        [
+            (item.spool - np.nanmedian(item.spool - model.spool) - model.spool) / item.spool_noise,
+            (item.pressure - np.nanmedian(item.pressure - model.pressure) - model.pressure)
+            / item.pressure_noise,
+        ]
+        for item, model in zip(experiments, modelled, strict=True)
+    ]
+    shares = np.nan_to_num(np.concatenate(residuals, axis=1)) / ESTIMATION.cauchy_scale
+    costs = np.log1p(shares**2)
+    masks = block_masks(experiments)
+    return max(BLOCKS, key=lambda name: float(costs[masks[name]].sum()))
+
+
+def pulls_of_blocks(
+    experiments: Sequence[Experiment], refined: Refinement, actuator: Actuator
+) -> dict[str, dict[str, float]]:
+    """What the residuals of each block alone would move the severities by.
+
+    At the optimum the pulls of all blocks cancel; a block with a pull is one that the others, or
+    what was known, hold against: by so much a severity may be wrong if the block is.
+
+    Parameters
+    ----------
+    experiments : Sequence[Experiment]
+        What was learned from.
+    refined : Refinement
+        The optimum, with data that pass for severities free.
+    actuator : Actuator
+        Of the unit's type, for the scales of the severities.
+
+    Returns
+    -------
+    dict[str, dict[str, float]]
+        By block, then by severity.
+    """
+    shares = severity_of_datum(actuator)
+    names = [item.name for item in refined.parameters]
+    inverse = np.linalg.pinv(
+        refined.normal + (refined.information if refined.information is not None else 0.0),
+        hermitian=True,
+    )
+    out: dict[str, dict[str, float]] = {}
+    for block, mask in block_masks(experiments).items():
+        used = refined.used & mask[: len(refined.used)]
+        step = -inverse @ (refined.jacobian[:, used] @ refined.residuals[used]) * refined.scale
+        out[block] = {
+            FAULT_OF_DATUM[symbol]: float(
+                step[names.index(f"datum_{symbol}")] * share * SIGNS.get(symbol, 1.0)
+            )
+            for symbol, share in shares.items()
+            if f"datum_{symbol}" in names
+        }
+    return out
+
+
+def words_of_pulls(pulls: Mapping[str, Mapping[str, float]]) -> str:
+    """Say in a line what the blocks would move the severities by."""
+    parts = (
+        f"{block} " + ", ".join(f"{name} {value:+.4f}" for name, value in of_block.items())
+        for block, of_block in pulls.items()
+    )
+    return "not explained, in severities: " + "; ".join(parts)
+
+
+class StepRules(NamedTuple):
+    """Break-aways of the spool in slow ramps."""
+
+    noise_stds: float = 5.0
+    """Least travel in a tick of a break-away, in deviations of the noise of a difference."""
+    model_share: float = 0.5
+    """The same of the model's, which has no noise, over it, 1."""
+    min_count: int = 6
+    """Least number of steps of a spool that creeps, 1: it breaks away once at each of the turns of
+    the stored test's ramps, of which there are three."""
+    same_size: float = 0.5
+    """Least size of a step that is a break-away of the model's, over the median of these, 1."""
+    min_count_ratio: float = 2.0
+    """Least ratio of that number to the model's break-aways, 1."""
+
+
+STEPS = StepRules()
+
+
+def spool_steps(spool: Array, least: float) -> Array:
+    """Sizes of the steps in which a spool moves, m.
+
+    Parameters
+    ----------
+    spool : Array
+        Position of each tick in a slow ramp, m; NaN where missing.
+    least : float
+        Least travel in a tick of a step, m.
+
+    Returns
+    -------
+    Array
+        Travel of each, of adjacent ticks together.
+    """
+    change = np.nan_to_num(np.diff(spool))
+    fast = np.concatenate([[0], np.abs(change) > least, [0]]).astype(int)
+    edges = np.flatnonzero(np.diff(fast))
+    sizes = [abs(change[a:b].sum()) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return np.array(sizes)
+
+
+def creep_note(experiments: Sequence[Experiment], modelled: Sequence[Array]) -> str:
+    """Say that the spool creeps in steps where the model jumps once; empty where it does not.
+
+    Where the oil at the spool's ends yields the pressure falls as soon as the spool moves: it stops
+    after a micrometre, and friction passes for hysteresis. In closed loop the sensor's noise breaks
+    the spool away, so only open loop is looked at.
+
+    Parameters
+    ----------
+    experiments : Sequence[Experiment]
+        What was identified from.
+    modelled : Sequence[Array]
+        Spool of each as the model has it, m.
+
+    Returns
+    -------
+    str
+        A note with number and size of the steps.
+    """
+    steps, jumps = np.zeros(0), np.zeros(0)
+    for item, model in zip(experiments, modelled, strict=True):
+        least = STEPS.noise_stds * math.sqrt(2.0) * item.spool_noise
+        for begin, end in () if item.test.closed_loop else item.test.windows.FSS:
+            ticks = slice(round(begin / item.tick), round(end / item.tick))
+            steps = np.concatenate([steps, spool_steps(item.spool[ticks], least)])
+            jumps = np.concatenate([jumps, spool_steps(model[ticks], STEPS.model_share * least)])
+    if len(steps) < max(STEPS.min_count, STEPS.min_count_ratio * len(jumps)):
+        return ""
+    if len(jumps) and (steps > STEPS.same_size * np.median(jumps)).sum() >= len(jumps):
+        return ""  # it breaks away as the model does
+    expected = f"{len(jumps)} break-aways"
+    if len(jumps):
+        expected += f" of {np.median(jumps) * 1e6:.1f} µm"
+    return (
+        f"the spool creeps in {len(steps)} steps of {np.median(steps) * 1e6:.1f} µm, the model has"
+        f" {expected}: the oil at the spool's ends yields, and friction looks like hysteresis"
+    )

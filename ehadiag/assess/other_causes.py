@@ -1,0 +1,438 @@
+"""Other faults than the three progressive ones, and the cause of an unexplained recording.
+
+Null bias, hysteresis, backlash and torque-motor gain each have a limit in the actuator file. One
+that is more likely beyond its limit than not (simple acceptance, JCGM 106:2012, 8.2) makes a
+verdict DEGRADED, never FAULT by itself. Where the model does not explain a recording every
+parameter of the registry is tried together with those estimated: one Gauss-Newton step from the
+estimate (a score test, C. R. Rao, Proc. Cambridge Phil. Soc. 44, 1948), then the model itself at
+shares of that step. What explains most is the suspect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+from ehadiag.assess.verdict import Verdict
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import actuator_channels
+from ehadiag.core.criteria import FIT, VERDICT
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.estimate import Culprit, Effect, Suspect, finite
+from ehadiag.identify.experiment import (
+    Experiment,
+    lay_out_spans,
+    residuals_by_experiment,
+    share_offsets,
+    unknowns_of,
+)
+from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.prior import UnitPrior, unit_prior, usual_prior
+from ehadiag.identify.ring import find_ring
+from ehadiag.model.parameter import Parameter, ParameterKind, scaled_to_channels
+from ehadiag.model.plant import REFERENCE_TEMPERATURE, relative_viscosity
+from ehadiag.model.registry import REGISTRY, parameter
+from ehadiag.model.residual_models import SimdModel
+from firmware_iface.recording import Environment
+
+QUANTILE_TWO_SIDED_95 = NormalDist().inv_cdf(0.975)
+
+
+def effects_of(identification: Identification | None, actuator: Actuator) -> tuple[Effect, ...]:
+    """Return every effect that was estimated, in the order of the identification.
+
+    identification: None where there is none; actuator: data of the unit, with its limits. Returns
+    values, limits, and what was known of them beforehand.
+    """
+    if identification is None:
+        return ()
+    prior_of_unit, channels = unit_prior(actuator), actuator_channels(actuator)
+    out = []
+    for name, found in identification.nuisances.items():
+        item = scaled_to_channels(parameter(name), channels)
+        half, limit = QUANTILE_TWO_SIDED_95 * found.std, item.limit_of(actuator)
+        known = math.isfinite(found.value) and math.isfinite(found.std)
+        chance = None
+        if limit is not None and known:
+            chance = chance_beyond(found.value, found.std, limit)
+        prior, source = _prior(item, prior_of_unit)
+        out.append(
+            Effect(
+                name=name,
+                value=finite(found.value),
+                unit=item.unit,
+                std=finite(found.std),
+                interval95=(
+                    (max(item.lower, found.value - half), min(item.upper, found.value + half))
+                    if known
+                    else None
+                ),
+                limit=limit,
+                beyond=None if chance is None else chance >= VERDICT.min_chance_beyond_limit,
+                chance=chance,
+                at_bound=found.at_bound,
+                prior_std=prior,
+                source=source,
+                meaning=item.short,
+            )
+        )
+    return tuple(out)
+
+
+def _prior(item: Parameter, prior_of_unit: UnitPrior) -> tuple[float | None, str]:
+    """Deviation of what was known of a parameter, and where that is from."""
+    joint = prior_of_unit.joint
+    if joint is not None and item.name in joint.names:
+        place = joint.names.index(item.name)
+        return math.sqrt(float(joint.covariance[place, place])), "calibration"
+    if item.name in prior_of_unit.priors:
+        source = "tolerance" if item.day_std is None else "probe"
+        return prior_of_unit.priors[item.name].std, source
+    if item.adds_to is not None:
+        return None, "nothing"
+    return usual_prior(item).std, "usual size"
+
+
+def with_limits(effects: Sequence[Effect], actuator: Actuator) -> tuple[Effect, ...]:
+    """Return the effects that have a limit, in the order of the actuator file's limits."""
+    order = actuator.limits.__struct_fields__
+    limited = [item for item in effects if item.limit is not None]
+    return tuple(sorted(limited, key=lambda item: order.index(parameter(item.name).limit)))
+
+
+def chance_beyond(value: float, std: float, limit: float) -> float:
+    """Chance that a normal variable is at or beyond a limit of either sign."""
+    if std <= 0.0:
+        return float(abs(value) >= limit)
+    density = NormalDist(value, std)
+    return density.cdf(-limit) + 1.0 - density.cdf(limit)
+
+
+def count_other_faults(
+    effects: Sequence[Effect], verdict: Verdict, reasons: tuple[str, ...]
+) -> tuple[Verdict, tuple[str, ...]]:
+    """Verdict with the effects counted: they make HEALTHY DEGRADED, never worse."""
+    beyond = tuple(f"{_size(item)} beyond {_limit(item)}" for item in effects if item.beyond)
+    if beyond and verdict is Verdict.HEALTHY:
+        verdict = Verdict.DEGRADED
+    return verdict, (*reasons, *beyond)
+
+
+def notes_on_effects(effects: Sequence[Effect]) -> tuple[str, ...]:
+    """Which of them may be beyond its limit, though more likely it is not."""
+    return tuple(
+        f"{_size(item)} may be beyond {_limit(item)}: chance {item.chance:.0%}"
+        for item in effects
+        if item.chance is not None
+        and VERDICT.min_chance_for_note < item.chance < VERDICT.min_chance_beyond_limit
+    )
+
+
+def _size(item: Effect) -> str:
+    return f"{item.meaning} {item.shown(item.value or 0.0):.3g} {item.shown_unit}"
+
+
+def _limit(item: Effect) -> str:
+    return f"the limit {item.shown(item.limit or 0.0):.3g} {item.shown_unit}"
+
+
+CULPRIT_SIGNALS = ("spool", "pressure")
+
+
+class SuspectSearch(NamedTuple):
+    """Search for parameters that would explain a recording."""
+
+    difference: float = 0.2
+    """Width of the differences, in units of the parameters' scales."""
+    step_shares: tuple[float, ...] = (0.0, 0.4, 1.0)
+    """Shares of the Gauss-Newton step that are tried, 1."""
+    range_shares: tuple[float, ...] = (0.25, 0.6)
+    """Shares of a parameter's bounds that are tried on a unit as new, 1."""
+    severity_as_new: float = 0.1
+    """Severities of that unit, 1."""
+    refined: int = 4
+    """Number of suspects that are refined, 1."""
+    steps: int = 2
+    """Steps of that refinement, 1."""
+    ridge: float = 1e-6
+    """Share added to the diagonal of the normal matrix, 1."""
+    named: int = 3
+    """Largest number of suspects that are named, 1."""
+    time_quantiles: tuple[float, float] = (0.1, 0.9)
+    """Quantiles of the unexplained cost between which its time is named, 1."""
+
+
+SUSPECTS = SuspectSearch()
+
+
+def find_culprit(
+    experiments: Sequence[Experiment], identification: Identification, environment: Environment
+) -> Culprit:
+    """Look for what would explain recordings that the estimate does not.
+
+    environment: of the first recording, for the oil's temperature.
+    """
+    shared = share_offsets(experiments)
+    free = tuple(item for item in REGISTRY if not item.name.startswith("position_"))
+    model = SimdModel(lay_out_spans(shared), unknowns_of(shared, free))
+    values = identification.values
+    x = np.array([values.get(item.name, 0.0) for item in free])
+    base = model.residuals(x[None, :])[0][0]
+    suspects = _suspects(model, x, base, set(values))
+    row, index, start, end = _worst_place(shared, base)
+    signal, experiment = CULPRIT_SIGNALS[row], shared[index]
+    ticks = slice(sum(item.ticks for item in shared[:index]), None)
+    modelled = _modelled(model, base, row, ticks.start, experiment.ticks)
+    advice = (
+        _signal_advice(experiment, modelled)
+        or _ring_advice(shared, values)
+        or _advice(suspects, environment)
+    )
+    return Culprit(
+        signal=signal,
+        test=experiment.test.name,
+        start=float(start),
+        end=float(end),
+        suspects=suspects,
+        advice=advice,
+    )
+
+
+def _cost(residuals: Array) -> Array:
+    """Cauchy's cost of each residual."""
+    return np.asarray(
+        ESTIMATION.cauchy_scale**2 * np.log1p((residuals / ESTIMATION.cauchy_scale) ** 2)
+    )
+
+
+def _suspects(model: SimdModel, x: Array, base: Array, estimated: set[str]) -> tuple[Suspect, ...]:
+    free = model.unknowns.free
+    own = [k for k, item in enumerate(free) if item.name in estimated]
+    tried = [k for k in range(len(free)) if k not in own]
+    points, costs = _stepped(model, x, base, own, tried)
+    far, far_costs = _range_points(model, x, own, tried)
+    better = far_costs < costs
+    points = np.where(better[:, None], far, points)
+    costs = np.where(better, far_costs, costs)
+    first = np.argsort(costs)[: SUSPECTS.refined]
+    points, costs = points[first], costs[first]
+    for _ in range(SUSPECTS.steps):
+        points, costs = _improved(model, points, [[*own, tried[place]] for place in first])
+    before = float(_cost(base).sum())
+    order = np.argsort(costs)
+    out = (
+        _suspect(free[k], points[place, k], 1.0 - costs[place] / before)
+        for place in order
+        for k in (tried[first[place]],)
+    )
+    return tuple(item for item in out if item.share >= FIT.min_suspect_share)[: SUSPECTS.named]
+
+
+def _stepped(
+    model: SimdModel, x: Array, base: Array, own: list[int], tried: list[int]
+) -> tuple[Array, Array]:
+    """Points and costs after one step with each of the tried parameters, shape (tried, k)."""
+    sides = _sides(model, x)
+    slopes = _slopes(model.residuals(x + np.diag(sides))[0], base, sides)
+    steps = np.array([_step(slopes, base, [*own, k]) for k in tried])
+    return _best_share(model, np.repeat(x[None, :], len(tried), axis=0), steps)
+
+
+def _range_points(
+    model: SimdModel, x: Array, own: list[int], tried: list[int]
+) -> tuple[Array, Array]:
+    """The best of some values all over the range of each tried parameter, on a unit as new."""
+    lower, upper = model.unknowns.lower, model.unknowns.upper
+    new = np.array(
+        [
+            SUSPECTS.severity_as_new if item.kind is ParameterKind.FAULT else 0.0
+            for item in model.unknowns.free
+        ]
+    )
+    offsets = [k for k in own if model.unknowns.free[k].adds_to is not None]
+    new[offsets] = x[offsets]
+    points = np.repeat(new[None, :], len(tried) * 2 * len(SUSPECTS.range_shares), axis=0)
+    points = points.reshape(len(tried), -1, len(new))
+    for place, k in enumerate(tried):
+        points[place, :, k] = [
+            side * r for r in SUSPECTS.range_shares for side in (lower[k], upper[k])
+        ]
+    costs = _cost(model.residuals(points.reshape(-1, len(new)))[0]).sum(axis=(1, 2))
+    costs = costs.reshape(len(tried), -1)
+    best = costs.argmin(axis=1)
+    places = np.arange(len(tried))
+    return points[places, best], costs[places, best]
+
+
+def _improved(model: SimdModel, points: Array, chosen: Sequence[list[int]]) -> tuple[Array, Array]:
+    """One Gauss-Newton step of each point, in its chosen coordinates."""
+    sides = [_sides(model, point) for point in points]
+    wanted = [
+        np.vstack([point, point + np.diag(side)[pick]])
+        for point, side, pick in zip(points, sides, chosen, strict=True)
+    ]
+    edges = np.cumsum([len(item) for item in wanted])[:-1]
+    runs = np.split(model.residuals(np.vstack(wanted))[0], edges)
+    steps = np.zeros_like(points)
+    for place, (run, side, pick) in enumerate(zip(runs, sides, chosen, strict=True)):
+        slopes = _slopes(run[1:], run[0], side[pick])
+        steps[place, pick] = _step(slopes, run[0], list(range(len(pick))))
+    return _best_share(model, points, steps)
+
+
+def _sides(model: SimdModel, x: Array) -> Array:
+    """Differences from a point that stay within the bounds, SI."""
+    scale = np.array([item.scale for item in model.unknowns.free])
+    return (
+        np.where(
+            x + SUSPECTS.difference * scale <= model.unknowns.upper,
+            SUSPECTS.difference,
+            -SUSPECTS.difference,
+        )
+        * scale
+    )
+
+
+def _slopes(runs: Array, base: Array, sides: Array) -> Array:
+    """Derivatives over the parameters' scales, shape (k, signals * N)."""
+    return ((runs - base) / (np.sign(sides) * SUSPECTS.difference)[:, None, None]).reshape(
+        len(runs), -1
+    )
+
+
+def _step(slopes: Array, base: Array, chosen: list[int]) -> Array:
+    """Gauss-Newton step in the chosen coordinates, in units of the scales; 0 in the others."""
+    left, rows = base.ravel(), slopes[chosen]
+    weighed = rows / (1.0 + (left / ESTIMATION.cauchy_scale) ** 2)
+    normal = weighed @ rows.T
+    normal += SUSPECTS.ridge * np.diag(np.diag(normal) + 1.0)
+    out = np.zeros(len(slopes))
+    out[chosen] = -np.linalg.solve(normal, weighed @ left)
+    return out
+
+
+def _best_share(model: SimdModel, points: Array, steps: Array) -> tuple[Array, Array]:
+    """Best of some shares of each step, and its cost."""
+    scale = np.array([item.scale for item in model.unknowns.free])
+    lower, upper = model.unknowns.lower, model.unknowns.upper
+    there = np.stack(
+        [np.clip(points + s * steps * scale, lower, upper) for s in SUSPECTS.step_shares]
+    )
+    costs = _cost(model.residuals(there.reshape(-1, points.shape[1]))[0]).sum(axis=(1, 2))
+    costs = costs.reshape(len(SUSPECTS.step_shares), -1)
+    best, places = costs.argmin(axis=0), np.arange(len(points))
+    return there[best, places], costs[best, places]
+
+
+def _suspect(item: Parameter, value: float, share: float) -> Suspect:
+    return Suspect(
+        name=item.name,
+        meaning=item.short,
+        value=float(value),
+        unit=item.unit,
+        share=float(share),
+    )
+
+
+def _worst_place(
+    experiments: Sequence[Experiment], residuals: Array
+) -> tuple[int, int, float, float]:
+    """Row, experiment, begin and end (s) of where most is unexplained."""
+    parts = [_cost(part) for part in residuals_by_experiment(experiments, residuals)]
+    sums = np.array([part.sum(axis=1) for part in parts])
+    index, row = divmod(int(sums.argmax()), sums.shape[1])
+    grown = np.cumsum(parts[index][row])
+    start, end = (
+        np.searchsorted(grown, np.array(SUSPECTS.time_quantiles) * grown[-1])
+        * experiments[index].tick
+    )
+    return row, index, float(start), float(end)
+
+
+def _modelled(
+    model: SimdModel, residuals: Array, row: int, first: int, count: int
+) -> tuple[int, Array]:
+    """Row of a signal, and what the model made of it at the estimate; NaN without a sample."""
+    part = slice(first, first + count)
+    measured = (model.batch.spool, model.batch.pressure)[row][part]
+    weight = model.batch.weight[row, part]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return row, np.where(weight > 0.0, measured - residuals[row, part] / weight, np.nan)
+
+
+def _signal_advice(experiment: Experiment, modelled: tuple[int, Array]) -> str:
+    """Advice by the worst signal alone; empty if there is none."""
+    row, model = modelled
+    name, lsb = CULPRIT_SIGNALS[row], experiment.channels[1 + row].grain
+    measured = (experiment.spool, experiment.pressure)[row]
+    since = _frozen_since(measured, model, lsb, round(FIT.min_frozen_s / experiment.tick))
+    if since is not None:
+        return (
+            f"the {name} sensor stands still from {since * experiment.tick:.1f} s on: "
+            f"dead or frozen, or the {'spool' if row == 0 else 'jack'} is seized"
+        )
+    seen = np.isfinite(measured) & np.isfinite(model)
+    one, other = measured[seen] - measured[seen].mean(), model[seen] - model[seen].mean()
+    if float(one @ other) < FIT.max_reversed_gain * float(other @ other):
+        return f"the {name} sensor reads with the wrong sign, or the torque motor is reversed"
+    return ""
+
+
+def _ring_advice(experiments: Sequence[Experiment], values: Mapping[str, float]) -> str:
+    """Advice by the frequency of the pressure's ring; empty if it is as expected, or none shows."""
+    if experiments[0].constants.OIL == 0.0:
+        return ""
+    ring = find_ring(experiments, values)
+    return ring.words if ring is not None and ring.is_of_other_volume else ""
+
+
+def _frozen_since(measured: Array, model: Array, lsb: float, least: int) -> int | None:
+    """First tick from which to the end a signal stands still while the model moves."""
+    seen = np.flatnonzero(np.isfinite(measured) & np.isfinite(model))
+    if seen.size < least:
+        return None
+    back = measured[seen][::-1]
+    wide = (
+        np.maximum.accumulate(back) - np.minimum.accumulate(back) > FIT.max_frozen_range_lsb * lsb
+    )
+    count = int(wide.argmax()) if wide.any() else len(back)
+    if count < least or float(np.ptp(model[seen[-count:]])) < FIT.min_modelled_range_lsb * lsb:
+        return None
+    return int(seen[-count])
+
+
+def _advice(suspects: Sequence[Suspect], environment: Environment) -> str:
+    if not suspects or suspects[0].share < FIT.min_advice_share:
+        return (
+            "no single effect or datum explains most of it: broken hardware, another actuator, or "
+            "a unit whose data differ in several places: calibrate it as new"
+        )
+    first = suspects[0]
+    item = next(entry for entry in REGISTRY if entry.name == first.name)
+    if first.name == "oil_viscosity":
+        error = _temperature_error(first.value, environment)
+        return f"oil temperature looks {error:+.0f} K off its probe"
+    if first.name == "supply_pressure":
+        return f"supply pressure looks {first.value / 1e6:+.2g} MPa off its probes"
+    if first.name in ("spool_gain", "pressure_gain"):
+        side = "high" if first.value > 0.0 else "low"
+        return f"the {first.meaning.split()[0]} sensor reads {abs(first.value):.0%} too {side}"
+    if item.kind is ParameterKind.DATUM:
+        return f"{first.meaning} looks {first.value:+.0%} off the actuator file: calibrate"
+    size = f"{first.value:+.1%}" if item.unit == "1" else f"{first.value:+.2g} {item.unit}"
+    return f"{first.meaning} looks {size}: estimate it (--nuisances all), or calibrate"
+
+
+def _temperature_error(value: float, environment: Environment) -> float:
+    """By how many kelvin the oil is warmer than its probe says, for that error of viscosity."""
+    probe = environment.oil_temperature
+    probe = REFERENCE_TEMPERATURE if probe is None else probe
+    grid = np.linspace(-54.0, 135.0, 379)
+    viscosity = np.array([relative_viscosity(float(t)) for t in grid])
+    wanted = (1.0 + value) * relative_viscosity(probe)
+    return float(np.interp(-wanted, -viscosity, grid)) - probe

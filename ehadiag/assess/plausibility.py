@@ -1,0 +1,294 @@
+"""Refuses units, signs, motion or actuator data that cannot be right, before identification.
+
+Relations between channels hold on any motion, whatever the faults: a wrong unit or sign shows,
+and so does a jack that does not travel as the spool's flow makes it, or a sensor that reads many
+times what the actuator can do. An actuator file whose ratios are far from those of any built
+actuator is refused too: a search would take minutes and explain the recording by no severities.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ehadiag.assess.response_checks import TRAVEL_SPAN_S, median_of_three
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import actuator_channels, largest_value
+from ehadiag.core.criteria import READINGS, RESPONSE
+from firmware_iface.recording import CHANNELS, CommandMode, Samples
+
+VELOCITY_SPAN_S = 0.05
+"""Over which a velocity is taken."""
+UNIT_ERROR_FACTORS: tuple[tuple[float, str], ...] = (
+    (-1.0, "its sign is reversed"),
+    (1e-3, "a unit 1000 times larger was sent"),
+    (1e3, "a unit 1000 times smaller was sent"),
+    (0.1, "a unit ten times larger was sent"),
+    (10.0, "a unit ten times smaller was sent"),
+    (25.4, "millimetres were sent as inches"),
+    (1.0 / 25.4, "inches were sent as millimetres"),
+    (14.5038, "psi were sent as bar"),
+    (1.0 / 14.5038, "bar were sent as psi"),
+)
+"""Measured over true value, and what makes that."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelRelation:
+    """Slope of one channel over another, as measured, over what the actuator's data say."""
+
+    upper: str
+    """Channel whose error raises the ratio."""
+    lower: str
+    """Channel whose error lowers it."""
+    ratio: float
+    """1 where both units and signs are right."""
+
+
+def channel_relations(samples: Samples, actuator: Actuator) -> tuple[ChannelRelation, ...]:
+    """Compare the channels with each other, as far as the motion shows.
+
+    Spool over current is the torque motor's gain over the feedback wire's stiffness (PHY-4);
+    velocity of the jack over spool the flow gain over its area (PHY-6, PHY-7); the current that of
+    its command, or of the control law (PHY-2, PHY-3).
+    """
+    valve, jack = actuator.servovalve, actuator.jack
+    half = max(round(0.5 * VELOCITY_SPAN_S * 1e9 / samples.period_ns), 1)
+    velocity = _velocity(samples.position, half, samples.period_ns * 1e-9)
+    found = [
+        _relation("spool", "current", samples.spool, samples.current, valve.GM / valve.KSF),
+        _relation("position", "spool", velocity, _smooth(samples.spool, half), valve.GQ / jack.AJ),
+    ]
+    if samples.mode is CommandMode.CURRENT:
+        found.append(_relation("command", "current", samples.command, samples.current, 1.0))
+    elif np.isfinite(samples.command).any():
+        found.append(_relation("command", "position", samples.command, samples.position, 1.0))
+    return tuple(item for item in found if item is not None)
+
+
+def objections_to_units(samples: Samples, actuator: Actuator) -> tuple[str, ...]:
+    """Return a sentence for each channel with a wrong unit or sign; none without motion.
+
+    Of several explanations that with the fewest channels is chosen.
+    """
+    found = channel_relations(samples, actuator)
+    out = list(_explained(found))
+    pressure = _pressure(samples, actuator, {item.lower for item in found})
+    return (*out, *pressure)
+
+
+def objections_to_readings(samples: Samples, actuator: Actuator) -> list[str]:
+    """Return a sentence for each channel whose readings are too large for its unit or scale."""
+    out = []
+    for channel in CHANNELS:
+        values = np.abs(np.asarray(getattr(samples, channel.name)))
+        values = values[np.isfinite(values)]
+        largest, unit = largest_value(actuator, channel), channel.per_unit
+        top = float(np.quantile(values, 0.99)) if values.size else 0.0
+        if top > READINGS.max_reading_factor * largest:
+            out.append(
+                f"{channel.name} reads {top / unit:.3g} {channel.unit}, the actuator reaches"
+                f" {largest / unit:.3g} {channel.unit}: check unit and scale of its signal"
+            )
+    return out
+
+
+def _explained(found: tuple[ChannelRelation, ...]) -> tuple[str, ...]:
+    if all(abs(item.ratio - 1.0) <= READINGS.max_channel_ratio_error for item in found):
+        return ()
+    names = sorted({name for item in found for name in (item.upper, item.lower)})
+    for count in (1, 2):
+        best: tuple[float, tuple[str, ...]] | None = None
+        for wrong in itertools.combinations(names, count):
+            for choice in itertools.product(UNIT_ERROR_FACTORS, repeat=count):
+                factor = {name: value for name, (value, _) in zip(wrong, choice, strict=True)}
+                off = max(
+                    abs(item.ratio * factor.get(item.lower, 1.0) / factor.get(item.upper, 1.0) - 1)
+                    for item in found
+                )
+                words = tuple(
+                    f"{name}: {text}, or the mapping says so"
+                    for name, (_, text) in zip(wrong, choice, strict=True)
+                )
+                if off <= READINGS.max_channel_ratio_error and (best is None or off < best[0]):
+                    best = (off, words)
+        if best is not None:
+            return best[1]
+    return tuple(
+        f"{item.upper} moves {item.ratio:.3g} times as much with the {item.lower} as the actuator's"
+        " data say"
+        for item in found
+        if abs(item.ratio - 1.0) > READINGS.max_channel_ratio_error
+    )
+
+
+def _pressure(samples: Samples, actuator: Actuator, moved: set[str]) -> tuple[str, ...]:
+    """Hold the pressure that moves the jack against the friction that it may have."""
+    jack = actuator.jack
+    half = max(round(0.5 * VELOCITY_SPAN_S * 1e9 / samples.period_ns), 1)
+    velocity = _velocity(samples.position, half, samples.period_ns * 1e-9)
+    present = (
+        np.isfinite(velocity)
+        & np.isfinite(samples.pressure)
+        & (np.abs(velocity) > READINGS.min_jack_speed_m_per_s)
+    )
+    if present.sum() < READINGS.min_moving_ticks or "spool" not in moved:
+        return ()
+    force = jack.AJ * samples.pressure[present] - jack.FR
+    usual = float(np.median(np.abs(force)))
+    low, high = (
+        READINGS.friction_range_shares[0] * jack.FDJ0,
+        READINGS.friction_range_shares[1] * jack.FDJ1,
+    )
+    ahead = float(np.mean(np.sign(force) == np.sign(velocity[present])))
+    if ahead < 0.35:
+        return ("pressure: its sign is reversed against the jack's motion, or the mapping says so",)
+    if low <= usual <= high:
+        return ()
+    fits = [
+        text for value, text in UNIT_ERROR_FACTORS if value > 0 and low <= usual / value <= high
+    ]
+    why = " or ".join(fits) if fits else "another unit was sent"
+    return (
+        f"pressure: {usual:.3g} N move the jack, its friction is {jack.FDJ0:g} …"
+        f" {jack.FDJ1:g} N: {why}",
+    )
+
+
+def _relation(
+    upper: str, lower: str, y: Array, x: Array, expected: float
+) -> ChannelRelation | None:
+    present = np.isfinite(x) & np.isfinite(y)
+    if present.sum() < READINGS.min_moving_ticks:
+        return None
+    x, y = x[present] - x[present].mean(), y[present] - y[present].mean()
+    power, other = float(x @ x), float(y @ y)
+    if (
+        power == 0.0
+        or other == 0.0
+        or abs(float(x @ y)) < READINGS.min_channel_correlation * np.sqrt(power * other)
+    ):
+        return None
+    return ChannelRelation(upper, lower, float(x @ y) / power / expected)
+
+
+def _velocity(position: Array, half: int, period: float) -> Array:
+    """Mean velocity about each tick, m/s; NaN near the ends."""
+    out = np.full(len(position), np.nan)
+    if len(position) > 2 * half:
+        out[half:-half] = (position[2 * half :] - position[: -2 * half]) / (2 * half * period)
+    return out
+
+
+def _smooth(values: Array, half: int) -> Array:
+    """Mean over the same ticks, of what is there."""
+    present = np.isfinite(values)
+    kernel = np.ones(2 * half)
+    if len(values) < len(kernel):
+        return values
+    total = np.convolve(np.where(present, values, 0.0), kernel, "same")
+    count = np.convolve(present.astype(np.float64), kernel, "same")
+    return np.where(count > half, total / np.maximum(count, 1.0), np.nan)
+
+
+def objections_to_travel(samples: Samples, actuator: Actuator) -> list[str]:
+    """Name the sensor that shows another motion than the other channels; empty where all agree.
+
+    The jack's velocity is close to the spool's position times flow gain over jack area (PHY-6,
+    PHY-7), so that both travels correlate. The current, which the spool follows, shows which of the
+    two sensors is wrong.
+    """
+    travels = _travels(samples, actuator)
+    if travels is None:
+        return []
+    expected, measured = travels
+    least = RESPONSE.min_rms_travel_lsb * actuator_channels(actuator).position.grain
+    moved = float(expected.std()), float(measured.std())
+    if max(moved) < least:
+        return []
+    correlation = float(np.mean((expected - expected.mean()) * (measured - measured.mean())))
+    correlation /= max(moved[0] * moved[1], np.finfo(np.float64).tiny)
+    if correlation >= READINGS.min_travel_correlation:
+        return []
+    spool_follows = any(
+        item.upper == "spool" and item.lower == "current" and item.ratio > 0.0
+        for item in channel_relations(samples, actuator)
+    )
+    sensor = "position" if spool_follows else "spool"
+    if correlation < READINGS.max_reversed_travel_correlation:
+        return [f"the {sensor} sensor reads with the wrong sign"]
+    what = (
+        "the position does not follow the flow that the spool lets through: jack seized or at its "
+        "end, or position sensor dead, frozen, or another signal"
+        if spool_follows
+        else "the spool follows neither the current nor the jack's motion: spool sensor dead, "
+        "frozen, or another signal, or torque motor wired the wrong way round"
+    )
+    return [
+        f"{what} (correlation of the jack's travel with the spool's flow {correlation:.2f}, "
+        f"at least {READINGS.min_travel_correlation:g} needed)"
+    ]
+
+
+def _travels(samples: Samples, actuator: Actuator) -> tuple[Array, Array] | None:
+    """Travel over the span by the spool's flow and by the position sensor, m; None: too few."""
+    tick = samples.period_ns * 1e-9
+    span = round(TRAVEL_SPAN_S / tick)
+    seen = np.flatnonzero(np.isfinite(samples.spool))
+    if len(seen) < RESPONSE.min_travel_share * len(samples.spool) or len(samples.spool) <= span + 2:
+        return None
+    spool = np.interp(np.arange(len(samples.spool)), seen, samples.spool[seen])
+    gain = actuator.servovalve.GQ / actuator.jack.AJ
+    passed = np.concatenate([[0.0], np.cumsum(spool[:-1])]) * tick * gain
+    expected = passed[span:] - passed[:-span]
+    position = _without_spikes(samples.position)
+    measured = position[span:] - position[:-span]
+    present = np.isfinite(measured)
+    if present.mean() < RESPONSE.min_travel_share:
+        return None
+    return expected[present], measured[present]
+
+
+def _without_spikes(values: Array) -> Array:
+    """Median of each known value and its known neighbours."""
+    out, seen = values.copy(), np.flatnonzero(np.isfinite(values))
+    present = values[seen]
+    if len(seen) > 2:
+        out[seen[1:-1]] = median_of_three(present)
+    return out
+
+
+def objections_to_actuator(actuator: Actuator) -> list[str]:
+    """Why an actuator file cannot be right, with the data to look at; empty if it can."""
+    controller, valve, jack = actuator.controller, actuator.servovalve, actuator.jack
+    slew = valve.GQF * valve.XFM / valve.AS
+    speed = valve.GQ * valve.XSM / jack.AJ
+    force = valve.GPF * valve.XFM * valve.AS
+    ratios = (
+        ("spool travel at rated current over spool stop", "GM, IM, KSF, XSM",
+         valve.GM * controller.IM / valve.KSF / valve.XSM, 1.0),
+        ("flapper travel at rated current over flapper stop", "GM, IM, KF, XFM",
+         valve.GM * controller.IM / valve.KF / valve.XFM, 2.0),
+        ("spool travel in 1 s over spool stop", "GQF, XFM, AS, XSM", slew / valve.XSM, 500.0),
+        ("first stage's force over spool friction at the limit", "GPF, XFM, AS, FSS1",
+         force / valve.FSS1, 5.0),
+        ("spool acceleration by the first stage over that in 0.1 ms", "GPF, XFM, AS, MS, GQF",
+         force / valve.MS / (slew / 1e-4), 20.0),
+        ("pressure at the spool's stop over supply", "GP, XSM, PSR",
+         valve.GP * valve.XSM / valve.PSR, 40.0),
+        ("jack travel in 1 s over jack stop", "GQ, XSM, AJ, XJM", speed / jack.XJM, 3.0),
+        ("jack force over jack friction at the limit", "PSR, AJ, FDJ1",
+         valve.PSR * jack.AJ / jack.FDJ1, 10.0),
+        ("jack acceleration by the supply over that in 10 ms", "PSR, AJ, MJ, GQ, XSM",
+         valve.PSR * jack.AJ / jack.MJ / (speed / 1e-2), 15.0),
+    )  # fmt: skip
+    return [
+        f"actuator file: {what} is {ratio:.2g}, usual is {usual:g}: check {data}"
+        for what, data, ratio, usual in ratios
+        if not usual / READINGS.max_actuator_ratio_factor
+        <= ratio
+        <= usual * READINGS.max_actuator_ratio_factor
+    ]

@@ -1,0 +1,339 @@
+"""Compares the measured signals with the response of the identified actuator.
+
+Late samples: residuals follow the modelled derivative, and their regression is the delay.
+Position sensor: its travel over a short span must be that of the modelled jack, since the
+severities come from spool and pressure alone and a broken position sensor would pass unseen.
+Supply: a measured pressure that stops where the modelled one rises further means a supply lower
+than its probe reads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.criteria import RESPONSE
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment
+from ehadiag.identify.identification_result import Identification
+from ehadiag.model.batch import NO_ANCHOR
+from ehadiag.model.residual_models import ModelResponse, model_response
+from firmware_iface.recording import SPOOL_CHANNEL
+
+
+def identified_response(experiment: Experiment, identification: Identification) -> ModelResponse:
+    """Return the response of the identified actuator to the current of an experiment.
+
+    Where a current was guessed the spool may break away another time, and the jack travels
+    otherwise for the rest of a ramp: the model is re-anchored on the spool then.
+    """
+    offset = identification.nuisances["spool_offset"].value
+    guessed = experiment.trace.guessed > 0.0
+    return model_response(
+        identification.constants(experiment.constants),
+        experiment.trace.current,
+        experiment.tick,
+        origin=experiment.origin,
+        measured=experiment.spool - offset,
+        anchor=experiment.anchor(ANCHOR_THRESHOLDS_LSB) if guessed else NO_ANCHOR,
+    )
+
+
+class DelayRegression(NamedTuple):
+    """Regression of delays, and fit of the position sensor."""
+
+    rounding_ticks: float = 0.15
+    """Distance from a whole number of ticks up to which a delay is one, ticks: of frames it always
+    is."""
+    travel_ticks: int = 20
+    """Span of the jack's travel, ticks: its position drifts from the model's."""
+    max_residual_stds: float = 4.0
+    """Largest residual of the regression, in deviations."""
+    corrections: int = 3
+    """Largest number of corrections, 1."""
+    regressions: int = 5
+    """Number of regressions, 1, each without the outliers of the one before."""
+    correlation_ticks: int = 20
+    """Ticks over which the model error is correlated, 1."""
+    fit_iterations: int = 8
+    """Iterations of the position sensor's robust fit, 1."""
+
+
+DELAYS = DelayRegression()
+
+
+@dataclass(frozen=True, slots=True)
+class Delay:
+    """Delay of a signal's samples."""
+
+    name: str
+    """The signal."""
+    value: float
+    """Ticks; positive: late."""
+    std: float
+    """Standard deviation, ticks."""
+
+
+def estimate_delays(experiment: Experiment, found: Identification) -> tuple[Delay, ...]:
+    """Regress the residuals of spool, pressure and position on the modelled derivatives.
+
+    The standard deviation of the position's delay is infinite where the jack hardly moves.
+    """
+    model = identified_response(experiment, found)
+    return (
+        _delay("spool", experiment.spool, model.spool),
+        _delay("pressure", experiment.pressure, model.pressure),
+        _delay("position", _travel(experiment.position), _travel(model.position)),
+    )
+
+
+def any_significant_delay(delays: Sequence[Delay]) -> bool:
+    """Whether a delay is large and certain enough to be corrected."""
+    return any(
+        abs(item.value) > max(RESPONSE.min_delay_ticks, RESPONSE.min_delay_stds * item.std)
+        for item in delays
+    )
+
+
+def correct_delays(
+    experiments: list[Experiment],
+    found: Identification,
+    identify: Callable[[Sequence[Experiment]], Identification],
+) -> tuple[list[Experiment], Identification, tuple[str, ...]]:
+    """Correct delays that the response shows, if that explains more of the recordings.
+
+    A delay of several ticks is seen only roughly before it is corrected, so the correction is
+    repeated. Returns experiments, their identification and notes; the arguments where no delay is
+    certain.
+    """
+    first, best = experiments, found
+    total = [estimate_delays(item, found) for item in experiments]
+    notes: tuple[str, ...] = ()
+    for _ in range(DELAYS.corrections):
+        if not any(map(any_significant_delay, total)):
+            break
+        moved = [shift_samples(item, own) for item, own in zip(first, total, strict=True)]
+        other = identify(moved)
+        if other.fit.outliers >= best.fit.outliers:
+            break
+        experiments, best = moved, other
+        notes = tuple(delay_note(own, first[0].tick) for own in total)
+        left = [estimate_delays(item, best) for item in experiments]
+        if not any(map(any_significant_delay, left)):
+            break
+        total = [_total_delays(own, rest) for own, rest in zip(total, left, strict=True)]
+    return experiments, best, notes
+
+
+def _total_delays(before: Sequence[Delay], left: Sequence[Delay]) -> tuple[Delay, ...]:
+    """Delays in all: those that were corrected, and those that remain."""
+    return tuple(
+        replace(rest, value=own.value + rest.value) for own, rest in zip(before, left, strict=True)
+    )
+
+
+def shift_samples(experiment: Experiment, delays: Sequence[Delay]) -> Experiment:
+    """Read late samples earlier, by straight lines between two of them."""
+    spool, pressure, position = (item.value for item in delays)
+    return replace(
+        experiment,
+        spool=_advanced(experiment.spool, spool),
+        pressure=_advanced(experiment.pressure, pressure),
+        position=_advanced(experiment.position, position),
+    )
+
+
+def delay_note(delays: Sequence[Delay], tick: float) -> str:
+    """Describe corrected delays in a sentence; tick: s."""
+    each = ", ".join(
+        f"{item.name} {1e3 * tick * item.value:+.3f} ± {1e3 * tick * item.std:.3f} ms"
+        for item in delays
+    )
+    return f"samples later than the ticks' ends, told by the response and put back: {each}"
+
+
+def _advanced(values: Array, ticks: float) -> Array:
+    """Values that many ticks later; NaN where one of two neighbours is missing."""
+    near = abs(ticks - round(ticks)) < DELAYS.rounding_ticks
+    whole = round(ticks) if near else math.floor(ticks)
+    part = 0.0 if near else ticks - whole
+    moved = _moved(values, whole)
+    return moved if part == 0.0 else (1.0 - part) * moved + part * _moved(values, whole + 1)
+
+
+def _moved(values: Array, ticks: int) -> Array:
+    out = np.full(len(values), np.nan)
+    if ticks >= 0:
+        out[: len(values) - ticks] = values[ticks:]
+    else:
+        out[-ticks:] = values[:ticks]
+    return out
+
+
+def _travel(position: Array) -> Array:
+    return position[DELAYS.travel_ticks :] - position[: -DELAYS.travel_ticks]
+
+
+def _delay(name: str, measured: Array, modelled: Array) -> Delay:
+    slope = np.gradient(modelled)
+    left = measured - modelled
+    used = np.isfinite(left)
+    value, std = 0.0, np.inf
+    for _ in range(DELAYS.regressions):
+        if used.sum() < RESPONSE.min_delay_samples or not np.ptp(slope[used]):
+            return Delay(name, 0.0, np.inf)
+        middle = slope[used].mean()
+        centred = slope[used] - middle
+        power = float(centred @ centred)
+        value = -float(centred @ left[used]) / power
+        away = left + value * slope
+        away = away - np.nanmean(away[used])
+        spread = 1.4826 * float(np.nanmedian(np.abs(away)))
+        std = spread / float(np.sqrt(power))
+        used = np.isfinite(left) & (np.abs(away) <= DELAYS.max_residual_stds * spread)
+    return Delay(name, float(value), std * float(np.sqrt(DELAYS.correlation_ticks)))
+
+
+TRAVEL_SPAN_S = 0.1
+"""Span over which measured and modelled travel of the jack are compared, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class PositionFit:
+    """Measured travel of the jack against the modelled one."""
+
+    gain: float
+    """Measured over modelled travel; NaN where the jack hardly moves."""
+    drift: float
+    """Of measured less modelled position, m/s."""
+    rms: float
+    """Of the travels that are left, in units of their noise (not below that of 1 LSB)."""
+    outliers: float
+    """Share of travels far off."""
+    most_drift: float = RESPONSE.max_position_drift_m_per_s
+    """Drift of a sound sensor at most, m/s."""
+
+
+def fit_position(experiment: Experiment, modelled: ModelResponse) -> PositionFit | None:
+    """Fit the sensor's gain and drift; None where there are too few samples of the position."""
+    span = round(TRAVEL_SPAN_S / experiment.tick)
+    measured = experiment.position[span:] - experiment.position[:-span]
+    seen = np.isfinite(measured)
+    if seen.mean() < RESPONSE.min_travel_share:
+        return None
+    model = modelled.position
+    channels = experiment.channels
+    unit = np.sqrt(2.0) * max(experiment.position_noise, channels.position.lsb)
+    travel = (model[span:] - model[:-span])[seen] / unit
+    moves = (
+        float(np.sqrt(np.mean(travel**2))) * unit
+        >= RESPONSE.min_rms_travel_lsb * channels.position.grain
+    )
+    columns = [travel, np.ones_like(travel)] if moves else [np.ones_like(travel)]
+    values = measured[seen] / unit - (0.0 if moves else travel)
+    solution, left = _robust_fit(np.column_stack(columns), values)
+    smoothed = np.abs(median_of_three(left))
+    most = np.minimum(left**2, RESPONSE.min_travel_outlier**2)
+    return PositionFit(
+        gain=float(solution[0]) if moves else float("nan"),
+        drift=float(solution[-1]) * unit / TRAVEL_SPAN_S,
+        rms=float(np.sqrt(np.mean(most))),
+        outliers=float(np.mean(smoothed > RESPONSE.min_travel_outlier)),
+        most_drift=RESPONSE.max_position_drift_m_per_s
+        * (channels.spool.full_scale / SPOOL_CHANNEL.full_scale),
+    )
+
+
+def max_position_gain_error(actuator: Actuator) -> float:
+    """Largest relative gain error of the sensor that errors of actuator data may explain."""
+    calibration = actuator.calibration
+    return (
+        RESPONSE.max_position_gain_error_calibrated
+        if calibration is not None and calibration.plays > 1
+        else RESPONSE.max_position_gain_error
+    )
+
+
+def objections_to_position(
+    fit: PositionFit, max_gain_error: float = RESPONSE.max_position_gain_error
+) -> list[str]:
+    """Reasons why the position sensor is not trusted; max_gain_error: largest error of its gain."""
+    if fit.gain < RESPONSE.max_reversed_position_gain:
+        return ["the position sensor reads with the wrong sign"]
+    if fit.gain < RESPONSE.min_position_gain:
+        return ["the position sensor does not follow the jack: dead, frozen, or another signal"]
+    if fit.outliers > RESPONSE.max_travel_outlier_share or fit.rms > RESPONSE.max_travel_rms:
+        return [
+            f"the position sensor does not follow the jack: travel over {TRAVEL_SPAN_S:g} s is "
+            f"off by "
+            f"{fit.rms:.1f} times the noise rms (limit {RESPONSE.max_travel_rms:g}), "
+            f"{fit.outliers:.1%} of it by "
+            f"more than {RESPONSE.min_travel_outlier:g} times (limit "
+            f"{RESPONSE.max_travel_outlier_share:.0%})"
+        ]
+    off = abs(fit.gain - 1.0)
+    if off > max_gain_error:
+        side = "high" if fit.gain > 1.0 else "low"
+        return [
+            f"the position sensor reads {off:.0%} too {side} (limit {max_gain_error:.0%}), or "
+            "flow gain and jack area are not those of the actuator file"
+        ]
+    if abs(fit.drift) > fit.most_drift:
+        return [
+            f"the position sensor runs away by {fit.drift * 1e3:.2g} mm/s "
+            f"(limit {fit.most_drift * 1e3:g})"
+        ]
+    return []
+
+
+def _robust_fit(columns: Array, values: Array) -> tuple[Array, Array]:
+    """Least squares reweighted by Cauchy's weights; the solution, and what is left."""
+    weight = np.ones_like(values)
+    for _ in range(DELAYS.fit_iterations):
+        weighed = columns * weight[:, None]
+        solution = np.linalg.pinv(weighed.T @ columns) @ (weighed.T @ values)
+        left = values - columns @ solution
+        weight = 1.0 / (1.0 + (left / ESTIMATION.cauchy_scale) ** 2)
+    return solution, left
+
+
+def median_of_three(values: Array) -> Array:
+    """Median of each value and its two neighbours, without the ends: a single bad value leaves no
+    trace.
+    """
+    return np.asarray(np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0))
+
+
+def objections_to_supply(
+    experiment: Experiment, modelled: ModelResponse, offset: float
+) -> list[str]:
+    """Reason to take the measured pressure for cut off; empty if it is not.
+
+    Supply less return pressure bounds the differential pressure (PHY-6); a probe that reads too
+    much shows only where that bound is reached, often for a few milliseconds of the test. offset:
+    of the pressure sensor, beyond the one that `experiment` is free of, Pa.
+    """
+    measured = experiment.pressure - offset
+    seen = np.isfinite(measured)
+    if not seen.any():
+        return []
+    for side in (1.0, -1.0):
+        got, expected = side * measured[seen], side * modelled.pressure[seen]
+        top = float(got.max())
+        margin = max(
+            RESPONSE.min_pressure_excess_stds * experiment.pressure_noise,
+            RESPONSE.min_pressure_excess_share * abs(top),
+        )
+        if np.count_nonzero(expected > top + margin) > RESPONSE.max_pressure_excess_ticks:
+            return [
+                f"the pressure stops at {side * top * 1e-6:.2f} MPa where the model goes on to "
+                f"{side * float(expected.max()) * 1e-6:.2f} MPa: supply lower than its probe says,"
+                " or pressure sensor cut off"
+            ]
+    return []

@@ -1,0 +1,335 @@
+"""Estimates when an acquisition sampled within the control ticks, from the response itself.
+
+What a logger shows of the ticks leaves some part of its sampling interval open, and a fast spool
+moves far in that. The model is held against each sample at its own instant within the tick: clock
+and drift are estimated together with the severities, by Gauss-Newton steps from those of the
+search; what they leave unsure is in the intervals. The samples then go to one instant of the tick
+by what the model moves from the one to the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ehadiag.compile.jit import Array
+from ehadiag.identify.estimates import interval95
+from ehadiag.identify.experiment import Experiment, unknowns_of
+from ehadiag.identify.identification_result import Identification
+from ehadiag.model.registry import FAULT_NAMES, FAULTS
+from ehadiag.model.residual_models import model_response
+from firmware_iface.sampling import SAMPLING, values_at
+
+__all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
+
+
+class InstantRules(NamedTuple):
+    """Estimation of sampling instants."""
+
+    rounds: int = 3
+    """Largest number of times that severities and instants are found from one another, 1."""
+    steps: int = 12
+    """Largest number of Gauss-Newton steps, 1."""
+    max_severity_step: float = 0.1
+    """Largest change of a severity in one step, 1."""
+    severity_step: float = 2e-3
+    """Difference of a severity for its derivative, 1."""
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1)
+    """Shares of a step that are tried until one explains more, 1."""
+    cauchy: float = 3.0
+    """Residual from which Cauchy's cost counts it little, in deviations."""
+    settled: float = 1e-4
+    """Share of the cost by which a step must lower it to be followed by another, 1."""
+    most_stds: float = 4.0
+    """Largest residual that counts, in deviations of all."""
+    fits: int = 6
+    """Fits of one step, 1, each without the outliers of the one before."""
+    sufficient_rate: float = 5000.0
+    """Rate that suffices, Hz: `tools/study daq-recordings` is exact from there on."""
+    max_step_ticks: float = 0.6
+    """Largest change of the instant, ticks: beyond it is another tick."""
+    instants_per_tick: int = 6
+    """Instants of a tick at which the model is run, 1, besides the four of a cubic: it rings on the
+    oil at 80 Hz, a thirteenth of a turn a tick."""
+
+
+INSTANTS = InstantRules()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Clock:
+    """Ticks on the acquisition's clock: lead (s) and drift (1) later than they were found."""
+
+    lead: float = 0.0
+    drift: float = 0.0
+
+    def ends(self, experiment: Experiment) -> Array:
+        """Ends of the ticks, s."""
+        acquired, tick = experiment.acquired, experiment.tick
+        assert acquired is not None
+        since = (np.arange(experiment.ticks) - 0.5 * experiment.ticks) * tick
+        return experiment.sampled + acquired.lead + self.lead + self.drift * since
+
+    def instant(self, experiment: Experiment) -> float:
+        """Time before the ends at which samples are wanted, s."""
+        assert experiment.acquired is not None
+        return (experiment.acquired.lead + self.lead) % experiment.tick
+
+
+class _Samples(NamedTuple):
+    """One sample of spool and pressure for each tick."""
+
+    value: Array
+    """In deviations of the noise, NaN where there is none, shape (2, n)."""
+    before: Array
+    """Time before the end of the tick, s, shape (2, n)."""
+
+
+def _sampled(experiment: Experiment, clock: _Clock) -> _Samples:
+    """Samples nearest to the instant that is wanted, within each tick."""
+    assert experiment.acquired is not None
+    ends, wanted, tick = clock.ends(experiment), clock.instant(experiment), experiment.tick
+    values, before = [], []
+    for recorded, row, offset, noise in zip(
+        experiment.acquired.signals[:2],
+        (experiment.spool, experiment.pressure),
+        (experiment.spool_offset, experiment.pressure_offset),
+        experiment.noise[:2],
+        strict=True,
+    ):
+        time, value = recorded.time, recorded.value
+        if tick * len(time) >= SAMPLING.averaged * (time[-1] - time[0]):
+            seen, lead = values_at(recorded, ends - wanted, tick)[0], np.full(len(ends), wanted)
+        else:
+            after = np.clip(np.searchsorted(time, ends - wanted), 1, len(time) - 1)
+            choice = np.stack([after - 1, after])
+            away = ends - time[choice]
+            outside = (away < 0.0) | (away >= tick)
+            best = np.argmin(np.where(outside, np.inf, np.abs(away - wanted)), axis=0)
+            rows = np.arange(len(ends))
+            lead = np.clip(away[best, rows], 0.0, tick)
+            seen = np.where(outside.all(axis=0), np.nan, value[choice[best, rows]])
+        # What was left out for another reason than its reading stays out.
+        here = values_at(recorded, experiment.sampled, tick)[0]
+        left_out = np.isnan(row) & np.isfinite(here)
+        values.append(np.where(left_out, np.nan, seen - offset) / noise)
+        before.append(lead)
+    return _Samples(np.stack(values), np.stack(before))
+
+
+class _Response:
+    """Response of the model at some instants of each tick, in deviations of the noise."""
+
+    def __init__(self, experiment: Experiment, severities: Array, before: Array) -> None:
+        low, high = float(before.min()), float(before.max())
+        count = 4 + math.ceil(INSTANTS.instants_per_tick * (high - low) / experiment.tick)
+        high = max(high, low + 1e-3 * experiment.tick)
+        if high > experiment.tick:
+            low, high = experiment.tick - (high - low), experiment.tick
+        self._low, self._step = low, (high - low) / (count - 1)
+        self._grid = np.stack(
+            [_at(experiment, severities, low + k * self._step) for k in range(count)]
+        )
+
+    def at(self, before: Array) -> tuple[Array, Array]:
+        """Response so long before the ends of the ticks, s, and its derivative, 1/s; (2, n)."""
+        place = (before - self._low) / self._step
+        first = np.clip(np.floor(place).astype(np.int64) - 1, 0, len(self._grid) - 4)
+        part = place - first
+        channel, tick = np.indices(before.shape)
+        value, slope = np.zeros(before.shape), np.zeros(before.shape)
+        for k in range(4):
+            others = [j for j in range(4) if j != k]
+            scale = math.prod(k - j for j in others)
+            factors = [part - j for j in others]
+            node = self._grid[first + k, channel, tick] / scale
+            value += node * factors[0] * factors[1] * factors[2]
+            slope += node * (
+                factors[0] * factors[1] + factors[0] * factors[2] + factors[1] * factors[2]
+            )
+        return value, slope / self._step
+
+
+def _at(experiment: Experiment, severities: Array, before: float) -> Array:
+    """Spool and pressure so long before the ends of the ticks, in deviations of the noise."""
+    acquired = experiment.acquired
+    assert acquired is not None
+    constants = unknowns_of([experiment], FAULTS).constants(severities)
+    constants = constants._replace(DLY=experiment.constants.DLY - acquired.lead + before)
+    model = model_response(
+        constants, experiment.trace.current, experiment.tick, origin=experiment.origin
+    )
+    spool, pressure = experiment.noise[:2]
+    return np.stack([model.spool / spool, model.pressure / pressure])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Severities and clock, and what they leave of the samples."""
+
+    severities: Array
+    clock: _Clock
+    samples: _Samples
+    model: Array
+    """At the samples' instants, shape (2, n)."""
+    slope: Array
+    """Of the model with the time before the ends, 1/s, shape (2, n)."""
+
+    @classmethod
+    def of(cls, experiment: Experiment, severities: Array, clock: _Clock) -> _Fit:
+        samples = _sampled(experiment, clock)
+        response = _Response(experiment, severities, samples.before)
+        return cls(severities, clock, samples, *response.at(samples.before))
+
+    @property
+    def cost(self) -> float:
+        """Mean of Cauchy's cost of the residuals, offsets aside."""
+        total = 0.0
+        for away in self.samples.value - self.model:
+            left = away[np.isfinite(away)]
+            left = left - np.median(left) if left.size else np.full(1, np.inf)
+            total += float(np.mean(np.log1p(left**2 / INSTANTS.cauchy**2)))
+        return total
+
+
+class _Step(NamedTuple):
+    severities: Array
+    """Change of the severities, shape (k,)."""
+    lead: float
+    """Change of the clock's lead, s."""
+    drift: float
+    """Change of the clock's rate, 1."""
+    variance: Array
+    """Of the severities, that the clock adds, shape (k,)."""
+
+
+def settle_instants(
+    experiments: Sequence[Experiment], severities: Mapping[str, float]
+) -> tuple[list[Experiment], Array]:
+    """Return the experiments with the instants that the response shows, and variances.
+
+    The variances, shape (k,), are what the instants add to those of the severities. severities:
+    from which to start.
+    """
+    done = [
+        (item, np.zeros(len(FAULT_NAMES))) if item.acquired is None else _settled(item, severities)
+        for item in experiments
+    ]
+    return [item for item, _ in done], np.max([variance for _, variance in done], axis=0)
+
+
+def _settled(experiment: Experiment, start: Mapping[str, float]) -> tuple[Experiment, Array]:
+    """One experiment at its own instants, and the variances that they add."""
+    fit = _Fit.of(experiment, np.array([start[name] for name in FAULT_NAMES]), _Clock())
+    step = _step(experiment, fit)
+    for _ in range(INSTANTS.steps):
+        for share in INSTANTS.shares:
+            other = _Fit.of(
+                experiment,
+                np.clip(fit.severities + share * step.severities, 0.0, 1.0),
+                _Clock(fit.clock.lead + share * step.lead, fit.clock.drift + share * step.drift),
+            )
+            if other.cost < fit.cost:
+                break
+        else:
+            break
+        gain, fit = fit.cost - other.cost, other
+        step = _step(experiment, fit)
+        if gain < INSTANTS.settled * fit.cost:
+            break
+    return _placed(experiment, fit), step.variance
+
+
+def _placed(experiment: Experiment, fit: _Fit) -> Experiment:
+    """Samples at one instant of the ticks."""
+    acquired, wanted = experiment.acquired, fit.clock.instant(experiment)
+    assert acquired is not None
+    at = fit.clock.ends(experiment) - wanted
+    there = _at(experiment, fit.severities, wanted)
+    spool, pressure = fit.samples.value - fit.model + there
+    position = values_at(acquired.signals[2], at, experiment.tick)[0]
+    return replace(
+        experiment,
+        sampled=at,
+        spool=spool * experiment.spool_noise,
+        pressure=pressure * experiment.pressure_noise,
+        position=position - experiment.position_offset,
+        constants=experiment.constants._replace(
+            DLY=experiment.constants.DLY - acquired.lead + wanted
+        ),
+        acquired=acquired._replace(lead=wanted),
+    )
+
+
+def why_sampled_seldom(experiments: Sequence[Experiment]) -> tuple[str, ...]:
+    """Name the rate of an acquisition that may be too slow for what is refused."""
+    rates = [item.acquired.rate for item in experiments if item.acquired is not None]
+    if min(rates, default=np.inf) >= (1.0 - 1e-3) * INSTANTS.sufficient_rate:
+        return ()
+    return (
+        f"the acquisition took {min(rates):.0f} samples a second, and the spool breaks away between"
+        f" them: {INSTANTS.sufficient_rate:.0f} Hz suffice",
+    )
+
+
+def widen_by_instants(found: Identification, variance: Array) -> Identification:
+    """Add the uncertainty of sampling instants to the severities' intervals."""
+    std = [
+        math.sqrt(item.std**2 + more)
+        for item, more in zip(found.estimates, variance.tolist(), strict=True)
+    ]
+    estimates = tuple(
+        replace(item, std=wide, interval95=interval95(item.value, wide))
+        for item, wide in zip(found.estimates, std, strict=True)
+    )
+    return replace(found, estimates=estimates, covariance=found.covariance + np.diag(variance))
+
+
+def _step(experiment: Experiment, fit: _Fit) -> _Step:
+    """Gauss-Newton step of severities, clock and offsets together."""
+    acquired = experiment.acquired
+    assert acquired is not None
+    wanted = fit.clock.instant(experiment)
+    here = _at(experiment, fit.severities, wanted)
+    columns: list[Array] = []
+    for index, value in enumerate(fit.severities.tolist()):
+        side = INSTANTS.severity_step if value < 0.5 else -INSTANTS.severity_step
+        other = np.asarray(fit.severities.copy())
+        other[index] += side
+        columns.append((_at(experiment, other, wanted) - here) / side)
+    since = (np.arange(experiment.ticks) - 0.5 * experiment.ticks) * experiment.tick
+    ones, none = np.ones(experiment.ticks), np.zeros(experiment.ticks)
+    columns += [fit.slope, fit.slope * since, np.stack([ones, none]), np.stack([none, ones])]
+    table = np.stack([column.ravel() for column in columns], axis=1)
+    left = (fit.samples.value - fit.model).ravel()
+    prior, about = np.zeros(table.shape[1]), np.zeros(table.shape[1])
+    count = len(FAULT_NAMES)
+    prior[:count] = 1.0
+    prior[count : count + 2] = 1.0 / acquired.lead_std**2, 1.0 / acquired.drift_std**2
+    about[count : count + 2] = -fit.clock.lead, -fit.clock.drift
+    used = np.isfinite(left)
+    scale = 1.0
+    step: Array = np.zeros(table.shape[1])
+    for _ in range(INSTANTS.fits):
+        rows = table[used]
+        information = rows.T @ rows / scale**2 + np.diag(prior)
+        right = rows.T @ left[used] / scale**2 + prior * about
+        step = np.asarray(np.linalg.solve(information, right))
+        away = np.abs(left - table @ step)
+        scale = max(1.4826 * float(np.nanmedian(away)), 1.0)
+        used = np.isfinite(left) & (away <= INSTANTS.most_stds * scale)
+    most = INSTANTS.max_step_ticks * experiment.tick
+    rest = np.delete(np.arange(table.shape[1]), [count, count + 1])
+    alone = np.linalg.inv(information[np.ix_(rest, rest)])
+    more = np.diag(np.linalg.inv(information))[:count] - np.diag(alone)[:count]
+    farthest = INSTANTS.max_severity_step
+    return _Step(
+        np.clip(step[:count], -farthest, farthest),
+        float(np.clip(step[count], -most, most)),
+        float(step[count + 1]),
+        np.maximum(more, 0.0),
+    )

@@ -1,0 +1,1 @@
+"""Many recordings in one call: workers, a journal that resumes, and files of all results."""

@@ -1,0 +1,290 @@
+"""The JSON-lines file of a call's results, which a later call can resume; one call at a time."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, NamedTuple
+
+import msgspec
+
+from ehadiag.core.conventions import MAX_RESULT_BYTES, fingerprint
+from ehadiag.records import configuration_of, package
+from ehadiag.result import Configuration, Log, Result
+from ehadiag.setup import Setup, log_of
+from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
+from firmware_iface.files import RESULT_MODE, Folder, create_file, reopen_file
+
+
+@contextmanager
+def lock_result_file(path: Path) -> Iterator[None]:
+    """Hold a file of results while the block runs, by an empty file `NAME.lock` beside it.
+
+    The system lets go of it too where the call is killed.
+
+    path: the file; it need not be there, but its folder must be. InputOutputError: another call
+    holds it; FileNotFoundError: there is no such folder.
+    """
+    from filelock import FileLock, Timeout  # noqa: PLC0415 - only who writes such a file
+
+    if not path.parent.is_dir():  # the library would make it
+        raise FileNotFoundError(2, "No such file or directory")
+    try:
+        lock = FileLock(f"{path}.lock", timeout=0).acquire()
+    except Timeout:
+        raise InputOutputError(
+            f"results {path}: another call is writing to it; wait for its end, or name another file"
+        ) from None
+    with lock:
+        yield
+
+
+MAX_DIFFERENCES_NAMED = 3
+"""Reasons that are told of one result."""
+CONFIGURATION_WORDS = {
+    "levels": "level of verdicts",
+    "nuisances": "choice of nuisances",
+    "time_limit_s": "time limit",
+    "every_test": "choice of tests (--all)",
+    "tests_sha256": "test file",
+    "columns_sha256": "meaning of columns",
+    "start_s": "start (--start)",
+    "end_s": "end (--end)",
+}
+"""What decides a result, where its key does not say it to people."""
+LogKey = tuple[int, str, int, int]
+"""Place of the setup that found it; path, size and time of the last change of a log."""
+
+
+class _StoredLine(NamedTuple):
+    """A result that an earlier call left."""
+
+    log: str
+    failed: bool
+    place: tuple[int, int]
+
+
+class ResultJournal:
+    """Results on the disk, one object a line, each there before the next is come to.
+
+    With an earlier call's file, its results stand for the logs that have not changed since, where
+    all that decides them is the same: options, actuator, tests, mapping, version. All others, and
+    logs that could not be read, are tried again. When the call ends, the file has one call's
+    results in the order of the inputs; until then, new ones are added at its end.
+
+    name: of the file; setups: what is wanted, of each actuator on the bus: results of other options
+    are none of this call; resume: whether the file may be there already. InputOutputError: the file
+    is there and nobody wants to go on with it; another call uses it; it cannot be read or written;
+    ConfigurationError: it holds something else.
+    """
+
+    def __init__(self, name: str, setups: Sequence[Setup], *, resume: bool) -> None:
+        self._name = name
+        self._path = Path(name)
+        self._own = [_decisive_of(setup) for setup in setups]
+        """What decides the results of each setup."""
+        self._others: Counter[str] = Counter()
+        self._known: dict[LogKey, list[tuple[int, int]]] = {}
+        self._order: list[tuple[int, int]] = []
+        self._there: list[_StoredLine] = []
+        """What earlier calls left, in its order."""
+        self._diagnosed: set[str] = set()
+        self._failed: set[str] = set()
+        """Logs of this call, by whether they gave a result."""
+        self._held = ExitStack()
+        try:
+            self._held.enter_context(lock_result_file(self._path))
+            with self._held:  # let go where the file cannot be opened
+                self._file = self._open(resume)
+                self._held = self._held.pop_all()
+        except FileExistsError:
+            raise InputOutputError(
+                f"results {name}: there is such a file; go on with it by --resume, or name another"
+            ) from None
+        except OSError as error:
+            raise InputOutputError(f"results {name}: {reason_of(error)}") from None
+
+    @property
+    def replaced(self) -> str:
+        """Say how many earlier results do not count, and why; empty where there are none."""
+        if not self._others:
+            return ""
+        why = ", ".join(f"another {what} ({count})" for what, count in self._others.most_common())
+        return (
+            f"results {self._name}: {self._others.total()} of an earlier call do not count here and"
+            f" are replaced by what is found now: {why}"
+        )
+
+    def found(self, log: str, place: int) -> list[Result]:
+        """Return the results of a log that an earlier call found; none where it must be now.
+
+        place: of the setup.
+        """
+        now = log_of(log)
+        if now is None:
+            return []
+        places = self._known.get(_key(place, now), [])
+        return [Result.from_json(self._line(at, size)) for at, size in places]
+
+    def add(self, result: Result, place: int, *, reused: bool) -> None:
+        """Write a result down, or take note of where one that was there already has its place."""
+        (self._failed if result.error else self._diagnosed).add(_path_of(result))
+        log = result.origins[0].log if result.origins else None
+        if reused and log is not None:
+            self._order.append(self._known[_key(place, log)][log.result - 1])
+            return
+        content = result.to_json().encode() + b"\n"
+        try:
+            self._file.seek(0, os.SEEK_END)
+            at = self._file.tell()
+            self._file.write(content)
+            self._file.flush()
+        except OSError as error:
+            raise InputOutputError(f"results {self._name}: {reason_of(error)}") from None
+        self._order.append((at, len(content)))
+
+    def settle(self) -> None:
+        """Bring the results of this call into the order of its inputs, each once as named.
+
+        Those of other logs stay, before them, and so does what was found of a log that cannot be
+        read any more.
+        """
+        order = [item.place for item in self._there if not self._is_replaced(item)] + self._order
+        at = 0
+        for start, size in order:
+            if start != at:
+                break
+            at += size
+        else:
+            self._file.seek(0, os.SEEK_END)
+            if at == self._file.tell():
+                return
+        try:
+            with (
+                Folder.at(self._path.parent, RESULT_MODE, follow=True) as folder,
+                folder.drafted(self._path.name) as file,
+            ):
+                for start, size in order:
+                    file.write(self._line(start, size).encode() + b"\n")
+                self._file.close()  # Windows replaces no file that is open
+        except OSError as error:
+            raise InputOutputError(f"results {self._name}: {reason_of(error)}") from None
+
+    def _is_replaced(self, item: _StoredLine) -> bool:
+        return item.log in self._diagnosed or (item.failed and item.log in self._failed)
+
+    def __enter__(self) -> ResultJournal:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+        self._held.close()
+
+    def _open(self, resume: bool) -> BinaryIO:
+        if not (resume and os.path.lexists(self._path)):
+            return os.fdopen(create_file(self._path), "r+b")
+        try:
+            file = os.fdopen(reopen_file(self._path), "r+b")
+        except OSError as error:
+            link = error.errno == errno.ELOOP
+            why = "a link, which is not followed" if link else reason_of(error)
+            raise InputOutputError(f"results {self._name}: {why}") from None
+        try:
+            self._index(file)
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def _index(self, file: BinaryIO) -> None:
+        """Find what an earlier call left; what it had only begun to write is cut off."""
+        at, number = 0, 0
+        groups: dict[LogKey, list[tuple[int, int]]] = {}
+        while line := file.readline(MAX_RESULT_BYTES):
+            number += 1
+            if not line.endswith(b"\n"):
+                if len(line) == MAX_RESULT_BYTES:
+                    raise ConfigurationError(f"results {self._name}: line {number} is none of ours")
+                file.truncate(at)
+                break
+            result = self._checked(line, number)
+            place = self._place_of(result)
+            log = result.origins[0].log if len(result.origins) == 1 else None
+            if place is not None and result.error is None and log is not None:
+                self._remember(groups, _key(place, log), log, (at, len(line)))
+            self._there.append(_StoredLine(_path_of(result), bool(result.error), (at, len(line))))
+            at += len(line)
+
+    def _remember(
+        self,
+        groups: dict[LogKey, list[tuple[int, int]]],
+        key: LogKey,
+        log: Log,
+        place: tuple[int, int],
+    ) -> None:
+        if log.result == 1:
+            groups[key] = []
+        groups.setdefault(key, []).append(place)
+        if len(groups[key]) == log.results:
+            self._known[key] = groups[key]
+
+    def _checked(self, line: bytes, number: int) -> Result:
+        """Return an earlier result; ConfigurationError where it is none."""
+        try:
+            return Result.from_json(line)
+        except ValueError:
+            raise ConfigurationError(
+                f"results {self._name}: line {number} is no object ehadiag.diagnosis/3"
+            ) from None
+
+    def _place_of(self, result: Result) -> int | None:
+        """Return the place of the setup whose result it is; None, and count why, of others."""
+        there = _decisive_options(
+            result.configuration, result.actuator_sha256, result.package.version
+        )
+        if there in self._own:
+            return self._own.index(there)
+        nearest = min(self._own, key=lambda own: len(_differing_options(own, there)))
+        self._others[" and ".join(_differing_options(nearest, there)[:MAX_DIFFERENCES_NAMED])] += 1
+        return None
+
+    def _line(self, at: int, size: int) -> str:
+        self._file.seek(at)
+        return self._file.read(size).decode().rstrip("\n")
+
+
+def _key(place: int, log: Log) -> LogKey:
+    return place, log.path, log.bytes, log.modified_ns
+
+
+def _path_of(result: Result) -> str:
+    """Path of the log that a result is of."""
+    log = result.error.log if result.error else result.origins[0].log if result.origins else None
+    return os.path.abspath(result.source) if log is None else log.path
+
+
+def _decisive_of(setup: Setup) -> dict[str, Any]:
+    """All that decides a setup's results, but for the logs."""
+    found = configuration_of(setup.request, setup.sources)
+    return _decisive_options(found, fingerprint(setup.actuator), package().version)
+
+
+def _decisive_options(found: Configuration, actuator: str | None, version: str) -> dict[str, Any]:
+    """All that decides results; of a mapping what it says counts, not where its file lies."""
+    same = {**msgspec.structs.asdict(found), "mapping": found.mapping.sha256}
+    return {**same, "actuator": actuator, "version": version}
+
+
+def _differing_options(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    keys = [key for key in (*one, *other) if one.get(key, ...) != other.get(key, ...)]
+    return [CONFIGURATION_WORDS.get(key, key) for key in dict.fromkeys(keys)]

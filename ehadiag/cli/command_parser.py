@@ -1,0 +1,123 @@
+"""Parser of every command: a short help and a long one, and errors that say what was meant."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from firmware_iface.errors import printable
+
+__all__ = ["CommandParser", "FullHelpAction", "refuse_former_options", "show_usual"]
+
+FORMER_OPTIONS = {
+    "--serial": "--port URL for a serial port, --unit N for the unit",
+    "--serial-number": "--unit N",
+}
+"""Options of earlier versions, with what is given instead."""
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Says what is wrong in one line, and where to read on; its help shows the usual options."""
+
+    usual: Sequence[str] = ()
+    """Options, or positional arguments, that the short help shows; none: it shows all."""
+    examples: Sequence[str] = ()
+    """Command lines at the end of the short help."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2 and one line."""
+        command = self.prog.partition(" ")[2]
+        where = f"{command}: " if command else ""
+        self.exit(2, f"ehadiag: {where}{printable(message)}; see {self.prog} --help\n")
+
+    def refuse_unknown(self, words: Sequence[str]) -> NoReturn:
+        """End for options that the command does not have; name the one most alike."""
+        from difflib import get_close_matches  # noqa: PLC0415 - not where nothing is misspelt
+
+        known = [name for action in self._actions for name in action.option_strings]
+        texts = []
+        for word in words:
+            name = word.split("=", 1)[0]
+            near = get_close_matches(name, known, n=1) if name.startswith("-") else []
+            texts.append(word + (f" (did you mean {near[0]}?)" if near else ""))
+        self.error(f"unrecognized arguments: {' '.join(texts)}")
+
+    def format_help(self) -> str:
+        """Return the help: of the usual options only, where the command names them."""
+        if not self.usual:
+            return super().format_help()
+        formatter = self._get_formatter()
+        named = {
+            name: item for item in self._actions for name in item.option_strings or [item.dest]
+        }
+        chosen = [named[name] for name in self.usual]
+        shown = [item for item in chosen if item.required or not item.option_strings]
+        formatter.add_usage(None, shown, (), f"usage: {self.prog} [options] ")
+        formatter.add_text(self.description)
+        formatter.start_section("most used")
+        formatter.add_arguments(chosen)
+        formatter.end_section()
+        rest = sum(item.help is not argparse.SUPPRESS for item in self._actions) - len(chosen)
+        text = formatter.format_help().replace(f"[options] {self.prog}", "[options]", 1)
+        examples = "".join(f"  {line}\n" for line in self.examples)
+        more = f"\n{self.prog} --help-all shows {rest} more options.\n"
+        return f"{text}\nexamples:\n{examples}{more}"
+
+    def format_full_help(self) -> str:
+        """Return the help of all options."""
+        return super().format_help()
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            from difflib import get_close_matches  # noqa: PLC0415 - not where nothing is misspelt
+
+            near = get_close_matches(str(value), list(action.choices), n=1)
+            hint = f", did you mean {near[0]}?" if near else ""
+            raise argparse.ArgumentError(None, f"there is no command {value!r}{hint}")
+        super()._check_value(action, value)
+
+
+class FullHelpAction(argparse.Action):
+    """Print the help of all options, and end."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        """Print and end."""
+        assert isinstance(parser, CommandParser)
+        print(parser.format_full_help(), end="")
+        parser.exit()
+
+
+def show_usual(parser: argparse.ArgumentParser, *usual: str, examples: Sequence[str]) -> None:
+    """Let `--help` show the usual options and examples only, and `--help-all` the rest too.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of a command.
+    *usual : str
+        Options and positional arguments.
+    examples : Sequence[str]
+        Command lines.
+    """
+    assert isinstance(parser, CommandParser)
+    parser.usual, parser.examples = usual, examples
+    parser.add_argument(
+        "--help-all", action=FullHelpAction, nargs=0, help="show all options and exit"
+    )
+
+
+def refuse_former_options(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    """End where an option of an earlier version is given; the error names the new ones.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command that is called.
+    given : Sequence[str]
+        The command line.
+    """
+    for word in given:
+        name = word.split("=", 1)[0]
+        if name in FORMER_OPTIONS:
+            parser.error(f"{name} has another name now: {FORMER_OPTIONS[name]}")

@@ -1,0 +1,395 @@
+"""Commands on recordings and their results: `diagnose` and `report`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from ehadiag.assess.verdict import Levels
+from ehadiag.batch.workers import LogInput, expand_logs
+from ehadiag.cli import options
+from ehadiag.cli.batch_run import add_batch_options, diagnose_all, diagnose_and_deliver
+from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.history_options import add_history_option, add_history_options, history_path
+from ehadiag.cli.option_values import (
+    ActuatorArguments,
+    add_actuators_options,
+    arguments_of_actuators,
+)
+from ehadiag.cli.result_output import (
+    OutputFile,
+    ResultWriter,
+    open_output_folder,
+    refuse_overwriting,
+    refuse_unwritable,
+    reserved_stems,
+)
+from ehadiag.core.conventions import MAX_RESULT_BYTES, fingerprint
+from ehadiag.core.interruption import defer_signals
+from ehadiag.report.rendering import (
+    diagnosis_html_page,
+    index_html_page,
+)
+from ehadiag.request import Request, request_options
+from ehadiag.result import Result
+from ehadiag.setup import Setup
+from ehadiag.terminal.output import (
+    exit_code_of_inputs,
+    print_compiling_notice,
+    print_status,
+    worst_exit_code,
+)
+from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
+from firmware_iface.files import read_small_file, write_file
+from firmware_iface.logs.log_files import FRAME_READERS
+
+if TYPE_CHECKING:
+    from ehadiag.result import Log
+    from firmware_iface.recording import Recording
+
+OPTIONS_UNUSED_BY_LIST = (
+    "joint", "out", "report", "history", "hours", "cycles", "results", "resume", "junit", "summary",
+)  # fmt: skip
+"""Options that say what becomes of a diagnosis."""
+UNSET_VALUES: tuple[object, ...] = (None, False, [])
+
+
+def define_diagnose(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        f"Diagnose actuators from recordings of their bus ({' '.join(FRAME_READERS)}, and these as"
+        " .gz)."
+    )
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        metavar="LOG",
+        help=request_options()["logs"].help,
+    )
+    options.add_request_options(parser, "test", "joint", "every_test")
+    parser.add_argument(
+        "--list", action="store_true", help="list the tests that each log holds, diagnose none"
+    )
+    options.add_request_options(parser, "start_s", "end_s")
+    parser.add_argument("--out", metavar="DIR", help="write a JSON file and a picture for each")
+    add_actuators_options(parser)
+    options.add_request_options(parser, "columns", "merge", *options.READING, *options.SEARCH)
+    options.add_json_option(parser)
+    add_history_options(parser)
+    options.add_result_options(parser)
+    options.add_report_option(parser)
+    add_batch_options(parser)
+    show_usual(
+        parser,
+        "logs",
+        "--test",
+        "--list",
+        "--out",
+        "--report",
+        "--json",
+        "--actuator",
+        "--mapping",
+        "--history",
+        "--jobs",
+        "--summary",
+        "--help-all",
+        examples=(
+            "ehadiag diagnose recording.blf --out results --report",
+            "ehadiag diagnose recordings/*.blf --jobs 4 --results all.csv",
+        ),
+    )
+    parser.set_defaults(run=run_diagnose)
+
+
+def run_diagnose(arguments: argparse.Namespace) -> int:
+    """Diagnose each log; return the worst exit code."""
+    inputs = expand_logs(arguments.logs, print_status)
+    if not inputs:
+        raise ConfigurationError("no recording named: the list on standard input is empty")
+    if arguments.list:
+        return exit_code_of_inputs(
+            [_list_tests(unit, inputs) for unit in arguments_of_actuators(arguments)]
+        )
+    # What is wrong with the options is said before anything slow is loaded.
+    _refuse_diagnose_contradictions(arguments)
+    setups = [_loaded(unit) for unit in arguments_of_actuators(arguments)]
+    if arguments.joint and len(setups) > 1:
+        raise ConfigurationError("--mapping: --joint is of one actuator, name one mapping")
+    outputs = _output_files(arguments)
+    reads = [("the log", item.name) for item in inputs]
+    reads += [("the DBC", setup.bus_map.name) for setup in setups]
+    refuse_overwriting(arguments, outputs, reads)
+    refuse_unwritable(outputs)
+    folder = open_output_folder(arguments.out) if arguments.out else None
+    results = ResultWriter(
+        arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
+    )
+    print_compiling_notice()
+    if arguments.merge:
+        codes = {_diagnose_merged(setup, results, inputs) for setup in setups}
+        code = worst_exit_code(codes) if len(codes) > 1 else codes.pop()
+    elif arguments.joint:
+        code = _diagnose_joint(setups[0], results, inputs)
+    else:
+        code = diagnose_all(arguments, setups, results, inputs)
+    defer_signals()
+    return code
+
+
+def _refuse_diagnose_contradictions(arguments: argparse.Namespace) -> None:
+    several = {
+        "--results": arguments.results,
+        "--resume": arguments.resume,
+        "--junit": arguments.junit,
+        "--summary": arguments.summary,
+        "--cluster": arguments.cluster,
+        "--jobs": arguments.jobs,
+    }
+    if arguments.joint and arguments.merge:
+        raise ConfigurationError("--merge: with --joint each log is a recording of its own")
+    alone = "--joint" if arguments.joint else "--merge" if arguments.merge else ""
+    for name, value in several.items():
+        if alone and value:
+            raise ConfigurationError(f"{name}: {alone} gives one result, and has no use for it")
+    for name in ("--jobs", "--cluster"):
+        if arguments.report and several[name]:
+            raise ConfigurationError(f"{name}: --report draws samples, which workers do not send")
+    if arguments.cluster and arguments.jobs:
+        raise ConfigurationError("--jobs: a cluster has its own number of workers")
+
+
+def _output_files(arguments: argparse.Namespace) -> list[OutputFile]:
+    """Files that hold the results of the whole call."""
+    named = [("--results", name) for name in arguments.results]
+    named += [(f"--{key}", getattr(arguments, key)) for key in ("resume", "junit", "summary")]
+    return [OutputFile(option, name) for option, name in named if name]
+
+
+def _loaded(unit: ActuatorArguments) -> Setup:
+    """Return what the command line names for one actuator; what is wrong with it is said here."""
+    setup = options.setup_of(unit.arguments, unit.label)
+    _ = setup.sources, setup.actuator
+    return setup
+
+
+def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
+    """Make one estimate from all logs."""
+    together: list[Recording] = []
+    logs: list[Log | None] = []
+    read_s, codes = 0.0, []
+    for item in inputs:
+        try:
+            if item.why:
+                raise InputOutputError(item.why)
+            reading = setup.read(item.name)
+        except EhadiagError as error:
+            print_status(str(error))
+            codes.append(error.exit_code)
+            continue
+        codes.append(0)
+        for recording, log in reading.each():
+            together.append(recording)
+            logs.append(log)
+        read_s += reading.seconds
+    if any(codes):
+        print_status("no joint estimate: not all of the logs could be read")
+        return exit_code_of_inputs(codes)
+    files = [item.name for item in inputs]
+    return diagnose_and_deliver(setup, results, together, files, logs, read_s, "joint")[1]
+
+
+def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
+    """Diagnose one recording that lies in several files."""
+    for item in inputs:
+        if item.why:
+            raise InputOutputError(item.why)
+    reading = setup.read(*(item.name for item in inputs))
+    codes = [
+        diagnose_and_deliver(setup, results, [recording], reading.files, [log], reading.seconds)[1]
+        for recording, log in reading.each()
+    ]
+    return worst_exit_code(codes)
+
+
+def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
+    """Print what the logs hold of one actuator."""
+    arguments, of = unit.arguments, f" ({unit.label})" if unit.label else ""
+    from ehadiag.terminal.output import print_test_list  # noqa: PLC0415
+
+    if unused := [
+        name for name in OPTIONS_UNUSED_BY_LIST if getattr(arguments, name) not in UNSET_VALUES
+    ]:
+        named = ", ".join(f"--{name}" for name in unused)
+        print_status(f"--list diagnoses none, and has no use for {named}")
+    # Whichever test is named once, all are listed.
+    setup = options.setup_of(arguments)
+    codes = []
+    groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
+    for group in groups:
+        try:
+            for item in group:
+                if item.why:
+                    raise InputOutputError(item.why)
+            names = [item.name for item in group]
+            print_test_list(", ".join(names) + of, setup.open(*names), as_json=arguments.json)
+        except EhadiagError as error:
+            print_status(str(error))
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    return exit_code_of_inputs(codes)
+
+
+MAX_ESTIMATE_DIFFERENCE = 1e-3
+"""Difference of an estimate from the stored one above which the recording is another's."""
+
+
+def define_report(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        "Write a report, one HTML page, beside each stored result (NAME.json of"
+        " `--out`). Where its recording is at hand, measured and modelled signals are drawn too;"
+        " where there is a health history, the trend of the unit."
+    )
+    parser.add_argument("results", nargs="+", metavar="RESULT", help="JSON result, NAME.json")
+    parser.add_argument(
+        "--index", metavar="FILE", help="also write a page with a line for each result, worst first"
+    )
+    add_history_option(parser)
+    options.add_request_options(
+        parser, "test", "actuator", *options.BUS, *options.READING, *options.LEVELS
+    )
+    show_usual(
+        parser,
+        "results",
+        "--history",
+        "--test",
+        "--actuator",
+        "--mapping",
+        "--help-all",
+        examples=(
+            "ehadiag report results/recording.json",
+            "ehadiag report results/*.json --history fleet.sqlite",
+        ),
+    )
+    parser.set_defaults(run=run_report)
+
+
+def run_report(arguments: argparse.Namespace) -> int:
+    """Write the reports; return the worst exit code."""
+    levels = Levels(arguments.advisory, arguments.limit)
+    setup = options.setup_of(arguments)
+    _ = setup.actuator, setup.tests
+    results = list(dict.fromkeys(arguments.results))
+    pages = [OutputFile("report", str(_page_path_of(Path(name)))) for name in results]
+    pages += [OutputFile("--index", arguments.index)] * bool(arguments.index)
+    reads = [("the result", name) for name in results]
+    refuse_overwriting(arguments, pages, [*reads, ("the DBC", setup.bus_map.name)])
+    codes, written = [], []
+    for name in results:
+        try:
+            written.append(
+                (_write_report(arguments, Path(name), levels), _page_path_of(Path(name)))
+            )
+        except EhadiagError as error:
+            print_status(str(error))
+            codes.append(error.exit_code)
+        else:
+            codes.append(0)
+    if arguments.index:
+        page = index_html_page(written, Path(arguments.index), levels, history_path(arguments))
+        write_file(Path(arguments.index), page, "index")
+        print_status(f"wrote {arguments.index}")
+    return exit_code_of_inputs(codes)
+
+
+def _write_report(arguments: argparse.Namespace, path: Path, levels: Levels) -> Result:
+    """Write the page of a stored result; return the result."""
+    line = read_small_file(path, MAX_RESULT_BYTES, "result")
+    try:
+        result = Result.from_json(line)
+    except ValueError:
+        raise ConfigurationError(f"result {path}: is none of ehadiag's JSON results") from None
+    try:
+        result = _redrawn(arguments, path, result)
+    except EhadiagError as error:
+        print_status(f"{error}; no responses are drawn")
+    if levels == Levels():
+        levels = Levels(result.request.advisory, result.request.limit)
+    page = diagnosis_html_page(result, levels, history_path(arguments))
+    target = _page_path_of(path)
+    write_file(target, page, "report")
+    print_status(f"wrote {target}")
+    return result
+
+
+def _page_path_of(result: Path) -> Path:
+    if not result.name:
+        raise ConfigurationError(f"result {result}: is a folder, name a file in it")
+    return result.with_suffix(".html")
+
+
+def _redrawn(arguments: argparse.Namespace, path: Path, result: Result) -> Result:
+    """Diagnose the result's recordings once more, as it says that they were; draw from that."""
+    named = result.request.logs or tuple(item.source for item in result.origins)
+    paths = [item.log.path for item in result.origins if item.log is not None]
+    files = [_at_hand(name, path, paths[place:]) for place, name in enumerate(named)]
+    if not files or None in files:
+        print_status(
+            f"result {path}: its recording {result.source} is not at hand; no responses are drawn"
+        )
+        return result
+    setup = Setup(_request(arguments, result.request))
+    if result.actuator_sha256 != fingerprint(setup.actuator):
+        name = setup.actuator.name
+        print_status(
+            f"result {path}: it goes by other actuator data than {name!r} has: name its"
+            " file by --actuator; no responses are drawn"
+        )
+        return result
+    print_compiling_notice()
+    readings = [[name for name in files if name]]
+    if not setup.request.merge:
+        readings = [[name] for name in readings[0]]
+    read = [setup.read(*names) for names in readings]
+    groups = [[recording] for reading in read for recording in reading.recordings]
+    if setup.request.joint:
+        groups = [[recording for reading in read for recording in reading.recordings]]
+    for recordings in groups:
+        found = setup.diagnose(recordings)
+        if _is_same_diagnosis(found, result):
+            return result.with_diagnosis(found.diagnosis)
+    print_status(
+        f"result {path}: {result.source} is diagnosed otherwise now; no responses are drawn"
+    )
+    return result
+
+
+def _at_hand(name: str, result: Path, paths: list[str]) -> str | None:
+    """Return a log's file: as it was named, beside the result, or where it was."""
+    places = [Path(name), result.parent / name, result.parent / Path(name).name, *map(Path, paths)]
+    return next((str(item) for item in places if item.is_file()), None)
+
+
+def _request(arguments: argparse.Namespace, stored: Request) -> Request:
+    """Return what was asked for, with what the command line says of where things are now."""
+    options_of, own = request_options(), options.request_of(arguments)
+    names = ("test", "actuator", *options.BUS, *options.READING)
+    given = {name: getattr(own, name) for name in names}
+    changed = {key: value for key, value in given.items() if value != options_of[key].default}
+    return msgspec.structs.replace(stored, **changed)
+
+
+def _is_same_diagnosis(found: Result, stored: Result) -> bool:
+    """Whether two results have the same estimates."""
+    for name, item in found.severities.items():
+        other = stored.severities.get(name)
+        if other is None or (item.estimate is None) != (other.estimate is None):
+            return False
+        if item.estimate is not None and abs(item.value - other.value) >= MAX_ESTIMATE_DIFFERENCE:
+            return False
+    return True

@@ -1,0 +1,357 @@
+"""Writes the results of a call: first to the disk, then to standard output, the picture last.
+
+No output replaces what the call reads, and none is begun that cannot be written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ehadiag.assess.verdict import Levels
+from ehadiag.cli.defaults import DEFAULTS_FILE_NAME, user_defaults_file
+from ehadiag.cli.history_options import HistoryWriter, history_path
+from ehadiag.core.conventions import MAX_RESULT_BYTES
+from ehadiag.core.interruption import defer_signals
+from ehadiag.report.rendering import diagnosis_html_page
+from ehadiag.result import Origin, Result
+from ehadiag.terminal.output import (
+    print_status,
+    print_text,
+    render_for_terminal,
+    report_failure,
+    worst_exit_code,
+    write_output,
+)
+from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name, reason_of
+from firmware_iface.files import RESULT_MODE, Folder, write_errors
+
+INPUT_FILE_OPTIONS = ("actuator", "mapping", "dbc", "test")
+"""Options, of any command, that name files to be read."""
+SQLITE_SUFFIXES = ("", "-wal", "-shm", "-journal")
+"""What SQLite appends to the name of a database for its own files."""
+RESULT_SUFFIXES = (".json", ".png", ".html")
+"""Suffixes of the files that an output folder has for each result."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputFile:
+    """A file that a call is to write whole, and by which option it was named."""
+
+    option: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.option} {self.name}"
+
+
+def refuse_overwriting(
+    arguments: argparse.Namespace,
+    outputs: Iterable[OutputFile],
+    reads: Iterable[tuple[str, str]] = (),
+) -> None:
+    """Refuse a call one of whose outputs is an input of it, the health history, or another output.
+
+    Files are the same by what the system says of them (also by links and other spellings), those
+    that are not there yet by their resolved paths.
+
+    arguments: the parsed command line: what it reads by options that commands share, and its
+    history; outputs: what it will write; reads: what else it will read: its kind and its name.
+    ConfigurationError: an output is named twice, or would replace what the call reads.
+    """
+    taken: dict[object, str] = {}
+    for place in _history_files(arguments):
+        taken[_file_identity(place)] = f"the health history {place}"
+    for output in outputs:
+        _refuse_same_file(str(output), taken.get(_file_identity(output.name)))
+        taken[_file_identity(output.name)] = str(output)
+    if not taken:
+        return
+    for kind, name in (*reads, *_input_files(arguments)):
+        key = _file_identity(name)
+        if key in taken and isinstance(key, tuple):  # it is there
+            _refuse_same_file(taken[key], f"{kind} {name}")
+
+
+def refuse_unwritable(outputs: Iterable[OutputFile]) -> None:
+    """Refuse a call one of whose outputs is to be in a folder in which nothing can be written.
+
+    outputs: what it will write. InputOutputError: there is no such folder, or no right to write in
+    it.
+    """
+    for output in outputs:
+        folder = Path(output.name).parent
+        try:
+            Folder.at(folder, RESULT_MODE, follow=True).close()
+            if not os.access(folder, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        except (OSError, ValueError) as error:
+            raise InputOutputError(f"{output}: {reason_of(error)}") from None
+
+
+def reserved_stems(folder: Path, outputs: Iterable[OutputFile]) -> set[str]:
+    """Return the names, without suffix, that no result in a folder may have for these outputs."""
+    there = os.path.realpath(folder)
+    paths = [Path(output.name) for output in outputs]
+    return {
+        path.stem
+        for path in paths
+        if path.suffix in RESULT_SUFFIXES and os.path.realpath(path.parent) == there
+    }
+
+
+def _refuse_same_file(output: str, other: str | None) -> None:
+    if other is not None:
+        raise ConfigurationError(f"{output}: is {other} as well; name another file")
+
+
+def _history_files(arguments: argparse.Namespace) -> list[str]:
+    """Files of the history that the call works with, or could."""
+    if not hasattr(arguments, "history"):
+        return []
+    place = history_path(arguments)
+    return [] if place is None else [f"{place}{end}" for end in SQLITE_SUFFIXES]
+
+
+def _input_files(arguments: argparse.Namespace) -> Iterator[tuple[str, str]]:
+    """Files that options name, and those of defaults, each with what it is."""
+    for key in INPUT_FILE_OPTIONS:
+        given = getattr(arguments, key, None) or []
+        for name in [given] if isinstance(given, str) else given:
+            yield f"--{key}", name
+    for path in (Path(DEFAULTS_FILE_NAME), user_defaults_file()):
+        if path is not None:
+            yield "the defaults file", str(path)
+
+
+def _file_identity(name: str) -> object:
+    """What two names of one file have in common."""
+    try:
+        info = os.stat(name)
+    except (OSError, ValueError):  # not there yet; ValueError: a name with a null character
+        return os.path.normcase(os.path.realpath(name)) if "\0" not in name else name
+    return (info.st_dev, info.st_ino)
+
+
+ATTACHMENT_SUFFIXES = (".png", ".html")
+"""Suffixes of what stands beside a result: picture and report."""
+
+
+def open_output_folder(name: str) -> Folder:
+    """Open the output folder, created if need be.
+
+    name: as the user named it. Returns the folder, held open. InputOutputError: it cannot be
+    created or written in, or is a link.
+    """
+    path = Path(name)
+    try:
+        if path.is_symlink():
+            raise InputOutputError(f"output folder {name}: is a link; name the folder it leads to")
+        path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK):
+            raise InputOutputError(f"output folder {name}: no right to write in it")
+        return Folder.at(path, RESULT_MODE)
+    except FileExistsError:
+        raise InputOutputError(f"output folder {name}: is a file; name a folder") from None
+    except OSError as error:
+        raise InputOutputError(f"output folder {name}: {reason_of(error)}") from None
+
+
+class ResultWriter:
+    """Where the results of one call go.
+
+    arguments: the parsed command line; folder: for JSON and pictures; None: nothing is written;
+    taken: names, without suffix, that other files of the call have there.
+    """
+
+    def __init__(
+        self, arguments: argparse.Namespace, folder: Folder | None, taken: Iterable[str] = ()
+    ) -> None:
+        self._arguments = arguments
+        self._folder = folder
+        self._names = set(taken)
+        self._keeper = HistoryWriter(arguments)
+        if arguments.report and folder is None:
+            raise ConfigurationError("--report: name by --out the folder where the page goes")
+        self.stopped = False
+        """Whether a signal came while a result was brought out."""
+
+    @property
+    def history(self) -> Path | None:
+        """Health history that the results are kept in; None: in none."""
+        return self._keeper.place
+
+    def load(self) -> None:
+        """Load what printing needs: a verdict must not wait for it."""
+        if not self._arguments.json:
+            import ehadiag.report.result_tables  # noqa: PLC0415
+
+            render_for_terminal(lambda _: None)
+        if self._arguments.report:
+            import ehadiag.report.report_pages  # noqa: F401, PLC0415
+
+    def deliver(self, result: Result, name: str, draw: Callable[[], bytes] | None) -> int:
+        """Write and print one result; return its exit code.
+
+        That is the verdict's, or 3 where something could not be written and that is worse (see
+        `worst_exit_code`). From here on signals do not change it: the first leaves the picture out,
+        the second what is not out yet.
+
+        name: of the files, without suffix; made safe, and numbered where it is taken. draw: makes
+        the picture; None: there is none.
+        """
+        came = defer_signals()
+        codes = [result.exit_code]
+        with contextlib.suppress(KeyboardInterrupt):
+            written = []
+            stem = None
+            with report_failure(codes):
+                stem = self._write_json(result, plain_name(name))
+            with report_failure(codes):
+                self._keeper.keep(result)
+            if stem is not None:
+                written.append(f"{stem}.json")
+            with report_failure(codes):
+                self._print(result)
+            if stem is not None and draw is not None and self.pictures and not came.is_set():
+                with report_failure(codes):
+                    self._draw(draw, f"{stem}.png")
+                    written.append(f"{stem}.png")
+            if stem is not None and self._arguments.report and not came.is_set():
+                with report_failure(codes):
+                    self._report(result, f"{stem}.html")
+                    written.append(f"{stem}.html")
+            if self._folder is not None and written:
+                print_status(
+                    "wrote " + ", ".join(str(self._folder.path / item) for item in written)
+                )
+        self.stopped = self.stopped or came.is_set()
+        return worst_exit_code(codes)
+
+    def refuse(self, result: Result) -> None:
+        """Say what is wrong with an input, and print its object."""
+        if result.error is not None:
+            print_status(result.error.text)
+        if self._arguments.json:
+            write_output(result.to_json() + "\n")
+
+    def repeat(self, result: Result) -> None:
+        """Print a result that an earlier call found: its object, or one line."""
+        if self._arguments.json:
+            write_output(result.to_json() + "\n")
+        else:
+            from ehadiag.report.head import verdict_word  # noqa: PLC0415
+
+            print_text(f"{verdict_word(result)}  {result.source}  (found by an earlier call)")
+
+    def has(self, result: Result, name: str) -> bool:
+        """Whether all that this call is to write of a result is there from an earlier one.
+
+        name: of the files, without suffix, as for `deliver`.
+        """
+        return self._keeper.has(result) and self._has_files(result, plain_name(name))
+
+    def _has_files(self, result: Result, wanted: str) -> bool:
+        folder = self._folder
+        if folder is None:
+            return True
+        content = result.to_json().encode() + b"\n"
+        suffixes = [".png"] * self.pictures + [".html"] * bool(self._arguments.report)
+        for stem in _numbered_stems(wanted):
+            try:
+                there = folder.read(f"{stem}.json", MAX_RESULT_BYTES)
+            except OSError:
+                return False
+            if there == content:
+                return all(folder.exists(f"{stem}{suffix}") for suffix in suffixes)
+        raise AssertionError("numbers have no end")
+
+    @property
+    def pictures(self) -> bool:
+        """Whether pictures are wanted."""
+        return self._folder is not None and not self._arguments.no_picture
+
+    def _print(self, result: Result) -> None:
+        if self._arguments.json:
+            write_output(result.to_json() + "\n")
+            return
+        from ehadiag.report.result_tables import print_result  # noqa: PLC0415
+
+        verbose = self._arguments.verbose
+        write_output(
+            render_for_terminal(
+                lambda console: print_result(result, console, verbose=verbose), least=0
+            )
+        )
+
+    def _write_json(self, result: Result, wanted: str) -> str | None:
+        """Write the object under the first name that no other recording's result has."""
+        folder = self._folder
+        if folder is None:
+            return None
+        content = result.to_json().encode() + b"\n"
+        for stem in _numbered_stems(wanted):
+            if stem in self._names:
+                continue
+            name = f"{stem}.json"
+            try:
+                if _is_same_recording(folder, name, result):
+                    folder.write(name, content)
+                    for suffix in ATTACHMENT_SUFFIXES:  # of the result that is no more
+                        folder.remove(f"{stem}{suffix}")
+                elif any(folder.exists(f"{stem}{suffix}") for suffix in ATTACHMENT_SUFFIXES):
+                    continue
+                else:
+                    folder.write_new(name, content)
+            except FileExistsError:
+                continue
+            except OSError as error:
+                place = folder.path / name
+                raise InputOutputError(f"result {place}: {reason_of(error)}") from None
+            self._names.add(stem)
+            return stem
+        raise AssertionError("numbers have no end")
+
+    def _draw(self, draw: Callable[[], bytes], name: str) -> None:
+        assert self._folder is not None
+        content = draw()
+        with write_errors(f"picture {self._folder.path / name}"):
+            self._folder.write(name, content)
+
+    def _report(self, result: Result, name: str) -> None:
+        assert self._folder is not None
+        levels = Levels(self._arguments.advisory, self._arguments.limit)
+        page = diagnosis_html_page(result, levels, self._keeper.place)
+        with write_errors(f"report {self._folder.path / name}"):
+            self._folder.write(name, page)
+
+
+def _numbered_stems(name: str) -> Iterator[str]:
+    """Names to try one after another."""
+    return (name if n == 1 else f"{name}-{n}" for n in itertools.count(1))
+
+
+def _is_same_recording(folder: Folder, name: str, result: Result) -> bool:
+    """Whether a file is the result of the same recording, of an earlier call.
+
+    The same name is not enough: logs of two folders may have one. What was read and what it held
+    must be the same too.
+    """
+    try:
+        there = Result.from_json(folder.read(name, MAX_RESULT_BYTES))
+    except (OSError, ValueError):
+        return False
+    return list(map(_recording_identity, there.origins)) == list(
+        map(_recording_identity, result.origins)
+    )
+
+
+def _recording_identity(origin: Origin) -> tuple[object, ...]:
+    """What tells one recording from others."""
+    return origin.source, origin.date, origin.serial, origin.log

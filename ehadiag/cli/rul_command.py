@@ -1,0 +1,148 @@
+"""The command `rul`: remaining useful life of a unit, or of all by urgency."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import TYPE_CHECKING
+
+from ehadiag.assess.verdict import Levels
+from ehadiag.cli import options
+from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.history_options import (
+    add_history_option,
+    add_usage_options,
+    named_actuator,
+    open_named_history,
+    usage_from_options,
+)
+from ehadiag.terminal.output import print_text, render_for_terminal, write_output
+from firmware_iface.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from ehadiag.history.store import History
+    from ehadiag.prognosis.units import Prognosis
+
+MAX_LISTED_SERIALS = 20
+"""Number of serial numbers that an error lists."""
+
+
+def define_rul(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        "Remaining useful life: hours, cycles or days until each severity of a unit"
+        " reaches the advisory level and the limit, from its health history and its fleet's. Where"
+        " the history cannot carry a number, the reason is given."
+    )
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        "--unit", type=options.unit_number, metavar="N", help="serial number of the unit"
+    )
+    which.add_argument("--all", action="store_true", help="all units, by urgency")
+    parser.add_argument(
+        "--actuator", metavar="NAME", help="of the unit, where several have its serial number"
+    )
+    parser.add_argument(
+        "--in",
+        dest="in_unit",
+        choices=("hours", "cycles", "days"),
+        help="of the answer (default: hours or cycles, what more of the diagnoses say)",
+    )
+    parser.add_argument(
+        "--before",
+        metavar="TIME",
+        help="chance to reach the limit before the next inspection: a date, or hours (cycles, days)"
+        " from now",
+    )
+    add_usage_options(parser)
+    add_history_option(parser)
+    options.add_request_options(parser, *options.LEVELS)
+    options.add_request_options(
+        parser, "seed", help="seed of the draws (default 0); the same seed, the same answer"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object a unit")
+    show_usual(
+        parser,
+        "--unit",
+        "--all",
+        "--in",
+        "--before",
+        "--history",
+        "--advisory",
+        "--limit",
+        "--json",
+        "--help-all",
+        examples=(
+            "ehadiag rul --unit 7 --history fleet.sqlite",
+            "ehadiag rul --all --before 200 --history fleet.sqlite",
+        ),
+    )
+    parser.set_defaults(run=run_rul)
+
+
+def run_rul(arguments: argparse.Namespace) -> int:
+    """Print the forecasts; 0 also where there is no number."""
+    from ehadiag.prognosis.units import all_prognoses, forecast  # noqa: PLC0415 - scipy
+    from ehadiag.report.prognosis_tables import (  # noqa: PLC0415
+        print_prognosis,
+        print_urgencies,
+        prognosis_tree,
+    )
+
+    levels = Levels(arguments.advisory, arguments.limit)
+    usage = usage_from_options(arguments)
+    if arguments.all and usage.known:
+        raise ConfigurationError("--hours, --cycles: of one unit, not of --all")
+    with open_named_history(arguments) as history:
+        if arguments.all:
+            both = (levels.advisory, levels.limit)
+            every = all_prognoses(history, both, arguments.in_unit, arguments.seed)
+            found = sorted(every, key=_urgency)
+        else:
+            actuator = named_actuator(history, arguments.unit, arguments.actuator)
+            if actuator is None:
+                raise ConfigurationError(_unknown_serial(history, arguments.unit))
+            found = [
+                forecast(
+                    history, arguments.unit, advisory=levels.advisory, limit=levels.limit,
+                    unit=arguments.in_unit, today=usage, actuator=actuator, seed=arguments.seed,
+                )
+            ]  # fmt: skip
+    ahead = [_time_before(item, arguments.before) for item in found] if arguments.before else None
+    if arguments.json:
+        for place, item in enumerate(found):
+            before = (arguments.before, ahead[place]) if ahead else None
+            print_text(json.dumps(prognosis_tree(item, before), allow_nan=False))
+    elif arguments.all:
+        write_output(render_for_terminal(lambda console: print_urgencies(found, console, ahead)))
+    else:
+        before = (arguments.before, ahead[0]) if ahead else None
+        write_output(
+            render_for_terminal(lambda console: print_prognosis(found[0], console, before))
+        )
+    return 0
+
+
+def _urgency(item: Prognosis) -> tuple[float, str, int]:
+    first = item.first()
+    left = math.inf if first is None else first[1].median or 0.0
+    return left, item.actuator or "", item.serial
+
+
+def _time_before(item: Prognosis, text: str) -> float:
+    """Hours, cycles or days until the next inspection."""
+    try:
+        time = float(text)
+    except ValueError:
+        return item.time_until(text)
+    if not 0.0 <= time < math.inf:
+        raise ConfigurationError(f"--before {text}: need a number of at least 0, or a date")
+    return time
+
+
+def _unknown_serial(history: History, serial: int) -> str:
+    known = sorted({number for _, number in history.units()})
+    named = ", ".join(map(str, known[:MAX_LISTED_SERIALS])) or "none"
+    more = f" and {len(known) - MAX_LISTED_SERIALS} more" if len(known) > MAX_LISTED_SERIALS else ""
+    return f"--unit {serial}: the history has no diagnosis of it; there are {named}{more}"

@@ -1,1 +1,0 @@
-"""Shows a running session on a terminal: a screen that is drawn anew, or plain lines."""

@@ -1,0 +1,276 @@
+"""Commands without a recording or bus: `init`, `tests`, `export`, `warmup`, `completion`."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import sys
+import time
+from importlib import resources
+from pathlib import Path
+
+from ehadiag.cli import options
+from ehadiag.cli.result_output import open_output_folder
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.request import TEST
+from ehadiag.terminal.output import (
+    print_status,
+    print_text,
+    render_for_terminal,
+    write_output,
+)
+from firmware_iface.errors import (
+    ConfigurationError,
+    InputOutputError,
+    install_command,
+    printable,
+    reason_of,
+)
+from firmware_iface.files import RESULT_MODE, Folder
+from firmware_iface.stored_test import COMMAND_UNITS, bundled_tests, resolve_test
+
+FILE_TEMPLATES = {
+    "actuator": (("ehadiag", "data/actuator.toml", "actuator.toml"),),
+    "test": (("firmware_iface", "data/tests/open.toml", "test.toml"),),
+    "mapping": (
+        ("firmware_iface", "data/eha_fcc.toml", "mapping.toml"),
+        ("firmware_iface", "data/eha_fcc.dbc", "eha_fcc.dbc"),
+    ),
+    "defaults": (("ehadiag", "data/templates/ehadiag.toml", "ehadiag.toml"),),
+}
+REFERENCE_PAGES = {
+    "actuator": "actuator-file.md",
+    "test": "test-file.md",
+    "mapping": "mapping-file.md",
+    "defaults": "command-line.md",
+}
+
+
+def define_init(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        "Write a commented template that works as it is: the reference actuator, the"
+        " open-loop test, the computer's own bus with its DBC, or defaults of options."
+    )
+    parser.add_argument("kind", choices=tuple(FILE_TEMPLATES), help="which file")
+    parser.add_argument(
+        "folder", nargs="?", default=".", metavar="DIR", help="where (default: the working folder)"
+    )
+    parser.set_defaults(run=run_init)
+
+
+def run_init(arguments: argparse.Namespace) -> int:
+    """Write the files; none that is there is changed."""
+    folder = Path(arguments.folder)
+    files = FILE_TEMPLATES[arguments.kind]
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise InputOutputError(f"{folder}: is no folder; name the one to write {files[0][2]} into")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with Folder.at(folder, RESULT_MODE, follow=True) as place:
+            for _, _, name in files:
+                if place.exists(name):
+                    raise InputOutputError(f"{folder / name}: is there already, not overwritten")
+            for package, source, name in files:
+                content = resources.files(package).joinpath(source).read_bytes()
+                place.write_new(name, content)
+                print_text(os.fspath(folder / name))
+    except FileExistsError as error:
+        raise InputOutputError(
+            f"{folder / str(error)}: is there already, not overwritten"
+        ) from None
+    except OSError as error:
+        raise InputOutputError(f"folder {folder}: {reason_of(error)}") from None
+    print_status(f"each key is explained in docs/reference/{REFERENCE_PAGES[arguments.kind]}")
+    return 0
+
+
+def define_tests(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = "List the stored tests; --csv prints time and command of one."
+    parser.add_argument("--csv", metavar=TEST, help="test to print as CSV")
+    parser.set_defaults(run=run_tests)
+
+
+def run_tests(arguments: argparse.Namespace) -> int:
+    """List the tests or print one."""
+    if arguments.csv:
+        test = resolve_test(arguments.csv)
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(["time_s", f"command_{test.unit}"])
+        scale = COMMAND_UNITS[test.mode][test.unit]
+        for time, value in zip(test.time(), test.command() / scale, strict=True):
+            writer.writerow([f"{time:.9g}", f"{value:.9g}"])
+        return 0
+    from rich.table import Table  # noqa: PLC0415 - not for CSV
+
+    table = Table(box=None, pad_edge=False)
+    for name in ("id", "name", "command", "length", "rate", "description"):
+        table.add_column(name, justify="right" if name in ("id", "length", "rate") else "left")
+    for test in sorted(bundled_tests().values(), key=lambda item: item.id):
+        table.add_row(
+            str(test.id),
+            test.name,
+            f"{test.mode}, {test.unit}",
+            f"{test.duration:g} s",
+            f"{test.rate:g} Hz",
+            test.description,
+        )
+    write_output(render_for_terminal(lambda console: console.print(table)))
+    return 0
+
+
+EXPORT_NOTICE = "compiling; this may take half a minute"
+
+
+def define_export(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        "Write monitor and identification as a static library with C headers for"
+        " another computer. No cross compiler is needed."
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--target", metavar="NAME", help="computer, see --list")
+    what.add_argument(
+        "--fmu",
+        action="store_true",
+        help="co-simulation units (FMI 2.0 and 3.0) of simulator and monitor, for this computer",
+    )
+    what.add_argument("--list", action="store_true", help="list the targets and exit")
+    parser.add_argument("--out", metavar="DIR", help="folder to write into")
+    parser.add_argument(
+        "--hours",
+        type=options.positive_number,
+        default=FALSE_ALARM_INTERVAL_H,
+        metavar="H",
+        help="mean time between false alarms of the monitor (default %(default)g)",
+    )
+    options.add_request_options(parser, "actuator")
+    parser.set_defaults(run=run_export)
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    """Write the export."""
+    if arguments.list:
+        from ehadiag.export.targets import TARGETS  # noqa: PLC0415 - loads the compiler
+
+        width = max(len(item.name) for item in TARGETS)
+        for item in TARGETS:
+            print_text(f"{item.name:<{width}}  {item.meaning}")
+        return 0
+    if arguments.out is None:
+        raise ConfigurationError("export: need --out DIR")
+    actuator = options.setup_of(arguments).actuator
+    names = (
+        _write_fmus(arguments, actuator) if arguments.fmu else _write_library(arguments, actuator)
+    )
+    for name in names:
+        print_text(printable(str(Path(arguments.out) / name)))
+    effects = actuator.calibration.effects if actuator.calibration else {}
+    if any(effects.values()) and arguments.fmu:
+        print_status(
+            "the units go by the calibrated data, but know none of the effects that the calibration"
+            f" learned ({', '.join(sorted(effects))})"
+        )
+    return 0
+
+
+def _write_fmus(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
+    from ehadiag.export.fmu import export_fmus  # noqa: PLC0415 - loads the compiler
+
+    with open_output_folder(arguments.out) as folder:
+        print_status(EXPORT_NOTICE)
+        return export_fmus(actuator, folder, hours=arguments.hours)
+
+
+def _write_library(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
+    from ehadiag.export.library import SHARED_LIBRARY_FILE, export_library  # noqa: PLC0415
+    from ehadiag.export.targets import find_target  # noqa: PLC0415
+
+    chosen = find_target(arguments.target)
+    with open_output_folder(arguments.out) as folder:
+        print_status(EXPORT_NOTICE)
+        names = export_library(actuator, chosen, folder, hours=arguments.hours)
+    if chosen.processor.shared and SHARED_LIBRARY_FILE not in names:
+        print_status("no C compiler (cc, or what CC names): no shared library, only the static one")
+    return names
+
+
+def define_warmup(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        "Compile the model's kernels into the cache folder (EHADIAG_CACHE_DIR, else"
+        " the user's cache), so that the first diagnosis does not wait for it."
+    )
+    parser.set_defaults(run=run_warmup)
+
+
+def run_warmup(_arguments: argparse.Namespace) -> int:
+    """Compile."""
+    begin = time.perf_counter()
+    from ehadiag.compile import libraries  # noqa: PLC0415 - not for help texts
+    from ehadiag.compile.sources import cache_folder  # noqa: PLC0415
+    from firmware_iface.bus_map import default_map  # noqa: PLC0415
+
+    absent = libraries.missing(libraries.SHIPPED)
+    libraries.prepare(absent, print_status)
+    default_map()  # keeps what it finds in the DBC
+    folder = cache_folder()
+    took = f"{time.perf_counter() - begin:.1f} s"
+    if not absent:
+        print_status("all kernels are there")
+        return 0
+    if folder is None:
+        print_status(f"kernels compiled in {took}, and kept nowhere")
+        return InputOutputError.exit_code
+    print_status(f"kernels ready in {folder.path} after {took}")
+    return 0
+
+
+FILE_METAVARS, FOLDER_METAVARS = ("FILE", "LOG"), ("DIR",)
+"""Metavariables whose values are paths."""
+
+
+def define_completion(parser: argparse.ArgumentParser) -> None:
+    """Add description and options of the command."""
+    parser.description = (
+        "Print a completion script: for bash, put its output into"
+        " ~/.local/share/bash-completion/completions/ehadiag."
+    )
+    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which shell")
+    parser.set_defaults(run=run_completion)
+
+
+def run_completion(arguments: argparse.Namespace) -> int:
+    """Print the script."""
+    from ehadiag.cli.main import parser_and_commands  # noqa: PLC0415 - it has this module's parser
+
+    parser, _ = parser_and_commands()
+    try:
+        import shtab  # noqa: PLC0415 - optional
+    except ImportError:
+        raise ConfigurationError(
+            f"completion: needs shtab: {install_command('completion')}"
+        ) from None
+    for action in _all_actions(parser):
+        names = action.metavar if isinstance(action.metavar, str) else ""
+        if names.endswith(FILE_METAVARS):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+        elif names.endswith(FOLDER_METAVARS):
+            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+    print_text(shtab.complete(parser, arguments.shell))
+    return 0
+
+
+def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """All options and arguments, of all commands."""
+    found: list[argparse.Action] = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                found += _all_actions(command)
+        else:
+            found.append(action)
+    return found

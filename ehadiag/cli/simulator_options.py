@@ -1,0 +1,166 @@
+"""Options of the simulated actuator, and the scenario file that holds whatever else it plays.
+
+Both are made of the fields of the classes in `ehadiag_sim.conditions`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from ehadiag.cli.options import seed_number
+from ehadiag_sim.conditions import (
+    ConditionOption,
+    DataErrors,
+    Effects,
+    Faults,
+    Sensors,
+    UnmodelledEffects,
+    condition_options,
+)
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.files import read_toml
+
+DATA_ERROR_NAMES = tuple(item.name for item in fields(DataErrors))
+OTHER_KEYS = ("data_error", "broken")
+"""Keys of a scenario that are no fields of a class of conditions."""
+CONDITIONS: tuple[type[Any], ...] = (Faults, Sensors, Effects, UnmodelledEffects)
+
+
+def add_simulator_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--simulate`, severities, oil, supply, noise, seed and serial number."""
+    group = parser.add_argument_group("simulated actuator")
+    group.add_argument(
+        "--simulate",
+        nargs="?",
+        const=True,
+        metavar="FILE",
+        help="simulate computer and actuator; FILE: a scenario (TOML) with effects, errors of"
+        " sensors and broken hardware, which other options overrule",
+    )
+    for kind in (Faults, Sensors, Effects):
+        for item in condition_options(kind):
+            if kind is Faults:
+                _add_condition(group, item, item.flag.lower())
+            elif item.basic:
+                _add_condition(group, item)
+    group.add_argument(
+        "--simulator-seed",
+        type=seed_number,
+        default=1,
+        metavar="N",
+        help="seed of the simulated noise (default 1)",
+    )
+    group.add_argument(
+        "--unit",
+        type=int,
+        default=1,
+        metavar="N",
+        help="serial number of the simulated unit (default 1)",
+    )
+
+
+def scenario_keys() -> tuple[str, ...]:
+    """Return the keys that a scenario file may have."""
+    return (*(_key(item) for kind in CONDITIONS for item in condition_options(kind)), *OTHER_KEYS)
+
+
+def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the keyword arguments of `ehadiag_sim.emulator.emulated_computer`.
+
+    arguments: the parsed command line. Returns severities, effects, errors of sensors, broken
+    hardware, seed and serial number. ConfigurationError: a value out of its range, a key that no
+    scenario has. InputOutputError: the scenario file cannot be read.
+    """
+    scenario: Mapping[str, Any] = {}
+    where = ""
+    if isinstance(arguments.simulate, str):
+        where = f"scenario {arguments.simulate}"
+        scenario = read_toml(Path(arguments.simulate), dict[str, Any], "scenario")
+        _refuse_unknown_keys(scenario, where)
+    values = {kind: _condition_values(arguments, scenario, kind, where) for kind in CONDITIONS}
+    return {
+        "faults": Faults(**values[Faults]),
+        "effects": Effects(
+            **values[Effects],
+            data=_data_errors(scenario.get("data_error", {}), where),
+            unmodelled=UnmodelledEffects(**values[UnmodelledEffects]),
+        ),
+        "sensors": Sensors(**values[Sensors]),
+        "broken": scenario.get("broken"),
+        "seed": arguments.simulator_seed,
+        "serial": arguments.unit,
+    }
+
+
+def _key(item: ConditionOption) -> str:
+    return item.flag.removeprefix("--").replace("-", "_")
+
+
+def _refuse_unknown_keys(scenario: Mapping[str, Any], where: str) -> None:
+    known = scenario_keys()
+    for name in scenario:
+        if name not in known:
+            near = get_close_matches(name, known, n=1)
+            hint = f", did you mean {near[0]}?" if near else ""
+            raise ConfigurationError(f"{where}: there is no key {name}{hint}")
+
+
+def _add_condition(group: argparse._ArgumentGroup, item: ConditionOption, *more: str) -> None:
+    several = isinstance(item.default, tuple)
+    group.add_argument(
+        item.flag,
+        *more,
+        dest=item.field,
+        type=int if isinstance(item.default, int) else float,
+        nargs=len(item.default) if several else None,
+        metavar=item.metavar,
+        help=item.help.replace("%", "%%"),
+    )
+
+
+def _condition_values(
+    arguments: argparse.Namespace, scenario: Mapping[str, Any], kind: type[Any], where: str
+) -> dict[str, Any]:
+    """Return values by field, SI: of the command line, else of the scenario, else the default."""
+    values = {}
+    for item in condition_options(kind):
+        value: Any = getattr(arguments, item.field, None)
+        if value is None:
+            value = scenario.get(_key(item), item.default)
+            _refuse_other_kinds(value, item, where)
+        value = tuple(value) if isinstance(value, list) else value
+        number = isinstance(item.default, float)
+        values[item.field] = float(value) * item.scale if number else value
+    return values
+
+
+def _refuse_other_kinds(value: Any, item: ConditionOption, where: str) -> None:
+    """Raise ConfigurationError unless a value of a scenario is of its default's kind."""
+    count = len(item.default) if isinstance(item.default, tuple) else None
+    numbers = value if isinstance(value, list | tuple) else [value]
+    sound = all(isinstance(number, int | float) and not isinstance(number, bool)
+                for number in numbers)  # fmt: skip
+    if isinstance(item.default, int):
+        sound = sound and all(isinstance(number, int) for number in numbers)
+    if not sound or isinstance(value, list | tuple) != (count is not None):
+        raise ConfigurationError(f"{where}: {_key(item)}: {value!r} is no such number")
+    if count is not None and len(numbers) != count:
+        raise ConfigurationError(f"{where}: {_key(item)}: need {count} numbers")
+
+
+def _data_errors(table: Any, where: str) -> DataErrors:
+    """Return how far data are off the actuator file's, by a scenario's table."""
+    if not isinstance(table, dict):
+        raise ConfigurationError(f"{where}: data_error: need a table, such as {{ GM = 0.05 }}")
+    for name, value in table.items():
+        if name not in DATA_ERROR_NAMES or not isinstance(value, int | float):
+            raise ConfigurationError(
+                f"{where}: data_error: {name} = {value!r}: need a fraction of one of "
+                f"{', '.join(DATA_ERROR_NAMES)}"
+            )
+    return DataErrors(**{name: float(value) for name, value in table.items()})

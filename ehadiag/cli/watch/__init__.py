@@ -1,1 +1,0 @@
-"""Watching a bus with the monitoring model: second half of `ehadiag monitor`."""

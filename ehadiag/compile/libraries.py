@@ -1,0 +1,328 @@
+"""Shared libraries of the kernels: which there are, where they come from, how they are loaded.
+
+A library that came with the package is taken where it was made of the sources that are here, for a
+level of instructions that this processor has, and has the digest that the manifest names. Else one
+of the cache folder, else one is compiled into it. All levels of a processor give the same digits.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import platform
+import sys
+from collections.abc import Callable, Collection, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ehadiag.compile.jit import Kernel
+from ehadiag.compile.sources import (
+    KERNEL_DIGEST,
+    MAX_LIBRARY_BYTES,
+    PREBUILT,
+    SOURCE_DIGESTS_FILE,
+    cache_folder,
+    source_hash,
+    sources_of,
+)
+from ehadiag.compile.worker import (
+    CFunction,
+    ObjectFile,
+    Processor,
+    SlotArguments,
+    object_code,
+    tool_versions,
+)
+from firmware_iface.errors import reason_of
+from firmware_iface.files import warn_once
+
+LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "search": {
+        "ehadiag.model.simd_residuals": ("_run_blocks",),
+        "ehadiag.model.simd_jack": ("fill_driven_jack_costs",),
+    },
+    "model": {
+        "ehadiag.model.residual_models": ("jack_response", "_residuals"),
+        "ehadiag.model.scalar_spool": ("spool_response",),
+        "ehadiag.model.laws": ("fill_control_currents",),
+        "ehadiag.identify.compact_ga": ("draw_generation", "update_state"),
+        "ehadiag.monitor.monitor_memory": ("prepare_monitor", "reset_monitor"),
+        "ehadiag.monitor.push_kernel": ("push_tick",),
+    },
+    "simulator": {"ehadiag_sim.plant_dynamics": ("advance_plant",)},
+    "onboard": {
+        "ehadiag.onboard.onboard_identification": (
+            "begin_identification",
+            "continue_identification",
+        ),
+        "ehadiag.onboard.onboard_memory": ("set_environment",),
+    },
+}
+"""Kernels of each library by their modules, the one that takes longest to compile first. A kernel
+in none of them is a library of its own."""
+SHIPPED = ("search", "model", "simulator")
+"""Libraries that come with the package; `onboard` runs elsewhere, and here only in studies."""
+IDENTIFICATION, SIMULATION = ("search", "model"), ("simulator",)
+"""Libraries that every identification and every simulation needs."""
+_X86, _ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"
+LEVELS: Mapping[tuple[str, str], Processor] = {
+    ("x86_64", "avx512"): Processor(_X86, "x86-64-v4", shared=True, fast=True),
+    ("x86_64", "avx2"): Processor(_X86, "x86-64-v3", shared=True, fast=True),
+    ("x86_64", "sse2"): Processor(_X86, "x86-64", shared=True, rounds=False, fast=True),
+    ("aarch64", "neon"): Processor(_ARM, "generic", shared=True, fast=True),
+}
+"""Levels of instructions by architecture, best first, for which there are shared libraries."""
+_V3 = frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"})
+_V4 = _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
+LEVEL_FLAGS: Mapping[str, frozenset[str]] = {"avx512": _V4, "avx2": _V3}
+"""What Linux must say of a processor that has a level, as LLVM's x86-64-v3 and v4 need it."""
+NO_LEVEL = ("", "host")
+"""Elsewhere: object files for this very processor, which LLVM loads."""
+HOST = Processor("", "host", fast=True)
+MANIFEST = "manifest.json"
+
+
+@cache
+def processor_level() -> tuple[str, str]:
+    """Architecture and best level of instructions of this processor."""
+    machine, flags = platform.machine(), frozenset[str]()
+    if sys.platform != "linux":
+        return NO_LEVEL
+    if machine == "x86_64":
+        lines = Path("/proc/cpuinfo").read_text("ascii", "replace").splitlines()
+        shown = next((line for line in lines if line.startswith("flags")), "")
+        flags = frozenset(shown.partition(":")[2].split())
+    levels = (key for key in LEVELS if key[0] == machine)
+    return next((key for key in levels if LEVEL_FLAGS.get(key[1], set()) <= flags), NO_LEVEL)
+
+
+def entry_address(kernel: Kernel) -> int:
+    """Address of a kernel's C function; its library is loaded, or made."""
+    module, name = kernel.py_func.__module__, kernel.py_func.__qualname__
+    held = (key for key, parts in LIBRARIES.items() if name in parts.get(module, ()))
+    return _loaded(next(held, f"{module}:{name}"))(_symbol(module, name))
+
+
+def prepare(names: Iterable[str], progress: Callable[[str], None] = lambda _text: None) -> None:
+    """Find or make libraries, several at a time.
+
+    Parameters
+    ----------
+    names : Iterable[str]
+        Of the libraries.
+    progress : Callable[[str], None]
+        Is given a line of text when one has been compiled.
+    """
+    absent = missing(names)
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        waiting = {pool.submit(_content, name): name for name in absent}
+        for left, done in enumerate(as_completed(waiting), 1 - len(absent)):
+            done.result()
+            progress(f"compiled: {waiting[done]}, {-left} left")
+
+
+def missing(names: Iterable[str]) -> list[str]:
+    """Libraries of these that must be compiled."""
+    return [name for name in names if _prebuilt(name) is None and _kept(name) is None]
+
+
+def build(folder: Path, levels: Collection[tuple[str, str]]) -> None:
+    """Write all libraries for levels of instructions into a folder, with their manifest.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to; it is made.
+    levels : Collection[tuple[str, str]]
+        Keys of LEVELS.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = [(name, level) for name in SHIPPED for level in levels]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        made = list(pool.map(lambda job: _made(*job), jobs))
+    digests = {}
+    for (name, level), content in zip(jobs, made, strict=True):
+        file = f"{name}-{'-'.join(level)}.so"
+        (folder / file).write_bytes(content)
+        digests[file] = KERNEL_DIGEST(content).hexdigest()
+    manifest = {
+        "sources": {name: _sources(name) for name in SHIPPED},
+        "compiler": tool_versions(),
+        "sha256": digests,
+    }
+    (folder / MANIFEST).write_text(json.dumps(manifest, indent=1))
+    modules = {part for name in SHIPPED for part in _modules(name)}
+    kept = {item.key: item[1:] for part in modules for item in sources_of(part).values()}
+    (folder / SOURCE_DIGESTS_FILE).write_text(json.dumps(kept, sort_keys=True))
+
+
+def _symbol(module: str, name: str) -> str:
+    return f"{module.replace('.', '_')}__{name}"
+
+
+def _parts(library: str) -> Mapping[str, tuple[str, ...]]:
+    """Kernels of a library by their modules."""
+    module, _, name = library.partition(":")
+    return LIBRARIES.get(library, {module: (name,)})
+
+
+def _modules(library: str) -> tuple[str, ...]:
+    """Modules of a library's kernels, and of what makes code of them."""
+    return (*_parts(library), "ehadiag.compile.object_code", "ehadiag.compile.elf")
+
+
+@cache
+def _sources(library: str) -> str:
+    """Hash of all that a library is made of."""
+    hashes = [source_hash(item) for item in _modules(library)]
+    return KERNEL_DIGEST(repr(hashes).encode()).hexdigest()[:16]
+
+
+def compiler_versions() -> dict[str, str]:
+    """Versions of what compiled the kernels: where the package came with them, or here."""
+    if _prebuilt(SHIPPED[0]) is None:
+        return tool_versions()
+    found: dict[str, str] = _manifest()["compiler"]
+    return found
+
+
+@cache
+def _manifest() -> dict[str, Any]:
+    """What the package says of its libraries; nothing where it came without."""
+    try:
+        manifest: dict[str, Any] = json.loads((PREBUILT / MANIFEST).read_bytes())
+    except FileNotFoundError:
+        return {}
+    return manifest
+
+
+@cache
+def _prebuilt(library: str) -> bytes | None:
+    """A library that came with the package, if it fits."""
+    manifest, level = _manifest(), processor_level()
+    if library not in SHIPPED or not manifest:
+        return None
+    if manifest["sources"].get(library) != _sources(library):
+        warn_once("the kernels that came with the package are not those of its sources: compiling")
+        return None
+    usable = [key for key in LEVELS if key[0] == level[0]]
+    usable = usable[usable.index(level) :] if level in usable else []
+    for key in usable:
+        file = f"{library}-{'-'.join(key)}.so"
+        if file in manifest["sha256"]:
+            content = (PREBUILT / file).read_bytes()
+            if KERNEL_DIGEST(content).hexdigest() == manifest["sha256"][file]:
+                return content
+            warn_once(f"{PREBUILT / file}: not the file that the package came with: compiling")
+            return None
+    warn_once("the package came without kernels for this processor: compiling")
+    return None
+
+
+@cache
+def _file(library: str) -> str:
+    """Name in the cache folder."""
+    processor = LEVELS.get(processor_level(), HOST)
+    made_by = repr((_sources(library), processor, tool_versions())).encode()
+    stem = library.replace(":", "-").replace(".", "_")
+    return f"{stem}-{KERNEL_DIGEST(made_by).hexdigest()[:16]}.kernel"
+
+
+def _kept(library: str) -> bytes | None:
+    """A library of the cache folder; one that is damaged is thrown away."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    name = _file(library)
+    try:
+        content = folder.read(name, MAX_LIBRARY_BYTES)
+        size = KERNEL_DIGEST().digest_size
+        if KERNEL_DIGEST(content[size:]).digest() == content[:size]:
+            return content[size:]
+        why = "damaged"
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        why = reason_of(error)
+    warn_once(f"cache folder {folder.path}: a compiled kernel is {why}; thrown away")
+    try:
+        folder.remove(name)
+    except OSError as error:
+        warn_once(f"cache folder {folder.path}: {reason_of(error)}")
+    return None
+
+
+@cache
+def _content(library: str) -> bytes:
+    """A library, wherever it comes from."""
+    folder = cache_folder()
+    found = _prebuilt(library) or _kept(library)
+    if found is not None or folder is None:
+        return found or _made(library, processor_level())
+    from filelock import FileLock  # noqa: PLC0415 - only where something is compiled
+
+    content = b""
+    try:
+        # Another process may be compiling the same.
+        with FileLock(folder.path / f"{_file(library)}.lock"):
+            content = _kept(library) or _made(library, processor_level())
+            folder.write(_file(library), KERNEL_DIGEST(content).digest() + content, synced=False)
+    except OSError as error:
+        warn_once(
+            f"cache folder {folder.path}: {reason_of(error)}; the compiled kernels are"
+            " not kept for the next run"
+        )
+    return content or _made(library, processor_level())
+
+
+def _made(library: str, level: tuple[str, str]) -> bytes:
+    """Compile a library."""
+    from ehadiag.compile.elementary import C_FUNCTIONS, ROUNDING_FUNCTIONS  # noqa: PLC0415
+    from ehadiag.compile.elf import shared_library  # noqa: PLC0415 - not where nothing is compiled
+
+    functions = [
+        CFunction(_symbol(module, name), getattr(import_module(module), name), SlotArguments())
+        for module, names in _parts(library).items()
+        for name in names
+    ]
+    processor = LEVELS.get(level, HOST)
+    replaced = C_FUNCTIONS if processor.rounds else C_FUNCTIONS | ROUNDING_FUNCTIONS
+    code = object_code(ObjectFile(functions, processor, replaced=replaced))
+    names = [item.name for item in functions]
+    return code if level == NO_LEVEL else shared_library(code, names)
+
+
+@cache
+def _loaded(library: str) -> Callable[[str], int]:
+    """Load a library; returns the function that finds the address of a name."""
+    content = _content(library)
+    if processor_level() == NO_LEVEL:
+        return _loaded_object(content)
+    # What was checked is what is loaded: a file of its own, which no other process can change. It
+    # stays open, since the loader takes two files of one path for the same.
+    handle = os.memfd_create(library)
+    os.write(handle, content)
+    shared = ctypes.CDLL(f"/proc/self/fd/{handle}")
+
+    def address(name: str) -> int:
+        return ctypes.cast(getattr(shared, name), ctypes.c_void_p).value or 0
+
+    return address
+
+
+def _loaded_object(content: bytes) -> Callable[[str], int]:
+    """Load an object file by LLVM, where there are no shared libraries."""
+    import llvmlite.binding as llvm  # noqa: PLC0415 - not where it is not needed
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(content))
+    engine.finalize_object()
+    found: Callable[[str], int] = engine.get_function_address
+    return found

@@ -1,0 +1,177 @@
+"""The process that compiles: what it is given, and how it is run."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any
+
+from firmware_iface.errors import ConfigurationError, EhadiagError, install_command
+
+
+@dataclass(frozen=True, slots=True)
+class PointerArgument:
+    """Argument of a C function whose address the kernel is given."""
+
+
+@dataclass(frozen=True, slots=True)
+class DoublesArgument:
+    """Argument of a C function that points to doubles, which the kernel is given as a tuple."""
+
+    count: int
+    """How many; 1: a number, not a tuple."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableArgument:
+    """Not an argument of the C function: the kernel is given the address of constants."""
+
+    name: str
+    """Of the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class SlotArguments:
+    """The only argument of a C function that points to all of the kernel's (`ehadiag.compile.jit`).
+
+    The result is written to the first slot.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class CFunction:
+    """A C function, `int name(pointer, …)`, and the kernel behind it."""
+
+    name: str
+    """Of the C function."""
+    kernel: Any
+    """Decorated kernel that returns a whole number; it takes addresses, numbers and tuples of
+    numbers."""
+    arguments: SlotArguments | tuple[PointerArgument | DoublesArgument | TableArgument, ...]
+    """In the order of the kernel's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Processor:
+    """What code is emitted for, in LLVM's names."""
+
+    triple: str
+    """Empty: this computer."""
+    cpu: str = ""
+    """Processor; "host": this one."""
+    features: str = ""
+    """What it has beyond or less than its name says."""
+    abi: str = ""
+    """Calling convention, empty: the triple's."""
+    shared: bool = False
+    """Whether the code may be part of a shared library."""
+    rounds: bool = True
+    """Whether it rounds to whole numbers by an instruction. Where not, a function of the C library
+    would be called, and no Arm code can hand it a number in both calling conventions."""
+    roots: bool = True
+    """Whether it has an instruction for the square root of doubles."""
+    single: bool = False
+    """Whether results are rounded to single precision, see `ehadiag.compile.object_code`."""
+    fast: bool = False
+    """Whether code may be large: loops are unrolled and vectorised."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectFile:
+    """An object file to be made."""
+
+    functions: Sequence[CFunction]
+    """The C functions in it."""
+    processor: Processor
+    """The target."""
+    tables: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """Constants by name."""
+    replaced: Mapping[str, Any] = field(default_factory=dict)
+    """Functions of one number of the C library, and the kernels that stand for them."""
+    allowed: frozenset[str] = frozenset()
+    """What else of the C library the code may call."""
+    exact: frozenset[Any] = frozenset()
+    """Kernels of which no result is rounded to single precision."""
+
+
+BEGIN = (
+    "import pickle, sys;"
+    "sys.path[:] = pickle.load(sys.stdin.buffer);"
+    "from ehadiag.compile.worker import main;"
+    "main()"
+)
+
+
+def object_code(wanted: ObjectFile) -> bytes:
+    """Make an object file in a process of its own.
+
+    Parameters
+    ----------
+    wanted : ObjectFile
+        What is to be in it.
+
+    Returns
+    -------
+    bytes
+        The object file, of the format of the target.
+
+    Raises
+    ------
+    EhadiagError
+        The compiler is not installed, or has no such target.
+    RuntimeError
+        The compiler has failed.
+    """
+    if find_spec("numba") is None:
+        raise ConfigurationError(
+            f"kernels must be compiled: needs numba: {install_command('compile')}"
+        )
+    import pickle  # noqa: PLC0415 - only where something is compiled
+    import subprocess  # noqa: PLC0415
+
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_DISABLE_JIT"}
+    environment["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"  # of errors that it expects
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", BEGIN],
+        input=pickle.dumps(sys.path) + pickle.dumps(wanted),
+        capture_output=True,
+        env=environment,
+        check=False,
+    )
+    if done.returncode != 0 or not done.stdout:
+        raise RuntimeError(f"the compiler failed:\n{done.stderr.decode(errors='replace')}")
+    made: bytes | EhadiagError = pickle.loads(done.stdout)
+    if isinstance(made, EhadiagError):
+        raise made
+    return made
+
+
+def main() -> None:
+    """Read what is wanted from standard input, write it to standard output."""
+    import gc  # noqa: PLC0415 - as above
+    import pickle  # noqa: PLC0415
+
+    gc.disable()  # numba's objects live as long as the process: to look for others takes a fifth
+    import ehadiag.compile.frontend  # noqa: PLC0415, F401 - first: it keeps numba from the folder
+    from ehadiag.compile.object_code import emitted  # noqa: PLC0415
+
+    wanted = pickle.load(sys.stdin.buffer)
+    made: bytes | EhadiagError
+    try:
+        made = emitted(wanted)
+    except EhadiagError as error:
+        made = error
+    sys.stdout.buffer.write(pickle.dumps(made))
+
+
+def tool_versions() -> dict[str, str]:
+    """Versions of what makes the code; empty where there is none of it."""
+    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - reads files
+
+    try:
+        return {name: version(name) for name in ("numba", "llvmlite")}
+    except PackageNotFoundError:
+        return {}

@@ -1,0 +1,307 @@
+"""Every threshold of what is good enough, explained, hopeless to search on, or plausible.
+
+Each has a quantity, a unit and how it was set: by the statistics of noise, by a bound, by a source,
+or by a study whose command shows it. Those that no study is named for are bounds of judgement.
+Recorded units: `tools/study recorded-units`; random units: `tools/study units`; broken hardware:
+`tools/study hardware`; buses with losses: `tools/study foreign-buses`.
+"""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import NamedTuple
+
+NOISE_OUTLIER_SHARE = 2.0 * NormalDist().cdf(-3.0)
+"""Share of residuals of noise alone beyond three deviations, 1: 0.0027."""
+
+
+class VerdictCriteria(NamedTuple):
+    """Chances that decide a verdict."""
+
+    max_chance_false_healthy: float = 0.025
+    """Largest chance that a severity is at or above the advisory level for HEALTHY, 1: the specific
+    consumer's risk of JCGM 106:2012."""
+    min_chance_fault: float = 0.5
+    """Least chance that a severity is at or above the limit for FAULT, 1: simple acceptance, JCGM
+    106:2012, 8.2."""
+    min_chance_beyond_limit: float = 0.5
+    """Least chance that another fault is beyond its limit for DEGRADED, 1: simple acceptance."""
+    min_chance_for_note: float = 0.025
+    """Least chance that another fault is beyond its limit for a note, 1: as
+    `max_chance_false_healthy`."""
+
+
+VERDICT = VerdictCriteria()
+
+
+class RecordingCriteria(NamedTuple):
+    """Limits of a recording that can be judged."""
+
+    max_frame_delay_s: float = 0.05
+    """Longest delay of a frame after its tick, s; a later one counts as lost."""
+    max_missing_share: float = 0.25
+    """Largest share of missing samples of a channel, 1: tried in docs/reference/bus-faults.md."""
+    max_missing_share_without_counter: float = 0.4
+    """Largest share of missing samples on a bus without counters, 1: of two samples a tick late one
+    counts as lost."""
+    max_sample_spacing_ticks: int = 2
+    """Largest regular spacing of samples, ticks: half the control rate suffices for a diagnosis."""
+    max_sample_gap_s: float = 0.25
+    """Longest span without a sample, s."""
+    min_command_frames: int = 100
+    """Least number of command frames that show the resolution of the command, 1."""
+    min_current_share_without_command: float = 0.4
+    """Least share of ticks with a measured current where the command was not recorded, 1."""
+    min_missing_end_s: float = 0.01
+    """Least span missing at an end of the test that is noted, s; a shorter one is a lost frame."""
+    min_sample_share_of_window: float = 0.5
+    """Least share of the samples of a window for its search, 1."""
+    max_saturated_share: float = 0.02
+    """Largest share of samples at an end of the converter, 1."""
+    oil_temperature_range_degc: tuple[float, float] = (-54.0, 135.0)
+    """Range of oil temperatures in which the oil's law is used, degC: from MIL-PRF-83282's lowest
+    to the usual limit of seals."""
+    min_supply_pressure_share: float = 0.5
+    """Least supply pressure, as a share of that in the actuator file, 1."""
+    max_current_residual_stds: float = 2.0
+    """Largest rms residual of the current, in deviations of the noise."""
+    max_control_residual_lsb: float = 4.0
+    """Largest rms residual of the current against the control law, LSB."""
+    min_sample_share_early: float = 0.75
+    """Least share of samples for estimating from a test that still runs, 1."""
+
+
+RECORDING = RecordingCriteria()
+
+
+class ReadingCriteria(NamedTuple):
+    """Limits of plausible units, signs, motion and actuator data."""
+
+    max_reading_factor: float = 10.0
+    """Largest reading over what the actuator can reach, 1."""
+    min_channel_correlation: float = 0.8
+    """Least correlation of two channels that shows their units, 1."""
+    max_channel_ratio_error: float = 0.25
+    """Largest relative error of the ratio of two channels by faults, load and supply, 1."""
+    min_jack_speed_m_per_s: float = 0.005
+    """Least speed of a moving jack, m/s; below it may stick."""
+    min_moving_ticks: int = 200
+    """Least number of ticks for a relation of two channels, 1."""
+    friction_range_shares: tuple[float, float] = (1.0, 1.2)
+    """Range of the force that moves the jack, over the friction as new and at the limit, 1: viscous
+    friction adds to it."""
+    min_travel_correlation: float = 0.7
+    """Least correlation of the jack's travel with the spool's flow, 1: 0.988 at least on 80 sound
+    units with all effects, data 5 % off and orifices, 0.84 with a sensor 50 ms late; 0.33 to -1
+    with another signal."""
+    max_reversed_travel_correlation: float = -0.7
+    """Largest correlation of travel and flow of a sensor with the wrong sign, 1."""
+    max_actuator_ratio_factor: float = 30.0
+    """Largest factor between a ratio of actuator data and its usual value, 1."""
+
+
+READINGS = ReadingCriteria()
+
+
+class FitCriteria(NamedTuple):
+    """Limits of residuals that count as explained, and signs of what explains the others."""
+
+    max_outlier_share: float = 0.015
+    """Largest share of residuals beyond three deviations for a verdict, 1: five to six times that
+    of noise, `NOISE_OUTLIER_SHARE`."""
+    max_rms: float = 1.25
+    """Largest rms residual for a verdict, in deviations of the noise."""
+    outlier_factor_further_effects: float = 6.0
+    """Factor on `max_outlier_share` for units with further effects, 1: recorded worn ones had up to
+    8 %, and errors well within their intervals."""
+    max_outlier_share_poor_calibration: float = 0.1
+    """Largest share of residuals beyond three deviations after whatever calibration, 1: recorded
+    worn units whose estimates held had up to 0.08, two that were sure and wrong 0.16 and 0.21."""
+    max_rms_poor_calibration: float = 1.8
+    """Largest rms residual after whatever calibration, in deviations of the noise: normal residuals
+    1.8 times as large as the noise have a tenth beyond three deviations."""
+    expected_cauchy_cost: float = 0.8618
+    """Mean of Cauchy's cost that an excess is over, 1. A standard normal residual has 0.874, 1.4 %
+    more; the limits of excess on this page were set with this value."""
+    max_outliers_of_noise: float = 0.01
+    """Largest share of residuals beyond three deviations where nothing is left to explain, 1."""
+    max_explained_excess: float = 1.25
+    """Largest excess of an explained signal, 1: 1.02 to 1.15 at the optimum of 80 simulated
+    tests."""
+    max_shown_std: float = 0.1
+    """Largest standard deviation of a severity that the test shows, 1."""
+    bound_tolerance: float = 1e-6
+    """Distance of a severity from its bound at which it is on it, 1."""
+    max_fit_outliers: float = 0.01
+    """Largest share of residuals beyond three deviations that needs no further search, 1."""
+    max_start_outliers: float = 0.15
+    """Largest share of outliers of a start for the severities alone, 1: mostly 0.04 at most on a
+    textbook's actuator, 0.29 and more on others; between break-aways a search may end away from the
+    optimum with 0.18."""
+    max_anchor_count: int = 4
+    """Largest number of re-anchorings at an optimum, 1: in all but one of 200 tests there were
+    none."""
+    max_outliers_for_search: float = 0.05
+    """Largest share of outliers after a refinement for which a further search is made, 1: 0.04 at
+    most on a textbook's actuator."""
+    max_excess_without_nuisances: float = 1.2
+    """Largest excess that needs no nuisances, 1: 1.15 at most in 80 recordings of units without
+    any."""
+    min_effect_change_stds: float = 6.0
+    """Least change of an effect since the calibration that is noted, in its deviations."""
+    min_effect_change_scales: float = 0.1
+    """Least change of an effect since the calibration that is noted, in units of its scale."""
+    min_suspect_share: float = 0.1
+    """Least share of the unexplained cost that a suspect would explain, 1."""
+    min_advice_share: float = 0.6
+    """Least share of the unexplained cost that a suspect explains to be named the cause, 1."""
+    max_frozen_range_lsb: float = 4.0
+    """Largest range of a frozen signal, LSB."""
+    min_modelled_range_lsb: float = 40.0
+    """Least range of the model while a signal is frozen, LSB."""
+    min_frozen_s: float = 0.5
+    """Least time for which a signal is frozen, s."""
+    max_reversed_gain: float = -0.5
+    """Largest gain of a signal against the model with the wrong sign, 1."""
+
+
+FIT = FitCriteria()
+
+
+class GiveUpCriteria(NamedTuple):
+    """Residuals after which a search is repeated, ends, or is given up."""
+
+    outliers: tuple[float, ...] = (0.3, 0.05)
+    """Outliers after one start, and after two, 1: 0.003 at most after the first one on sound units,
+    0.08 and more on broken ones."""
+    outliers_closed_loop: tuple[float, ...] = (0.6, 0.42, 0.42, 0.2)
+    """The same in closed loop, 1: searches of sound units left 0.45 after a first start, 0.38 after
+    one or two slow ones, and 0.07 after three; further ones explained each of them."""
+    spool_excess: float = 30.0
+    """Excess of the spool in closed loop after two starts, 1: 19 at most on those units."""
+    pressure_outliers: float = 0.1
+    """Outliers in closed loop after two starts where the pressure is explained worse than the
+    spool, 1: 0.07 at most on those units, 0.16 and more on broken ones."""
+    excess: float = 3.0
+    """Excess in open loop after two starts, 1: 1.6 at most on sound units that a further start
+    explained, 2.0 with a load that is not estimated. In closed loop that of the pressure, or of the
+    spool while the pressure is explained, which would show a break-away at a wrong tick, too."""
+    same_end_cost: float = 10.0
+    """Largest difference of the objective of two ends in one place, 1: a parameter one deviation
+    off costs 1."""
+    third_start_outliers: tuple[float, float] = (0.005, 0.1)
+    """Range of outliers for which three ends must agree, two otherwise, 1: twice two searches of
+    sound units ended at one wrong place, with 0.01 and 0.04. Broken units leave 0.16 and more,
+    mostly; spikes leave less."""
+    min_confirmed_share: float = 0.98
+    """Least excess over that with fewer unknowns that is no improvement, 1."""
+    max_open_loop_excess: float = 1.3
+    """Largest excess of open loop alone whose density closed loop starts from, 1: with more the
+    search has ended away from the optimum, with too narrow a density."""
+    min_other_end_gain: float = 30.0
+    """Least gain in objective of another place, 1."""
+    max_trial_share: float = 0.5
+    """Largest share of the excess over noise that an effect leaves on trial, 1: loads of 20 to 80 N
+    left 1.1 of 1.3 to 2.0, broken hardware as much as before."""
+    max_load_trial_excess: float = 15.0
+    """Largest excess after all nuisances for which a load is tried, 1."""
+    max_unchanged_excess: float = 1.3
+    """Largest excess by a calibration's prior of an unchanged unit, 1: wear shows what its model
+    leaves out, which loosened effects would replace."""
+    max_changed_share: float = 0.5
+    """Largest share of the excess over noise that may remain where effects have changed since,
+    1."""
+    min_unambiguous_hysteresis: float = 5e-3
+    """Full relative width of hysteresis below which closed loop keeps the spool breaking away,
+    1."""
+    max_last_part_step: float = 3.0
+    """Longest step by the last part of a test, in deviations of the first part."""
+    max_severity_step: float = 1.0
+    """The same of a severity, in its deviations; beyond, the whole test is refined."""
+    max_cost_rise: float = 4.0
+    """Largest rise of the cost by that step, 1: what break-aways make of a descent."""
+
+
+GIVE_UP = GiveUpCriteria()
+
+
+class ResponseCriteria(NamedTuple):
+    """Limits of position sensor, supply and delays against the identified response."""
+
+    min_travel_share: float = 0.25
+    """Least share of measured travels for a check of the position sensor, 1."""
+    min_rms_travel_lsb: float = 10.0
+    """Least rms travel over the span for a gain, LSB."""
+    min_position_gain: float = 0.2
+    """Least gain of a position sensor that follows the jack, 1."""
+    max_reversed_position_gain: float = -0.5
+    """Largest gain of a position sensor with the wrong sign, 1."""
+    max_position_gain_error: float = 0.1
+    """Largest error of the position sensor's gain, 1: twice that of flow gain and jack area 5 %
+    off."""
+    max_position_gain_error_calibrated: float = 0.25
+    """The same on a unit calibrated with effects of its own, 1: flow gain and jack area, which the
+    pressure shows by their ratio to others, may replace what the model leaves out."""
+    max_position_drift_m_per_s: float = 0.8e-3
+    """Largest drift of the position sensor, m/s, on a spool of the default range: an unseen spool
+    offset of 1 µm makes half of it."""
+    max_travel_rms: float = 4.0
+    """Largest rms residual of the travel, in deviations of its noise: 1.0 to 2.5 on sound units."""
+    min_travel_outlier: float = 12.0
+    """Least residual of an outlier of the travel, in deviations of its noise."""
+    max_travel_outlier_share: float = 0.01
+    """Largest share of outliers of the travel, 1; those of a single bad sample do not count."""
+    min_pressure_excess_stds: float = 10.0
+    """Least excess of the modelled over the largest measured pressure, in deviations of the
+    noise."""
+    min_pressure_excess_share: float = 0.12
+    """Least excess of the modelled over the largest measured pressure, as a share of it, 1: a sound
+    unit with another law of friction had 10 % for two ticks."""
+    max_pressure_excess_ticks: int = 1
+    """Largest number of ticks with such an excess, 1: one tick in 32 recordings of sound units."""
+    min_delay_ticks: float = 0.05
+    """Least delay of a signal that is corrected, ticks."""
+    min_delay_stds: float = 5.0
+    """Least delay of a signal that is corrected, in its deviations."""
+    min_delay_samples: int = 100
+    """Least number of samples for a delay, 1."""
+
+
+RESPONSE = ResponseCriteria()
+
+
+class LossCriteria(NamedTuple):
+    """Limits of lost and misplaced samples."""
+
+    max_guessed_share: float = 0.015
+    """Largest share of ticks in closed loop with a guessed current, 1:
+    docs/reference/bus-faults.md."""
+    max_guessed_share_reconstructed: float = 0.1
+    """Largest share of guessed currents that is reconstructed, 1: tried with 0.005 to 0.04."""
+    max_guessed_share_observable: float = 0.25
+    """Largest share of guessed currents with which jack friction is estimated, 1: tried up to
+    0.13."""
+    max_out_of_order_share: float = 0.01
+    """Largest share of commands at other ticks than their own, 1."""
+    min_outlier_share_misplaced: float = 2.0 * NOISE_OUTLIER_SHARE
+    """Least share of outliers from which rows placed by time may be misplaced, 1: twice that of
+    noise."""
+    max_outlier_share_reconstructed: float = 0.35
+    """Largest share of outliers from which lost samples are reconstructed, 1: up to 0.12 it
+    worked."""
+    min_gain_moved_rows: float = 8.0
+    """Least gain in fit by moving rows, in variances: time and current placed them."""
+    min_gain_lost_position: float = 4.0
+    """Least gain in fit of the best lost position over the second, in variances."""
+    reconstruction_std: float = 1e-3
+    """Standard deviation of a severity that a reconstruction adds, 1: errors up to 0.0014 were
+    seen."""
+    min_severity_std: float = 0.01
+    """Least standard deviation of a severity with lost samples, 1: off by 0.001 at most in closed
+    loop with up to 13 % guessed, and in open loop sorted by stamps that jitter by a tick."""
+    guessed_current_std: float = 2e-4
+    """Standard deviation of a severity where the model was re-anchored more often, 1: 3e-4 off was
+    seen with a tenth of the positions guessed."""
+
+
+LOSSES = LossCriteria()

@@ -1,0 +1,206 @@
+"""The health history as a table with one row for each severity: CSV, Parquet, and CSV read in."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from ehadiag.core.conventions import utc_time_text
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity
+from ehadiag.history.records import Entry, SourceRecord, Usage, current_utc_text
+from firmware_iface.errors import ConfigurationError, install_command, valid_text
+
+__all__ = ["HISTORY_COLUMNS", "entries_from_csv", "history_csv", "history_parquet"]
+
+HISTORY_COLUMNS: dict[str, type] = {
+    "number": int, "when": str, "actuator": str, "serial": int, "hours": float, "cycles": float,
+    "test": str, "verdict": str, "severity": str, "estimate": float, "std": float,
+    "low95": float, "high95": float, "at_bound": int, "shown": int, "recording": str,
+    "sha256": str, "withdrawn": str,
+}  # fmt: skip
+"""Columns with the kinds of their values."""
+NEEDED_COLUMNS = ("when", "actuator", "serial", "verdict", "severity", "estimate", "std")
+FORMULA_PREFIXES = ("=", "+", "-", "@", "\t", "\r")
+IMPORT_SCHEMA = "ehadiag.history-import/1"
+KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
+MAX_INTERVAL_STDS = 1.96
+"""Half width of an interval of 95 %, in deviations."""
+
+
+def history_csv(entries: Sequence[Entry]) -> str:
+    """Write entries as CSV (RFC 4180); one line without a severity where nothing was identified.
+
+    Parameters
+    ----------
+    entries : Sequence[Entry]
+        What is written.
+
+    Returns
+    -------
+    str
+        With a head; empty cells where there is no number. A text that a spreadsheet would take for
+        a formula begins with an apostrophe.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\r\n")
+    writer.writerow(HISTORY_COLUMNS)
+    for row in _rows(entries):
+        writer.writerow(_cell(value) for value in row)
+    return out.getvalue()
+
+
+def history_parquet(entries: Sequence[Entry]) -> bytes:
+    """Write entries as Parquet with the columns of the CSV file.
+
+    Parameters
+    ----------
+    entries : Sequence[Entry]
+        What is written.
+
+    Returns
+    -------
+    bytes
+        The file.
+
+    Raises
+    ------
+    ConfigurationError
+        pyarrow is not installed.
+    """
+    try:
+        import pyarrow  # noqa: PLC0415 - optional, and slow
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError:
+        raise ConfigurationError(
+            f"history: Parquet needs pyarrow: {install_command('parquet')}"
+        ) from None
+    kinds = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
+    schema = pyarrow.schema([(name, kinds[kind]) for name, kind in HISTORY_COLUMNS.items()])
+    rows = [dict(zip(HISTORY_COLUMNS, row, strict=True)) for row in _rows(entries)]
+    out = io.BytesIO()
+    parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), out)
+    return out.getvalue()
+
+
+def _rows(entries: Sequence[Entry]) -> Iterator[tuple[Any, ...]]:
+    for entry in entries:
+        head = (
+            entry.number, entry.when, entry.actuator, entry.serial, entry.usage.hours,
+            entry.usage.cycles, entry.test, entry.verdict,
+        )  # fmt: skip
+        source = entry.sources[0] if entry.sources else None
+        tail = (source and source.path, source and source.sha256, entry.withdrawn)
+        for item in entry.severities:
+            numbers = (item.estimate, item.std, *(item.interval95 or (None, None)))
+            yield (*head, item.name, *numbers, int(item.at_bound), int(item.shown), *tail)
+        if not entry.severities:
+            yield (*head, *[None] * 7, *tail)
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, str) and value.startswith(FORMULA_PREFIXES):
+        return f"'{value}"
+    return value
+
+
+def entries_from_csv(text: str, name: str, severities: Sequence[str]) -> list[Entry]:
+    """Read diagnoses of another system, in the columns of an exported CSV file.
+
+    Parameters
+    ----------
+    text : str
+        The file. Rows of one time, actuator and serial number in a row are one diagnosis.
+    name : str
+        Of the file, for errors.
+    severities : Sequence[str]
+        Names that there are.
+
+    Returns
+    -------
+    list[Entry]
+        Not appended yet; withdrawn rows are left out.
+
+    Raises
+    ------
+    ConfigurationError
+        A column is missing, or a cell is none of its kind.
+    """
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    missing = [item for item in NEEDED_COLUMNS if item not in (reader.fieldnames or ())]
+    if missing:
+        raise ConfigurationError(f"{name}: has no column {missing[0]}; see ehadiag history export")
+    out = []
+    numbered = ((reader.line_num, row) for row in reader if not row.get("withdrawn"))
+    for _, group in itertools.groupby(
+        numbered, key=lambda pair: [pair[1].get(key) for key in ("number", *NEEDED_COLUMNS[:3])]
+    ):
+        lines = list(group)
+        try:
+            out.append(_entry_of([row for _, row in lines], severities))
+        except (ValueError, TypeError, ConfigurationError) as error:
+            raise ConfigurationError(f"{name}, line {lines[0][0]}: {error}") from None
+    return out
+
+
+def _entry_of(rows: Sequence[dict[str, str]], severities: Sequence[str]) -> Entry:
+    first, now = rows[0], current_utc_text()
+    verdict = _text(first["verdict"])
+    if verdict not in KNOWN_VERDICTS:
+        raise ConfigurationError(f"verdict: there is {', '.join(KNOWN_VERDICTS)}")
+    found = [_severity_of(row, severities) for row in rows if row["severity"]]
+    path, sha256 = _text(first.get("recording") or ""), first.get("sha256") or None
+    origin = {"schema": IMPORT_SCHEMA, "number": first.get("number")}
+    return Entry(
+        appended=now,
+        tested=utc_time_text(first["when"]),
+        actuator=_text(first["actuator"]),
+        serial=int(first["serial"]),
+        test=_text(first.get("test") or "") or None,
+        verdict=verdict,
+        reasons=(),
+        usage=Usage(_number(first.get("hours")), _number(first.get("cycles"))),
+        sources=(SourceRecord(path, sha256, None),) if path else (),
+        severities=tuple(found),
+        covariance=None,
+        effects=(),
+        version="",
+        simulated=False,
+        result=json.dumps(origin),
+    )
+
+
+def _severity_of(row: dict[str, str], severities: Sequence[str]) -> Severity:
+    if row["severity"] not in severities:
+        raise ConfigurationError(f"severity: there is {', '.join(severities)}")
+    estimate, std = _number(row["estimate"]), _number(row["std"])
+    low, high = _number(row.get("low95")), _number(row.get("high95"))
+    if estimate is not None and std is not None and None in (low, high):
+        low, high = estimate - MAX_INTERVAL_STDS * std, estimate + MAX_INTERVAL_STDS * std
+    return Severity(
+        name=row["severity"],
+        estimate=estimate,
+        std=std,
+        interval95=None if low is None or high is None else (low, high),
+        flags=(AT_BOUND,) * (row.get("at_bound") == "1")
+        + (NOT_SHOWN,) * (row.get("shown", "1") == "0"),
+    )
+
+
+def _number(text: str | None) -> float | None:
+    if not text:
+        return None
+    value = float(text)
+    if not math.isfinite(value):
+        raise ConfigurationError("a number is not finite")
+    return value
+
+
+def _text(text: str) -> str:
+    """Text of a cell, without the apostrophe that an export puts before a formula."""
+    plain = text[1:] if text.startswith("'") and text[1:].startswith(FORMULA_PREFIXES) else text
+    return valid_text(plain)

@@ -1,0 +1,451 @@
+"""An identification from first approximation to uncertainty, fed while the test still runs.
+
+`warm_up` loads, or compiles, every kernel that a diagnosis runs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
+
+import numpy as np
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.criteria import FIT, LOSSES
+from ehadiag.identify import compact_ga
+from ehadiag.identify.estimates import (
+    estimate_covariance,
+    excess_cost,
+    identification_result,
+    independent_covariance,
+    is_pressure_misfit,
+    refinement_outlier_share,
+)
+from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, share_offsets
+from ehadiag.identify.exponent_range import over_exponents
+from ehadiag.identify.identification_result import Identification, IdentificationTiming
+from ehadiag.identify.least_squares import Refinement
+from ehadiag.identify.nuisance_estimate import NuisanceEstimate, NuisanceEstimator
+from ehadiag.identify.partial_refinement import (
+    FirstPart,
+    StartResiduals,
+    first_part_spans,
+    refine_first_part,
+    start_residuals,
+)
+from ehadiag.identify.posterior import no_interruption
+from ehadiag.identify.prior import EXACT_UNIT_PRIOR, UnitPrior, basic_nuisances_of
+from ehadiag.identify.severity_estimate import (
+    SeverityAttempt,
+    best_further_attempt,
+    explains_recording,
+    first_part_ticks,
+    is_current_guessed,
+    refined_attempt,
+    search_full_window,
+    severities_by_name,
+)
+from ehadiag.identify.solvers import CompactGa, SearchResult, Solver
+from ehadiag.identify.staged_search import (
+    STAGE_SHARES,
+    FirstApproximation,
+    StageMemory,
+    StageProgress,
+    experiment_arrays,
+    first_approximation_ready_at,
+    inputs_digest,
+    recalled_first_approximation,
+    search_stages,
+    stage_ready_at,
+    staged_search,
+)
+from ehadiag.model.registry import FAULTS
+from ehadiag.model.residual_models import model_response
+from firmware_iface.recording import CommandMode, Environment, Samples
+from firmware_iface.stored_test import Line, SearchWindows, StoredTest
+
+
+class NuisanceMode(Enum):
+    """Which effects of the installation are estimated besides the severities and the offsets."""
+
+    AUTO = "auto"
+    """Those that are needed: none where the severities alone explain the recording."""
+    NONE = "none"
+    ALL = "all"
+    """From the start."""
+
+
+@dataclass(frozen=True, slots=True)
+class InterimEstimate:
+    """Severities as a test that still runs shows them."""
+
+    stage: str
+    """What was done last, in words."""
+    values: Mapping[str, float]
+    """Severities by name."""
+    std: Mapping[str, float] | None = None
+    """Their standard deviations by name; None before a refinement."""
+
+
+class IdentificationSession:
+    """An identification that takes recordings while they grow, and is finished with complete ones.
+
+    What was computed from the beginning of a test is used again where the samples are the same to
+    the last bit, so the answer is that of the recording alone, only sooner. One thread at a time.
+    solver: global search, the compact genetic algorithm unless given; prior: of the unit, whose
+    inexact data are always estimated, too.
+    """
+
+    def __init__(
+        self,
+        solver: Solver | None = None,
+        seed: int = 0,
+        nuisances: NuisanceMode = NuisanceMode.AUTO,
+        prior: UnitPrior = EXACT_UNIT_PRIOR,
+    ) -> None:
+        self.solver = solver or CompactGa()
+        self.seed = seed
+        self.nuisances = nuisances
+        self.prior = prior
+        self._memory = StageMemory()
+        self._latest_start: tuple[bytes, StartResiduals] | None = None
+        self._latest_digest: tuple[tuple[Experiment, ...], bytes] = (), b""
+        self.so_far: InterimEstimate | None = None
+        """What the latest `feed` showed; None before the first. Another thread may look."""
+
+    @property
+    def reused(self) -> int:
+        """Stages that did not have to run again."""
+        return self._memory.reused
+
+    def feed(self, experiments: Sequence[Experiment]) -> None:
+        """Run the stages for which the samples so far suffice: of tests that have begun."""
+        ready = min(_ready_stages(item) for item in experiments)
+        if ready < 0:
+            return
+        experiments, self._latest_digest = self._prepared(experiments), ((), b"")
+        best = start = self._first(experiments)[1]
+        self.so_far = InterimEstimate("first approximation", severities_by_name(best))
+        for stage, result in enumerate(
+            itertools.islice(self._stages(experiments, best, lambda _share: None), ready)
+        ):
+            best = result.best
+            self.so_far = InterimEstimate(
+                f"search, stage {stage + 1} of {len(STAGE_SHARES)}", severities_by_name(best)
+            )
+        if ready < len(STAGE_SHARES):
+            return
+        for point in (start, best):
+            if self._resembles(experiments, point):
+                part = self._first_part(experiments, point, no_interruption)
+                self.so_far = _interim_estimate(part.refined)
+                return
+
+    def searched(self, experiments: Sequence[Experiment]) -> dict[str, float]:
+        """Severities by the search alone, from complete recordings of one actuator."""
+        experiments, self._latest_digest = share_offsets(experiments), ((), b"")
+        start = self._first(experiments)[1]
+        stages = self._stages(experiments, start, lambda _share: None)
+        return severities_by_name(staged_search(stages, lambda _stage, _share: None).best)
+
+    def finish(
+        self, experiments: Sequence[Experiment], progress: StageProgress | None = None
+    ) -> Identification:
+        """Estimate the severities from one or more complete recordings of one actuator."""
+        windows = [repr(item.test.windows) for item in experiments]
+        arrays = [array for item in experiments for array in experiment_arrays(item)]
+        key = inputs_digest(
+            f"identify {self.seed} {self.solver!r} {self.nuisances} {windows}", arrays
+        )
+        callback = progress or (lambda _stage, _share: None)
+        return self._memory.recall(
+            key,
+            Identification,
+            lambda: over_exponents(
+                self._identify(experiments, callback),
+                experiments[0].constants,
+                self.prior.exponents,
+            ),
+        )
+
+    def _prepared(self, experiments: Sequence[Experiment]) -> list[Experiment]:
+        """Experiments with offsets shared; of exponents of clogging with the largest one.
+
+        Friction and exponent act by their ratio alone: with the largest exponent the friction is
+        within its bounds for all of them (`over_exponents`).
+        """
+        shared = share_offsets(experiments)
+        low, high = self.prior.exponents
+        if low == high:
+            return shared
+        return [replace(item, constants=item.constants._replace(CLE=high)) for item in shared]
+
+    def _identify(
+        self, experiments: Sequence[Experiment], progress: StageProgress
+    ) -> Identification:
+        begin = time.perf_counter()
+        progress("first approximation", 0.0)
+        experiments, self._latest_digest = self._prepared(experiments), ((), b"")
+        first, start = self._first(experiments)
+        searched_at = time.perf_counter()
+        found = staged_search(
+            self._stages(experiments, start, partial(progress, "search")), progress
+        )
+        search_s = time.perf_counter() - searched_at
+        progress("refinement", 0.0)
+        has_inexact_data = self.prior.has_inexact_data
+        alone = self.nuisances is NuisanceMode.NONE and not has_inexact_data
+        found, start, near = self._refinement_start(experiments, found, start)
+        best: SeverityAttempt | None = None
+        if alone or (near and self.nuisances is NuisanceMode.AUTO and not has_inexact_data):
+            best = refined_attempt(
+                experiments, found, start, self._first_part, partial(progress, "refinement", 0.0)
+            )
+            best = replace(best, evaluations=best.evaluations + found.evaluations)
+        freed: NuisanceEstimate | None = None
+        if not alone and (best is None or not _severities_suffice(best.refined)):
+            hint = best.refined.values if best else severities_by_name(start)
+            alone_left = excess_cost(best.refined.residuals) if best else np.inf
+            progress("nuisances", 0.0)
+            basic = basic_nuisances_of(experiments[0].constants.OIL)
+            freeing = NuisanceEstimator(
+                self.prior,
+                () if self.nuisances is NuisanceMode.NONE else basic,
+                partial(progress, "nuisances"),
+            )
+            freed = freeing.estimated(experiments, hint if near else None, alone_left)
+        conclude = partial(
+            identification_result, solver=self.solver.name, seed=self.seed, about=self.prior.about
+        )
+        if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
+            if (
+                near
+                and refinement_outlier_share(best.refined) <= FIT.max_outliers_for_search
+                and not _misfit_is_not_of_search(freed, best)
+            ):
+                best = best_further_attempt(
+                    experiments, best, self._first_part, self.solver, self.seed, progress,
+                    time.perf_counter,
+                )  # fmt: skip
+            return conclude(
+                first,
+                best.found,
+                best.refined,
+                estimate_covariance(best.refined)
+                + _guessed_covariance(best.refined)
+                + self._discrepancy(best.refined),
+                best.experiments,
+                evaluations=first.evaluations
+                + best.evaluations
+                + (freed.evaluations if freed else 0),
+                attempts=best.count + (freed.starts if freed else 0),
+                timing=_timing(begin, searched_at, search_s + best.search_s),
+            )
+        assert freed is not None
+        values = freed.refined.values
+        severities = np.array([values[item.name] for item in FAULTS])
+        before = best.evaluations if best else found.evaluations
+        return conclude(
+            first,
+            replace(found, best=severities, cost=freed.refined.cost),
+            freed.refined,
+            estimate_covariance(freed.refined)
+            + freed.covariance
+            + self.prior.spread(freed.refined.parameters, values, experiments[0].constants)
+            + self._discrepancy(freed.refined),
+            freed.experiments,
+            evaluations=first.evaluations + before + freed.evaluations,
+            attempts=freed.starts + (1 if best else 0),
+            timing=_timing(begin, searched_at, search_s),
+        )
+
+    def _discrepancy(self, refined: Refinement) -> Array:
+        """Covariance by wrong laws of the faults."""
+        return self.prior.discrepancy_covariance(
+            refined.parameters, refined.values, excess_cost(refined.residuals)
+        )
+
+    def _refinement_start(
+        self, experiments: Sequence[Experiment], found: SearchResult, start: Array
+    ) -> tuple[SearchResult, Array, bool]:
+        """Return the search, the point a refinement begins from, and whether it may explain the
+        recordings: the first approximation, which has no seed, unless only the optimum of the
+        search resembles them, or of one over the whole window where currents were guessed."""
+        for point in (start, found.best):
+            if self._resembles(experiments, point):
+                return found, point, True
+        if not any(item.trace.guessed for item in experiments):
+            return found, found.best, False
+        other = search_full_window(experiments, found, self.solver, self.seed + len(STAGE_SHARES))
+        other = replace(other, evaluations=found.evaluations + other.evaluations)
+        near = self._resembles(experiments, other.best)
+        found = other if near else replace(found, evaluations=other.evaluations)
+        return found, found.best, near
+
+    def _resembles(self, experiments: Sequence[Experiment], point: Array) -> bool:
+        """Whether a refinement from a point may explain the recordings."""
+        look = self._start_residuals(experiments, point)
+        return look.outlier_share <= FIT.max_start_outliers
+
+    def _first(self, experiments: Sequence[Experiment]) -> tuple[FirstApproximation, Array]:
+        """First approximation, and the same as a point among the severities."""
+        first = recalled_first_approximation(experiments, self._memory)
+        return first, np.array([first.values[item.name] for item in FAULTS])
+
+    def _stages(
+        self, experiments: Sequence[Experiment], start: Array, progress: Callable[[float], None]
+    ) -> Iterator[SearchResult]:
+        return search_stages(experiments, start, self.solver, self.seed, self._memory, progress)
+
+    def _first_part(
+        self, experiments: Sequence[Experiment], start: Array, between: Callable[[], None]
+    ) -> FirstPart:
+        """Refinement on the first parts of the tests, from memory if the inputs are the same."""
+        until = [first_part_ticks(item) for item in experiments]
+        return self._memory.recall(
+            self._first_part_digest(experiments, until, start),
+            FirstPart,
+            lambda: refine_first_part(
+                experiments,
+                until,
+                severities_by_name(start),
+                between,
+                self._start_residuals(experiments, start),
+            ),
+        )
+
+    def _start_residuals(self, experiments: Sequence[Experiment], start: Array) -> StartResiduals:
+        """Look at the first parts of the tests; the latest one is kept."""
+        until = [first_part_ticks(item) for item in experiments]
+        key = self._first_part_digest(experiments, until, start)
+        if self._latest_start is None or self._latest_start[0] != key:
+            self._latest_start = key, start_residuals(experiments, until, severities_by_name(start))
+        return self._latest_start[1]
+
+    def _first_part_digest(
+        self, experiments: Sequence[Experiment], until: Sequence[int], start: Array
+    ) -> bytes:
+        """Fingerprint of the first parts of the tests and a start among the severities.
+
+        That of the parts is worked out once in a call for the same experiments.
+        """
+        if self._latest_digest[0] != tuple(experiments):
+            free = lay_out_spans(experiments, first_part_spans(experiments, until))
+            base = [np.array(item.constants) for item in experiments]
+            self._latest_digest = tuple(experiments), inputs_digest("first part", [*free, *base])
+        return inputs_digest(
+            "start", [np.frombuffer(self._latest_digest[1], dtype=np.uint8), start]
+        )
+
+
+def identify(
+    experiments: Sequence[Experiment],
+    *,
+    solver: Solver | None = None,
+    seed: int = 0,
+    nuisances: NuisanceMode = NuisanceMode.AUTO,
+    prior: UnitPrior = EXACT_UNIT_PRIOR,
+    progress: StageProgress | None = None,
+) -> Identification:
+    """Estimate the severities from one or more recordings of one actuator, fed once."""
+    return IdentificationSession(solver, seed, nuisances, prior).finish(experiments, progress)
+
+
+def _guessed_covariance(refinement: Refinement) -> Array:
+    """Covariance that a guessed current adds to the severities'."""
+    std = LOSSES.guessed_current_std if is_current_guessed(refinement) else 0.0
+    return independent_covariance(
+        refinement.parameters, dict.fromkeys((item.name for item in FAULTS), std)
+    )
+
+
+def _timing(begin: float, searched_at: float, search_s: float) -> IdentificationTiming:
+    """Time spent so far, s: on the first approximation, on searches, and on the rest."""
+    return IdentificationTiming(
+        searched_at - begin, search_s, time.perf_counter() - searched_at - search_s
+    )
+
+
+def _interim_estimate(refined: Refinement) -> InterimEstimate:
+    """Severities of a refinement on the first part of a test."""
+    std = dict(
+        zip(
+            (item.name for item in refined.parameters),
+            np.sqrt(np.diag(estimate_covariance(refined))).tolist(),
+            strict=True,
+        )
+    )
+    values = {item.name: refined.values[item.name] for item in FAULTS}
+    return InterimEstimate("refinement of its first part", values, std)
+
+
+def _severities_suffice(refinement: Refinement) -> bool:
+    """Whether the severities alone explain a recording, without slow residuals, of which
+    small nuisances would be the cause."""
+    return (
+        explains_recording(refinement)
+        and excess_cost(refinement.residuals) <= FIT.max_excess_without_nuisances
+    )
+
+
+def _nuisances_explain_no_more(freed: NuisanceEstimate, alone: SeverityAttempt) -> bool:
+    """Whether nuisances explain a recording no better than the severities alone do: what is left
+    is none of theirs, as where guessed positions stand in for lost ones."""
+    return not freed.explained and freed.excess >= excess_cost(alone.refined.residuals)
+
+
+def _misfit_is_not_of_search(freed: NuisanceEstimate | None, alone: SeverityAttempt) -> bool:
+    """Whether what the severities alone leave is not for want of a search: of the pressure, or left
+    where several searches with all effects ended."""
+    if freed is None:
+        return False
+    confirmed = freed.confirmed and not is_current_guessed(alone.refined)
+    return confirmed or is_pressure_misfit(freed.refined.residuals)
+
+
+def _ready_stages(experiment: Experiment) -> int:
+    """Stages of the genetic search that the samples so far suffice for, -1: not even the first."""
+    test, seconds = experiment.test, experiment.ticks * experiment.tick
+    if seconds < first_approximation_ready_at(test):
+        return -1
+    return sum(seconds >= stage_ready_at(test, stage) for stage in range(len(STAGE_SHARES)))
+
+
+def warm_up(actuator: Actuator, test: StoredTest) -> None:
+    """Identify from a fraction of a second at rest, in the loop that the test closes."""
+    ticks = 200
+    rest = np.zeros(ticks)
+    samples = Samples(
+        period_ns=round(1e9 / test.rate),
+        mode=CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT,
+        current=rest,
+        spool=rest,
+        pressure=rest,
+        position=rest,
+        command=rest,
+        saturated=np.zeros((4, ticks), dtype=np.bool_),
+        host_ns=np.arange(ticks),
+    )
+    length = ticks / test.rate
+    whole = ((0.0, length),)
+    silence = StoredTest(
+        name="silence",
+        id=test.id,
+        mode=test.mode,
+        unit=test.unit,
+        rate=test.rate,
+        segment=(Line(((0.0, 0.0), (length, 0.0))),),
+        windows=SearchWindows(whole, whole, whole, whole),
+    )
+    experiment = build_experiment(samples, Environment(), silence, actuator)
+    identify([experiment], solver=CompactGa(budget=20))
+    state = compact_ga.initial_state(np.full(3, 0.5), np.full(3, 0.1), seed=0)
+    population = np.empty((2, 3))
+    compact_ga.draw_generation(state, population)
+    compact_ga.update_state(state, population, np.zeros(2), 2.0, 1.0, np.empty(3))
+    model_response(experiment.constants, experiment.trace.current, experiment.tick)

@@ -1,0 +1,267 @@
+"""Refinement of the severities by robust least squares.
+
+Constant errors of the sensors are estimated with the severities; oil and supply, which the bus says
+in steps, in the last round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.identify.linearisation import (
+    CoordinateCross,
+    Derivatives,
+    LinearModel,
+    ParameterDensity,
+    capped_cost,
+    linearised_on_cross,
+)
+from ehadiag.identify.posterior import (
+    FEW_UNKNOWNS_SCHEDULE,
+    SearchSchedule,
+    bounded_step,
+    cauchy_weights,
+    no_interruption,
+    search_posterior,
+)
+from ehadiag.model.parameter import Parameter
+from ehadiag.model.registry import ResidualModel
+from ehadiag.model.severities import SEARCH_STDS
+
+SEARCH_OPTIMUM_STD = np.array(SEARCH_STDS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """Optimum of the robust least squares; k parameters, N ticks."""
+
+    parameters: tuple[Parameter, ...]
+    """What was estimated."""
+    x: Array
+    """The optimum, in units of `scale`; shape (k,)."""
+    scale: Array
+    """Shape (k,)."""
+    cost: float
+    """Capped sum of squares there."""
+    residuals: Array
+    """Weighted, there; 0 where no sample; shape (signals, N)."""
+    jacobian: Array
+    """Derivative of the residuals by x; 0 in rows left out; shape (k, signals, N)."""
+    considered: Array
+    """Change of the residuals by a standard deviation of each considered parameter that is held;
+    shape (c, signals, N)."""
+    used: NDArray[np.bool_]
+    """Rows that took part; shape (signals, N)."""
+    weighted: NDArray[np.bool_]
+    """Rows that have a sample; shape (signals, N)."""
+    evaluations: int
+    """Runs of the model."""
+    converged: bool
+    """Whether the search came to rest."""
+    anchored: int
+    """How often the model was re-anchored at the optimum."""
+    information: Array | None = None
+    """What was known beforehand: inverse covariance, in units of `scale`; shape (k, k)."""
+    daily: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    """As `considered`, of those that the last round moved; shape (d, signals, N)."""
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Estimates by name, SI."""
+        values = (self.x * self.scale).tolist()
+        return {item.name: value for item, value in zip(self.parameters, values, strict=True)}
+
+    @property
+    def normal(self) -> Array:
+        """JᵀJ of the rows that took part, in units of `scale`, shape (k, k)."""
+        rows = self.jacobian.reshape(len(self.jacobian), -1)  # 0 where none took part
+        return np.asarray(rows @ rows.T)
+
+
+def refine_severities(
+    model: Derivatives,
+    start: Mapping[str, float],
+    spread: Array | float = SEARCH_OPTIMUM_STD,
+    between: Callable[[], None] = no_interruption,
+    schedule: SearchSchedule = FEW_UNKNOWNS_SCHEDULE,
+) -> Refinement:
+    """Narrow a density about a start, values by name (0 where not named).
+
+    spread: of the severities about it, shape (c,), or of each of them. between, schedule: see
+    `search_posterior`.
+    """
+    x = np.array([start.get(item.name, 0.0) for item in model.estimated]) / model.scale
+    curved = model.curved
+    begin = ParameterDensity(
+        np.clip(x, model.lower, model.upper),
+        np.diag(np.broadcast_to(spread, curved.shape) / model.scale[curved]),
+    )
+    found = search_posterior(
+        model, begin, begin, np.zeros((len(x), len(x))), linearised_on_cross, schedule, between
+    )
+    return refinement_by_lines(model, found.density.x, found.linear, settled=found.settled)
+
+
+def refinement_by_lines(
+    model: Derivatives, x: Array, linear: LinearModel, *, settled: bool
+) -> Refinement:
+    """Evaluate an optimum close to the middle of the last round.
+
+    Its residuals are the middle's, moved by the lines where these hold: no run of the model.
+    """
+    jacobian = np.where(linear.scatter < ESTIMATION.max_row_scatter, linear.jacobian, 0.0)
+    residuals = linear.middle + np.tensordot(x - linear.at, jacobian, 1)
+    # The last round counts re-anchorings and considered parameters.
+    considered = np.zeros((0, *residuals.shape))
+    return _refinement(model, x, linear, residuals, considered, anchored=0, settled=settled)
+
+
+def refinement_at(
+    model: Derivatives,
+    x: Array,
+    linear: LinearModel,
+    *,
+    settled: bool,
+    information: Array | None = None,
+) -> Refinement:
+    """Evaluate an optimum; linear: the model about it, over the width of its density."""
+    residuals, considered, anchored, _ = model.at(x)
+    held, daily = considered[~model.daily], considered[model.daily]
+    found = _refinement(model, x, linear, residuals, held, anchored=anchored, settled=settled)
+    return replace(found, information=information, daily=daily)
+
+
+def _refinement(
+    model: Derivatives,
+    x: Array,
+    linear: LinearModel,
+    residuals: Array,
+    considered: Array,
+    *,
+    anchored: int,
+    settled: bool,
+) -> Refinement:
+    """Refinement by the residuals at an optimum and the lines about it."""
+    weighted = model.model.batch.weight > 0.0
+    used = (
+        (linear.scatter < ESTIMATION.max_row_scatter)
+        & (residuals**2 < ESTIMATION.residual_cap)
+        & weighted
+    )
+    return Refinement(
+        parameters=model.estimated,
+        x=x,
+        scale=model.scale,
+        cost=capped_cost(residuals),
+        residuals=residuals,
+        jacobian=np.where(used, linear.jacobian, 0.0),
+        considered=considered,
+        used=used,
+        weighted=weighted,
+        evaluations=model.evaluations,
+        converged=settled,
+        anchored=anchored,
+    )
+
+
+def median_offsets(model: ResidualModel, residuals: Array) -> dict[str, float]:
+    """Median residual of each signal as the constant error of its sensor, SI by name.
+
+    For a model that runs free: re-anchoring would take most of an offset away. A signal that is
+    left out has none.
+    """
+    out = {}
+    for item in model.unknowns.free:
+        if item.adds_to is not None and item.adds_to < len(model.batch.weight):
+            weight = model.batch.weight[item.adds_to]
+            used = weight > 0.0
+            shares = residuals[item.adds_to, used] / weight[used]
+            out[item.name] = float(np.median(shares)) if used.any() else 0.0
+    return out
+
+
+MIN_LAST_ROUND_INFORMATION = 1e-9
+"""Information on what no sample shows, in units of the scales."""
+
+
+LAST_ROUND_WEIGHINGS = 3
+"""Weighings of a last round, 1: oil half a step colder than the bus says shifts many residuals."""
+
+
+def last_round(
+    model: Derivatives, density: ParameterDensity, settled: bool, *others: Array
+) -> tuple[Refinement, list[float]]:
+    """Linearise the model over a density once more, and step with oil and supply free.
+
+    model: of all of the tests, re-anchored on the spool; settled: whether the rounds before
+    converged; others: further points, run in the same blocks. Returns the refinement, whose
+    residuals are those of `model` moved by the lines, and the costs of the density's mean and of
+    the other points.
+    """
+    cross = CoordinateCross.about(model, density)
+    sides = cross.points[1:]
+    middle, considered, anchored, runs = model.at(density.x, *sides, *others)
+    linear = cross.lines(model, np.concatenate([middle[None], runs[: len(sides)]]))
+    daily = considered[model.daily]
+    x, shift = _last_round_step(
+        model, linear, linear.residuals, daily, weighings=LAST_ROUND_WEIGHINGS
+    )
+    moved = replace(linear, residuals=linear.residuals + shift, middle=linear.middle + shift)
+    found = refinement_by_lines(model, x, moved, settled=settled)
+    found = replace(
+        found,
+        considered=considered[~model.daily],
+        daily=daily,
+        anchored=anchored,
+    )
+    return found, [capped_cost(middle), *map(capped_cost, runs[len(sides) :])]
+
+
+def refined_with_day(model: Derivatives, found: Refinement, linear: LinearModel) -> Refinement:
+    """Move an optimum by oil and supply of the day; linear: the model about the optimum."""
+    if not len(found.daily):
+        return found
+    at = replace(linear, x=found.x, residuals=found.residuals)
+    settled = np.zeros_like(found.residuals)
+    x, shift = _last_round_step(model, at, settled, found.daily, found.information)
+    residuals = found.residuals + shift
+    return replace(found, x=x, residuals=residuals, cost=capped_cost(residuals))
+
+
+def _last_round_step(
+    model: Derivatives,
+    linear: LinearModel,
+    pulls: Array,
+    daily: Array,
+    information: Array | None = None,
+    *,
+    weighings: int = 1,
+) -> tuple[Array, Array]:
+    """Point to which residuals lead, each weighted by the linear model, and their shift.
+
+    linear: model about the point; pulls: what of its residuals the estimates have not settled;
+    daily: see `Refinement`, estimated with a density of unit width each; the shift of the residuals
+    is theirs.
+    """
+    count, shape = len(linear.x), pulls.shape
+    rows = np.concatenate([linear.jacobian, daily]).reshape(count + len(daily), -1)
+    prior = np.eye(len(rows))
+    prior[:count, :count] = MIN_LAST_ROUND_INFORMATION * np.eye(count)
+    if information is not None:
+        prior[:count, :count] += information
+    free = np.full(len(daily), np.inf)
+    lower, upper = np.concatenate([model.lower, -free]), np.concatenate([model.upper, free])
+    begin = out = np.concatenate([linear.x, np.zeros(len(daily))])
+    for _ in range(weighings):
+        moved = linear.residuals + ((out - begin) @ rows).reshape(shape)
+        weighed = rows * cauchy_weights(replace(linear, residuals=moved)).ravel()
+        gradient = weighed @ linear.residuals.ravel()
+        gradient[:count] = weighed[:count] @ pulls.ravel()
+        out = bounded_step(begin, weighed @ rows.T + prior, gradient, lower, upper)
+    return out[:count], (out[count:] @ rows[count:]).reshape(shape)

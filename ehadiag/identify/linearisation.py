@@ -1,0 +1,406 @@
+"""Linear models of residuals: differences at a point, regression over the parameters' spread.
+
+A difference leaves out samples where a break-away makes a jump. A regression over points as far
+apart as the parameters are uncertain sees its mean effect (statistical linear regression: Lefebvre,
+Bruyninckx, De Schutter, IEEE Trans. Automatic Control 47(8), 2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
+from ehadiag.model.parameter import Parameter, ParameterKind
+from ehadiag.model.registry import ResidualModel
+
+
+class DifferenceRules(NamedTuple):
+    """Differences of residuals at a point."""
+
+    step: float = 5e-5
+    """Half-width of the differences, in units of the parameters' scales."""
+    wide_step: float = 2e-4
+    """Half-width of the differences that check them, in units of the parameters' scales."""
+    max_difference: float = 0.2
+    """Largest relative difference of derivatives over the two widths, 1, with the typical
+    derivative."""
+    max_kink: float = 0.3
+    """Largest disagreement of two-sided differences, in deviations; more is a break-away."""
+    max_considered: float = 1.0
+    """Largest change by a whole deviation of a considered parameter on board, in deviations; more
+    is a break-away."""
+    considered_step: float = 0.125
+    """Change of a considered parameter for its effect, in its deviations: half a deviation of oil
+    at -20 °C changes the pressure by less than its noise, as a break-away does not."""
+
+
+DIFFERENCES = DifferenceRules()
+
+
+@dataclass(frozen=True, slots=True)
+class ConsideredParameter:
+    """A parameter with a narrow density about 0.
+
+    That of a day moves in the last round alone; that of an instant is held, and its uncertainty
+    counts (Schmidt's consider filter).
+    """
+
+    parameter: Parameter
+    std: float
+    """Standard deviation of what is not known of it, in its unit."""
+    rows: tuple[int, ...] | None = None
+    """Signals on which it counts; all unless given."""
+    by_rate: bool = False
+    """Whether it is an instant of sampling (s before the end of a tick), too short for the signals
+    to bend: what it does is worked out from how fast they change, without a run of the model."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualSlope:
+    """Residuals at a point and how they change about it."""
+
+    x: Array
+    """The point, in units of the scales; shape (k,)."""
+    residuals: Array
+    """Weighted, there; shape (signals, N)."""
+    cost: float
+    """Their capped sum of squares."""
+    jacobian: Array
+    """Derivatives of the residuals; shape (k, signals, N)."""
+    smooth: NDArray[np.bool_]
+    """Rows whose derivatives hold; shape (signals, N)."""
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Rows that a step goes by, shape (signals, N)."""
+        return self.smooth & (self.residuals**2 < ESTIMATION.residual_cap)
+
+
+class Derivatives:
+    """A model in scaled coordinates, with differences.
+
+    model: its unknowns are those that are estimated, then those considered. noise: of the signals,
+    the scale of their sensors' constant errors. considered: the last unknowns of the model.
+    """
+
+    def __init__(
+        self,
+        model: ResidualModel,
+        noise: tuple[float, ...],
+        considered: Sequence[ConsideredParameter] = (),
+    ) -> None:
+        self.model = model
+        free = model.unknowns.free
+        self.considered = tuple(considered)
+        self.daily = np.array([not item.by_rate for item in considered], dtype=np.bool_)
+        """Which of the considered parameters the last round moves: oil and supply of the day."""
+        self.estimated: tuple[Parameter, ...] = free[: len(free) - len(considered)]
+        """Parameters in the order of a point's coordinates."""
+        self.scale = np.array([search_scale(item, noise) for item in self.estimated])
+        self.lower = np.array([item.lower for item in self.estimated]) / self.scale
+        self.upper = np.array([item.upper for item in self.estimated]) / self.scale
+        self.curved: NDArray[np.int64] = np.array(
+            [k for k, item in enumerate(self.estimated) if item.adds_to is None], dtype=np.int64
+        )
+        """Coordinates that act through the model."""
+        self.faults = np.array([item.kind is ParameterKind.FAULT for item in self.estimated])
+        """Which coordinates are severities, shape (k,)."""
+
+    @property
+    def evaluations(self) -> int:
+        """Runs of the model so far."""
+        return self.model.evaluations
+
+    def many(self, points: Array) -> Array:
+        """Weighted residuals of points, shape (n, signals, N) for points of shape (n, k)."""
+        return self.model.residuals(self.values(points))[0]
+
+    def at(self, x: Array, *others: Array) -> tuple[Array, Array, int, Array]:
+        """Residuals at a point, the effect of considered parameters, re-anchorings, other points'
+        runs.
+
+        Shapes (signals, N), (c, signals, N) by a standard deviation of each considered parameter,
+        scalar, and (n, signals, N) of the other points, run in the same blocks.
+        """
+        by_runs = [j for j, item in enumerate(self.considered) if not item.by_rate]
+        points = self.values(np.vstack([x, *[x] * len(by_runs), *others]))
+        for row, j in enumerate(by_runs):
+            points[1 + row, len(x) + j] = DIFFERENCES.considered_step * self.considered[j].std
+        runs, anchored = self.model.residuals(points)
+        step = DIFFERENCES.considered_step
+        changes = np.empty((len(self.considered), *runs.shape[1:]))
+        changes[by_runs] = runs[1 : 1 + len(by_runs)] - runs[0]
+        for change, item in zip(changes, self.considered, strict=True):
+            if item.by_rate:
+                change[:] = step * item.std * self._rates(runs[0])
+        considered = np.where(np.abs(changes) < DIFFERENCES.max_kink, changes, 0.0) / step
+        for change, item in zip(considered, self.considered, strict=True):
+            if item.rows is not None:
+                change[np.isin(np.arange(len(change)), item.rows, invert=True)] = 0.0
+        return runs[0], considered, int(anchored[0]), runs[1 + len(by_runs) :]
+
+    def _rates(self, residuals: Array) -> Array:
+        """How fast the modelled signals change, weighted, from their residuals; 1/s.
+
+        By the neighbours of each sample; 0 where one of them is missing.
+        """
+        batch, out = self.model.batch, np.zeros(residuals.shape)
+        measured = batch.spool, batch.pressure, batch.position
+        for rate, values, row, weight in zip(out, measured, residuals, batch.weight, strict=False):
+            counts = weight > 0.0
+            share = np.divide(row, weight, out=np.full(row.shape, np.nan), where=counts)
+            modelled = values - share
+            for a, b, tick in zip(batch.start[:-1], batch.start[1:], batch.tick, strict=True):
+                rate[a:b] = np.gradient(modelled[a:b], tick) * weight[a:b]
+        return np.nan_to_num(out, copy=False)
+
+    def slopes(self, centres: Sequence[Array]) -> list[ResidualSlope]:
+        """Residuals and derivatives at several points, all runs of the model together."""
+        sides = [self._sides(x, DIFFERENCES.step) for x in centres]
+        points = [np.vstack([x[None, :], at]) for x, at in zip(centres, sides, strict=True)]
+        runs = np.split(self.many(np.vstack(points)), len(centres))
+        out = []
+        for x, at, run in zip(centres, sides, runs, strict=True):
+            jacobian, smooth = self._differences(x, run[0], at, run[1:])
+            out.append(ResidualSlope(x, run[0], capped_cost(run[0]), jacobian, smooth))
+        return out
+
+    def trusted_slope(self, x: Array) -> ResidualSlope:
+        """Residuals and derivatives at a point, rows left out as by `trusted`; in one block."""
+        at = self._sides(x, DIFFERENCES.step)
+        runs = self.many(np.vstack([x[None, :], at, self.wide_sides(x)]))
+        jacobian, smooth = self._differences(x, runs[0], at, runs[1 : 1 + len(at)])
+        slope = ResidualSlope(x, runs[0], capped_cost(runs[0]), jacobian, smooth)
+        return self.trusted(slope, runs[1 + len(at) :])
+
+    def trusted(self, slope: ResidualSlope, runs: Array | None = None) -> ResidualSlope:
+        """Leave rows out where derivatives over a wider difference disagree.
+
+        `runs`: residuals at `wide_sides` of the slope's point, if they are known.
+        """
+        sides = self.wide_sides(slope.x)
+        if runs is None:
+            runs = self.many(sides)
+        wide, wide_smooth = self._differences(slope.x, slope.residuals, sides, runs)
+        typical = np.sqrt(np.mean(wide**2, axis=(1, 2), keepdims=True))
+        allowed = (
+            DIFFERENCES.max_difference * np.maximum(np.abs(slope.jacobian), np.abs(wide)) + typical
+        )
+        agree = np.all(np.abs(slope.jacobian - wide) <= allowed, axis=0)
+        return replace(slope, smooth=slope.smooth & wide_smooth & agree)
+
+    def wide_sides(self, x: Array) -> Array:
+        """Points about x for derivatives over a wider difference, see `_sides`."""
+        return self._sides(x, DIFFERENCES.wide_step)
+
+    def values(self, points: Array) -> Array:
+        """Values of all unknowns of the model, the considered ones at 0."""
+        out = np.zeros((len(points), len(self.estimated) + len(self.considered)))
+        out[:, : len(self.estimated)] = points * self.scale
+        return out
+
+    def _sides(self, x: Array, width: float) -> Array:
+        """Points above and below x in each curved coordinate, within its bounds."""
+        out = np.repeat(x[None, :], 2 * len(self.curved), axis=0)
+        for row, j in enumerate(self.curved):
+            above, below = x[j] + width, x[j] - width
+            out[2 * row, j] = above if above <= self.upper[j] else x[j] - 2.0 * width
+            out[2 * row + 1, j] = below if below >= self.lower[j] else x[j] + 2.0 * width
+        return out
+
+    def _differences(
+        self, x: Array, residuals: Array, sides: Array, runs: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Derivatives from runs on both sides, and the rows where these agree with the middle."""
+        out = self.additive_slopes()
+        smooth = np.ones(residuals.shape, dtype=np.bool_)
+        for row, j in enumerate(self.curved):
+            above, below = sides[2 * row, j], sides[2 * row + 1, j]
+            high, low = runs[2 * row], runs[2 * row + 1]
+            out[j] = (high - low) / (above - below)
+            straight = low + out[j] * (x[j] - below)
+            smooth &= np.abs(residuals - straight) < DIFFERENCES.max_kink
+        return out, smooth
+
+    def additive_slopes(self) -> Array:
+        """Derivatives by what is simply added to a signal, 0 by all else, shape (k, signals, N)."""
+        weight = self.model.batch.weight
+        out = np.zeros((len(self.estimated), *weight.shape))
+        for j, item in enumerate(self.estimated):
+            if item.adds_to is not None and item.adds_to < len(weight):
+                out[j, item.adds_to] = -weight[item.adds_to] * self.scale[j]
+        return out
+
+
+def search_scale(item: Parameter, noise: Sequence[float]) -> float:
+    """Unit of a parameter in a search: its scale, or the noise of the signal it adds to."""
+    return item.scale if item.adds_to is None else noise[item.adds_to]
+
+
+def capped_cost(residuals: Array) -> float:
+    """Sum of squares of weighted residuals, each at most `ESTIMATION.residual_cap`."""
+    return float(np.minimum(residuals**2, ESTIMATION.residual_cap).sum())
+
+
+RUN_BLOCK_SIZE = 16
+"""Runs come in blocks of that size."""
+MIN_SINGULAR_RATIO = 1e-6
+"""Singular value, over the largest, below which a direction is not seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParameterDensity:
+    """A normal density of the parameters."""
+
+    x: Array
+    """Mean, in units of the model's scales; shape (k,)."""
+    root: Array
+    """Root of the covariance of the coordinates that act through the model: root rootᵀ; shape (c,
+    c)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearModel:
+    """Residuals as a linear function about a point."""
+
+    x: Array
+    """Mean of the points that were run; shape (k,)."""
+    residuals: Array
+    """Their mean; shape (signals, N)."""
+    jacobian: Array
+    """Shape (k, signals, N)."""
+    scatter: Array
+    """Variance about the linear function; shape (signals, N)."""
+    at: Array
+    """Mean of the density itself; shape (k,)."""
+    middle: Array
+    """Residuals there; shape (signals, N)."""
+
+
+def linearised_by_regression(
+    model: Derivatives, density: ParameterDensity, rng: np.random.Generator
+) -> LinearModel:
+    """Regress the residuals on points drawn about a density.
+
+    The points are the mean and as many as nearly fill whole blocks of runs, in pairs that mirror
+    each other, along random orthogonal directions: their mean and covariance are nearly the
+    density's own.
+    """
+    curved, count = model.curved, len(model.curved)
+    pairs = RUN_BLOCK_SIZE // 2 * -(-(count + 1) // (RUN_BLOCK_SIZE // 2)) - 1
+    shares = _directions(rng, count, pairs)
+    points = np.repeat(density.x[None, :], 1 + 2 * pairs, axis=0)
+    points[1:, curved] += np.vstack([shares, -shares]) @ density.root.T
+    points[:, curved] = _mirrored(points[:, curved], model.lower[curved], model.upper[curved])
+    x = points.mean(axis=0)
+    runs = model.many(points)
+    shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+    # Offsets in units of the spread, so that the regression is well conditioned.
+    inverse = np.linalg.inv(density.root)
+    offsets = (points - x)[:, curved] @ inverse.T
+    basis, triangle = np.linalg.qr(np.column_stack([np.ones(len(points)), offsets]))
+    along = basis.T @ flat
+    left = np.einsum("ij,ij->j", flat, flat) - np.einsum("ij,ij->j", along, along)
+    scatter = np.maximum(left, 0.0) / max(len(points) - 1 - count, 1)
+    slopes = inverse.T @ pseudo_inverse(triangle[1:, 1:])
+    jacobian = model.additive_slopes()
+    jacobian[curved] = (slopes @ along[1:]).reshape(count, *shape)
+    mean = (along[0] * basis[0, 0]).reshape(shape)
+    return LinearModel(x, mean, jacobian, scatter.reshape(shape), points[0], runs[0])
+
+
+def pseudo_inverse(square: Array) -> Array:
+    """Pseudo-inverse of a square matrix.
+
+    Random rotations give many equal singular values, with which the library's decomposition (divide
+    and conquer) does not converge once in some thousand searches; that of the normal equations
+    does.
+    """
+    try:
+        return np.asarray(np.linalg.pinv(square, rcond=MIN_SINGULAR_RATIO))
+    except np.linalg.LinAlgError:
+        normal = square.T @ square
+        return np.asarray(np.linalg.pinv(normal, MIN_SINGULAR_RATIO**2, hermitian=True) @ square.T)
+
+
+def linearised_on_cross(model: Derivatives, density: ParameterDensity) -> LinearModel:
+    """Fit a line to the residuals along each coordinate through the mean of a density.
+
+    For few unknowns: a middle and two points on each coordinate. A coordinate without effect gets
+    exactly no slope, which a regression on all points at once does not give. At a bound both points
+    are on the same side.
+    """
+    cross = CoordinateCross.about(model, density)
+    return cross.lines(model, model.many(cross.points))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoordinateCross:
+    """Points of `linearised_on_cross`: the mean of a density, and two on each coordinate."""
+
+    points: Array
+    """Shape (1 + 2 c, k)."""
+    offsets: Array
+    """Where on its coordinate the mean and its two points stand, from the mean; shape (c, 3)."""
+
+    @classmethod
+    def about(cls, model: Derivatives, density: ParameterDensity) -> CoordinateCross:
+        """Lay the points, within the bounds of the model."""
+        curved, count = model.curved, len(model.curved)
+        reach = np.sqrt(REFINEMENT.cross_variances) * np.sqrt((density.root**2).sum(axis=1))
+        points = np.repeat(density.x[None, :], 1 + 2 * count, axis=0)
+        offsets = np.zeros((count, 3))
+        for k, j in enumerate(curved):
+            there, width = density.x[j], reach[k]
+            above, below = min(width, model.upper[j] - there), min(width, there - model.lower[j])
+            if below < REFINEMENT.min_bound_distance * width:
+                below = -0.5 * above
+            elif above < REFINEMENT.min_bound_distance * width:
+                above = -0.5 * below
+            points[1 + 2 * k, j], points[2 + 2 * k, j] = there + above, there - below
+            offsets[k, 1:] = above, -below
+        return cls(points, offsets)
+
+    def lines(self, model: Derivatives, runs: Array) -> LinearModel:
+        """Fit a line along each coordinate to residuals at the points."""
+        count = len(model.curved)
+        shape, flat = runs.shape[1:], runs.reshape(len(runs), -1)
+        # By differences from the middle: what slopes, and, at unit length, what a line through the
+        # three runs of a coordinate does not explain.
+        shares = np.zeros((2 * count, len(runs) - 1))
+        for k, offsets in enumerate(self.offsets):
+            mine = slice(2 * k, 2 * k + 2)
+            along = offsets - offsets.mean()
+            across = np.array([along[1] - along[2], along[2] - along[0], along[0] - along[1]])
+            shares[k, mine] = (along / (along @ along))[1:]
+            shares[count + k, mine] = (across / np.sqrt(across @ across))[1:]
+        differences = flat[1:] - flat[0]
+        out = shares @ differences
+        jacobian = model.additive_slopes()
+        jacobian[model.curved] = out[:count].reshape(count, *shape)
+        left = out[count:]
+        scatter = np.einsum("ij,ij->j", left, left).reshape(shape) / count
+        mean = (flat[0] + differences.sum(axis=0) / len(runs)).reshape(shape)
+        middle = self.points.mean(axis=0)
+        return LinearModel(middle, mean, jacobian, scatter, self.points[0], runs[0])
+
+
+def _directions(rng: np.random.Generator, count: int, pairs: int) -> Array:
+    """Rows of random rotations, each as long as a standard normal vector, shape (pairs, count)."""
+    turns = [
+        np.linalg.qr(rng.standard_normal((count, count)))[0] for _ in range(-(-pairs // count))
+    ]
+    return np.asarray(np.vstack(turns)[:pairs] * np.sqrt(count))
+
+
+def _mirrored(points: Array, lower: Array, upper: Array) -> Array:
+    """Points beyond a bound as far inside of it."""
+    points = np.where(points < lower, 2.0 * lower - points, points)
+    points = np.where(points > upper, 2.0 * upper - points, points)
+    return np.clip(points, lower, upper)

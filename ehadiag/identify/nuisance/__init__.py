@@ -1,1 +1,0 @@
-"""Identification with nuisance parameters: what the installation adds, estimated beside faults."""

@@ -1,0 +1,291 @@
+"""Estimate of severities and nuisances from recordings, with a load where it is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.criteria import GIVE_UP
+from ehadiag.identify.estimates import (
+    excess_cost,
+    independent_covariance,
+    is_pressure_misfit,
+    is_unexplainable,
+)
+from ehadiag.identify.experiment import (
+    Experiment,
+    lay_out_spans,
+    residuals_by_experiment,
+    unknowns_of,
+    with_residual_noise,
+)
+from ehadiag.identify.least_squares import Refinement, refined_with_day, refinement_at
+from ehadiag.identify.linearisation import (
+    ConsideredParameter,
+    Derivatives,
+    LinearModel,
+    ParameterDensity,
+    linearised_by_regression,
+)
+from ehadiag.identify.nuisance_search import (
+    MultistartResult,
+    NuisanceSearchSettings,
+    free_run_model,
+    noise_scaled_model,
+    search_in_stages,
+)
+from ehadiag.identify.partial_refinement import considered_parameters
+from ehadiag.identify.posterior import (
+    FEW_UNKNOWNS_SCHEDULE,
+    FINAL_SCHEDULE,
+    cauchy_cost,
+    no_interruption,
+    search_posterior,
+)
+from ehadiag.identify.prior import UnitPrior, density_about, prior_density, prior_information
+from ehadiag.model.parameter import Parameter
+from ehadiag.model.registry import SENSOR_OFFSETS, parameter
+from ehadiag.model.residual_models import SimdModel
+from ehadiag.model.severities import FAULT_LAWS
+
+FINAL_SPREAD_RATIO = 3.0
+"""Spread of the last look, with the noise as judged, in spreads of the search's end."""
+HYSTERESIS_NAME = "hysteresis"
+AMBIGUOUS_STDS = {name: law.ambiguous_std for name, law in FAULT_LAWS.items()}
+LinearisationMethod = Callable[[Derivatives, ParameterDensity], LinearModel]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NuisanceEstimate:
+    """Estimate of the free parameters from recordings."""
+
+    refined: Refinement
+    """Optimum, residuals and derivatives over the width of what is known."""
+    experiments: list[Experiment]
+    """With their noise as judged."""
+    covariance: Array
+    """Covariance by several optima of like cost, SI, besides that of the refinement; shape (k,
+    k)."""
+    explained: bool
+    confirmed: bool
+    """See `ehadiag.identify.nuisance_search.MultistartResult`."""
+    excess: float
+    """See `ehadiag.identify.estimates.excess_cost`."""
+    starts: int
+    """Searches that it took."""
+    evaluations: int
+    """Runs of the model in all."""
+
+
+def estimate_nuisances(
+    experiments: Sequence[Experiment],
+    settings: NuisanceSearchSettings,
+    considered: Sequence[ConsideredParameter] = (),
+) -> NuisanceEstimate:
+    """Estimate parameters of one actuator from one or more recordings of it.
+
+    considered: parameters that are held, with a tolerance that counts in the interval.
+    """
+    staged = search_in_stages(experiments, settings)
+    model, found = staged.model, staged.found
+    judged = _with_judged_noise(experiments, found.residuals)
+    held = [item.parameter for item in considered]
+    fine = noise_scaled_model(
+        free_run_model(judged, (*settings.free, *held), staged.levels), judged, considered
+    )
+    priors = settings.priors, settings.joint
+    at_first = prior_density(fine, *priors), prior_information(fine, *priors)
+    between = no_interruption if settings.progress is None else partial(settings.progress, 1.0)
+    density = ParameterDensity(found.density.x * model.scale / fine.scale, found.density.root)
+    given_up = not found.explained and is_unexplainable(found.residuals, found.starts)
+    if not (settings.give_up and given_up):
+        rng = np.random.default_rng([settings.seed, -1 % 2**32])
+        draw = partial(linearised_by_regression, rng=rng)
+        if settings.require_agreement and not found.confirmed:
+            # A break-away may stand between the end of the search and the optimum.
+            density = _search_about(
+                fine,
+                density,
+                staged.restart_root,
+                at_first,
+                draw,
+                between,
+                GIVE_UP.min_other_end_gain,
+            )
+        density = _search_about(
+            fine, density, FINAL_SPREAD_RATIO * density.root, at_first, draw, between
+        )
+    linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
+    refined = refinement_at(
+        fine, density.x, linear, settled=found.explained, information=at_first[1]
+    )
+    refined = refined_with_day(fine, refined, linear)
+    return NuisanceEstimate(
+        refined=refined,
+        experiments=judged,
+        covariance=optima_covariance(found, model.scale) + _ambiguity_covariance(refined, judged),
+        explained=settings.explains(refined.residuals),
+        confirmed=found.confirmed,
+        excess=excess_cost(refined.residuals),
+        starts=found.starts,
+        evaluations=staged.evaluations + fine.evaluations,
+    )
+
+
+def _ambiguity_covariance(refined: Refinement, experiments: Sequence[Experiment]) -> Array:
+    """Covariance of equivalent optima where hysteresis is small, SI, shape (k, k)."""
+    values = refined.values
+    alike = (
+        HYSTERESIS_NAME in values
+        and all(item.test.closed_loop for item in experiments)
+        and values[HYSTERESIS_NAME] + experiments[0].constants.HYS
+        < GIVE_UP.min_unambiguous_hysteresis
+    )
+    return independent_covariance(refined.parameters, AMBIGUOUS_STDS if alike else {})
+
+
+def _with_judged_noise(experiments: Sequence[Experiment], residuals: Array) -> list[Experiment]:
+    """Weight the experiments by the noise that residuals of all their ticks show."""
+    parts = residuals_by_experiment(experiments, residuals)
+    return [with_residual_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
+
+
+def _search_about(
+    fine: Derivatives,
+    there: ParameterDensity,
+    root: Array,
+    before: tuple[ParameterDensity, Array],
+    draw: LinearisationMethod,
+    between: Callable[[], None],
+    least_gain: float = 0.0,
+) -> ParameterDensity:
+    """Search about a density; the end of it if that is better by a least gain, else the density.
+
+    root: of the covariance over which it searches; before: the prior and its information.
+    """
+    wider = ParameterDensity(there.x, root)
+    seen = search_posterior(
+        fine, before[0], wider, before[1], draw, FINAL_SCHEDULE, between
+    ).density
+    costs = cauchy_cost(fine.many(np.vstack([there.x, seen.x])))
+    return seen if costs[0] - costs[1] > least_gain else there
+
+
+def optima_covariance(found: MultistartResult, scale: Array) -> Array:
+    """Covariance of the optima that the starts ended in, about the best, SI, shape (k, k).
+
+    Each has the weight of its likelihood, exp(-cost / 2), costs in units of what the best one
+    leaves unexplained (a Birge ratio, R. T. Birge, Phys. Rev. 40, 1932): a mixture density, as
+    JCGM 101:2008 would sample it.
+    """
+    count = max(int((found.residuals != 0.0).sum()), 1)
+    unit = max(found.cost / count, 1.0)
+    costs = np.array([place.cost for place in found.places])
+    weights = np.exp(-0.5 * (costs - found.cost) / unit)
+    shifts = np.array([place.x - found.density.x for place in found.places]) * scale
+    return np.asarray((shifts.T * (weights / weights.sum())) @ shifts)
+
+
+TRIAL_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, settled_ratio=0.85, settled_step=0.5, most_rounds=6)
+
+
+def would_effect_explain(effect: Parameter, found: NuisanceEstimate) -> bool:
+    """Whether an effect that is not free may explain the residuals of an estimate.
+
+    Some rounds of the search from the estimate, over a tenth of the usual width: some 100 runs of
+    the model.
+    """
+    experiments = found.experiments
+    unknowns = unknowns_of(experiments, (*found.refined.parameters, effect))
+    model = Derivatives(SimdModel(lay_out_spans(experiments), unknowns), experiments[0].noise)
+    first = prior_density(model, {})
+    begin = density_about(model, first, found.refined.values)
+    linearise = partial(linearised_by_regression, rng=np.random.default_rng(0))
+    there = search_posterior(
+        model, first, begin, prior_information(model, {}), linearise, TRIAL_SCHEDULE
+    ).density
+    return excess_cost(model.many(there.x[None, :])[0]) - 1.0 <= GIVE_UP.max_trial_share * (
+        found.excess - 1.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class NuisanceEstimator:
+    """Estimator of severities with other parameters free."""
+
+    prior: UnitPrior
+    """Of the unit."""
+    effects: tuple[Parameter, ...]
+    """Free parameters besides the severities, the sensors' offsets and inexact data."""
+    progress: Callable[[float], None]
+    """Called repeatedly with the share of a search's budget that is spent."""
+
+    def estimated(
+        self, experiments: Sequence[Experiment], hint: Mapping[str, float] | None, before: float
+    ) -> NuisanceEstimate:
+        """Estimate severities and all free parameters from recordings of one actuator.
+
+        hint: values by name near which the optimum probably lies; before: excess of the severities
+        alone.
+        """
+        found = self._with(experiments, self.prior, hint, before)
+        if found.explained:
+            return found
+        if not self.prior.has_inexact_data:
+            return self._with_load(experiments, found)
+        if self.prior.joint is None or found.excess <= GIVE_UP.max_unchanged_excess:
+            return found
+        loose = self._with(experiments, self.prior.loosened(), hint)
+        return (
+            loose
+            if loose.excess - 1.0 < GIVE_UP.max_changed_share * (found.excess - 1.0)
+            else found
+        )
+
+    def _with_load(
+        self, experiments: Sequence[Experiment], found: NuisanceEstimate
+    ) -> NuisanceEstimate:
+        """Estimate a constant load, too, where that explains what the other effects do not."""
+        load = parameter("load")
+        if found.excess > GIVE_UP.max_load_trial_excess or is_pressure_misfit(
+            found.refined.residuals
+        ):
+            return found
+        if not would_effect_explain(load, found):
+            return found
+        values = found.refined.values
+        more = self._with(experiments, self.prior, values, found.excess, (load,))
+        best = more if more.explained or more.excess < found.excess else found
+        return replace(
+            best,
+            evaluations=found.evaluations + more.evaluations,
+            starts=found.starts + more.starts,
+        )
+
+    def _with(
+        self,
+        experiments: Sequence[Experiment],
+        prior: UnitPrior,
+        hint: Mapping[str, float] | None,
+        before: float = float("inf"),
+        further: tuple[Parameter, ...] = (),
+    ) -> NuisanceEstimate:
+        effects = (*self.effects, *further)
+        free = (*prior.severities, *SENSOR_OFFSETS, *prior.with_free(effects))
+        settings = NuisanceSearchSettings(
+            free,
+            priors=prior.priors,
+            joint=prior.joint,
+            hint=hint,
+            progress=self.progress,
+            # Of other units the first starts may leave as much as of an unknown effect.
+            give_up=prior.explains_sound_units,
+            explains=prior.explains,
+            require_agreement=any(item.test.closed_loop for item in experiments),
+            excess_before=before,
+        )
+        return estimate_nuisances(experiments, settings, considered_parameters(experiments, free))

@@ -1,0 +1,416 @@
+"""Search for severities and nuisances from several starts: open-loop recordings first, then all.
+
+A search may end away from the optimum, which its residuals show; further starts go on until the
+recording is explained or further ones will not help.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.criteria import GIVE_UP
+from ehadiag.identify.estimates import (
+    ExplanationTest,
+    excess_cost,
+    is_noise,
+    is_unexplainable,
+    misses_only_pressure,
+    residual_outlier_share,
+)
+from ehadiag.identify.experiment import Experiment, lay_out_spans, unknowns_of
+from ehadiag.identify.linearisation import (
+    RUN_BLOCK_SIZE,
+    ConsideredParameter,
+    Derivatives,
+    ParameterDensity,
+    linearised_by_regression,
+)
+from ehadiag.identify.posterior import (
+    MANY_UNKNOWNS_SCHEDULE,
+    SLOW_SCHEDULE,
+    cauchy_cost,
+    search_posterior,
+)
+from ehadiag.identify.prior import (
+    SPOOL_OFFSET_ALIAS,
+    JointPrior,
+    ParameterPrior,
+    density_about,
+    prior_density,
+    prior_information,
+    small_effects_density,
+)
+from ehadiag.model.batch import SPOOL_ROW
+from ehadiag.model.parameter import Parameter
+from ehadiag.model.residual_models import SimdModel
+
+
+class RestartRules(NamedTuple):
+    """Restarts of a search."""
+
+    spread_share: float = 0.1
+    """Spread about the best end so far, in spreads of the first."""
+    alias_half_span: float = 1.25
+    """Half-width over which a parameter is moved against its alias, in units of its scale."""
+    closed_loop_share: float = 0.3
+    """Spread about the best end in closed loop, in spreads of what open loop alone leaves."""
+    closed_loop_budgets: int = 3
+    """Budgets of a search in closed loop without open loop, 1: ten of 300 units were given up with
+    one, one with two, none with three."""
+    relaxed_noise: float = 100.0
+    """Weight of the spool over the pressure while the spool is explained first, 1."""
+
+
+RESTARTS = RestartRules()
+
+NUISANCE_RUN_BUDGET = 1600
+"""Runs of the model after which no further start is made, 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartEnd:
+    """End of one start."""
+
+    x: Array
+    """Shape (k,)."""
+    cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MultistartResult:
+    """Best end of a search from several starts."""
+
+    density: ParameterDensity
+    residuals: Array
+    """Weighted, at its mean; shape (signals, N)."""
+    cost: float
+    """Robust, see `cauchy_cost`."""
+    explained: bool
+    places: tuple[StartEnd, ...]
+    """Where all starts ended."""
+    confirmed: bool = False
+    """Whether only the pressure is not explained there, and another search ended there, too."""
+
+    @property
+    def starts(self) -> int:
+        """How many it took."""
+        return len(self.places)
+
+
+def multistart_search(
+    model: Derivatives,
+    prior: ParameterDensity,
+    information: Array,
+    origins: Sequence[ParameterDensity],
+    explains: Callable[[Array], bool],
+    *,
+    restart_root: Array | None = None,
+    slow_restarts: bool = False,
+    alias: str = "",
+    budget: int = NUISANCE_RUN_BUDGET,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+    gives_up: Callable[[Array, int], bool] | None = None,
+    require_agreement: bool = False,
+    confirms: bool = False,
+    excess_before: float = np.inf,
+) -> MultistartResult:
+    """Search from several starts until the residuals are explained, or the budget is spent.
+
+    model: free-running model; prior: density before the recordings; information: inverse covariance
+    of the prior, shape (k, k); origins: every other start, in turn; the starts between are near the
+    best end so far; explains: whether residuals leave no better optimum to search for;
+    restart_root: root of the covariance about the best end for a start near it, shape (c, c); a
+    tenth of the prior's unless given; slow_restarts: whether such a start takes the slow schedule;
+    alias: name of a parameter that is an alias of a sensor's constant error; budget: runs of the
+    model after which no further start is made; seed: the same seed gives the same answer; progress:
+    called before each round and after each start with the share of the budget that is spent; what
+    it raises ends the search; gives_up: whether further starts will not help, by the best residuals
+    and the number of starts; require_agreement: whether all starts but the first are slow and from
+    the last origin, until enough have ended at the same point; else every other start is near the
+    best end so far; confirms: whether an end that misses only the pressure ends the search, too,
+    where a second start agrees or the excess is that of `excess_before`; excess_before: excess of
+    another search with fewer unknowns. Returns best end, and those of all starts.
+    """
+    until = model.evaluations + budget
+    restart_root = RESTARTS.spread_share * prior.root if restart_root is None else restart_root
+
+    def between() -> None:
+        if progress is not None:
+            progress(min(1.0 - (until - model.evaluations) / max(budget, 1), 1.0))
+
+    best: MultistartResult | None = None
+    confirmed = False
+    places: list[StartEnd] = []
+    while best is None or (not best.explained and model.evaluations < until):
+        turn, from_best = divmod(len(places), 2)
+        slow = best is not None and (require_agreement or (from_best and slow_restarts))
+        schedule = SLOW_SCHEDULE if slow else MANY_UNKNOWNS_SCHEDULE
+        if require_agreement:
+            begin = origins[0 if best is None else -1]
+        elif best is None or not from_best:
+            begin = origins[turn % len(origins)]
+        else:
+            begin = ParameterDensity(_best_along_alias(model, best, alias), restart_root)
+        rng = np.random.default_rng([seed, len(places)])
+        linearise = partial(linearised_by_regression, rng=rng)
+        narrowed = search_posterior(model, prior, begin, information, linearise, schedule, between)
+        density, settled = narrowed.density, narrowed.settled
+        residuals = model.many(density.x[None, :])[0]
+        cost = float(cauchy_cost(residuals))
+        places.append(StartEnd(density.x, cost))
+        if best is None or cost < best.cost:
+            best = MultistartResult(density, residuals, cost, settled and explains(residuals), ())
+        confirmed = confirms and _is_confirmed(best, places, excess_before)
+        if confirmed or (gives_up is not None and gives_up(best.residuals, len(places))):
+            break
+        if require_agreement and _ends_agree(best, places):
+            break
+        between()
+    return replace(best, places=tuple(places), confirmed=confirmed)
+
+
+def _is_confirmed(best: MultistartResult, places: Sequence[StartEnd], excess_before: float) -> bool:
+    """Whether further starts would end there, too, since another start or fewer unknowns did."""
+    if best.explained or not misses_only_pressure(best.residuals):
+        return False
+    return (
+        _ends_agree(best, places)
+        or excess_cost(best.residuals) >= GIVE_UP.min_confirmed_share * excess_before
+    )
+
+
+def _ends_agree(best: MultistartResult, places: Sequence[StartEnd]) -> bool:
+    """Whether enough starts ended at the best point."""
+    unit = max(best.cost / max(int(np.count_nonzero(best.residuals)), 1), 1.0)
+    least, most = GIVE_UP.third_start_outliers
+    enough = 3 if least <= residual_outlier_share(best.residuals) <= most else 2
+    return sum(place.cost - best.cost <= GIVE_UP.same_end_cost * unit for place in places) >= enough
+
+
+def _best_along_alias(model: Derivatives, best: MultistartResult, alias: str) -> Array:
+    """Best point along the line on which a parameter and a sensor's constant error trade."""
+    names = [item.name for item in model.estimated]
+    x = best.density.x
+    if alias not in names:
+        return x
+    j = names.index(alias)
+    shifts = (
+        RESTARTS.alias_half_span
+        * (np.arange(RUN_BLOCK_SIZE) - 0.5 * RUN_BLOCK_SIZE + 1.0)
+        / (0.5 * RUN_BLOCK_SIZE)
+    )
+    points = np.repeat(x[None, :], RUN_BLOCK_SIZE, axis=0)
+    points[:, j] = np.clip(x[j] + shifts, model.lower[j], model.upper[j])
+    # Medians do not see the samples that a wrong pair spoils.
+    slopes, runs = model.additive_slopes(), model.many(points)
+    for k, item in enumerate(model.estimated):
+        if item.adds_to is not None and item.adds_to < slopes.shape[1]:
+            slope, run = slopes[k, item.adds_to], runs[:, item.adds_to]
+            used = slope != 0.0
+            points[:, k] -= np.median(run[:, used] / slope[used], axis=1)
+    return points[int(np.argmin(cauchy_cost(model.many(points))))]
+
+
+GiveUpTest = Callable[[Array, int], bool]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NuisanceSearchSettings:
+    """Parameters that are estimated, their priors, and end of the search."""
+
+    free: Sequence[Parameter]
+    """Parameters that are estimated."""
+    priors: Mapping[str, ParameterPrior] = field(default_factory=dict)
+    """Priors of some of them by name."""
+    joint: JointPrior | None = None
+    """Prior of some others together."""
+    hint: Mapping[str, float] | None = None
+    """Values by name (0 where not named) near which the optimum probably lies."""
+    hint_of_open: bool = False
+    """Whether the hint is of the open-loop recordings alone: a search with the others then starts
+    where that with these ends."""
+    budget: int = NUISANCE_RUN_BUDGET
+    seed: int = 0
+    """The same seed gives the same answer."""
+    progress: Callable[[float], None] | None = None
+    """Called repeatedly with the share of the budget that is spent; what it raises ends the
+    estimation."""
+    give_up: bool = False
+    """Whether to stop early where no effect explains the recordings."""
+    excess_before: float = np.inf
+    """Excess without any of the effects."""
+    explains: ExplanationTest = is_noise
+    """Whether residuals leave no better optimum to search for."""
+    require_agreement: bool = False
+    """See `multistart_search`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StagedSearchResult:
+    """Result of a search in stages."""
+
+    model: Derivatives
+    """Of whole tests, which it ran."""
+    found: MultistartResult
+    levels: NDArray[np.int64]
+    """Of that model."""
+    restart_root: Array
+    """Root of the covariance over which a further look is taken; shape (c, c)."""
+    evaluations: int
+    """Runs of the model, with those of all stages."""
+
+
+def search_in_stages(
+    experiments: Sequence[Experiment], settings: NuisanceSearchSettings
+) -> StagedSearchResult:
+    """Search with the open-loop recordings alone, if there are others, then with all."""
+    part = [item for item in experiments if not item.test.closed_loop]
+    if not 0 < len(part) < len(experiments):
+        return _search_recordings(experiments, settings)
+    before = _search_recordings(part, settings)
+    led = excess_cost(before.found.residuals) <= GIVE_UP.max_open_loop_excess
+    whole = _search_recordings(experiments, settings, before if led else None)
+    return replace(whole, evaluations=before.evaluations + whole.evaluations)
+
+
+def _search_recordings(
+    experiments: Sequence[Experiment],
+    settings: NuisanceSearchSettings,
+    before: StagedSearchResult | None = None,
+) -> StagedSearchResult:
+    """Search with some recordings; before: result of the open-loop ones among them."""
+    priors, joint, hint = settings.priors, settings.joint, settings.hint
+    require_agreement = (
+        settings.require_agreement
+        and before is None
+        and any(item.test.closed_loop for item in experiments)
+    )
+    coarse = free_run_model(experiments, settings.free)
+    model = noise_scaled_model(coarse, experiments)
+    first, information = (
+        prior_density(model, priors, joint),
+        prior_information(model, priors, joint),
+    )
+    origins = [first] if require_agreement else [first, small_effects_density(model, first)]
+    if hint is not None:
+        origins = [density_about(model, first, hint), *origins[::-1]]
+    guide: Derivatives | None = None
+    restart_root = RESTARTS.spread_share * first.root
+    if before is not None:
+        there = density_of_all_recordings(before.model, before.found.density, model)
+        origins, restart_root = [there], RESTARTS.closed_loop_share * there.root
+        if hint is not None and not settings.hint_of_open:
+            origins = [ParameterDensity(density_about(model, first, hint).x, restart_root), there]
+    elif any(item.constants.OIL > 0.0 for item in experiments):
+        guide = _spool_guide(experiments, settings.free, coarse.levels)
+        guided = multistart_search(
+            guide,
+            first,
+            information,
+            origins,
+            _spool_is_noise,
+            budget=settings.budget // 2,
+            seed=settings.seed,
+            gives_up=_spool_is_unexplainable if settings.give_up else None,
+            progress=settings.progress,
+        )
+        values = (guided.density.x * guide.scale).tolist()
+        names = [item.name for item in guide.estimated]
+        origins = [density_about(model, first, dict(zip(names, values, strict=True))), *origins]
+    found = multistart_search(
+        model,
+        first,
+        information,
+        origins,
+        settings.explains,
+        restart_root=restart_root,
+        slow_restarts=before is not None,
+        alias=SPOOL_OFFSET_ALIAS,
+        budget=settings.budget
+        * (RESTARTS.closed_loop_budgets if require_agreement and settings.give_up else 1),
+        seed=settings.seed,
+        progress=settings.progress,
+        gives_up=_give_up_test(give_up=settings.give_up, require_agreement=require_agreement),
+        require_agreement=require_agreement,
+        confirms=settings.give_up,
+        excess_before=settings.excess_before,
+    )
+    runs = sum(item.evaluations for item in (guide, model) if item)
+    return StagedSearchResult(model, found, coarse.levels, restart_root, runs)
+
+
+def density_of_all_recordings(
+    part: Derivatives, found: ParameterDensity, whole: Derivatives
+) -> ParameterDensity:
+    """Return the density of a part of the recordings in the coordinates of a model of all of them.
+
+    Both models have the same parameters. A constant error of a sensor that each recording has for
+    itself begins at that of the first.
+    """
+    values: dict[str, float] = {}
+    for item, value in zip(part.estimated, (found.x * part.scale).tolist(), strict=True):
+        values.setdefault(item.name, value)
+    x = np.array([values[item.name] for item in whole.estimated]) / whole.scale
+    widths = part.scale[part.curved] / whole.scale[whole.curved]
+    return ParameterDensity(np.clip(x, whole.lower, whole.upper), widths[:, None] * found.root)
+
+
+def _give_up_test(*, give_up: bool, require_agreement: bool) -> GiveUpTest | None:
+    """Test of when further starts will not help."""
+    if not give_up:
+        return None
+    return partial(is_unexplainable, astray=True) if require_agreement else is_unexplainable
+
+
+def free_run_model(
+    experiments: Sequence[Experiment],
+    parameters: Sequence[Parameter],
+    levels: NDArray[np.int64] | None = None,
+) -> SimdModel:
+    """Model of whole tests; `levels`: of one of the same tests, if there was one."""
+    return SimdModel(
+        lay_out_spans(experiments), unknowns_of(experiments, parameters), levels=levels
+    )
+
+
+def noise_scaled_model(
+    model: SimdModel,
+    experiments: Sequence[Experiment],
+    considered: Sequence[ConsideredParameter] = (),
+) -> Derivatives:
+    """Coordinates scaled by the noise."""
+    return Derivatives(model, experiments[0].noise, considered)
+
+
+def _spool_guide(
+    experiments: Sequence[Experiment], free: Sequence[Parameter], levels: NDArray[np.int64]
+) -> Derivatives:
+    """Model of the spool alone, for a start where the oil stores the pressure.
+
+    Compressible oil keeps for tenths of a second what the spool did and rings, so that far from the
+    optimum the pressure misleads the search; the spool, which is independent of it, is explained
+    first.
+    """
+    relaxed = [
+        item.with_noise(
+            (item.spool_noise, RESTARTS.relaxed_noise * item.pressure_noise, item.position_noise)
+        )
+        for item in experiments
+    ]
+    return Derivatives(free_run_model(relaxed, free, levels), experiments[0].noise)
+
+
+def _spool_is_noise(residuals: Array) -> bool:
+    return is_noise(residuals[SPOOL_ROW : SPOOL_ROW + 1])
+
+
+def _spool_is_unexplainable(residuals: Array, starts: int) -> bool:
+    return is_unexplainable(residuals[SPOOL_ROW : SPOOL_ROW + 1], starts)

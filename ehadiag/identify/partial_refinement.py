@@ -1,0 +1,331 @@
+"""Refinement on the first part of a test while it runs, and the step that its last part adds.
+
+The optimum of the first part stands with its normal matrix; one Gauss-Newton step on the residuals
+of the last part leads to the optimum of the whole (a measurement update of the information filter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.criteria import GIVE_UP
+from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.identify.experiment import (
+    ANCHOR_THRESHOLDS_LSB,
+    Experiment,
+    WindowSpans,
+    even_jack_levels,
+    lay_out_spans,
+    unknowns_of,
+    with_residual_noise,
+)
+from ehadiag.identify.least_squares import (
+    SEARCH_OPTIMUM_STD,
+    Refinement,
+    last_round,
+    median_offsets,
+    refine_severities,
+)
+from ehadiag.identify.linearisation import (
+    ConsideredParameter,
+    Derivatives,
+    ParameterDensity,
+    ResidualSlope,
+)
+from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE, bounded_step, no_interruption
+from ehadiag.identify.staged_search import RUN_IN_S
+from ehadiag.model.batch import SPOOL_ROW
+from ehadiag.model.parameter import Parameter
+from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, parameter
+from ehadiag.model.residual_models import SimdModel
+
+CONSIDERED_PARAMETERS = (
+    ConsideredParameter(
+        parameter("sampling_lead"), ESTIMATION.sampling_lead_std, (SPOOL_ROW,), by_rate=True
+    ),
+)
+"""Half a step of a plant that is integrated at 0.25 µs is of this size; sized on the spool, which
+moves fastest."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstPart:
+    """Optimum on the first part of one or more tests."""
+
+    refined: Refinement
+    noise: tuple[tuple[float, ...], ...]
+    """Of the signals of each test (m, Pa, m), as the residuals show it."""
+    levels: NDArray[np.int64]
+    """How a model of these spans cuts its ticks (`ehadiag.model.residual_models.SimdModel`); shape
+    (N,)."""
+    evaluations: int
+    """Runs of the model in all."""
+
+    def judged(self, experiments: Sequence[Experiment]) -> list[Experiment]:
+        """Return the experiments with the noise that was found."""
+        return [item.with_noise(noise) for item, noise in zip(experiments, self.noise, strict=True)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartResiduals:
+    """Residuals of a free-running model on the first parts of the tests at some severities."""
+
+    residuals: Array
+    """Weighted, no offsets taken off; shape (signals, N)."""
+    offsets: Mapping[str, float]
+    """Constant errors of the sensors, as medians show them, SI by name."""
+    weight: Array
+    """Shape (signals, N)."""
+
+    @property
+    def outlier_share(self) -> float:
+        """Share of residuals beyond the cap, offsets aside.
+
+        Above `FIT.max_start_outliers` a refinement from there will not explain them.
+        """
+        residuals = self.residuals.copy()
+        for item in SENSOR_OFFSETS:
+            if item.adds_to is not None:
+                residuals[item.adds_to] -= self.offsets[item.name] * self.weight[item.adds_to]
+        return float(np.mean(residuals[self.weight > 0.0] ** 2 >= ESTIMATION.residual_cap))
+
+
+def start_residuals(
+    experiments: Sequence[Experiment], until: Sequence[int], start: Mapping[str, float]
+) -> StartResiduals:
+    """Run the first `until` ticks of each test at severities by name."""
+    free, residuals = free_run_residuals(experiments, first_part_spans(experiments, until), start)
+    return StartResiduals(residuals, median_offsets(free, residuals), free.batch.weight)
+
+
+def refine_first_part(
+    experiments: Sequence[Experiment],
+    until: Sequence[int],
+    start: Mapping[str, float],
+    between: Callable[[], None] = no_interruption,
+    at_start: StartResiduals | None = None,
+) -> FirstPart:
+    """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
+
+    `start`: severities by name. `between`: called between rounds; what it raises ends the search.
+    `at_start`: of `look_at` there, if there was one.
+    """
+    spans = first_part_spans(experiments, until)
+    at_start = at_start or start_residuals(experiments, until, start)
+    start = {**start, **at_start.offsets}
+    experiments = _with_judged_noise(experiments, until, at_start.residuals)
+    levels = anchored_model(experiments, spans).levels
+    best = _refined_spans(experiments, spans, start, levels, SEARCH_OPTIMUM_STD, between)
+    evaluations = 1 + best.evaluations
+    for _ in range(ESTIMATION.max_noise_judgements):
+        before = [item.noise for item in experiments]
+        judged = _with_judged_noise(experiments, until, best.residuals)
+        after = [item.noise for item in judged]
+        if np.allclose(before, after, rtol=ESTIMATION.noise_tolerance, atol=0.0):
+            break
+        experiments = judged
+        best = _refined_spans(
+            experiments, spans, best.values, levels, ESTIMATION.refined_std, between
+        )
+        evaluations += best.evaluations
+    noise = tuple(item.noise for item in experiments)
+    return FirstPart(best, noise, levels, evaluations)
+
+
+def free_run_residuals(
+    experiments: Sequence[Experiment], spans: WindowSpans | None, start: Mapping[str, float]
+) -> tuple[SimdModel, Array]:
+    """A model that runs free, and its residuals at severities by name, no offsets taken off."""
+    batch = lay_out_spans(experiments, spans)
+    model = SimdModel(batch, unknowns_of(experiments), levels=even_jack_levels(batch))
+    point = np.array([[start.get(item.name, 0.0) for item in model.unknowns.free]])
+    return model, model.residuals(point)[0][0]
+
+
+def _refined_spans(
+    experiments: Sequence[Experiment],
+    spans: WindowSpans,
+    start: Mapping[str, float],
+    levels: NDArray[np.int64],
+    spread: Array | float,
+    between: Callable[[], None],
+) -> Refinement:
+    batch = lay_out_spans(experiments, spans, anchor_lsb=ANCHOR_THRESHOLDS_LSB)
+    # What is considered is worked out with the last part.
+    model = SimdModel(batch, unknowns_of(experiments), levels=levels)
+    return refine_severities(Derivatives(model, experiments[0].noise), start, spread, between)
+
+
+def anchored_derivatives(
+    experiments: Sequence[Experiment],
+    spans: WindowSpans | None = None,
+    levels: NDArray[np.int64] | None = None,
+) -> Derivatives:
+    """Spans of the tests, re-anchored on the spool, in coordinates scaled by the noise."""
+    return anchored_model_derivatives(
+        anchored_model(experiments, spans, levels=levels), experiments
+    )
+
+
+def anchored_model_derivatives(model: SimdModel, experiments: Sequence[Experiment]) -> Derivatives:
+    """A model of `anchored_model`, in coordinates scaled by the noise."""
+    return Derivatives(model, experiments[0].noise, considered_parameters(experiments))
+
+
+def anchored_model(
+    experiments: Sequence[Experiment],
+    spans: WindowSpans | None = None,
+    *,
+    lead: float = 0.0,
+    levels: NDArray[np.int64] | None = None,
+) -> SimdModel:
+    """Model of spans of the tests, re-anchored on the spool.
+
+    `levels`: of a model of the same spans, if there was one.
+    """
+    batch = lay_out_spans(experiments, spans, lead=lead, anchor_lsb=ANCHOR_THRESHOLDS_LSB)
+    considered = [item.parameter for item in considered_parameters(experiments)]
+    unknowns = unknowns_of(experiments, (*FAULTS, *SENSOR_OFFSETS, *considered))
+    return SimdModel(batch, unknowns, levels=levels)
+
+
+def considered_parameters(
+    experiments: Sequence[Experiment], free: Sequence[Parameter] = ()
+) -> tuple[ConsideredParameter, ...]:
+    """Parameters that move in the last round alone, each with a density of its own about 0.
+
+    `CONSIDERED_PARAMETERS`, and oil and supply by their steps on the bus, unless they are free.
+    """
+    stds = {
+        "oil_viscosity": max(item.viscosity_std for item in experiments),
+        "supply_pressure": max(item.supply_std for item in experiments),
+    }
+    names = {item.name for item in free}
+    return (
+        *CONSIDERED_PARAMETERS,
+        *(
+            ConsideredParameter(parameter(name), std)
+            for name, std in stds.items()
+            if std > 0.0 and name not in names
+        ),
+    )
+
+
+def first_part_spans(experiments: Sequence[Experiment], until: Sequence[int]) -> WindowSpans:
+    """The first ticks of each test as spans."""
+    return [[(0.0, ticks * item.tick)] for item, ticks in zip(experiments, until, strict=True)]
+
+
+def _with_judged_noise(
+    experiments: Sequence[Experiment], until: Sequence[int], residuals: Array
+) -> list[Experiment]:
+    """Weigh all experiments by the noise that residuals show, shape (signals, sum of `until`)."""
+    parts = np.split(residuals, np.cumsum(until)[:-1], axis=1)
+    return [with_residual_noise(item, part) for item, part in zip(experiments, parts, strict=True)]
+
+
+LAST_PART_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, most_rounds=4, whole_rounds=2)
+"""Rounds of the whole where it is refined: the test is over by then, and the verdict awaited."""
+MIN_LAST_PART_INFORMATION = 1e-12
+"""Information on what no sample shows, in units of the scales."""
+
+
+def add_last_part(
+    experiments: Sequence[Experiment], until: Sequence[int], first_part: FirstPart
+) -> Refinement | None:
+    """Optimum on all of the tests from that on their first parts; None where it is elsewhere.
+
+    experiments: with the noise as the first part shows it; until: ticks of the first part of each
+    test.
+    """
+    first, rows = first_part.refined, _PartRows.of(experiments, until)
+    levels = np.full(sum(item.ticks for item in experiments), -1, dtype=np.int64)
+    levels[rows.first] = first_part.levels
+    if len(rows.last):
+        last = anchored_model(experiments, rows.spans, lead=RUN_IN_S)
+        levels[rows.last] = last.levels[rows.counted]
+    whole = anchored_derivatives(experiments, levels=levels)
+    x, normal, settled = first.x * first.scale / whole.scale, first.normal, first.converged
+    others: list[Array] = []
+    evaluations = 0
+    if len(rows.last):
+        model = anchored_model_derivatives(last, experiments)
+        slope = model.trusted_slope(x)
+        taken = slope.used & (last.batch.weight > 0.0)
+        moved, normal = _last_part_step(x, first, slope, taken, model)
+        step = first.jacobian[:, first.used].T @ (moved - x)
+        if step @ step > GIVE_UP.max_last_part_step**2:
+            return None
+        std = _deviations(first.normal)
+        others, evaluations = [x], model.evaluations
+        if np.any(np.abs(moved - x)[whole.faults] > GIVE_UP.max_severity_step * std[whole.faults]):
+            names = (item.name for item in whole.estimated)
+            start = dict(zip(names, (moved * whole.scale).tolist(), strict=True))
+            width = FEW_UNKNOWNS_SCHEDULE.width * (std * whole.scale)[whole.curved]
+            found = refine_severities(whole, start, width, schedule=LAST_PART_SCHEDULE)
+            others, moved, normal, settled = [], found.x, found.normal, found.converged
+        x = moved
+    width = FEW_UNKNOWNS_SCHEDULE.width * _deviations(normal)[whole.curved]
+    root = np.diag(np.minimum(width, SEARCH_OPTIMUM_STD / whole.scale[whole.curved]))
+    found, (cost, *before) = last_round(whole, ParameterDensity(x, root), settled, *others)
+    if before and cost > before[0] + GIVE_UP.max_cost_rise:
+        found, _ = last_round(whole, ParameterDensity(others[0], root), settled)
+    return replace(found, evaluations=evaluations + found.evaluations)
+
+
+def _last_part_step(
+    x: Array, first: Refinement, slope: ResidualSlope, taken: NDArray[np.bool_], model: Derivatives
+) -> tuple[Array, Array]:
+    """Step by the residuals of the last part, and the information of both parts.
+
+    taken: rows that count, shape (signals, n).
+    """
+    before, now = first.jacobian[:, first.used], slope.jacobian[:, taken]
+    stands, pulls = before @ first.residuals[first.used], now @ slope.residuals[taken]
+    # At the optimum of the first part the gradient is 0, but into a bound.
+    at_bound = (x == model.lower) | (x == model.upper)
+    normal = before @ before.T + now @ now.T + MIN_LAST_PART_INFORMATION * np.eye(len(x))
+    gradient = np.where(at_bound, stands, 0.0) + pulls
+    return bounded_step(x, normal, gradient, model.lower, model.upper), normal
+
+
+def _deviations(normal: Array) -> Array:
+    """Standard deviations of the estimates by their information."""
+    return np.sqrt(np.diag(np.linalg.inv(normal + MIN_LAST_PART_INFORMATION * np.eye(len(normal)))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PartRows:
+    """Ticks of first and last parts among those of all tests.
+
+    spans: s, the last part of each test; none of one that ends too early. first, last: ticks of the
+    whole tests. counted: the last parts among the ticks of their own batch, which have a run-in.
+    """
+
+    spans: list[list[tuple[float, float]]]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    counted: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, experiments: Sequence[Experiment], ends: Sequence[int]) -> _PartRows:
+        """Rows of the tests one behind the other."""
+        spans: list[list[tuple[float, float]]] = []
+        first, last, counted = [], [], []
+        begin = run = 0
+        for item, until in zip(experiments, ends, strict=True):
+            first.append(begin + np.arange(until))
+            spans.append([])
+            if item.ticks - until > 1:
+                spans[-1].append((until * item.tick, item.ticks * item.tick))
+                last.append(begin + np.arange(until, item.ticks))
+                lead = min(round(RUN_IN_S / item.tick), until)
+                counted.append(run + lead + np.arange(item.ticks - until))
+                run += lead + item.ticks - until
+            begin += item.ticks
+        return cls(spans, *(np.concatenate([np.zeros(0, int), *p]) for p in (first, last, counted)))

@@ -1,1 +1,0 @@
-"""Local refinement: robust least squares from the optimum of the search."""

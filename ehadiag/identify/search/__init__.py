@@ -1,1 +1,0 @@
-"""Global search: the three one-dimensional searches and the genetic algorithm."""

@@ -1,1 +1,0 @@
-"""Monitoring model for many candidates at once, one in each lane of the vector unit."""

@@ -1,0 +1,525 @@
+"""Second stage and jack of a block of candidates over a step, one lane each.
+
+One step of the linear second stage or of the one of orifices for all lanes; a lane whose jack
+stops, starts or meets its stop takes that step alone (`ehadiag.model.simd_jack_pieces`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ehadiag.compile.elementary import LN2
+from ehadiag.compile.jit import Array, Array2, bare_kernel, inlined, kernel
+from ehadiag.compile.vector import (
+    VECTOR_WIDTH,
+    Mask,
+    Vector,
+    absolute,
+    any_lane,
+    load,
+    maximum,
+    minimum,
+    packed,
+    store,
+    where,
+)
+from ehadiag.model.jack import JACK_STEPS
+from ehadiag.model.laws import (
+    JackLaw,
+    effective_opening,
+    jack_law,
+    plant_of,
+    stage_pressure,
+    stage_resistance,
+)
+from ehadiag.model.second_stage import (
+    ORIFICE_STEPS,
+    land_opening,
+    land_opening_slope,
+    oil_at,
+    orifice_rate,
+    orifice_step,
+)
+from ehadiag.model.sensors import (
+    RADAU,
+    cubic_through_ends,
+    cubic_through_stages,
+    filter_output,
+    radau_creep_pressures,
+    radau_pressures,
+    radau_velocity,
+    read_pressure,
+    sensor_law,
+)
+from ehadiag.model.simd_jack_pieces import LANE_PIECES_SIZE, jack_events, jack_over_pieces
+from ehadiag.model.simd_layout import (
+    COEFFICIENTS,
+    LANE_FILTER_ROWS,
+    LANE_NODES,
+    LANE_PATH,
+    LANE_PATH_ROWS,
+    LANE_PATH_SLOPE,
+    LANE_STATE_ROWS,
+    LANES,
+    MAX_JACK_HALVINGS,
+    ROWS,
+    full_filter_steps,
+    jack_law_of_lane,
+    jack_laws,
+    keep_jack_law,
+    keep_sensor_law,
+    sampled_filter_steps,
+    sensor_laws,
+)
+
+
+class LaneSteps(NamedTuple):
+    """Steps of the jack of a block; a lane with a larger one is computed alone."""
+
+    travel: float = 8.0e-6
+    """Spool travel from first to last stage of a step, m; further from the middle, its distance."""
+    corner_travel: float = 4.0e-6
+    """Spool travel of a step past the opening at which the pressure gain saturates, m."""
+    orifice_halvings: int = 2
+    """Least halvings of a tick with orifices, 1: nodes of the spool's path are then ends of
+    steps."""
+    ringing: float = 2.0 * ORIFICE_STEPS.ringing
+    """Step in radians of the ringing, 1."""
+
+
+LANE_STEPS = LaneSteps()
+
+
+def _stages() -> Array:
+    """Where stages, start and middle of steps stand on the spool's path, shape (5, 16, 5, 5), flat.
+
+    For a tick cut into 1, 2, 4, 8 or 16 steps, and each step: the node before, and Hermite's
+    weights of place before and after and of slope (by the length of the tick) before and after.
+    """
+    out = np.zeros((MAX_JACK_HALVINGS + 1, 1 << MAX_JACK_HALVINGS, 5, 5))
+    for level in range(MAX_JACK_HALVINGS + 1):
+        for step in range(1 << level):
+            for stage, share in enumerate((RADAU.c1, RADAU.c2, 1.0, 0.0, 0.5)):
+                where = (step + share) / (1 << level) * LANE_NODES
+                node = min(int(where), LANE_NODES - 1)
+                u = where - node
+                out[level, step, stage] = (
+                    node,
+                    (1.0 + 2.0 * u) * (1.0 - u) ** 2,
+                    u * u * (3.0 - 2.0 * u),
+                    u * (1.0 - u) ** 2 / LANE_NODES,
+                    u * u * (u - 1.0) / LANE_NODES,
+                )
+    return out.ravel()
+
+
+STAGE_TABLE = _stages()
+
+
+class StagePlaces(NamedTuple):
+    """Places in the table of stages, of a step."""
+
+    end: int = 10
+    """First number of its end; the other stages precede it."""
+    start: int = 15
+    """First number of its start."""
+    middle: int = 20
+    """First number of its middle."""
+    columns: int = 25
+    """Numbers of a step."""
+
+
+STAGES = StagePlaces()
+
+
+@packed
+def stage_position(path: Array, o: int, k: int, tick: float) -> Vector:
+    """Spool at the stage whose place in STAGES is `k`, lanes from `o`."""
+    a = int(STAGE_TABLE[k]) * LANES + o
+    b = a + LANES
+    slopes = load(path, LANE_PATH_SLOPE * LANES + a) * STAGE_TABLE[k + 3]
+    slopes = slopes + load(path, LANE_PATH_SLOPE * LANES + b) * STAGE_TABLE[k + 4]
+    return STAGE_TABLE[k + 1] * load(path, a) + STAGE_TABLE[k + 2] * load(path, b) + tick * slopes
+
+
+@packed
+def land_opening_lanes(end: int, path: Array, coefficients: Array) -> None:
+    """Make the spool's path of a tick that of the lands' opening, all lanes, in place."""
+    for o in range(0, end, VECTOR_WIDTH):
+        j = jack_laws(coefficients, o)
+        for n in range(LANE_NODES + 1):
+            place, slope = (LANE_PATH + n) * LANES + o, (LANE_PATH_SLOPE + n) * LANES + o
+            x = load(path, place)
+            store(path, slope, land_opening_slope(j, x) * load(path, slope))
+            store(path, place, land_opening(j, x))
+
+
+@packed
+def _limited(j: JackLaw, p12: Vector) -> Vector:
+    """Pressure within what the supply allows, Pa."""
+    return maximum(minimum(p12, j.supply), -j.supply)
+
+
+@packed
+def _sense(
+    j: JackLaw, these: Mask, level: int, step: int, o: int,
+    p0: Vector, p1: Vector, p2: Vector, p3: Vector,
+    state: Array, coefficients: Array,
+) -> None:  # fmt: skip
+    """Follow the pressure of these lanes through their filters, from start and stages of a step."""
+    cubic = cubic_through_stages(_limited(j, p0), _limited(j, p1), _limited(j, p2), _limited(j, p3))
+    filter_pressure(cubic, these, level, step, o, state, coefficients)
+
+
+@packed
+def filter_pressure(
+    cubic: Any, these: Mask, level: int, step: int, o: int,
+    state: Array, coefficients: Array,
+) -> None:  # fmt: skip
+    """Follow the pressure of these lanes, cubics over a step, through their filters."""
+    place = level * LANE_FILTER_ROWS * LANES + o
+    before, seen = (
+        load(state, ROWS.pressure_lagged * LANES + o),
+        load(state, ROWS.pressure_sampled * LANES + o),
+    )
+    sampled = (
+        load(coefficients, (COEFFICIENTS.filter + LANE_FILTER_ROWS - 1) * LANES + place)
+        == step * 1.0
+    )
+    at_sampling = filter_output(sampled_filter_steps(coefficients, place), before, cubic)
+    store(state, ROWS.pressure_sampled * LANES + o, where(these & sampled, at_sampling, seen))
+    at_end = filter_output(full_filter_steps(coefficients, place), before, cubic)
+    store(state, ROWS.pressure_lagged * LANES + o, where(these, at_end, before))
+
+
+def _jack_lane_step(senses: bool) -> Any:
+    """Compiled step of the jack of all lanes, with or without the sensor of pressure."""
+
+    @packed
+    def lanes(
+        end: int, level: int, step: int, tick: float, state: Array, path: Array, coefficients: Array
+    ) -> bool:
+        any_busy = False
+        h = tick / (1 << level)
+        k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
+        for o in range(0, end, VECTOR_WIDTH):
+            j = jack_laws(coefficients, o)
+            place, velocity = (
+                load(state, ROWS.jack * LANES + o),
+                load(state, ROWS.jack_velocity * LANES + o),
+            )
+            d = load(state, ROWS.jack_direction * LANES + o)
+            x3 = stage_position(path, o, k + STAGES.end, tick)
+            e3 = stage_resistance(j, x3)
+            # At rest: the force of the second stage, times e, against what holds.
+            force = j.load + j.spring * place
+            push = j.area * j.flow * x3 - force * e3
+            held = absolute(push) <= j.static * e3
+            held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
+            done = load(state, ROWS.done * LANES + o) != 0.0
+            rests = (d == 0.0) & held & ~done
+            fine = done | rests
+            if senses and any_lane(rests):
+                x0, x1, x2 = (
+                    stage_position(path, o, k + STAGES.start, tick),
+                    stage_position(path, o, k, tick),
+                    stage_position(path, o, k + 5, tick),
+                )
+                _sense(
+                    j, rests, level, step, o,
+                    stage_pressure(j, x0, 0.0), stage_pressure(j, x1, 0.0), stage_pressure(j, x2,
+                    0.0),
+                    stage_pressure(j, x3, 0.0), state, coefficients,
+                )  # fmt: skip
+            if any_lane(d != 0.0):
+                creeps = senses and any_lane(j.extra > 0.0)
+                x1 = stage_position(path, o, k, tick)
+                x2 = stage_position(path, o, k + 5, tick)
+                e1, e2, pull = (
+                    stage_resistance(j, x1),
+                    stage_resistance(j, x2),
+                    force + d * j.friction,
+                )
+                if senses:
+                    if creeps:
+                        p1, p2, p3 = radau_creep_pressures(
+                            j, h, pull, d, velocity, x1, x2, x3, e1, e2, e3
+                        )
+                    else:
+                        p1, p2, p3 = radau_pressures(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
+                    later = j.flow * x3 - e3 * p3
+                else:
+                    later = radau_velocity(j, h, pull, velocity, x1, x2, x3, e1, e2, e3)
+                moved = place + 0.5 * h * (velocity + later)
+                slides = (later * d > 0.0) & (absolute(moved) < j.stroke)
+                # What the collocation does not follow: a fresh start, a fast way past the closed
+                # orifice.
+                near = where(x1 * x3 > 0.0, minimum(absolute(x1), absolute(x3)), 0.0)
+                travel = absolute(x3 - x1)
+                coarse = travel > maximum(near, LANE_STEPS.travel)
+                coarse = coarse | (
+                    (near < j.corner)
+                    & (maximum(effective_opening(j, x1), effective_opening(j, x3)) > j.corner)
+                    & (travel > LANE_STEPS.corner_travel)
+                )
+                if creeps:
+                    fade = j.flow * j.by_stribeck
+                    coarse = coarse | (
+                        (near * fade < JACK_STEPS.creep_limit) & (travel * fade > JACK_STEPS.fade)
+                    )
+                slides = slides & ~coarse & (load(state, ROWS.fresh * LANES + o) == 0.0)
+                slides = slides & ~done
+                store(state, ROWS.jack * LANES + o, where(slides, moved, place))
+                store(state, ROWS.jack_velocity * LANES + o, where(slides, later, velocity))
+                fine = fine | slides
+                if senses and any_lane(slides):
+                    p0 = stage_pressure(
+                        j, stage_position(path, o, k + STAGES.start, tick), velocity
+                    )
+                    _sense(j, slides, level, step, o, p0, p1, p2, p3, state, coefficients)
+            store(state, ROWS.busy * LANES + o, where(fine, 0.0, 1.0))
+            if any_lane(~fine):
+                any_busy = True
+        return any_busy
+
+    return lanes
+
+
+jack_lanes, sensed_jack_lanes = _jack_lane_step(False), _jack_lane_step(True)
+"""Compiled: jack of the lanes before `end` over one of the 2^level steps of a tick; with the second
+one their pressure as the filter before its converter has it. Lanes with an event are marked busy
+and left as they were; returns whether there are any."""
+
+
+@packed
+def sampled_pressures(end: int, kept: bool, state: Array, path: Array, coefficients: Array) -> None:
+    """Differential pressure of all lanes as it is sampled in a tick, into the state.
+
+    kept: whether any lane has it in the state, stored in the oil or behind a filter.
+    """
+    for o in range(0, end, VECTOR_WIDTH):
+        j = jack_laws(coefficients, o)
+        x = load(path, (LANE_PATH + LANE_NODES) * LANES + o)
+        p12 = _limited(j, stage_pressure(j, x, load(state, ROWS.jack_velocity * LANES + o)))
+        if kept:
+            law = sensor_laws(coefficients, o)
+            p12 = where(j.oil > 0.0, load(state, ROWS.pressure * LANES + o), p12)
+            p12 = where(
+                law.lag + law.lead > 0.0, load(state, ROWS.pressure_sampled * LANES + o), p12
+            )
+        store(state, ROWS.pressure_sampled * LANES + o, p12)
+
+
+@packed
+def sampled_positions(end: int, state: Array, coefficients: Array) -> None:
+    """Jack of all lanes as it is sampled in a tick, into the state."""
+    for o in range(0, end, VECTOR_WIDTH):
+        before = sensor_laws(coefficients, o).lead * load(state, ROWS.jack_velocity * LANES + o)
+        store(state, ROWS.position_sampled * LANES + o, load(state, ROWS.jack * LANES + o) - before)
+
+
+@packed
+def anchor_jack_lanes(
+    end: int, measured: float, follow: float, state: Array, coefficients: Array
+) -> None:
+    """Move the jack of all lanes by a share of its innovation."""
+    for o in range(0, end, VECTOR_WIDTH):
+        law, stroke = sensor_laws(coefficients, o), jack_laws(coefficients, o).stroke
+        error = measured - law.position_offset
+        error = error - law.position_gain * load(state, ROWS.position_sampled * LANES + o)
+        place = load(state, ROWS.jack * LANES + o) + follow * error
+        store(state, ROWS.jack * LANES + o, maximum(minimum(place, stroke), -stroke))
+
+
+@packed
+def rest_jack_lanes(
+    end: int, origin: float, place: float, state: Array, coefficients: Array
+) -> None:
+    """Jack of all lanes at rest, spool and jack at these positions, m."""
+    for o in range(0, end, VECTOR_WIDTH):
+        j = jack_laws(coefficients, o)
+        store(state, ROWS.jack * LANES + o, place)
+        p12 = _limited(j, stage_pressure(j, land_opening(j, j.load * 0.0 + origin), 0.0))
+        store(state, ROWS.pressure_lagged * LANES + o, p12)
+        store(state, ROWS.pressure * LANES + o, p12)
+
+
+@inlined
+def orifice_level(tick: float, coefficients: Array) -> int:
+    """Halvings of a tick (s) for the lane that rings fastest."""
+    fastest = 0.0
+    for i in range(LANES):
+        j = jack_law_of_lane(coefficients, i)
+        fastest = max(fastest, math.sqrt(j.oil * j.area * j.by_mass))
+    wanted = math.ceil(math.log(max(tick * fastest / ORIFICE_STEPS.ringing, 1.0)) / LN2 - 1e-9)
+    return min(max(wanted, LANE_STEPS.orifice_halvings), MAX_JACK_HALVINGS)
+
+
+def _orifice_lane_step(senses: bool) -> Any:
+    """Compiled step of all lanes, with or without the sensor of pressure."""
+
+    @packed
+    def lanes(
+        end: int, level: int, step: int, tick: float, state: Array, path: Array, coefficients: Array
+    ) -> bool:
+        any_busy = False
+        h = tick / (1 << level)
+        k = ((level << MAX_JACK_HALVINGS) + step) * STAGES.columns
+        for o in range(0, end, VECTOR_WIDTH):
+            j = jack_laws(coefficients, o)
+            place, velocity = (
+                load(state, ROWS.jack * LANES + o),
+                load(state, ROWS.jack_velocity * LANES + o),
+            )
+            d, p12 = (
+                load(state, ROWS.jack_direction * LANES + o),
+                load(state, ROWS.pressure * LANES + o),
+            )
+            x0, x2 = (
+                stage_position(path, o, k + STAGES.start, tick),
+                stage_position(path, o, k + STAGES.end, tick),
+            )
+            x1 = stage_position(path, o, k + STAGES.middle, tick)
+            middle = place + 0.5 * h * velocity
+            force, oil = j.load + j.spring * middle, oil_at(j, middle)
+            p, v, travel = orifice_step(j, h, force, oil, d, x0, x1, x2, p12, velocity)
+            push = j.area * p - j.load - j.spring * place
+            held = absolute(push) <= j.static
+            held = held | ((absolute(place) >= j.stroke) & (place * push > 0.0))
+            slides = (v * d > 0.0) & (absolute(place + travel) < j.stroke)
+            done = load(state, ROWS.done * LANES + o) != 0.0
+            goes = (((d == 0.0) & held) | slides) & ~done
+            goes = goes & (
+                oil * j.area * j.by_mass * (h * h) < LANE_STEPS.ringing * LANE_STEPS.ringing
+            )
+            steep = j.extra * j.by_stribeck * j.by_mass * h > ORIFICE_STEPS.creep_growth
+            slow = (
+                minimum(absolute(velocity), absolute(v)) * j.by_stribeck < ORIFICE_STEPS.creep_limit
+            )
+            goes = goes & ~(steep & slow & (d != 0.0))
+            if senses:
+                cubic = cubic_through_ends(
+                    p12, p,
+                    h * orifice_rate(j, x0, p12, velocity, oil), h * orifice_rate(j, x2, p, v, oil),
+                )  # fmt: skip
+                filter_pressure(cubic, goes, level, step, o, state, coefficients)
+            store(state, ROWS.pressure * LANES + o, where(goes, p, p12))
+            store(state, ROWS.jack_velocity * LANES + o, where(goes, v, velocity))
+            store(state, ROWS.jack * LANES + o, where(goes, place + travel, place))
+            store(state, ROWS.busy * LANES + o, where(goes | done, 0.0, 1.0))
+            if any_lane(~(goes | done)):
+                any_busy = True
+        return any_busy
+
+    return lanes
+
+
+def _ticks(senses: bool) -> Any:
+    """Compiled tick of all lanes, with or without the sensor of pressure."""
+    lanes = _orifice_lane_step(senses)
+
+    @bare_kernel
+    def ticks(
+        count: int,
+        end: int,
+        tick: float,
+        level: int,
+        state: Array,
+        path: Array,
+        coefficients: Array,
+    ) -> None:
+        for step in range(1 << level):
+            if lanes(end, level, step, tick, state, path, coefficients):
+                jack_events(count, level, step, tick, state, path, coefficients)
+
+    return ticks
+
+
+orifice_tick, sensed_orifice_tick = _ticks(False), _ticks(True)
+"""Compiled: jack of all lanes over a tick cut into 2^level steps; with the second one their
+pressure as the filter before its converter has it."""
+
+
+def driven_jack_costs(
+    candidates: Array, nodes: Array, before: float, pressure: Array, noise: float, cap: float
+) -> Array:
+    """Capped squared pressure residuals of candidates, from rest: shape (n,).
+
+    candidates: rows of physical constants; nodes: the spool's path, a piece each tick: duration
+    (s), position at its end (m), velocities at start and end (m/s), shape (ticks, 4 or more);
+    before: position before, m; pressure: measured, Pa, NaN where missing; noise: of it, Pa.
+    """
+    out = np.zeros(len(candidates))
+    scratch = DrivenScratch(
+        sums=np.zeros(LANES),
+        state=np.zeros(LANE_STATE_ROWS * LANES),
+        path=np.zeros(LANE_PATH_ROWS * LANES),
+        coefficients=np.zeros(COEFFICIENTS.end * LANES),
+        pieces=np.zeros(LANE_PIECES_SIZE),
+    )
+    contiguous = (np.ascontiguousarray(item) for item in (candidates, nodes, pressure))
+    candidates, nodes, pressure = contiguous
+    fill_driven_jack_costs(candidates, nodes, before, pressure, noise, cap, scratch, out)
+    return out
+
+
+class DrivenScratch(NamedTuple):
+    """Memory of `fill_driven_jack_costs`."""
+
+    sums: Array
+    state: Array
+    path: Array
+    coefficients: Array
+    pieces: Array
+
+
+@kernel
+def fill_driven_jack_costs(
+    candidates: Array2,
+    nodes: Array2,
+    before: float,
+    pressure: Array,
+    noise: float,
+    cap: float,
+    scratch: DrivenScratch,
+    out: Array,
+) -> None:
+    """Write what `driven_jack_costs` returns."""
+    sums, state, path = scratch.sums, scratch.state, scratch.path
+    coefficients, pieces = scratch.coefficients, scratch.pieces
+    for first in range(0, candidates.shape[0], LANES):
+        here = min(LANES, candidates.shape[0] - first)
+        end = VECTOR_WIDTH if here <= VECTOR_WIDTH else LANES
+        for i in range(LANES):
+            c = plant_of(candidates[first + min(i, here - 1)])
+            keep_jack_law(coefficients, i, jack_law(c))
+            keep_sensor_law(coefficients, i, sensor_law(c))
+        state[:] = 0.0
+        sums[:] = 0.0
+        rest_jack_lanes(end, before, 0.0, state, coefficients)
+        from_xs = before
+        for k in range(nodes.shape[0]):
+            tick, to_xs = nodes[k, 0], nodes[k, 1]
+            for lane in range(VECTOR_WIDTH):
+                pieces[lane], pieces[VECTOR_WIDTH + lane] = tick, to_xs
+                pieces[2 * VECTOR_WIDTH + lane] = nodes[k, 2]
+                pieces[3 * VECTOR_WIDTH + lane] = nodes[k, 3]
+            for o in range(0, end, VECTOR_WIDTH):
+                j = jack_laws(coefficients, o)
+                every = j.load * 0.0 + 1.0
+                store(path, LANE_PATH * LANES + o, every * from_xs)
+                jack_over_pieces(o, every, 1, tick, state, path, coefficients, pieces)
+                store(path, (LANE_PATH + LANE_NODES) * LANES + o, land_opening(j, every * to_xs))
+            from_xs = to_xs
+            if math.isfinite(pressure[k]):
+                sampled_pressures(end, True, state, path, coefficients)
+                for o in range(0, end, VECTOR_WIDTH):
+                    seen = load(state, ROWS.pressure_sampled * LANES + o)
+                    shown = read_pressure(sensor_laws(coefficients, o), seen)
+                    residual = (pressure[k] - shown) * (1.0 / noise)
+                    store(sums, o, load(sums, o) + minimum(residual * residual, cap))
+        for i in range(here):
+            out[first + i] = sums[i]

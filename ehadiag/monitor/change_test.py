@@ -1,0 +1,309 @@
+"""Tests whether a unit in free motion has changed, by scores of blocks of ticks, and what changed.
+
+Of each parameter the others, within what is no change, are projected out of the scores. A block
+counts at most as much as three mean ones, and by three of its deviations. The estimate over a span
+of blocks is divided by its scatter from block to block, since what a motion leaves unmodelled has
+no known law, and by what is no change. A change lasts: it counts by the lesser of two spans in a
+row that agree in sign. The threshold is one of the largest values in pieces of healthy motion, see
+`alarm_threshold`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ehadiag.compile.jit import Array, Array2
+from ehadiag.model.registry import FAULT_NAMES, parameter
+from ehadiag.monitor.plan import FALSE_ALARM_HOURS_RANGE
+from ehadiag.monitor.score_bank import BANK, BANK_NAMES, REST, BlockScore, ScoreBank
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.recording import CommandMode, Environment
+
+BLOCK_S: Final = 0.5
+"""Length of a block, s."""
+SETTLING_BLOCKS: Final = 2
+"""Blocks that only put the modelled spool where it is seen, 1."""
+SPANS: Final = (20, 60)
+"""Blocks of a span, 1: 10 and 30 s, the longer one for what shows seldom."""
+STRIDE: Final = 10
+"""Blocks between two looks, 1."""
+MAX_BLOCK_SHARE: Final = 3.0
+"""Largest information of a block, in means of the span."""
+MAX_BLOCK_DEVIATIONS: Final = 3.0
+"""Largest score of a block, in deviations: a jack that stuck in the model alone is one block."""
+MIN_BLOCKS: Final = 4.0
+"""Least effective number of blocks in a span, 1: fewer have no scatter."""
+CAUSES: Final = tuple(index for index in range(len(BANK)) if index != REST)
+"""Places of the causes in the bank."""
+HEALTHY_SPREADS: Final = np.array([
+    (1.6, 1.8), (1.8, 2.1), (1.4, 1.4), (1.0, 1.0), (1.0, 1.0), (1.3, 1.2), (1.5, 2.3), (1.0, 1.1),
+    (1.0, 1.2), (1.0, 1.0), (1.0, 1.0), (1.3, 1.7), (1.0, 1.0), (1.0, 1.0),
+]).T  # fmt: skip
+"""97 % of the values of healthy motion are below, by span and cause (tools/study free-motion
+--calibrate)."""
+PIECE_H: Final = 1.0 / 12.0
+"""Length of the pieces of healthy motion whose largest values make the threshold, h."""
+GUMBEL: Final = (1.08, 0.54)
+"""Location and scale of Gumbel's law of those values (the same command)."""
+TRIAL_BLOCKS: Final = 40
+"""Blocks in which causes are tried, 1: 20 s."""
+TRIAL_STEPS: Final = (0.3, 1.0, 3.0, 9.0)
+"""Sizes in which each cause is tried first, steps of the bank."""
+REFINED_CAUSES: Final = 3
+"""Causes whose sizes are tried more closely, 1."""
+TRIAL_FACTORS: Final = ((0.6, 1.6), (0.8, 1.25), (0.9, 1.1))
+"""Factors of the best sizes by which it is done."""
+LIKELY_SHARE: Final = 0.8
+"""Share of the best cause's gain from which another one is named, too."""
+REPEAT_S: Final = 60.0
+"""Time without a sign of a change after which one is another alarm, s."""
+LEAST: Final = 0.02
+"""Least change of a severity worth an alarm, 1, by default: some errors of a diagnosis."""
+
+
+CAUSE_UNITS: Final = {
+    "spool_offset": (1e6, " µm"), "pressure_offset": (1e-6, " MPa"), "null_bias": (1e3, " mA"),
+    "load": (1.0, " N"), "supply": (1e-6, " MPa"), "oil": (1.0, " K"),
+    "current_offset": (1e3, " mA"), "current_gain": (100.0, " %"), "spool_gain": (100.0, " %"),
+    "pressure_gain": (100.0, " %"), "position_gain": (100.0, " %"),
+}  # fmt: skip
+"""Scale and unit of a cause's size, for people; a severity has none."""
+BUS_CAUSES: Final = {
+    "supply": "supply pressure", "oil": "oil temperature",
+    "current_offset": "current sensor offset", "current_gain": "current sensor gain",
+}  # fmt: skip
+"""Causes that the registry has no name for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What may have changed, by how much."""
+
+    name: str
+    """By the registry's names, or `supply`, `oil`, `current_offset`, `current_gain`."""
+    size: float
+    """SI."""
+    stderr: float
+    """Standard error by the scatter of blocks, SI."""
+
+    def __str__(self) -> str:
+        """What it is, its size and its standard error: `spool friction +0.04 ± 0.01`."""
+        scale, unit = CAUSE_UNITS.get(self.name, (1.0, ""))
+        short = BUS_CAUSES.get(self.name) or parameter(self.name).short
+        size, error = self.size * scale, self.stderr * scale
+        places = max(0, -math.floor(math.log10(max(error, 1e-6))))
+        return f"{short} {size:+.{places}f} ± {error:.{places}f}{unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A change that was found."""
+
+    causes: tuple[Cause, ...]
+    """The most likely one first, then those that explain nearly as much."""
+    value: float
+    """Of the test, over its threshold."""
+    repeated: bool
+    """Whether it follows another one closely."""
+
+
+def alarm_threshold(hours: float) -> float:
+    """Value of the test that healthy motion exceeds once in so many hours.
+
+    The pieces of motion are exchangeable, whatever the correlation within one; expected numbers of
+    alarms add up even where pieces are not independent. Beyond the hours of the study Gumbel's law
+    of their largest values is extrapolated. Hours out of range raise ConfigurationError.
+    """
+    if not FALSE_ALARM_HOURS_RANGE[0] <= hours <= FALSE_ALARM_HOURS_RANGE[1]:
+        low, high = FALSE_ALARM_HOURS_RANGE
+        raise ConfigurationError(f"hours between false alarms {hours:g}: need {low:g} … {high:g}")
+    share = -math.expm1(-PIECE_H / hours)
+    return GUMBEL[0] - GUMBEL[1] * math.log(-math.log1p(-share))
+
+
+class ChangeTest:
+    """Takes ticks and finds changes.
+
+    bank: of the unit; rate: ticks a second; hours: mean time between false alarms, h; least: least
+    change of a severity worth an alarm, 1. ConfigurationError: hours or least out of range.
+    """
+
+    def __init__(self, bank: ScoreBank, rate: float, hours: float, least: float = LEAST) -> None:
+        if not 0.0 <= least <= 1.0:
+            raise ConfigurationError(f"least change {least:g}: need 0 … 1")
+        self._bank, self._least, self._mode = bank, least, bank.mode
+        self._threshold = alarm_threshold(hours)
+        self._rows = np.empty((round(BLOCK_S * rate), 5))
+        self._count = 0
+        self._settling = 0
+        self._environment = Environment()
+        kept = 2 * max(SPANS)
+        self._scores: deque[BlockScore] = deque(maxlen=kept)
+        self._kept: deque[tuple[Array2, Environment]] = deque(maxlen=TRIAL_BLOCKS)
+        self._spans: deque[list[tuple[Array, Array] | None]] = deque(maxlen=kept // STRIDE)
+        self._since = math.inf
+        self._looks = 0
+        self._ignored = 0
+        self.value = 0.0
+        """Of the test when it looked last, over its threshold."""
+        self.values: Array2 = np.zeros((len(SPANS), len(CAUSES)))
+        """Of each cause by span, normal deviates."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew after a silence: the spool is anywhere."""
+        self._count, self._settling = 0, SETTLING_BLOCKS
+
+    def tune(self, environment: Environment) -> None:
+        """Take this oil and supply from the next block on."""
+        self._environment = environment
+
+    def follow(self, mode: CommandMode) -> Change | None:
+        """Take commands as of this mode from the next tick on; a change may end a block."""
+        if mode is self._mode:
+            return None
+        found, self._mode = self._end_block(), mode
+        self._bank.follow(mode)
+        return found
+
+    def push(self, tick: tuple[float, float, float, float, float]) -> Change | None:
+        """Take a tick as `Monitor.push`; returns a change with the tick that ends its block."""
+        self._rows[self._count] = tick
+        self._count += 1
+        return self._end_block() if self._count == len(self._rows) else None
+
+    def _end_block(self) -> Change | None:
+        rows, self._count = self._rows[: self._count].copy(), 0
+        if not len(rows):
+            return None
+        self._bank.tune(self._environment)
+        if self._settling:
+            if self._settling == SETTLING_BLOCKS:
+                seen = rows[np.isfinite(rows[:, 2]), 2]
+                if not len(seen):
+                    return None
+                self._bank.reset(float(seen[0]))
+            self._settling -= 1
+            self._bank.settle(rows)
+            return None
+        self._scores.append(self._bank.push(rows))
+        self._kept.append((rows, self._environment))
+        self._looks += 1
+        return self._look() if self._looks % STRIDE == 0 else None
+
+    def _look(self) -> Change | None:
+        scores, steady = list(self._scores), self._bank.steady
+        now = [
+            span_values(scores[-span:], steady) if len(scores) >= span else None for span in SPANS
+        ]
+        self._spans.append(now)
+        values = np.zeros((len(SPANS), len(CAUSES)))
+        sizes = np.zeros_like(values)
+        for place, (span, found) in enumerate(zip(SPANS, now, strict=True)):
+            ago = span // STRIDE + 1
+            before = self._spans[-ago][place] if len(self._spans) >= ago else None
+            if found is not None and before is not None:
+                values[place] = _lasting(found[0], before[0])
+                sizes[place] = 0.5 * (found[1] + before[1])
+        self.values = values
+        shares = np.abs(values) / HEALTHY_SPREADS / self._threshold
+        self.value = float(shares.max())
+        self._since += STRIDE * BLOCK_S
+        if self.value <= 1.0:
+            return None
+        if self._since < REPEAT_S:
+            self._since = 0.0
+            return Change((), self.value, repeated=True)
+        if self._looks < self._ignored:
+            return None
+        best = shares.argmax(axis=0), np.arange(len(CAUSES))
+        causes = self._causes(values[best], sizes[best])
+        if not causes or (causes[0].name in FAULT_NAMES and abs(causes[0].size) < self._least):
+            self._ignored = self._looks + max(SPANS)
+            return None
+        self._since = 0.0
+        return Change(causes, self.value, repeated=False)
+
+    def _causes(self, values: Array, sizes: Array) -> tuple[Cause, ...]:
+        """Try all causes in some sizes, the best ones about theirs, and order them by the gain."""
+        found: dict[int, tuple[float, float]] = {}
+
+        def try_sizes(trials: list[tuple[int, float]]) -> list[int]:
+            gains = self._bank.gains(
+                list(self._kept), [(CAUSES[place], size) for place, size in trials]
+            )
+            for (place, size), gain in zip(trials, gains, strict=True):
+                if gain > found.get(place, (0.0, 0.0))[0]:
+                    found[place] = gain, size
+            return sorted(found, key=lambda place: -found[place][0])
+
+        sides = np.where(sizes < 0.0, -1.0, 1.0)
+        ordered = try_sizes(
+            [(place, float(sides[place] * size)) for place in range(len(CAUSES))
+             for size in TRIAL_STEPS if size <= MAX_SIZES[place]]
+        )[:REFINED_CAUSES]  # fmt: skip
+        for factors in TRIAL_FACTORS:
+            ordered = try_sizes(
+                [(place, found[place][1] * factor) for place in ordered for factor in factors
+                 if abs(found[place][1] * factor) <= MAX_SIZES[place]]
+            )[:REFINED_CAUSES]  # fmt: skip
+        likely = [
+            place for place in ordered
+            if found[place][0] >= LIKELY_SHARE * found[ordered[0]][0]
+        ]  # fmt: skip
+        steps = self._bank.steps[list(CAUSES)]
+        return tuple(
+            Cause(
+                BANK_NAMES[CAUSES[place]],
+                float(found[place][1] * steps[place]),
+                float(abs(found[place][1] * steps[place]) / max(abs(values[place]), 1.0)),
+            )
+            for place in likely
+        )
+
+
+def span_values(scores: list[BlockScore], steady: Array) -> tuple[Array, Array]:
+    """Value of each cause over a span of blocks, and its size in steps.
+
+    steady: standard deviations of what is no change, steps. Values are normal deviates where blocks
+    are alike.
+    """
+    causes = np.array(CAUSES)
+    score = np.array([item.score for item in scores])[:, causes]
+    information = np.array([item.information for item in scores])[:, causes[:, None], causes]
+    own = steady[causes]
+    root = np.linalg.inv(information.sum(axis=0) + np.diag(own**-2.0))
+    # Column k leaves of k what the others, by their own spread, do not explain.
+    apart = root / np.diagonal(root)
+    score = score @ apart
+    weight = np.maximum(np.einsum("bkj,jk->bk", information, apart), 1e-12)
+    share = np.minimum(1.0, MAX_BLOCK_SHARE * weight.mean(axis=0) / weight)
+    deviations = share * np.abs(score) / np.sqrt(share * weight)
+    share *= np.minimum(1.0, MAX_BLOCK_DEVIATIONS / np.maximum(deviations, MAX_BLOCK_DEVIATIONS))
+    score, weight = score * share, weight * share
+    total = weight.sum(axis=0)
+    size = score.sum(axis=0) / total
+    count = total**2 / (weight**2).sum(axis=0)
+    scatter = ((score - weight * size) ** 2).sum(axis=0) * count / np.maximum(count - 1.0, 0.1)
+    spread = np.sqrt(np.maximum(scatter, total) / total**2 + own**2)
+    shown = (total > MIN_INFORMATION) & (count >= MIN_BLOCKS)
+    return np.where(shown, size / spread, 0.0), size
+
+
+MIN_INFORMATION: Final = 1e-3
+"""Least information of a span, squares of steps: below there is nothing to see."""
+MAX_SIZES: Final = np.array(
+    [3.0, 6.0, 6.0, 60.0, 60.0, 5.0, 5.0, 10.0, 25.0, 200.0, 30.0, 30.0, 200.0, 50.0]
+)
+"""Largest sizes that are tried, steps, by cause: severities by 0.2 and 0.3, sensors by some
+percent or some tenths of their range; oil and supply by 90 K and 9 MPa."""
+
+
+def _lasting(now: Array, before: Array) -> Array:
+    """The lesser of two values that agree in sign, else 0."""
+    return np.where(now * before > 0.0, np.sign(now) * np.minimum(np.abs(now), np.abs(before)), 0.0)

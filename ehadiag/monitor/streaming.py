@@ -1,0 +1,384 @@
+"""Streaming monitors: one sample a tick in, residuals and their cumulative sums out.
+
+`Monitor` follows a test. `FreeMotionMonitor` follows a unit between tests too: its sums of the
+pressure rest while the spool is so near to the middle that less than a converter step decides the
+pressure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, NoReturn, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array, Array2, Kernel
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.conversion import actuator_channels
+from ehadiag.model.batch import Anchor
+from ehadiag.model.laws import JACK_STATIC_FRICTION_RATIO
+from ehadiag.model.plant import PlantConstants, relative_viscosity
+from ehadiag.model.registry import FAULTS, REGISTRY, Unknowns, parameter, unit_constants
+from ehadiag.monitor import monitor_memory
+from ehadiag.monitor.monitor_memory import MonitorUnit, prepare_monitor, reset_monitor
+from ehadiag.monitor.plan import CusumDesign, default_noise, design_cusum, monitor_plan
+from ehadiag.monitor.push_kernel import push_tick, push_ticks
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.recording import Channels, CommandMode, Environment
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+TICK_RANGE_S = (1e-5, 0.1)
+"""Range of the control tick, s."""
+SPOOL_POSITION_PLACES = [
+    monitor_memory.MONITOR.valve + monitor_memory.ValveMemory._fields.index(name)
+    for name in ("xs", "wire", "jack_spool", "lagged")
+]
+"""All that has the spool's position (`ehadiag.monitor.push_kernel.push_tick`)."""
+LOST_TICKS_PLACE = monitor_memory.MONITOR.command + monitor_memory.CommandMemory._fields.index(
+    "lost"
+)
+STATE_PLACES = slice(monitor_memory.MONITOR.valve, monitor_memory.MONITOR.slide)
+"""All that goes on from tick to tick."""
+VISCOSITY_PLACE, SUPPLY_PLACE, CLOSED_PLACE = (
+    monitor_memory.SEVERITY_COUNT + MonitorUnit._fields.index(name)
+    for name in ("viscosity", "supply", "closed")
+)
+ALARM_TABLE = np.array([[[n & 1, n & 2], [n & 4, n & 8]] for n in range(16)], dtype=np.bool_)
+"""What `push_tick` returns, taken apart: rows spool and pressure, columns upper and lower sum."""
+
+
+class Tick(NamedTuple):
+    """What the bus says of one control tick; SI, NaN where lost or at the converter's end."""
+
+    command: float
+    """A or m, active during the tick."""
+    current: float
+    """A, as measured at the end of the tick, like the rest."""
+    spool: float
+    """m."""
+    pressure: float
+    """Pa."""
+    position: float
+    """m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What the monitor holds after a push; the arrays are its own and change with the next one."""
+
+    predicted: Array
+    """Spool (m), pressure (Pa), position (m; from 0 at the start), shape (3,)."""
+    residual: Array
+    """Measured less modelled spool and pressure, in units of noise, shape (2,); NaN where the
+    sample is lost."""
+    cusum: Array
+    """Upper and lower sum (columns) of spool and pressure (rows), in units of noise; a sum that
+    gave alarm is back at 0."""
+    alarmed: NDArray[np.bool_]
+    """Which sums gave alarm at this tick, shape (2, 2)."""
+
+    def copy(self) -> Reading:
+        """Return a reading that stays."""
+        return Reading(
+            self.predicted.copy(), self.residual.copy(), self.cusum.copy(), self.alarmed.copy()
+        )
+
+
+class Monitor:
+    """Follows an actuator tick by tick.
+
+    `push` takes constant memory and no lock of its own: call it from the thread that receives, and
+    from one thread only. It is compiled when the monitor is made, never in `push`.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        Data of the actuator.
+    faults : Sequence[float] | Array
+        Severities in the order of the registry, each 0 … 1, as last identified.
+    environment : Environment | None
+        Oil and supply; None: as the actuator's data say.
+    mode : CommandMode
+        What commands are.
+    hours : float
+        Mean time between false alarms of the monitor as a whole, on white noise, h.
+    shift : float
+        Of the mean, in units of noise, that the sums are to find soonest, 0.1 … 5.
+    noise : tuple[float, float] | None
+        Standard deviation of spool (m) and pressure (Pa), white; None: that of PHY-22 on the
+        converters, finer ones than 12 bits counted as 12.
+    offsets : tuple[float, float]
+        Constant errors of spool (m) and pressure sensor (Pa).
+    effects : Mapping[str, float] | None
+        Nuisances and errors of data by the registry's names, as last identified, SI; None: none.
+    anchor : Anchor | None
+        How the modelled spool is kept on the measured one; None: by the converters' steps.
+    channels : Channels | None
+        Converters of the unit; None: those of its actuator file.
+
+    Raises
+    ------
+    ConfigurationError
+        A value out of its range.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        faults: Sequence[float] | Array,
+        environment: Environment | None = None,
+        *,
+        mode: CommandMode = CommandMode.CURRENT,
+        hours: float = FALSE_ALARM_INTERVAL_H,
+        shift: float = 1.0,
+        noise: tuple[float, float] | None = None,
+        offsets: tuple[float, float] = (0.0, 0.0),
+        effects: Mapping[str, float] | None = None,
+        anchor: Anchor | None = None,
+        channels: Channels | None = None,
+    ) -> None:
+        law = actuator.controller
+        tick = 1.0 / law.rate
+        channels = channels or actuator_channels(actuator)
+        noise = noise or default_noise(channels)
+        values = _checked_severities(faults, noise, offsets, tick)
+        base = unit_constants(actuator)
+        constants = Unknowns((), (base,), _checked_effects(effects or {})).constants(np.empty(0))
+        self.design: CusumDesign = design_cusum(hours, tick, shift)
+        """Reference value and threshold of the sums."""
+        self.constants: PlantConstants = constants
+        """Of the unit as new with its effects, at the oil and supply of the actuator's data."""
+        self.noise: tuple[float, float] = noise
+        """Of spool (m) and pressure (Pa)."""
+        self._plan = monitor_plan(actuator, constants, self.design, noise, anchor, channels)
+        closed = float(mode is CommandMode.POSITION)
+        start = MonitorUnit(*offsets, 1.0, float(constants.PSR), closed)
+        self._unit = np.array([*values, *start], dtype=np.float64)
+        p = np.zeros(monitor_memory.MONITOR.end)
+        self._memory, self._address = p, p.ctypes.data
+        self.tune(environment or Environment())
+        self._push = cast("Kernel", push_tick).of_one_thread()
+        self._alarms = 0
+        self._alarmed = np.zeros((2, 2), dtype=np.bool_)
+        self.reading: Reading = Reading(
+            _view(p[monitor_memory.MONITOR.predicted : monitor_memory.MONITOR.residual]),
+            _view(p[monitor_memory.MONITOR.residual : monitor_memory.MONITOR.cusum]),
+            _view(p[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.plays].reshape(2, 2)),
+            _view(self._alarmed),
+        )
+        """What the last push left."""
+        self.push(Tick(0.0, 0.0, 0.0, 0.0, 0.0))
+        self.reset()
+
+    def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
+        """Advance by one tick, a `Tick` or its five numbers; returns `reading`, always the same.
+
+        Call it for every tick: a tick that did not arrive is `Tick` of five NaN. To look at types
+        takes time that this call does not have: what `float` takes for a number, a text too, is
+        taken.
+
+        Parameters
+        ----------
+        sample : tuple[float, float, float, float, float]
+            The tick: command, current, spool, pressure, position.
+
+        Returns
+        -------
+        Reading
+            The monitor's reading, always the same object.
+
+        Raises
+        ------
+        TypeError
+            Not a tuple of five of these, or whatever a `__float__` raised; the monitor is as it
+            was.
+        """
+        try:
+            alarms = self._push(self._address, *map(float, sample))
+        except Exception:  # whatever a `__float__` raises
+            raise TypeError(f"a tick is a tuple of five numbers, not {sample!r}") from None
+        if alarms != self._alarms:
+            self._alarms = alarms
+            self._alarmed[:] = ALARM_TABLE[alarms]
+        return self.reading
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be copied: the copy would go on in the memory of this one."""
+        raise TypeError("a monitor cannot be copied; make another one")
+
+    @property
+    def mode(self) -> CommandMode:
+        """What commands are."""
+        closed = self._memory[monitor_memory.MONITOR_CLOSED] != 0.0
+        return CommandMode.POSITION if closed else CommandMode.CURRENT
+
+    def follow(self, mode: CommandMode) -> None:
+        """Take commands as of this mode from the next tick on; all else continues.
+
+        The control law starts anew, as the flight-control computer's does.
+        """
+        closed = float(mode is CommandMode.POSITION)
+        if self._memory[monitor_memory.MONITOR_CLOSED] == closed:
+            return
+        self._memory[monitor_memory.MONITOR_CLOSED] = self._unit[CLOSED_PLACE] = closed
+        self._memory[monitor_memory.MONITOR.control : monitor_memory.MONITOR.command] = 0.0
+        # The last command was of another kind: no slope leads on from it.
+        self._memory[LOST_TICKS_PLACE] = 1.0
+
+    def tune(self, environment: Environment) -> None:
+        """Take this oil and supply from the next tick on; all else continues.
+
+        What the environment does not state is as the actuator's data say. A supply that is not
+        above the return pressure raises ConfigurationError.
+        """
+        unit, oil = self._unit, environment.oil_temperature
+        supply, drain = environment.supply_pressure, environment.return_pressure
+        unit[VISCOSITY_PLACE] = 1.0 if oil is None else relative_viscosity(oil)
+        unit[SUPPLY_PLACE] = (
+            self.constants.PSR if supply is None or drain is None else supply - drain
+        )
+        state = self._memory[STATE_PLACES].copy()
+        if prepare_monitor(self._address, self._plan.ctypes.data, unit.ctypes.data) != 0:
+            raise ConfigurationError(f"supply pressure {unit[SUPPLY_PLACE]:g} Pa: need more than 0")
+        self._memory[STATE_PLACES] = state
+
+    def push_block(self, samples: Array2) -> Array2:
+        """Advance by some ticks, rows as of `push`, as fast as the model can.
+
+        Returns spool (m), position (m) and current (A) of the model, and residuals of spool and
+        pressure in units of noise, shape (n, 5).
+        """
+        modelled = np.empty_like(samples)
+        push_ticks(self._address, samples, modelled)
+        return modelled
+
+    def adopt(self, other: Monitor) -> None:
+        """Go on from the state of another monitor of this unit."""
+        self._memory[STATE_PLACES] = other._memory[STATE_PLACES]
+
+    def nudge(self, spool: float) -> None:
+        """Move the modelled spool by some m, as re-anchoring does, and restart the sums."""
+        self._memory[SPOOL_POSITION_PLACES] += spool
+        self._memory[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.plays] = 0.0
+
+    def reset(self, spool: float = 0.0) -> None:
+        """Restart from rest with the spool there (m), as a stored test begins."""
+        self._alarms, self._alarmed[:] = 0, False
+        reset_monitor(self._address, spool)
+
+
+def _checked_severities(
+    faults: Sequence[float] | Array,
+    noise: tuple[float, float],
+    offsets: tuple[float, float],
+    tick: float,
+) -> tuple[float, ...]:
+    values = tuple(float(value) for value in faults)
+    if len(values) != len(FAULTS) or not all(0.0 <= value <= 1.0 for value in values):
+        names = ", ".join(item.name for item in FAULTS)
+        raise ConfigurationError(f"severities {values}: need {names}, each 0 … 1")
+    if not all(0.0 < value < math.inf for value in noise):
+        raise ConfigurationError(f"noise {noise}: need two positive numbers, m and Pa")
+    if not all(math.isfinite(value) for value in offsets):
+        raise ConfigurationError(f"offsets {offsets}: need two numbers, m and Pa")
+    if not TICK_RANGE_S[0] <= tick <= TICK_RANGE_S[1]:
+        raise ConfigurationError(f"controller.rate {1.0 / tick:g} Hz: need 10 … 1e5 Hz")
+    return values
+
+
+def _checked_effects(effects: Mapping[str, float]) -> dict[str, float]:
+    """Effects as plain numbers, checked against the registry."""
+    bounds = {item.name: (item.lower, item.upper) for item in REGISTRY if item not in FAULTS}
+    for name, value in effects.items():
+        if name not in bounds:
+            raise ConfigurationError(f"effect {name!r}: none of the registry's")
+        lower, upper = bounds[name]
+        if not lower <= value <= upper:
+            raise ConfigurationError(f"effect {name} {value:g}: need {lower:g} … {upper:g}")
+    return {name: float(value) for name, value in effects.items()}
+
+
+def _view(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+UNDECIDED_SPOOL_STEPS = 3.0
+"""Uncertainty of the modelled spool position, in converter steps."""
+SETTLING_TICKS = 300
+"""Ticks with a spool sample until alarms count, 1."""
+PRESSURE_PAUSE_TICKS = 5
+"""Ticks without pressure after the last undecided one, 1: the jack may still stick."""
+
+
+class FreeMotionMonitor:
+    """Follows an actuator tick by tick, in tests and between them.
+
+    monitor: the monitor that it pushes into, with the unit's own severities; undecided: spool
+    position either side of the middle within which the pressure is undecided, m; see
+    `undecided_spool`; offset: constant error of the spool's sensor, m.
+    """
+
+    def __init__(self, monitor: Monitor, undecided: float, offset: float = 0.0) -> None:
+        self.monitor = monitor
+        """What it pushes into."""
+        self._undecided, self._offset = undecided, offset
+        self._resting = 0
+        self._age = 0
+
+    @property
+    def settled(self) -> bool:
+        """Whether alarms count."""
+        return self._age >= SETTLING_TICKS
+
+    def settle(self) -> None:
+        """Continue from the present state as from an uncertain one."""
+        self._age = 0
+
+    def push(self, sample: tuple[float, float, float, float, float]) -> Reading:
+        """Advance by one tick, see `Monitor.push`; residual of the pressure NaN where it is
+        undecided.
+        """
+        command, current, spool, _, position = sample
+        monitor, near = self.monitor, self._undecided
+        if abs(spool - self._offset) < near or abs(monitor.reading.predicted[0]) < near:
+            self._resting = PRESSURE_PAUSE_TICKS
+        if self._resting:
+            self._resting -= 1
+            sample = command, current, spool, math.nan, position
+        reading = monitor.push(sample)
+        if self._age < SETTLING_TICKS:
+            residual = float(reading.residual[0])
+            if math.isfinite(residual):
+                self._age += 1
+                monitor.nudge(residual * monitor.noise[0] / (self._age + 1))
+        return reading
+
+    def follow(self, mode: CommandMode) -> None:
+        """Take commands as of this mode from the next tick on, see `Monitor.follow`."""
+        self.monitor.follow(mode)
+
+    def reset(self, spool: float = 0.0) -> None:
+        """Restart from rest with the spool there (m)."""
+        self._resting, self._age = PRESSURE_PAUSE_TICKS, 0
+        self.monitor.reset(spool)
+
+
+def undecided_spool(actuator: Actuator, severity: float) -> float:
+    """Distance of the spool from the middle within which it does not decide the pressure, m.
+
+    The jack sticks where the pressure gain times the spool's position is less than its static
+    friction, at a severity FDJ; the resolution of the converter is added.
+    """
+    constants: PlantConstants = unit_constants(actuator)
+    step = actuator_channels(actuator).spool.grain
+    worn = Unknowns((parameter("FDJ"),), (constants,), {}).constants(np.array([severity]))
+    friction = JACK_STATIC_FRICTION_RATIO * float(worn.FDJ)
+    return friction / (actuator.jack.AJ * actuator.servovalve.GP) + UNDECIDED_SPOOL_STEPS * step

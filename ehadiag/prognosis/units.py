@@ -1,0 +1,265 @@
+"""Forecasts of one unit, or of all, from the diagnoses and events of a health history."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ehadiag.history.records import counted_entries, current_utc_text
+from ehadiag.history.store import History
+from ehadiag.prognosis.averaging import learn_fleet
+from ehadiag.prognosis.forecast import Forecast, RemainingLife
+from ehadiag.prognosis.forecast import forecast as severity_forecast
+from ehadiag.prognosis.lives import USAGE_UNITS, Life, days_of, lives_of, usage_of
+from firmware_iface.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from ehadiag.history.records import Entry, MaintenanceEvent, Usage
+
+__all__ = ["Prognosis", "all_prognoses", "forecast", "prognosis_of"]
+
+MIN_DAYS_FOR_DATES = 7.0
+"""Days between first and last diagnosis, from which on use a day is known well enough for dates."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prognosis:
+    """Forecasts of one unit."""
+
+    serial: int
+    actuator: str | None
+    """None: the history does not know the unit."""
+    unit: str
+    """One of `USAGE_UNITS`."""
+    diagnoses: int
+    """That count, of this unit."""
+    used: int
+    """Of these, those of the same actuator as the last that say hours (or cycles)."""
+    levels: tuple[float, ...]
+    forecasts: tuple[Forecast, ...]
+    seed: int
+    per_day: float | None
+    """Hours or cycles a calendar day, between first and last diagnosis; None where not known."""
+    now: str
+    """When it was made: UTC, ISO 8601."""
+
+    def first(self, place: int = -1) -> tuple[Forecast, RemainingLife] | None:
+        """Return the severity whose median reaches a level first; None without a number."""
+        found = [
+            (item, item.remaining[place])
+            for item in self.forecasts
+            if item.remaining[place].median is not None
+        ]
+        return min(found, key=lambda pair: pair[1].median or 0.0, default=None)
+
+    def chance_within(self, time: float, place: int = -1) -> float | None:
+        """Chance that any severity reaches a level within a time; those without a number apart."""
+        chances = [item.remaining[place].chance_within(time) for item in self.forecasts]
+        known = [chance for chance in chances if chance is not None]
+        return float(1.0 - np.prod(1.0 - np.array(known))) if known else None
+
+    def date_after(self, time: float) -> str | None:
+        """Return the day a time from now at the unit's use a day; None where that is not known."""
+        if not self.per_day or time / self.per_day > 36500.0:
+            return None
+        moment = datetime.fromisoformat(self.now) + timedelta(days=time / self.per_day)
+        return moment.date().isoformat()
+
+    def time_until(self, date: str) -> float:
+        """Return hours, cycles or days until a date at the unit's use a day.
+
+        Parameters
+        ----------
+        date : str
+            ISO 8601.
+
+        Returns
+        -------
+        float
+            Not below 0.
+
+        Raises
+        ------
+        ConfigurationError
+            It is no date, or the unit's use a day is not known.
+        """
+        try:
+            moment = datetime.fromisoformat(date)
+        except ValueError:
+            raise ConfigurationError(f"{date}: need a date, ISO 8601, or a number") from None
+        if not self.per_day:
+            raise ConfigurationError(f"{date}: the unit's use a day is not known; name {self.unit}")
+        ahead = days_of((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).isoformat())
+        return max(ahead - days_of(self.now), 0.0) * self.per_day
+
+
+def prognosis_of(
+    serial: int,
+    entries: Sequence[Entry],
+    events: Sequence[MaintenanceEvent],
+    levels: Sequence[float],
+    unit: str | None = None,
+    seed: int = 0,
+    *,
+    today: Usage | None = None,
+    actuator: str | None = None,
+) -> Prognosis:
+    """Forecast each severity of a unit.
+
+    Parameters
+    ----------
+    serial : int
+        Of the unit.
+    entries : Sequence[Entry]
+        Diagnoses of the unit and its fleet, in the order in which they were appended. Units of the
+        same actuator are the fleet; simulated ones are none of a real unit's.
+    events : Sequence[MaintenanceEvent]
+        Their maintenance events.
+    levels : Sequence[float]
+        That are to be reached, 0 … 1, rising.
+    unit : str | None
+        One of `USAGE_UNITS`; None: the one that more of the unit's diagnoses say.
+    seed : int
+        Of the draws; the same seed gives the same digits.
+    today : Usage | None
+        Hours and cycles of the unit by now; None: those at its last diagnosis.
+    actuator : str | None
+        Of the unit, where its serial number is another actuator's too; None: that of the last
+        diagnosis.
+
+    Returns
+    -------
+    Prognosis
+        One forecast for each severity, each with a number or why there is none.
+    """
+    counted = counted_entries(entries)
+    own = [i for i in counted if i.serial == serial and actuator in (None, i.actuator)]
+    if unit is None:
+        unit = max(
+            ("hours", "cycles"), key=lambda n: sum(i.usage.amount(n) is not None for i in own)
+        )
+    last = own[-1] if own else None
+    kind = (last.actuator, last.simulated) if last else (None, False)
+    alike = [item for item in counted if (item.actuator, item.simulated) == kind]
+    now = current_utc_text()
+    at = days_of(now) if unit == "days" else today.amount(unit) if today else None
+    forecasts, none = [], np.empty(0)
+    for name in dict.fromkeys(part.name for item in alike for part in item.severities):
+        lives = lives_of(alike, events, name, unit)
+        mine = lives.pop(serial, [])
+        present = mine[-1] if mine else Life(serial, none, none, none, 0.0)
+        others = [*mine[:-1], *(life for several in lives.values() for life in several)]
+        ages = [life.age[-1] for life in (present, *others) if len(life.age)]
+        fleet = learn_fleet(others, float(np.median(ages)) if ages else 1.0, seed)
+        elapsed = 0.0
+        if at is not None and len(present.age):
+            elapsed = max(at - present.born - float(present.age[-1]), 0.0)
+        forecasts.append(severity_forecast(name, unit, present, fleet, levels, seed, elapsed))
+    same = [item for item in own if (item.actuator, item.simulated) == kind]
+    used = [item for item in same if usage_of(item, unit) is not None]
+    return Prognosis(
+        serial, kind[0], unit, len(own), len(used), tuple(levels), tuple(forecasts), seed,
+        _use_a_day(used, unit), now,
+    )  # fmt: skip
+
+
+def _use_a_day(entries: Sequence[Entry], unit: str) -> float | None:
+    """Hours or cycles a calendar day between first and last dated diagnosis."""
+    if unit == "days":
+        return 1.0
+    dated = sorted(
+        (days_of(item.tested), usage_of(item, unit) or 0.0) for item in entries if item.tested
+    )
+    if not dated or dated[-1][0] - dated[0][0] < MIN_DAYS_FOR_DATES:
+        return None
+    rate = (dated[-1][1] - dated[0][1]) / (dated[-1][0] - dated[0][0])
+    return rate if rate > 0.0 else None
+
+
+def forecast(
+    history: History | str | PathLike[str],
+    serial: int,
+    *,
+    advisory: float = 0.25,
+    limit: float = 0.75,
+    unit: str | None = None,
+    today: Usage | None = None,
+    actuator: str | None = None,
+    seed: int = 0,
+) -> Prognosis:
+    """Forecast each severity of a unit of a health history.
+
+    Parameters
+    ----------
+    history : History | str | PathLike[str]
+        An open history, or its file.
+    serial : int
+        Of the unit.
+    advisory : float
+        Severity of the first level, 1.
+    limit : float
+        Severity of the second level, 1.
+    unit : str | None
+        `hours`, `cycles` or `days`; None: what more of the unit's diagnoses say.
+    today : Usage | None
+        Hours and cycles of the unit by now; None: those at its last diagnosis.
+    actuator : str | None
+        Of the unit, where its serial number is another actuator's too.
+    seed : int
+        Of the draws; the same seed gives the same digits.
+
+    Returns
+    -------
+    Prognosis
+        One forecast for each severity, each with a number or why there is none.
+
+    Raises
+    ------
+    ConfigurationError
+        The unit of usage is none.
+    """
+    if unit not in (None, *USAGE_UNITS):
+        raise ConfigurationError(f"unit {unit}: there is {', '.join(USAGE_UNITS)}")
+    if not isinstance(history, History):
+        with History(Path(history)) as opened:
+            return forecast(
+                opened, serial, advisory=advisory, limit=limit, unit=unit, today=today,
+                actuator=actuator, seed=seed,
+            )  # fmt: skip
+    entries, events = history.alike(serial, actuator)
+    return prognosis_of(
+        serial, entries, events, (advisory, limit), unit, seed, today=today, actuator=actuator
+    )
+
+
+def all_prognoses(
+    history: History, levels: Sequence[float], unit: str | None = None, seed: int = 0
+) -> Iterator[Prognosis]:
+    """Forecast all units of a history, one by one.
+
+    Parameters
+    ----------
+    history : History
+        An open history.
+    levels : Sequence[float]
+        That are to be reached, 0 … 1, rising.
+    unit : str | None
+        One of `USAGE_UNITS`; None: the one that more of a unit's diagnoses say.
+    seed : int
+        Of the draws.
+
+    Yields
+    ------
+    Prognosis
+        Of each serial number of each actuator.
+    """
+    for actuator, serial in history.units():
+        entries, events = history.alike(serial, actuator)
+        yield prognosis_of(serial, entries, events, levels, unit, seed, actuator=actuator)

@@ -1,0 +1,134 @@
+"""The table of a fleet, worst unit first: front page of `serve`, and index of a batch's reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from markupsafe import Markup
+
+from ehadiag.report.head import plain_name
+from firmware_iface.errors import printable
+
+if TYPE_CHECKING:
+    from ehadiag.assess.verdict import Levels
+    from ehadiag.estimate import Severity
+    from ehadiag.prognosis.units import Prognosis
+
+__all__ = ["FLEET_HEAD", "Cell", "FleetUnit", "fleet_rows"]
+
+FLEET_HEAD = ("unit", "verdict", "worst", "trend", "time left", "last test", "actuator", "")
+WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
+MAX_SPARK_VALUES = 30
+"""Number of diagnoses in a sparkline, the newest ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell of a list."""
+
+    text: str
+    """Markup, such as a drawing, stays markup."""
+    link: str = ""
+    kind: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetUnit:
+    """One line of the table."""
+
+    serial: int | None
+    actuator: str
+    verdict: str
+    """Name of the newest verdict."""
+    word: str
+    """Word for it that people see."""
+    severities: Sequence[Severity]
+    """Newest ones."""
+    past: Sequence[float]
+    """Worst severity of each diagnosis, oldest first."""
+    tested: str
+    """Date of the newest test."""
+    link: str
+    """Of the unit's page."""
+    report: str = ""
+    """Link of its report."""
+    prognosis: Prognosis | None = None
+
+
+def fleet_rows(units: Sequence[FleetUnit], levels: Levels) -> list[list[Cell]]:
+    """Return the lines of the table, worst first.
+
+    Parameters
+    ----------
+    units : Sequence[FleetUnit]
+        In any order.
+    levels : Levels
+        Advisory level and limit, for the sparklines.
+
+    Returns
+    -------
+    list[list[Cell]]
+        Cells under `FLEET_HEAD`.
+    """
+    ordered = sorted(units, key=lambda unit: (WORST_FIRST.index(unit.verdict), -_worst(unit)[1]))
+    return [_row(unit, levels) for unit in ordered]
+
+
+def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
+    name, value = _worst(unit)
+    worst = "none" if value < 0.0 else f"{plain_name(name)} {100.0 * value:.0f} %"
+    serial = "unknown" if unit.serial is None else str(unit.serial)
+    return [
+        Cell(serial, unit.link),
+        Cell(unit.word, kind=unit.verdict),
+        Cell(worst),
+        Cell(_sparkline(unit.past, levels)),
+        Cell(_left(unit.prognosis)),
+        Cell(unit.tested[:16].replace("T", " ")),
+        Cell(printable(unit.actuator)),
+        Cell("report", unit.report) if unit.report else Cell(""),
+    ]
+
+
+def _worst(unit: FleetUnit) -> tuple[str, float]:
+    """Name and value of the worst severity; below 0 where none is known."""
+    known = [(item.name, item.estimate) for item in unit.severities if item.estimate is not None]
+    return max(known, key=lambda pair: pair[1], default=("", -1.0))
+
+
+def _left(prognosis: Prognosis | None) -> str:
+    """Time until the first severity reaches the limit."""
+    if prognosis is None:
+        return ""
+    left = [item.remaining[-1].median for item in prognosis.forecasts]
+    known = [value for value in left if value is not None]
+    if known and min(known) <= 0.0:
+        return "limit reached"
+    unit = "h" if prognosis.unit == "hours" else prognosis.unit
+    return f"{float(f'{min(known):.2g}'):g} {unit}" if known else "no number"
+
+
+def _sparkline(values: Sequence[float], levels: Levels) -> str:
+    """Draw severities between 0 and 1 with both levels; numbers only, so no text of others."""
+    shown = values[-MAX_SPARK_VALUES:]
+    if len(shown) < 2:
+        return ""
+    step = 100.0 / (len(shown) - 1)
+    points = " ".join(
+        f"{n * step:.1f},{30.0 * (1.0 - min(v, 1.0)):.1f}" for n, v in enumerate(shown)
+    )
+    lines = "".join(
+        f'<line class="{name}" x1="0" x2="100" y1="{y:.1f}" y2="{y:.1f}"/>'
+        for name, y in _level_heights({"advisory": levels.advisory, "limit": levels.limit}).items()
+    )
+    return Markup(
+        f'<svg class="spark" viewBox="0 0 100 30" width="100" height="30" role="img"'
+        f' aria-label="worst severity, {len(shown)} tests">{lines}'
+        f'<polyline points="{points}"/></svg>'
+    )
+
+
+def _level_heights(levels: Mapping[str, float]) -> dict[str, float]:
+    return {name: 30.0 * (1.0 - level) for name, level in levels.items()}

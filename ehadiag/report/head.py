@@ -1,0 +1,308 @@
+"""The head of a result: what is wrong, how bad, what to do. Every surface lays out the same.
+
+Terminal, report, page of `serve` and notebook show a `Head`; none of them words a verdict itself.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, NamedTuple
+
+from ehadiag.assess.verdict import Verdict
+from ehadiag.core.conventions import display_unit
+
+if TYPE_CHECKING:
+    from ehadiag.assess.verdict import Levels
+    from ehadiag.estimate import Severity
+    from ehadiag.prognosis.units import Prognosis
+    from ehadiag.result import Result
+
+__all__ = [
+    "Bar",
+    "Head",
+    "Reason",
+    "head_of",
+    "percent",
+    "plain_name",
+    "remaining_sentences",
+    "verdict_word",
+]
+
+INCONCLUSIVE = "INCONCLUSIVE"
+"""Word for a test that ran and was identified, but not explained; its verdict is NOT TESTED."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """One severity as it is drawn."""
+
+    name: str
+    """Plain, such as `spool friction`."""
+    symbol: str
+    """As in the registry of parameters."""
+    value: float | None
+    """Severity, 0 … 1; None: not known."""
+    interval: tuple[float, float] | None
+    """95 % interval."""
+    state: str
+    """Name of the verdict that this severity alone gives; empty: not known."""
+    standing: str
+    """Against the levels, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why there is no verdict."""
+
+    cause: str
+    """In plain words."""
+    evidence: tuple[str, ...]
+    """What was found, in the terms of the field; empty: the cause says it."""
+    action: str
+    """What to do; empty: nothing general can be said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """Content of the head of a result."""
+
+    word: str
+    """HEALTHY, DEGRADED, FAULT, INCONCLUSIVE or NOT TESTED."""
+    verdict: str
+    """Name of the verdict, which gives colour and exit code."""
+    sentences: tuple[str, ...]
+    """What is wrong and what to do, worst first; the first one stands beside the word."""
+    reasons: tuple[Reason, ...]
+    """Why there is no verdict, the plain cause first; none where there is one."""
+    bars: tuple[Bar, ...]
+    """Severities, worst first."""
+    advisory: float
+    """Level from which a severity is DEGRADED, 0 … 1."""
+    limit: float
+    """Level from which it is FAULT."""
+    facts: tuple[tuple[str, str], ...]
+    """Date of the test, unit, test, actuator: label and text."""
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Sentences, then what to do where there is no verdict."""
+        return (
+            *self.sentences,
+            *dict.fromkeys(item.action for item in self.reasons if item.action),
+        )
+
+
+class _Explanation(NamedTuple):
+    """Plain words for the reasons that a pattern finds."""
+
+    pattern: str
+    cause: str
+    action: str = ""
+
+
+CONSEQUENCES = frozenset({"Samples are missing."})
+"""Causes that a recording that begins late or ends early explains."""
+CUT_OFF = ("The recording ends early", "The recording begins late")
+CUT_NOTE = re.compile(r"the (last|first) .* are missing")
+
+
+@cache
+def _explanations() -> tuple[_Explanation, ...]:
+    """Plain cause and action of each reason, root causes before their consequences."""
+    text = resources.files("ehadiag").joinpath("data/reasons.toml").read_text(encoding="utf-8")
+    return tuple(_Explanation(*row) for row in tomllib.loads(text)["explanations"])
+
+
+def verdict_word(result: Result) -> str:
+    """Return the word for a verdict that people see; NOT TESTED has two.
+
+    Parameters
+    ----------
+    result : Result
+        What was found.
+
+    Returns
+    -------
+    str
+        INCONCLUSIVE: the test ran and was identified, but cannot be explained.
+    """
+    if result.verdict is Verdict.NOT_TESTED and result.identified:
+        return INCONCLUSIVE
+    return result.verdict.name.replace("_", " ")
+
+
+def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) -> Head:
+    """Return the content of a result's head.
+
+    Parameters
+    ----------
+    result : Result
+        What was found.
+    levels : Levels
+        Advisory level and limit.
+    prognosis : Prognosis | None
+        Remaining life of the unit; None: not known.
+
+    Returns
+    -------
+    Head
+        To be laid out.
+    """
+    bars = sorted(
+        (_bar(item, levels) for item in result.severities.values()),
+        key=lambda bar: -1.0 if bar.value is None else bar.value,
+        reverse=True,
+    )
+    untested = result.verdict is Verdict.NOT_TESTED
+    reasons = _explained(result) if untested else ()
+    sentences = tuple(item.cause for item in reasons) if untested else _found(result, bars, levels)
+    if prognosis is not None and not untested:
+        sentences += tuple(remaining_sentences(prognosis)[:1])
+    serial = "unknown" if result.serial is None else str(result.serial)
+    facts = (
+        ("tested", "date unknown" if result.date is None else _shown_date(result.date)),
+        ("unit", serial),
+        ("test", result.test or "unknown"),
+        ("actuator", result.actuator),
+    )
+    return Head(
+        verdict_word(result), result.verdict.name, sentences, reasons, tuple(bars),
+        levels.advisory, levels.limit, facts,
+    )  # fmt: skip
+
+
+def remaining_sentences(prognosis: Prognosis) -> list[str]:
+    """Return when severities reach the limit, the soonest first; only those with a number."""
+    found = []
+    for item in prognosis.forecasts:
+        left = item.remaining[-1]
+        if left.median is None or left.low is None or left.high is None or left.high <= 0.0:
+            continue
+        unit = "h" if prognosis.unit == "hours" else prognosis.unit
+        text = (
+            f"{plain_name(item.name)} reaches its limit in about {_rounded(left.median)} {unit}"
+            f" (80 %: {_rounded(left.low)} to {_rounded(left.high)})."
+        )
+        found.append((left.median, text[0].upper() + text[1:]))
+    return [text for _, text in sorted(found)]
+
+
+def _rounded(value: float) -> str:
+    """Write a number with two digits that count."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def percent(value: float, *others: float) -> str:
+    """Write a share in percent, with as many digits as tell it from other ones."""
+    for digits in range(3):
+        text = f"{100.0 * value:.{digits}f}"
+        if all(text != f"{100.0 * other:.{digits}f}" for other in others if other != value):
+            break
+    return f"{text} %"
+
+
+def plain_name(name: str) -> str:
+    """Return the plain name of a severity or effect; an unknown name as it is."""
+    from ehadiag.model.registry import parameter  # noqa: PLC0415 - loads numba
+
+    try:
+        return parameter(name).short
+    except KeyError:
+        return name
+
+
+def _shown_date(date: str) -> str:
+    return f"{date[:10]} {date[11:16]} UTC"
+
+
+def _bar(item: Severity, levels: Levels) -> Bar:
+    value, state, standing = item.estimate, "", "not known"
+    if value is not None:
+        state, standing = "HEALTHY", "below both levels"
+        if value >= levels.limit:
+            state, standing = "FAULT", "at or above the limit"
+        elif value >= levels.advisory:
+            state, standing = "DEGRADED", "at or above the advisory level"
+        elif item.interval95 is not None and item.interval95[1] >= levels.advisory:
+            standing = "may be above the advisory level"
+        standing += ", at its bound" * item.at_bound
+    if not item.shown:
+        state, standing = "", "not shown by the test"
+    return Bar(
+        item.meaning or plain_name(item.name), item.name, value, item.interval95, state, standing
+    )
+
+
+def _found(result: Result, bars: Sequence[Bar], levels: Levels) -> tuple[str, ...]:
+    """Say what is worn, worst first, with what to do."""
+    both = (levels.advisory, levels.limit)
+    out = []
+    for bar in bars:
+        advice = result.severities[bar.symbol].advice
+        if bar.value is None:
+            continue
+        size = f"{bar.name} is at {percent(bar.value, *both)}"
+        if bar.state == "FAULT":
+            text = f"{size}, its limit is {percent(levels.limit)}."
+            text += f" {advice[:1].upper()}{advice[1:]}." if advice else ""
+        elif bar.state == "DEGRADED":
+            text = f"{size}, above its advisory level of {percent(levels.advisory)}."
+            text += f" Plan to {advice}." if advice else ""
+        elif any(reason.startswith(f"{bar.symbol} ") for reason in result.reasons):
+            text = f"{size}, and may be above its advisory level of {percent(levels.advisory)}."
+        else:
+            continue
+        out.append(text[0].upper() + text[1:])
+    for item in result.other:
+        if item.beyond and item.limit is not None and item.value is not None:
+            factor, unit = display_unit(item.unit, item.limit)
+            text = f"{item.meaning} is {factor * item.value:.3g} {unit}"
+            text += f", its limit is {factor * item.limit:.3g} {unit}."
+            out.append(text[0].upper() + text[1:])
+    if not out and bars and bars[0].value is not None:
+        worst = bars[0]
+        out.append(
+            f"Nothing is worn beyond its advisory level of {percent(levels.advisory)};"
+            f" {worst.name} is highest, at {percent(bars[0].value, *both)}."
+        )
+    return tuple(out)
+
+
+def _explained(result: Result) -> tuple[Reason, ...]:
+    """Group reasons by their plain causes, in the order of the data file."""
+    texts = [*result.reasons]
+    if any("missing" in text for text in texts):
+        texts += [note for note in result.notes if CUT_NOTE.match(note)]
+    known = _explanations()
+    groups: dict[str, tuple[int, list[str], str]] = {}
+    for text in texts:
+        rank, cause, action = len(known), _sentence(text), ""
+        for place, item in enumerate(known):
+            if re.search(item.pattern, text):
+                numbers = re.findall(r"\d+\.\d+", text)
+                short = f"{float(numbers[0]):.1f}" if numbers else ""
+                cause = item.cause.format(short, evidence=text)
+                rank, action = place, item.action
+                break
+        groups.setdefault(cause, (rank, [], action))[1].append(text)
+    cut = [cause for cause in groups if cause.startswith(CUT_OFF)]
+    if cut:  # what is missing is missing for this reason
+        for cause in CONSEQUENCES & groups.keys():
+            groups[cut[0]][1].extend(groups.pop(cause)[1])
+        rank, evidence, _ = groups[cut[0]]
+        groups[cut[0]] = (rank, evidence[1:], "Record the test to its end, then diagnose again.")
+    found = sorted(groups.items(), key=lambda pair: pair[1][0])
+    return tuple(
+        Reason(cause, () if [_sentence(item) for item in evidence] == [cause] else tuple(evidence),
+               action)
+        for cause, (_, evidence, action) in found
+    )  # fmt: skip
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."

@@ -1,0 +1,214 @@
+"""Tables, sentences and JSON objects of remaining life."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+
+from firmware_iface.errors import printable
+
+if TYPE_CHECKING:
+    from ehadiag.prognosis.forecast import Forecast, RemainingLife
+    from ehadiag.prognosis.units import Prognosis
+
+__all__ = [
+    "named_levels", "print_prognosis", "print_urgencies", "prognosis_tree", "remaining_text",
+]  # fmt: skip
+
+PROGNOSIS_SCHEMA = "ehadiag.rul/2"
+LEVEL_NAMES = ("advisory", "limit")
+SHORT_NAMES = {"Kintas": "filter clogging", "FSS": "spool friction", "FDJ": "jack friction"}
+"""Those of the registry, which loads the compiler."""
+FIGURES = 2
+"""Figures of a time that is printed, 1: an interval of 80 % carries no more."""
+
+
+def print_prognosis(
+    prognosis: Prognosis, console: Console, before: tuple[str, float] | None = None
+) -> None:
+    """Print a prognosis.
+
+    Parameters
+    ----------
+    prognosis : Prognosis
+        What the history says.
+    console : Console
+        Console to print to.
+    before : tuple[str, float] | None
+        The next inspection: as it was named, and hours, cycles or days until it.
+    """
+    head = f"serial {prognosis.serial}, actuator {printable(prognosis.actuator or 'unknown')}"
+    used = f"{prognosis.used} of {prognosis.diagnoses} diagnoses say {prognosis.unit}"
+    console.print(f"{head}: {used}", soft_wrap=True)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    table.add_column("severity", no_wrap=True)
+    table.add_column("now", justify="right", no_wrap=True)
+    for name, level in named_levels(prognosis):
+        table.add_column(f"{prognosis.unit} to {name} {level:g}", overflow="fold")
+    table.add_column("wear", overflow="fold")
+    for item in prognosis.forecasts:
+        cells = [remaining_text(left) for left in item.remaining]
+        now = "-" if item.value is None else f"{item.value:.4f}"
+        table.add_row(item.name, now, *cells, _wear_text(item))
+    console.print(table, crop=False)
+    for line in _sentences(prognosis, before):
+        console.print(f"  {line}", soft_wrap=True)
+    for item in prognosis.forecasts:
+        if item.note:
+            console.print(f"  {item.name}: {item.note}", soft_wrap=True)
+        if item.alarm:
+            console.print(f"  ALARM: {item.name} {item.alarm}", soft_wrap=True)
+
+
+def print_urgencies(
+    found: Sequence[Prognosis], console: Console, before: Sequence[float] | None = None
+) -> None:
+    """Print one line for each unit, those that reach the limit first at the top.
+
+    Parameters
+    ----------
+    found : Sequence[Prognosis]
+        Of the units, in the order of the table.
+    console : Console
+        Console to print to.
+    before : Sequence[float] | None
+        Hours, cycles or days of each until the next inspection.
+    """
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    heads = ("serial", "actuator", "first", "to the limit", "about")
+    for name in (*heads, *(("chance before",) if before else ()), "alarms"):
+        table.add_column(name, overflow="fold")
+    for place, item in enumerate(found):
+        first = item.first()
+        alarms = ", ".join(part.name for part in item.forecasts if part.alarm)
+        chance = [_percent(item.chance_within(before[place]))] if before else []
+        cells = ("-", "no number", "-")
+        if first is not None:
+            severity, left = first
+            cells = (severity.name, f"{remaining_text(left)} {item.unit}", _date(item, left) or "-")
+        table.add_row(
+            str(item.serial), printable(item.actuator or "unknown"), *cells, *chance, alarms or "-"
+        )
+    console.print(table, crop=False)
+
+
+def _sentences(prognosis: Prognosis, before: tuple[str, float] | None) -> list[str]:
+    """What a planner wants to know, in sentences."""
+    out = []
+    if (first := prognosis.first()) is not None:
+        item, left = first
+        assert left.median is not None
+        assert left.low is not None
+        assert left.high is not None
+        if left.high == 0.0:
+            out.append(f"First: {SHORT_NAMES[item.name]} is at its limit.")
+        else:
+            when = f" ({date})" if (date := _date(prognosis, left)) else ""
+            out.append(
+                f"First: {SHORT_NAMES[item.name]} reaches its limit in about"
+                f" {_rounded(left.median)} {prognosis.unit}{when},"
+                f" {_rounded(left.low)} to {_rounded(left.high)} with 80 %."
+            )
+    if before is not None:
+        name, time = before
+        chance = prognosis.chance_within(time)
+        without = [i.name for i in prognosis.forecasts if i.remaining[-1].median is None]
+        rest = f"; without {', '.join(without)}: no number" if without else ""
+        out.append(f"Chance of a severity at its limit before {name}: {_percent(chance)}{rest}.")
+    return out
+
+
+def remaining_text(left: RemainingLife) -> str:
+    """Write hours, cycles or days to a level, or why there is no number."""
+    if left.median is None or left.low is None or left.high is None:
+        return f"no number: {left.why}"
+    if left.high == 0.0:
+        return "reached"
+    return f"{_rounded(left.median)} (80 %: {_rounded(left.low)} … {_rounded(left.high)})"
+
+
+def _rounded(value: float) -> str:
+    if value <= 0.0:
+        return "0"
+    digits = 1 + math.floor(math.log10(value))
+    return f"{round(value, FIGURES - digits):.{max(FIGURES - digits, 0)}f}"
+
+
+def _percent(chance: float | None) -> str:
+    if chance is None:
+        return "no number"
+    return "below 1 %" if chance < 0.01 else f"{100.0 * min(chance, 0.99):.0f} %"
+
+
+def _date(prognosis: Prognosis, left: RemainingLife) -> str | None:
+    return None if left.median is None else prognosis.date_after(left.median)
+
+
+def named_levels(prognosis: Prognosis) -> list[tuple[str, float]]:
+    """Levels with their names."""
+    return list(zip(LEVEL_NAMES, prognosis.levels, strict=True))
+
+
+def prognosis_tree(prognosis: Prognosis, before: tuple[str, float] | None = None) -> dict[str, Any]:
+    """Return a prognosis as a JSON object.
+
+    Parameters
+    ----------
+    prognosis : Prognosis
+        What the history says.
+    before : tuple[str, float] | None
+        The next inspection: as it was named, and hours, cycles or days until it.
+
+    Returns
+    -------
+    dict[str, Any]
+        Plain values, null where there is no number.
+    """
+    first = prognosis.first()
+    return {
+        "schema": PROGNOSIS_SCHEMA,
+        "serial": prognosis.serial,
+        "actuator": prognosis.actuator,
+        "unit": prognosis.unit,
+        "diagnoses": prognosis.diagnoses,
+        "used": prognosis.used,
+        "seed": prognosis.seed,
+        "first": first and first[0].name,
+        "per_day": prognosis.per_day,
+        "before": before and before[0],
+        "chance_before": before and prognosis.chance_within(before[1]),
+        "severities": {
+            item.name: {
+                "at": item.at,
+                "estimate": item.value,
+                "diagnoses": item.diagnoses,
+                "fleet": item.fleet,
+                "weights": item.weights,
+                "note": item.note or None,
+                "alarm": item.alarm or None,
+                "remaining": {
+                    name: {
+                        "level": left.level,
+                        "median": left.median,
+                        "interval80": None if left.median is None else [left.low, left.high],
+                        "date": _date(prognosis, left),
+                        "chance_before": before and left.chance_within(before[1]),
+                        "why": left.why or None,
+                    }
+                    for name, left in zip(LEVEL_NAMES, item.remaining, strict=True)
+                },
+            }
+            for item in prognosis.forecasts
+        },
+    }
+
+
+def _wear_text(item: Forecast) -> str:
+    if not item.weights:
+        return "-"
+    lives = f"{item.fleet} other li{'fe' if item.fleet == 1 else 'ves'}"
+    return f"mostly {item.process}, {item.diagnoses} diagnoses, {lives}"

@@ -1,0 +1,166 @@
+"""Pictures and pages of a result as bytes; matplotlib and bokeh are loaded only when needed.
+
+A working folder's matplotlib settings and fonts are not used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from ehadiag.assess.verdict import Levels
+
+if TYPE_CHECKING:
+    from ehadiag.calibration.unit_models import Calibrated
+    from ehadiag.report.picture import Picture
+    from ehadiag.report.report_pages import UnitTrend
+    from ehadiag.result import Result
+
+__all__ = [
+    "calibration_html_page",
+    "diagnosis_html_page",
+    "diagnosis_png",
+    "index_html_page",
+    "isolated_png",
+]
+
+
+@contextlib.contextmanager
+def _isolated_matplotlib() -> Iterator[None]:
+    """Load matplotlib in a folder of its own.
+
+    It reads `matplotlibrc` in the working folder, which may be anybody's, and keeps a list of fonts
+    in a folder that need not be safe either.
+    """
+    import tempfile  # noqa: PLC0415
+
+    from firmware_iface.files import private_folder  # noqa: PLC0415
+
+    if "matplotlib" in sys.modules:
+        yield
+        return
+    with contextlib.ExitStack() as stack:
+        own = private_folder("matplotlib")
+        if own is None:
+            place = stack.enter_context(tempfile.TemporaryDirectory(prefix="ehadiag-"))
+        else:
+            stack.enter_context(own)
+            place = str(own.path)
+        os.environ.setdefault("MPLCONFIGDIR", place)
+        with contextlib.suppress(OSError):
+            stack.enter_context(contextlib.chdir(place))
+        yield
+
+
+def diagnosis_png(result: Result) -> bytes:
+    """Return the picture of a result as a PNG; see `Result.can_be_drawn`."""
+    from ehadiag.report.response_signals import result_picture  # noqa: PLC0415
+
+    return isolated_png(result_picture(result))
+
+
+def isolated_png(picture: Picture) -> bytes:
+    """Return a picture as a PNG; matplotlib is loaded in a folder of its own."""
+    with _isolated_matplotlib():
+        from ehadiag.report.matplotlib_figures import picture_png  # noqa: PLC0415 - slow
+
+    return picture_png(picture)
+
+
+def diagnosis_html_page(result: Result, levels: Levels, history: Path | None) -> bytes:
+    """Return the page of a result, with its trend where there is a history, as UTF-8.
+
+    Responses are drawn where the result's diagnosis is at hand.
+    """
+    from ehadiag.history.records import current_utc_text  # noqa: PLC0415
+    from ehadiag.report.report_pages import diagnosis_page  # noqa: PLC0415 - bokeh is slow
+
+    trend = None if history is None else _unit_trend(result, levels, history)
+    page = diagnosis_page(result, levels, version("ehadiag"), current_utc_text(), trend)
+    return page.encode("utf-8", errors="backslashreplace")
+
+
+def index_html_page(
+    results: Sequence[tuple[Result, Path]], place: Path, levels: Levels, history: Path | None
+) -> bytes:
+    """Return a page with a line for each result and a link to its report, as UTF-8.
+
+    Parameters
+    ----------
+    results : Sequence[tuple[Result, Path]]
+        Results with the files of their reports.
+    place : Path
+        Where the page goes; links are relative to it.
+    levels : Levels
+        Advisory level and limit.
+    history : Path | None
+        Health history, for trends and remaining life; None: none is drawn.
+
+    Returns
+    -------
+    bytes
+        HTML.
+    """
+    from ehadiag.report.fleet_table import FLEET_HEAD, FleetUnit, fleet_rows  # noqa: PLC0415
+    from ehadiag.report.head import verdict_word  # noqa: PLC0415
+    from ehadiag.report.page_parts import templates_of  # noqa: PLC0415 - bokeh is slow
+
+    units = []
+    for result, page in results:
+        trend = None if history is None else _unit_trend(result, levels, history)
+        past = [
+            max(item.estimate or 0.0 for item in entry.severities)
+            for entry in (trend.entries if trend else ())
+            if entry.severities
+        ]
+        link = quote(os.path.relpath(page, place.parent).replace(os.sep, "/"))
+        units.append(
+            FleetUnit(
+                serial=result.serial,
+                actuator=result.actuator,
+                verdict=result.verdict.name,
+                word=verdict_word(result),
+                severities=tuple(result.severities.values()),
+                past=past,
+                tested=result.date or "",
+                link=link,
+                report=link,
+                prognosis=trend.prognosis if trend else None,
+            )
+        )
+    template = templates_of("ehadiag.report").get_template("index.html.j2")
+    page_text = template.render(head=FLEET_HEAD, rows=fleet_rows(units, levels))
+    return page_text.encode("utf-8", errors="backslashreplace")
+
+
+def calibration_html_page(found: Calibrated) -> bytes:
+    """Return the page of a calibration as UTF-8."""
+    from ehadiag.history.records import current_utc_text  # noqa: PLC0415
+    from ehadiag.report.report_pages import calibration_page  # noqa: PLC0415 - bokeh is slow
+
+    page = calibration_page(found, version("ehadiag"), current_utc_text())
+    return page.encode("utf-8", errors="backslashreplace")
+
+
+def _unit_trend(result: Result, levels: Levels, place: Path) -> UnitTrend | None:
+    from ehadiag.history.records import counted_entries  # noqa: PLC0415
+    from ehadiag.history.store import History  # noqa: PLC0415
+    from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415
+    from ehadiag.report.report_pages import UnitTrend  # noqa: PLC0415
+
+    serial = result.serial
+    if serial is None or not place.exists():
+        return None
+    with History(place) as history:
+        entries, events = history.alike(serial)
+    mine = counted_entries([item for item in entries if item.serial == serial])
+    if not mine:
+        return None
+    future = prognosis_of(serial, entries, events, (levels.advisory, levels.limit))
+    return UnitTrend(mine, [item for item in events if item.serial == serial], future)

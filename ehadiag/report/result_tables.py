@@ -1,0 +1,497 @@
+"""Tables and JSON objects of results: diagnosis, calibration, score of a test.
+
+The JSON of a diagnosis is made in `ehadiag.result`; the other three are small and stand beside
+their tables.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ehadiag.assess.verdict import Levels
+from ehadiag.core.conventions import display_unit
+from ehadiag.estimate import AT_BOUND, NOT_SHOWN
+from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
+from ehadiag.report.head import head_of, percent
+from firmware_iface.errors import printable, valid_text
+
+if TYPE_CHECKING:
+    from ehadiag.calibration.unit_models import Calibrated, CalibratedValue
+    from ehadiag.design.score import Bound, Score
+    from ehadiag.estimate import Effect, Severity
+    from ehadiag.report.head import Bar, Head
+    from ehadiag.result import Onboard, Result
+    from firmware_iface.stored_test import StoredTest
+
+__all__ = [
+    "CALIBRATION_SCHEMA",
+    "DESIGN_SCHEMA",
+    "calibration_json",
+    "diagnosis_html",
+    "diagnosis_text",
+    "print_calibration",
+    "print_result",
+    "print_score",
+    "score_tree",
+]
+
+
+STATE_STYLES = {
+    "HEALTHY": "bold green",
+    "DEGRADED": "bold yellow",
+    "FAULT": "bold red",
+    "NOT_TESTED": "bold magenta",
+}
+TEXT_COLUMNS = 10_000
+"""Columns of a text that no terminal bounds: nothing of ours is cut."""
+MAX_BAR_COLUMNS = 48
+"""Columns of a severity's bar; 2 % each."""
+FLAG_REMARKS = {AT_BOUND: "at its bound", NOT_SHOWN: "not shown by the test"}
+"""What the table says of a severity's flags."""
+
+
+def diagnosis_text(result: Result, *, verbose: bool = False) -> str:
+    """Return a result as plain lines of text, the last one without its end."""
+    console = Console(
+        file=io.StringIO(), width=TEXT_COLUMNS, highlight=False, record=True, force_jupyter=False
+    )
+    print_result(result, console, verbose=verbose)
+    return "\n".join(line.rstrip() for line in console.export_text().splitlines())
+
+
+def diagnosis_html(result: Result) -> str:
+    """Return a result as a piece of HTML for a notebook, its text escaped."""
+    from ehadiag.report.page_parts import templates_of  # noqa: PLC0415 - bokeh is slow
+
+    head = head_of(result, Levels(result.request.advisory, result.request.limit))
+    template = templates_of("ehadiag.report").get_template("notebook.html.j2")
+    severities = [result.severities[bar.symbol] for bar in head.bars]
+    return template.render(head=head, severities=severities, percent=percent)
+
+
+def print_result(result: Result, console: Console, *, verbose: bool = False) -> None:
+    """Print a result: its head, then the numbers.
+
+    Parameters
+    ----------
+    result : Result
+        What was found.
+    console : Console
+        Console to print to.
+    verbose : bool
+        The course of the search, reasons in terms of the field, and every effect that was
+        estimated, not only those that are not 0 beyond doubt.
+    """
+    head = head_of(result, Levels(result.request.advisory, result.request.limit))
+    _print_head(head, result, console)
+    if verbose:
+        for reason in result.reasons:
+            _line(console, f"- {reason}")
+    for line in result.culprit.lines if result.culprit else ():
+        _line(console, f"  {line}")
+    if result.identified:
+        console.print(_severities([result.severities[bar.symbol] for bar in head.bars]), crop=False)
+    if result.identified and verbose:
+        for name in ("first", "search"):
+            values = (f"{k} {_number(getattr(v, name), 4)}" for k, v in result.severities.items())
+            _line(console, f"after the {name}: {', '.join(values)}")
+    onboard = result.origins[0].onboard if len(result.origins) == 1 else None
+    if onboard is not None:
+        _line(console, _on_board(onboard, result))
+    if result.other:
+        console.print(_limited(result), crop=False)
+    effects = [item for item in result.effects if verbose or _is_shown(item)]
+    effects = [item for item in effects if item.limit is None]
+    if effects:
+        _line(console, f"also estimated: {', '.join(map(_size, effects))}")
+    _line(console, _quality_text(result))
+    for note in result.notes:
+        _line(console, f"note: {note}")
+    if result.identified:
+        _line(console, _effort_text(result))
+
+
+def _print_head(head: Head, result: Result, console: Console) -> None:
+    indent = " " * (len(head.word) + 2)
+    first, *rest = head.sentences or ("",)
+    lines = _wrapped(first, console, len(indent))
+    text = Text(head.word, style=STATE_STYLES[head.verdict])
+    text.append(f"  {lines[0]}", style="not bold default")
+    console.print(text, soft_wrap=True)
+    for sentence in ("\n".join(lines[1:]), *rest):
+        for line in _wrapped(sentence, console, len(indent)) if sentence else ():
+            console.print(indent + line, soft_wrap=True)
+    for reason in head.reasons:
+        for item in reason.evidence:
+            _line(console, f"- {item}")
+        if reason.action:
+            _line(console, f"→ {reason.action}" if _unicode(console) else f"> {reason.action}")
+    facts = ", ".join(f"{label} {printable(value)}" for label, value in head.facts)
+    _line(console, facts)
+    _line(console, f"recording {printable(result.source)}")
+    if result.identified:
+        for bar in head.bars:
+            console.print(_bar(bar, head, console), soft_wrap=True)
+        levels = f"marks at | advisory {percent(head.advisory)}, | limit {percent(head.limit)}"
+        start = max(min(27, console.width - len(levels)), 0)
+        console.print(" " * start + levels, soft_wrap=True)
+
+
+def _bar(bar: Bar, head: Head, console: Console) -> Text:
+    """Draw a severity: plain name, percent, bar with a mark at each level."""
+    length = max(min(console.width - 30, MAX_BAR_COLUMNS), 8)
+    full, empty = ("█", "·") if _unicode(console) else ("#", ".")
+    value = bar.value or 0.0
+    done = round(min(value, 1.0) * length)
+    cells = [full] * done + [empty] * (length - done)
+    for level in (head.advisory, head.limit):
+        cells[min(round(level * length), length - 1)] = "|"
+    known = "unknown" if bar.value is None else percent(bar.value, head.advisory, head.limit)
+    text = Text(f"  {bar.name:16}{known:>8} ")
+    text.append("".join(cells), style=STATE_STYLES.get(bar.state, "magenta"))
+    return text
+
+
+def _unicode(console: Console) -> bool:
+    return (console.encoding or "utf-8").lower().startswith("utf")
+
+
+def _wrapped(text: str, console: Console, indent: int) -> list[str]:
+    """Break a text between words, for what is left of a line."""
+    width = max(console.width - indent, 20)
+    plain = printable(text.replace("\n", " "))
+    return textwrap.wrap(plain, width, break_long_words=False, break_on_hyphens=False) or [""]
+
+
+def _line(console: Console, text: str) -> None:
+    """Print a line as it is: what others named is neither markup nor a terminal's command."""
+    for number, line in enumerate(_wrapped(text, console, 4)):
+        indent = "    " if number else "  "
+        console.print(f"{indent}{line}", soft_wrap=True, highlight=False, markup=False, emoji=False)
+
+
+def _severities(severities: Sequence[Severity]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 1))
+    table.add_column("severity", no_wrap=True)
+    for name in ("estimate", "std", "95 % interval"):
+        table.add_column(name, justify="right", no_wrap=True)
+    remarked = any(item.flags for item in severities)
+    if remarked:
+        table.add_column("", no_wrap=True)
+    for item in severities:
+        low, high = item.interval
+        table.add_row(
+            item.name,
+            _number(item.estimate, 5),
+            _number(item.std, 5),
+            f"{low:.5f} … {high:.5f}",
+            *([", ".join(FLAG_REMARKS[flag] for flag in item.flags)] if remarked else []),
+        )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "nan" if value is None else f"{value:.{digits}f}"
+
+
+def _limited(result: Result) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    table.add_column("effect", no_wrap=True)
+    for name in ("estimate", "std", "95 % interval", "limit"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for item in result.other:
+        low, high = item.interval95 or (math.nan, math.nan)
+        table.add_row(
+            item.meaning,
+            f"{item.shown(_known(item.value)):.4g} {item.shown_unit}",
+            f"{item.shown(_known(item.std)):.2g}",
+            f"{item.shown(low):.4g} … {item.shown(high):.4g}",
+            f"{item.shown(_known(item.limit)):.3g} {item.shown_unit}",
+            "beyond its limit" if item.beyond else "",
+        )
+    return table
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _is_shown(item: Effect) -> bool:
+    """Whether an effect is told unasked: no offset, which the fit has, nor what was learned."""
+    offsets = {offset.name for offset in SENSOR_OFFSETS}
+    return item.significant and item.name not in offsets and item.source != "calibration"
+
+
+def _size(item: Effect) -> str:
+    value, std = item.shown(_known(item.value)), item.shown(_known(item.std))
+    return f"{item.meaning} {value:.4g} ± {std:.2g} {item.shown_unit}"
+
+
+def _on_board(found: Onboard, result: Result) -> str:
+    """What the flight-control computer found, beside what was found here."""
+    parts = [f"on board: {(found.verdict or 'no verdict').replace('_', ' ')}"]
+    parts += [
+        f"{name} {_known(item.estimate):.7f} ± {_known(item.std):.7f}"
+        for name, item in found.faults.items()
+    ]
+    if found.evaluations is not None:
+        parts.append(f"{found.evaluations} model runs")
+    apart = [
+        abs(item.estimate - own.value) / item.std
+        for name, item in found.faults.items()
+        if item.estimate is not None and item.std
+        if (own := result.severities.get(name)) is not None and own.estimate is not None
+    ]
+    if apart:
+        parts.append(f"at most {max(apart):.2f} of its deviations from what was found here")
+    return ", ".join(parts)
+
+
+def _quality_text(result: Result) -> str:
+    item = result.quality
+    if item is None:
+        return "no frames"
+    return (
+        f"frames {item.frames}, lost {item.lost}, repeated {item.repeated}, "
+        f"conflicts {item.conflicts}, CRC errors {item.crc_errors}"
+    )
+
+
+def _effort_text(result: Result) -> str:
+    fit, timing, search = result.fit, result.timing_s, result.search
+    assert fit is not None
+    assert timing is not None
+    took = f"{timing.total - timing.read:.2f} s"
+    if timing.after_test is not None:
+        took = f"{timing.after_test:.2f} s after the test"
+    return (
+        f"residual rms spool {_known(fit.spool_rms):.2f}, pressure {_known(fit.pressure_rms):.2f} "
+        f"of the noise, {_known(fit.outliers):.2%} outliers; solver {search.name}, "
+        f"seed {search.seed}, {search.evaluations} model runs, {took}"
+    )
+
+
+CALIBRATION_SCHEMA = "ehadiag.calibration/1"
+
+
+def calibration_json(found: Calibrated) -> str:
+    """Return one line without its end, strict JSON.
+
+    Parameters
+    ----------
+    found : Calibrated
+        What was learned, or why nothing.
+
+    Returns
+    -------
+    str
+        The object (docs/reference/json.md).
+    """
+    unit = found.actuator
+    calibration = unit.calibration if unit else None
+    tree: dict[str, Any] = {
+        "schema": CALIBRATION_SCHEMA,
+        "sources": [valid_text(item.source) for item in found.recordings],
+        "tests": [item.name if item else None for item in found.tests],
+        "actuator": found.start.name,
+        "serial": calibration.serial if calibration else None,
+        "calibrated": unit is not None,
+        "reasons": [valid_text(reason) for reason in found.reasons],
+        "notes": [valid_text(note) for note in found.notes],
+        "severities": {
+            item.name: {"estimate": item.value, "std": item.std} for item in found.severities
+        },
+        "values": {
+            item.name: {
+                "symbol": item.symbol,
+                "start": item.start,
+                "value": item.value,
+                "std": item.std,
+                "shown": item.shown,
+            }
+            for item in found.values
+        },
+        "models": [
+            {"model": item.words, "excess": item.excess, "criterion": item.criterion}
+            for item in found.tried
+        ],
+        "second_stage": unit.second_stage.kind if unit else None,
+        "plays": calibration.plays if calibration else None,
+        "fit": (
+            {
+                "excess": calibration.fit.excess,
+                "outliers": calibration.fit.outliers,
+                "spool_rms": calibration.fit.spool_rms,
+                "pressure_rms": calibration.fit.pressure_rms,
+            }
+            if calibration
+            else None
+        ),
+        "seed": found.seed,
+        "evaluations": found.evaluations,
+        "elapsed_s": round(found.elapsed, 3),
+    }
+    return json.dumps(tree, allow_nan=False)
+
+
+def print_calibration(found: Calibrated, console: Console) -> None:
+    """Print a calibration.
+
+    Parameters
+    ----------
+    found : Calibrated
+        What was learned, or why nothing.
+    console : Console
+        Console to print to.
+    """
+    unit = found.actuator
+    calibration = unit.calibration if unit else None
+    head = "CALIBRATED" if unit else "NOT CALIBRATED"
+    names = " + ".join(printable(item.source) for item in found.recordings)
+    console.print(head, style="bold green" if unit else "bold magenta", end="")
+    console.print(f"  {names}", soft_wrap=True, highlight=False, markup=False, emoji=False)
+    serial = (
+        ""
+        if calibration is None or calibration.serial is None
+        else f", serial {calibration.serial}"
+    )
+    _line(console, f"actuator {found.start.name}{serial}")
+    for reason in found.reasons:
+        _line(console, f"- {reason}")
+    if found.severities:
+        words = ", ".join(
+            f"{item.name} {item.value:.4f} ± {item.std:.4f}" for item in found.severities
+        )
+        _line(console, f"severities that the recordings show: {words}")
+    if found.values:
+        console.print(_calibrated_values(found.values), crop=False)
+    if len(found.tried) > 1:
+        console.print(_compared_models(found), crop=False)
+    for note in found.notes:
+        _line(console, f"note: {note}")
+    if calibration is not None:
+        fit = calibration.fit
+        _line(
+            console,
+            f"residuals {fit.excess:.2f} times the noise, rms spool {fit.spool_rms:.2f}, pressure "
+            f"{fit.pressure_rms:.2f} of it, {fit.outliers:.2%} outliers; seed {found.seed}, "
+            f"{found.evaluations} model runs, {found.elapsed:.1f} s",
+        )
+
+
+def _calibrated_values(values: tuple[CalibratedValue, ...]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    table.add_column("learned", no_wrap=True)
+    for name in ("start", "value", "std", "unit"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for item in values:
+        factor, unit = display_unit(item.unit, max(abs(item.start), abs(item.value)))
+        table.add_row(
+            item.symbol,
+            f"{item.start * factor:.6g}",
+            f"{item.value * factor:.6g}",
+            f"{item.std * factor:.2g}",
+            unit,
+            item.meaning
+            + ("" if item.shown else ", hardly shown: little more is known than before"),
+        )
+    return table
+
+
+def _compared_models(found: Calibrated) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
+    table.add_column("model", no_wrap=True)
+    for name in ("residuals / noise", "evidence against it (BIC)"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for item in found.tried:
+        table.add_row(item.words, f"{item.excess:.2f}", f"{item.criterion:.0f}")
+    return table
+
+
+DESIGN_SCHEMA = "ehadiag.design/1"
+
+
+def print_score(test: StoredTest, score: Score, console: Console) -> None:
+    """Print what a test shows and asks.
+
+    Parameters
+    ----------
+    test : StoredTest
+    score : Score
+    console : Console
+    """
+    console.print(
+        f"test {printable(test.name)}: {100.0 * score.figure:.4f} % "
+        "(geometric mean of all bounds; less is better)"
+    )
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 2))
+    table.add_column("severities")
+    for item in FAULTS:
+        table.add_column(f"{item.name}, %", justify="right")
+    for item in FAULTS:
+        table.add_column(f"{item.name} alone, %", justify="right")
+    table.add_column("hardly told apart")
+    for bound in score.bounds:
+        table.add_row(
+            " ".join(f"{value:g}" for value in bound.severities),
+            *(f"{100.0 * value:.4f}" for value in (*bound.std, *bound.alone)),
+            ", ".join(f"{a} from {b} ({r:+.2f})" for a, b, r in bound.alike) or "-",
+        )
+    console.print(table, crop=False)
+    unseen = sorted({name for bound in score.bounds for name in bound.unseen})
+    if unseen:
+        console.print(f"  not shown by the test: {', '.join(unseen)}")
+    console.print(
+        f"  travel {1e3 * score.travel:.1f} mm, rate {1e3 * score.rate:.0f} mm/s, "
+        f"pressure {1e-6 * score.pressure:.1f} MPa, duration {test.duration:g} s"
+    )
+
+
+def score_tree(test: StoredTest, score: Score) -> dict[str, Any]:
+    """Return the same as an object of plain values, SI.
+
+    Parameters
+    ----------
+    test : StoredTest
+        The test.
+    score : Score
+        What it shows.
+
+    Returns
+    -------
+    dict[str, Any]
+        For JSON.
+    """
+    return {
+        "test": test.name,
+        "figure": score.figure,
+        "travel_m": score.travel,
+        "rate_m_per_s": score.rate,
+        "pressure_Pa": score.pressure,
+        "duration_s": test.duration,
+        "bounds": [_bound_tree(item) for item in score.bounds],
+    }
+
+
+def _bound_tree(bound: Bound) -> dict[str, Any]:
+    names = [item.name for item in FAULTS]
+    return {
+        "severities": dict(zip(names, bound.severities, strict=True)),
+        "std": dict(zip(names, bound.std.tolist(), strict=True)),
+        "std_alone": dict(zip(names, bound.alone.tolist(), strict=True)),
+        "hardly_told_apart": [
+            {"severity": a, "from": b, "correlation": r} for a, b, r in bound.alike
+        ],
+        "not_shown": list(bound.unseen),
+    }

@@ -1,0 +1,142 @@
+"""Describes the pictures of a unit's health history and of the channels on a bus."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import datetime
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ehadiag.core.conversion import Conversion
+from ehadiag.history.records import Entry, MaintenanceEvent
+from ehadiag.report.picture import (
+    Area,
+    Curve,
+    Panel,
+    Picture,
+    PictureColumn,
+    ReferenceLine,
+)
+from firmware_iface.errors import printable
+from firmware_iface.recording import CommandMode, Samples
+
+if TYPE_CHECKING:
+    from ehadiag.prognosis.forecast import Forecast
+    from ehadiag.prognosis.units import Prognosis
+
+__all__ = ["bus_picture", "history_picture", "trend_column"]
+
+
+def history_picture(
+    entries: Sequence[Entry], events: Sequence[MaintenanceEvent], prognosis: Prognosis
+) -> Picture:
+    """Describe one unit's history over the prognosis' unit, else over time.
+
+    At least one of the entries has severities.
+    """
+    column = trend_column(entries, events, prognosis, numbered=False)
+    return Picture(f"{printable(entries[-1].actuator)}, serial {entries[-1].serial}", (column,))
+
+
+def trend_column(
+    entries: Sequence[Entry],
+    events: Sequence[MaintenanceEvent],
+    prognosis: Prognosis,
+    *,
+    numbered: bool = True,
+) -> PictureColumn:
+    """Describe a unit's severities over hours or cycles, where the prognosis uses them, else time.
+
+    Entries without hours (or cycles) are left out. Both levels are drawn, and of each forecast the
+    median and the 80 % interval. Curves are broken at events, which are marked by their numbers
+    from 1, or by their texts.
+    """
+    unit = prognosis.unit if prognosis.used else None
+    levels = prognosis.levels
+    changes = [(at, item) for item in events if (at := _abscissa(item, unit)) is not None]
+    placed = [(at, item) for item in entries if (at := _abscissa(item, unit)) is not None]
+    placed.sort(key=lambda pair: pair[0])
+    names = dict.fromkeys(item.name for entry in entries for item in entry.severities)
+    curves, low, high = [], 0.0, max(0.05, *levels, 0.0)
+    for index, name in enumerate(names):
+        rows = [
+            (at, item.estimate, *item.interval95)
+            for at, entry in placed
+            for item in entry.severities
+            if item.name == name and item.estimate is not None and item.interval95 is not None
+        ]
+        if rows:
+            rows += [(at, *3 * (math.nan,)) for at, _ in changes]
+            x, y, lows, highs = np.array(sorted(rows, key=itemgetter(0)), dtype=np.float64).T
+            curves.append(Curve(name, f"severity {index % 3}", y, x, lows, highs))
+            low, high = min(low, np.nanmin(lows)), max(high, np.nanmax(highs))
+    lines = [
+        ReferenceLine(level, role, role)
+        for level, role in zip(levels, ("advisory", "limit"), strict=True)
+    ]
+    numbers = {id(event): number for number, event in enumerate(events, start=1)}
+    lines += [
+        ReferenceLine(
+            at, "event", str(numbers[id(event)]) if numbered else printable(event.text)[:40],
+            upright=True,
+        )
+        for at, event in changes
+    ]  # fmt: skip
+    fans = [_fan(item, f"forecast {list(names).index(item.name) % 3}")
+            for item in prognosis.forecasts if unit is not None and item.name in names]  # fmt: skip
+    areas = tuple(area for fan in fans for area in fan[0])
+    curves += [curve for fan in fans for curve in fan[1]]
+    panel = Panel(
+        "severity, 95 % interval", "", np.array([at for at, _ in placed]), tuple(curves),
+        lines=tuple(lines), areas=areas, y_range=(low - 0.02 * high, 1.05 * high),
+    )  # fmt: skip
+    return PictureColumn("", (panel,), unit or "time", dates=unit is None)
+
+
+def _fan(item: Forecast, role: str) -> tuple[list[Area], list[Curve]]:
+    """Area and median of a forecast, from the newest diagnosis to each level; none without one."""
+    ahead = [
+        (left.median, left.low, left.high, left.level)
+        for left in item.remaining
+        if left.median is not None
+        and left.low is not None
+        and left.high is not None
+        and math.isfinite(left.high)
+        and left.high > 0.0
+    ]
+    if not ahead or item.at is None or item.value is None:
+        return [], []
+    medians, lows, highs, levels = np.array([(0.0, 0.0, 0.0, item.value), *ahead]).T
+    border = np.concatenate([lows, highs[::-1]])
+    area = Area(role, item.at + border, np.concatenate([levels, levels[::-1]]))
+    return [area], [Curve(f"{item.name}, forecast", role, levels, item.at + medians)]
+
+
+def _abscissa(item: Entry | MaintenanceEvent, unit: str | None) -> float | None:
+    if unit is None:
+        return datetime.fromisoformat(item.when).timestamp()
+    return item.usage.amount(unit)
+
+
+def bus_picture(samples: Samples, conversion: Conversion, title: str) -> Picture:
+    """Describe each channel, with the command of the commanded one and samples at range ends."""
+    commanded = "position" if samples.mode is CommandMode.POSITION else "current"
+    panels = []
+    for channel, saturated in zip(conversion.channels, conversion.saturated, strict=True):
+        values = np.asarray(getattr(samples, channel.name)) / channel.per_unit
+        curves = [Curve("measured", "signal", values)]
+        if channel.name == commanded and np.isfinite(samples.command).any():
+            curves.append(Curve("command", "command", samples.command / channel.per_unit))
+        if saturated.any():
+            label = f"at the converter's end ({int(saturated.sum())})"
+            at = np.flatnonzero(saturated)
+            at = at[:: 1 + len(at) // 4000]
+            curves.append(Curve(label, "saturated", values[at], samples.time[at]))
+        full_scale = channel.full_scale / channel.per_unit
+        panels.append(
+            Panel(channel.name, channel.unit, samples.time, tuple(curves), full_scale=full_scale)
+        )
+    return Picture(printable(title), (PictureColumn("", tuple(panels), "time, s"),))

@@ -1,0 +1,314 @@
+"""A built-in test on a bus: requested or awaited, recorded, identified meanwhile, diagnosed."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from ehadiag.core.actuator import Actuator
+from ehadiag.live import Snapshot, publish
+from ehadiag.session.bit_session import BitView, EarlyIdentification, early_identification
+from ehadiag.setup import Deadline, Setup, log_of
+from firmware_iface.bus_map import BusMap
+from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name
+from firmware_iface.files import unused_path
+from firmware_iface.recording import BitOutcome, Environment, Quality, Recording
+from firmware_iface.stored_test import RATE_TOLERANCE, StoredTest
+
+if TYPE_CHECKING:
+    from ehadiag.result import Result
+    from ehadiag.session.monitor_session import BitMonitor
+    from firmware_iface.handshake import ChannelLimits
+    from firmware_iface.logs.recorder import Recorder
+    from firmware_iface.tester import BitProgress, RequestOutcome
+    from firmware_iface.transport.base import Transport
+    from firmware_iface.transport.frames import Frame
+
+STOPPED_REASON = "stopped by the user"
+STOPPED_TWICE_REASON = "stopped by the user; the abort was requested, its answer not waited for"
+
+Connection = AbstractContextManager[tuple["Transport", "Recorder | None"]]
+"""Opens a bus and the recording of its frames; the test closes the recording."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BitSettings:
+    """How a test is run."""
+
+    transmit: bool
+    """Whether the test is requested; otherwise one that somebody else starts is awaited."""
+    limits: ChannelLimits | None = None
+    """Values beyond which the test is aborted; None: none."""
+    onboard_wait_s: float = 0.0
+    """Time after the test in which the computer's own result is awaited, s."""
+    bitrate: float | None = None
+    """Of the bus, bit/s; None: unknown."""
+    own_fault: Callable[[], str] = str
+    """Says after an incomplete test why this computer is the cause; empty where it is not."""
+
+
+class BitTest:
+    """One test of one actuator: `acquire`, then `diagnose`, within the context.
+
+    setup: actuator, bus and options; its one test is run; settings: how the test is run; monitor:
+    monitors the unit during the test; None: there are no residuals; progress: called with the stage
+    and the share of it that is done, 0 … 1; snapshots: called four times a second while the bus is
+    open and until the verdict, in a thread of its own.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        settings: BitSettings,
+        *,
+        monitor: BitMonitor | None = None,
+        progress: Callable[[str, float], None] | None = None,
+        snapshots: Callable[[Snapshot], None] | None = None,
+    ) -> None:
+        from ehadiag.identify.identification_session import warm_up  # noqa: PLC0415 - loads numba
+
+        assert setup.default is not None
+        self.setup, self.test, self._settings = setup, setup.default, settings
+        self._progress, self._snapshots = progress, snapshots
+        # Before the test: a verdict must not wait for the compiler.
+        warm_up(setup.actuator, self.test)
+        self._begin = time.perf_counter()
+        self._session = setup.session([self.test])
+        self._view = BitView(setup.actuator, self.test, self._session, settings.bitrate, monitor)
+        self._published = ExitStack()
+        self._recording: Recording | None = None
+        self._why = ""
+        self._ended_at: float | None = None
+        self._read_s = 0.0
+        self._deadline = Deadline(math.inf)
+        self.interrupted = False
+        """Whether KeyboardInterrupt ended the acquisition or the diagnosis."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._published.close()
+
+    def acquire(self, connection: Connection, source: str, stop: threading.Event) -> None:
+        """Run the test on a bus, or wait for it; the recording is closed at the end.
+
+        connection: bus and recording; entered here; source: name of the recording; stop: when set,
+        the abort is requested. KeyboardInterrupt does not wait for its answer. EhadiagError: bus or
+        recording cannot be opened, nothing may be sent on the bus.
+        """
+        from firmware_iface.tester import Assembler, run_test  # noqa: PLC0415 - loads python-can
+
+        setup, settings, view, test = self.setup, self._settings, self._view, self.test
+        assembler = Assembler(source, setup.bus_map)
+        outcome, why, listened, bus = None, STOPPED_REASON, 0.0, ""
+        with early_identification(self._session, assembler, test) as ahead:
+
+            def on_progress(progress: BitProgress) -> None:
+                ahead.watch(progress)
+                view.progress(progress)
+                self._report(f"test {test.name}", min(progress.elapsed / test.duration, 1.0))
+
+            def on_frame(frame: Frame) -> None:
+                assembler.add(frame)
+                view.take(frame)
+
+            try:
+                with connection as (transport, recorder):
+                    bus = transport.name
+                    self._publish(transport)
+                    began = time.monotonic()
+                    # From here on a second signal does not wait for the answer to the abort.
+                    why = STOPPED_TWICE_REASON if settings.transmit else STOPPED_REASON
+                    try:
+                        outcome = run_test(
+                            transport,
+                            test_id=test.id,
+                            duration=test.duration,
+                            transmit=settings.transmit,
+                            recorder=recorder,
+                            bus_map=setup.bus_map,
+                            limits=settings.limits,
+                            on_frame=on_frame,
+                            stop=stop,
+                            progress=on_progress,
+                            all_there=ahead.all_there,
+                            onboard_wait=settings.onboard_wait_s,
+                        )
+                    except InputOutputError as error:  # of the recording; the abort was requested
+                        why = str(error)
+                    listened = time.monotonic() - began
+            except KeyboardInterrupt:
+                self.interrupted = True
+            self._deadline = Deadline(setup.request.time_limit_s or math.inf)
+            if ahead.complete_recording is not None:
+                recording = ahead.complete_recording
+            elif len(assembler):
+                recording = assembler.recording()
+            else:
+                state = BitOutcome() if outcome is None else outcome.outcome
+                recording = Recording(source, None, None, None, state, Environment(), Quality())
+            if outcome is not None:
+                recording = _with_outcome(recording, outcome)
+                why = outcome.why
+                if outcome.degraded:
+                    view.notes = (outcome.degraded,)
+            if outcome is None or not outcome.complete:
+                ahead.abandon()
+            if outcome is not None and not outcome.complete:
+                why = settings.own_fault() or why + _traffic_text(recording, bus, listened)
+            elif outcome is not None and not _finish_identification(ahead, self._deadline, stop):
+                ahead.abandon()
+                passed = self._deadline.passed
+                why = self._deadline.reason("work ahead") if passed else STOPPED_REASON
+        self._recording, self._why = setup.labelled(recording), why
+        self._ended_at = ahead.ended_at
+        self._read_s = time.perf_counter() - self._begin
+
+    def diagnose(self, stop: threading.Event) -> Result:
+        """Return the result of the acquired test; NOT TESTED after a stop."""
+        assert self._recording is not None
+        recordings, why, source = [self._recording], self._why, self._recording.source
+        recorded = log_of(source)
+        origin: Any = {
+            "files": [source] if recorded else [],
+            "logs": [recorded],
+            "read_s": self._read_s,
+            "ended_at": self._ended_at,
+        }
+        result = None
+        if stop.is_set() and not why:
+            why = STOPPED_REASON
+        if not why:
+            try:
+                result = self.setup.diagnose(
+                    recordings,
+                    session=self._session,
+                    deadline=self._deadline,
+                    progress=self._report_stage,
+                    **origin,
+                )
+            except KeyboardInterrupt:
+                self.interrupted, why = True, STOPPED_REASON
+        if result is None:
+            result = self.setup.not_tested(recordings, why, **origin)
+        self._view.ended(result)
+        self._published.close()
+        return result
+
+    def _publish(self, transport: Transport) -> None:
+        self._view.connected(transport)
+        if self._snapshots is not None:
+            self._published.enter_context(publish(self._view.look, self._snapshots))
+
+    def _report_stage(self, stage: str, share: float) -> None:
+        self._view.working(stage, share)
+        self._report(stage, share)
+
+    def _report(self, stage: str, share: float) -> None:
+        if self._progress is not None:
+            self._progress(stage, share)
+
+
+def listen_for_tests(
+    tests: Sequence[BitTest],
+    transport: Transport,
+    recorder: Recorder,
+    source: str,
+    stop: threading.Event,
+) -> None:
+    """Let several actuators' tests listen to one bus, each in a thread of its own.
+
+    tests: tests that listen; transport: the bus; to be closed by the caller; recorder: gets each
+    frame once; closed at the end; source: name of the recording; stop: ends all; set where one of
+    them fails. EhadiagError: the bus or a listener failed.
+    """
+    from firmware_iface.logs.recorder import SharedBus  # noqa: PLC0415 - loads python-can
+
+    with (
+        SharedBus(transport, len(tests), recorder) as shared,
+        ThreadPoolExecutor(len(tests), thread_name_prefix="ehadiag-listen") as pool,
+    ):
+        futures = [
+            pool.submit(test.acquire, nullcontext((branch, None)), source, stop)
+            for test, branch in zip(tests, shared.branches, strict=True)
+        ]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            stop.set()
+            raise
+
+
+def recording_path(folder: Path, test: StoredTest) -> Path:
+    """Return a file name for the recording of a test, now, that does not exist yet."""
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    return unused_path(folder, f"{stamp}-{plain_name(test.name)}", ".blf")
+
+
+def refuse_untestable(
+    test: StoredTest, actuator: Actuator, bus_map: BusMap, *, transmit: bool
+) -> None:
+    """Refuse a test that could not end in a verdict, before the surface moves.
+
+    test: the stored test; actuator: data of the actuator; bus_map: the bus that will carry the
+    test; transmit: whether the test is to be requested. ConfigurationError: different rates, a bus
+    on which the test cannot be requested, or its end not seen.
+    """
+    from firmware_iface.codec import Encoder  # noqa: PLC0415 - loads cantools
+
+    rates = {
+        f"test {test.name!r}": test.rate,
+        f"controller of actuator {actuator.name!r}": actuator.controller.rate,
+        "mapping of the bus": 1e9 / bus_map.tick_ns,
+    }
+    if max(rates.values()) > min(rates.values()) * (1.0 + RATE_TOLERANCE):
+        each = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
+        raise ConfigurationError(f"different rates: {each}")
+    if transmit:
+        encoder = Encoder(bus_map)
+        for code in ("start", "abort"):
+            encoder.request(code, test.id)
+    elif bus_map.find("status.state") is None:
+        raise ConfigurationError(
+            f"--listen: the mapping {bus_map.name} has no status.state, and nothing else tells when"
+            " a test begins and ends: record with another tool, and find the test by ehadiag"
+            " diagnose"
+        )
+
+
+def _finish_identification(
+    ahead: EarlyIdentification, deadline: Deadline, stop: threading.Event
+) -> bool:
+    """Wait for the identification under way; a signal or the time limit ends the wait."""
+    with suppress(KeyboardInterrupt):
+        return ahead.finish(deadline, stop)
+    return False
+
+
+def _with_outcome(recording: Recording, outcome: RequestOutcome) -> Recording:
+    """Return a recording with the serial number and the onboard result of its outcome."""
+    serial = outcome.serial if recording.serial is None else recording.serial
+    onboard = outcome.onboard if outcome.onboard is not None else recording.onboard
+    return replace(recording, serial=serial, onboard=onboard)
+
+
+def _traffic_text(recording: Recording, bus: str, listened: float) -> str:
+    """Return what tells a silent bus from a foreign one, for the end of a reason."""
+    quality = recording.quality
+    if quality.total("received"):
+        return ""
+    if not quality.foreign:
+        return f"; {bus} was silent for {listened:.1f} s"
+    return (
+        f"; {quality.foreign} frames heard on {bus} in {listened:.1f} s, none that the mapping "
+        "knows: see ehadiag check-bus"
+    )

@@ -1,0 +1,451 @@
+"""From a request to a result: the one way, of commands, workers and Python alike."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, wait
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
+
+from ehadiag.api import (
+    PathLike,
+    resolve_actuator,
+    resolve_bus_map,
+    resolve_stored_test,
+    stored_tests_with,
+)
+from ehadiag.core.actuator import Actuator, with_tolerance
+from ehadiag.core.conventions import date_text, fingerprint
+from ehadiag.core.interruption import COMPUTING_THREAD_NAME
+from ehadiag.records import failed_result, result_of
+from ehadiag.request import Request
+from ehadiag.result import Log, Mapped, Result, Sources
+from firmware_iface.errors import EhadiagError, NotTestedError, valid_text
+from firmware_iface.find_test import CandidateTests
+from firmware_iface.stored_test import StoredTest
+
+if TYPE_CHECKING:
+    from ehadiag.assess.diagnosis import Diagnosis, DiagnosisSession
+    from ehadiag.identify.solvers import Solver
+    from firmware_iface.bus_map import BusMap
+    from firmware_iface.logs.log_files import Budget
+    from firmware_iface.recording import Recording
+    from firmware_iface.signals.columns import ColumnMap
+
+Progress = Callable[[str, float], None]
+"""Is called with a stage and its share done, 0 … 1."""
+MAX_OVERTIME_S = 0.5
+"""Seconds after its time in which a computation may end by itself, at its next report."""
+DEADLINE_POLL_S = 0.1
+"""Seconds between two looks at the clock: on Windows a longer wait holds up Ctrl-C."""
+
+T = TypeVar("T")
+
+
+class Deadline:
+    """A number of seconds, wall clock, from now on: the time limit of an identification.
+
+    The identification reports its progress between two generations of a search and two rounds of a
+    refinement, 16 to 32 runs of the model apart; it ends there.
+
+    seconds: how long; clock: gives the time, s; another one than the system's only in tests.
+    """
+
+    def __init__(self, seconds: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._seconds = seconds
+        self._clock = clock
+        self._end = clock() + seconds
+
+    @property
+    def passed(self) -> bool:
+        """Whether the time is over."""
+        return self._clock() >= self._end
+
+    def watch(self, progress: Progress) -> Progress:
+        """Return a progress report that ends what reports to it when the time is over.
+
+        progress: report that it hands on to. Returns report of a stage and the share of it that is
+        done; it raises NotTestedError once the time is over.
+        """
+
+        def report(stage: str, share: float) -> None:
+            if self.passed:
+                raise NotTestedError(self.reason(stage))
+            progress(stage, share)
+
+        return report
+
+    def run(self, work: Callable[[Progress], T], progress: Progress) -> T:
+        """Call a function in a thread of its own, and wait for it until the time is over.
+
+        The caller goes on then, whether or not the function reports its progress. One that is
+        left behind ends at its next report.
+
+        work: function, called with the progress report that it is to use; progress: report that
+        this one hands on to. Returns result of the function, whose exceptions are raised here too.
+        NotTestedError: the time is over.
+        """
+        stages = ["beginning"]
+        left_behind = threading.Event()
+        watched = self.watch(progress)
+        result: Future[T] = Future()
+
+        def report(stage: str, share: float) -> None:
+            stages[0] = stage
+            if left_behind.is_set():
+                raise NotTestedError(self.reason(stage))
+            watched(stage, share)
+
+        def compute() -> None:
+            try:
+                result.set_result(work(report))
+            except BaseException as error:
+                result.set_exception(error)
+
+        threading.Thread(target=compute, name=COMPUTING_THREAD_NAME, daemon=True).start()
+        try:
+            while not wait([result], DEADLINE_POLL_S).done:
+                if self._clock() > self._end + MAX_OVERTIME_S:
+                    raise NotTestedError(self.reason(stages[0]))
+        finally:
+            left_behind.set()
+        return result.result()
+
+    def reason(self, stage: str) -> str:
+        """Say why there is no estimate."""
+        return f"no estimate within {self._seconds:g} s: given up in the {stage} (see --time-limit)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What was read of one recording's files."""
+
+    recordings: tuple[Recording, ...]
+    files: tuple[str, ...]
+    log: Log | None
+    seconds: float
+
+    def each(self) -> list[tuple[Recording, Log | None]]:
+        """Each recording with its log."""
+        count = len(self.recordings)
+        return [
+            (item, self.log and msgspec.structs.replace(self.log, result=number, results=count))
+            for number, item in enumerate(self.recordings, start=1)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What a request names, loaded when it is first used; it can be sent to workers."""
+
+    request: Request
+    """What is asked for."""
+    objects: Mapping[str, Any] = field(default_factory=dict)
+    """Given as objects, not by name, by the fields of the request: `actuator`, `test`, `mapping`,
+    `columns`, `solver`; and `candidates`, tests to look for."""
+    label: str = ""
+    """Tells its results from those of other actuators on the same bus; empty of the only one."""
+
+    @cached_property
+    def actuator(self) -> Actuator:
+        """Data of the actuator, with the tolerance that was asked for."""
+        found = resolve_actuator(self.objects.get("actuator", self.request.actuator))
+        tolerance = self.request.tolerance
+        return found if tolerance is None else with_tolerance(found, tolerance)
+
+    @cached_property
+    def named_tests(self) -> tuple[StoredTest, ...]:
+        """Tests that the request names besides the stored ones."""
+        return tuple(map(resolve_stored_test, self.objects.get("test", self.request.test)))
+
+    @cached_property
+    def tests(self) -> tuple[StoredTest, ...]:
+        """All tests that a recording may be of; of one number the one named last."""
+        return stored_tests_with(self.named_tests)
+
+    @property
+    def default(self) -> StoredTest | None:
+        """Test of recordings that do not say which they are of."""
+        return self.named_tests[0] if len(self.named_tests) == 1 else None
+
+    @cached_property
+    def bus_map(self) -> BusMap:
+        """Meaning of the bus's frames."""
+        given = self.objects.get("mapping", None if self._maps_columns else self.request.mapping)
+        found = resolve_bus_map(given, None if self._maps_columns else self.request.dbc)
+        if self.request.id_offset is not None:
+            found = found.shifted(self.request.id_offset)
+        channel = self.request.log_channel
+        return found if channel is None else replace(found, channel=channel)
+
+    @cached_property
+    def columns(self) -> ColumnMap | None:
+        """Meaning of the columns of decoded signals; None: by their names."""
+        if "columns" in self.objects:
+            found: ColumnMap = self.objects["columns"]
+            return found
+        if not (self._maps_columns or self.request.columns):
+            return None
+        from firmware_iface.signals.columns import ColumnMap, load_columns, named_columns  # noqa: PLC0415 - loads numpy
+
+        known = load_columns(self.request.mapping or "") if self._maps_columns else ColumnMap()
+        return named_columns(list(self.request.columns), known)
+
+    @cached_property
+    def _maps_columns(self) -> bool:
+        """Whether the mapping file is one of columns."""
+        if self.request.mapping is None or "mapping" in self.objects:
+            return False
+        from firmware_iface.files import (  # noqa: PLC0415
+            MAX_TOML_BYTES,
+            read_small_file,
+        )
+        from firmware_iface.signals.columns import COLUMNS_SCHEMA  # noqa: PLC0415
+
+        text = read_small_file(Path(self.request.mapping), MAX_TOML_BYTES, "mapping file")
+        return f'"{COLUMNS_SCHEMA}"'.encode() in text
+
+    @property
+    def budget(self) -> Budget:
+        """What reading a recording may cost."""
+        from firmware_iface.logs.log_files import Budget  # noqa: PLC0415
+
+        return Budget(
+            frames=self.request.max_frames,
+            size=self.request.max_log_bytes,
+            seconds=self.request.max_read_time_s,
+        )
+
+    @property
+    def candidate_tests(self) -> CandidateTests:
+        """What to look for in a recording whose bus does not say when which test ran."""
+        if "candidates" in self.objects:
+            found: CandidateTests = self.objects["candidates"]
+            return found
+        tests = (self.default,) if self.default else self.tests
+        request = self.request
+        return CandidateTests(tests, self.actuator.controller, request.start_s, request.end_s)
+
+    @cached_property
+    def solver(self) -> Solver:
+        """The search."""
+        from ehadiag.identify.solvers import make_solver  # noqa: PLC0415 - loads numba
+
+        found: Solver = self.objects.get("solver") or make_solver(self.request.solver)
+        return found
+
+    @cached_property
+    def sources(self) -> Sources:
+        """Fingerprints of what the request names."""
+        tests = (self.default,) if self.default else self.tests
+        file = self.request.mapping
+        return Sources(
+            tests_sha256=fingerprint(tests),
+            columns_sha256=None if self.columns is None else fingerprint(self.columns),
+            mapping=Mapped(
+                name=valid_text(self.bus_map.name),
+                sha256=fingerprint(self.bus_map),
+                file=None if file is None else valid_text(file),
+            ),
+            solver=self.solver.name if "solver" in self.objects else None,
+        )
+
+    def session(self, tests: Sequence[StoredTest] | None = None) -> DiagnosisSession:
+        """Begin a diagnosis that can be fed a running test.
+
+        tests: that a recording may be of; None: all. Returns for `diagnose`.
+        """
+        from ehadiag.assess.diagnosis import DiagnosisSession  # noqa: PLC0415 - loads numba
+        from ehadiag.identify.identification_session import NuisanceMode  # noqa: PLC0415
+
+        return DiagnosisSession(
+            self.actuator,
+            self.tests if tests is None else tests,
+            default=self.default,
+            levels=self.request.levels,
+            solver=self.solver,
+            seed=self.request.seed,
+            nuisances=NuisanceMode(self.request.nuisances),
+        )
+
+    def open(self, *files: PathLike) -> Iterator[Recording]:
+        """Read the tests that one recording holds, in order of time.
+
+        files: files to read; several hold one recording. Returns at least one; without samples
+        where there is no test. InputOutputError: a file cannot be read; ConfigurationError: its
+        kind is unknown.
+        """
+        from firmware_iface.signals.recordings import Interpretation, recorded_tests  # noqa: PLC0415 - loads cantools
+
+        meaning = Interpretation(self.bus_map, self.columns, self.candidate_tests)
+        return iter(recorded_tests([os.fspath(item) for item in files], meaning, self.budget))
+
+    def read(self, *files: PathLike) -> Reading:
+        """Read what is to be diagnosed of one recording; see `open`.
+
+        files: files to read; several hold one recording. Returns at least one recording, and the
+        time that it took.
+        """
+        from firmware_iface.logs.reader import choose_recording  # noqa: PLC0415 - loads cantools
+
+        begin = time.perf_counter()
+        tests = self.open(*files)
+        # Of a long log's tests only one is held, unless all are wanted.
+        found = tuple(tests) if self.request.every_test else (choose_recording(tests),)
+        if self.label:
+            found = tuple(self.labelled(item) for item in found)
+        names = tuple(os.fspath(item) for item in files)
+        return Reading(found, names, log_of(names[0]), time.perf_counter() - begin)
+
+    def labelled(self, recording: Recording) -> Recording:
+        """Return a recording with a note that tells it from those of other units on its bus."""
+        if not self.label:
+            return recording
+        notes = (*recording.quality.notes, f"actuator of mapping {self.label}")
+        return replace(recording, quality=replace(recording.quality, notes=notes))
+
+    def diagnose(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        files: Sequence[str] = (),
+        logs: Sequence[Log | None] = (),
+        read_s: float = 0.0,
+        ended_at: float | None = None,
+        progress: Progress | None = None,
+        session: DiagnosisSession | None = None,
+        deadline: Deadline | None = None,
+    ) -> Result:
+        """Diagnose one actuator.
+
+        recordings: of the same actuator; files: that they were read from; empty where they were at
+        hand; logs: log of each recording; read_s: time of reading or acquiring them, s; ended_at:
+        when a live test ended, on `time.perf_counter`; progress: called with each stage and the
+        share of it that is done; where there is a deadline, in another thread; session: that was
+        fed while the test ran; deadline: that has begun already; None: the request's time limit
+        from now on. Returns NOT TESTED where the time limit was reached. KeyboardInterrupt: the
+        progress report raised it.
+        """
+        begin = time.perf_counter()
+        limit = self.request.time_limit_s
+        report = progress or _silent
+        if deadline is None and limit is not None:
+            deadline = Deadline(limit)
+        try:
+            session = session or self.session()
+            work = partial(session.finish, recordings)
+            found = work(report) if deadline is None else deadline.run(work, report)
+        except NotTestedError as error:
+            found = self._not_tested(recordings, str(error), time.perf_counter() - begin)
+        return self.result(found, files=files, logs=logs, read_s=read_s, ended_at=ended_at)
+
+    def not_tested(
+        self,
+        recordings: Sequence[Recording],
+        why: str,
+        *,
+        files: Sequence[str] = (),
+        logs: Sequence[Log | None] = (),
+        read_s: float = 0.0,
+        ended_at: float | None = None,
+    ) -> Result:
+        """Return the result NOT TESTED of recordings that were not judged; as `diagnose`."""
+        found = self._not_tested(recordings, why)
+        return self.result(found, files=files, logs=logs, read_s=read_s, ended_at=ended_at)
+
+    def result(
+        self,
+        diagnosis: Diagnosis,
+        *,
+        files: Sequence[str] = (),
+        logs: Sequence[Log | None] = (),
+        read_s: float = 0.0,
+        ended_at: float | None = None,
+    ) -> Result:
+        """Put a diagnosis down with what it was asked for; as `diagnose`."""
+        merge = self.request.merge
+        joint = len(diagnosis.recordings) > 1 and not merge
+        request = msgspec.structs.replace(
+            self.request, logs=tuple(files), joint=joint, merge=merge and len(files) > 1
+        )
+        at_hand = not files and not any(logs)
+        return result_of(
+            diagnosis,
+            request,
+            sources=self._sources_at_hand if at_hand else self.sources,
+            logs=logs,
+            read_s=read_s,
+            after_test_s=None if ended_at is None else time.perf_counter() - ended_at,
+        )
+
+    def failure(self, log: str, error: str, exit_code: int) -> Result:
+        """Return the result of a log that could not be read."""
+        request = msgspec.structs.replace(self.request, logs=(log,), joint=False, merge=False)
+        return failed_result(
+            log, error, exit_code, request, self.actuator, sources=self.sources, log=log_of(log)
+        )
+
+    def each(self, *files: str, progress: Progress | None = None) -> Iterator[Result]:
+        """Read and diagnose one recording; what cannot be read has a result too.
+
+        files: files to read; several hold one recording; progress: called with each stage and the
+        share of it that is done. Yields at least one; several where every test is asked for.
+        """
+        try:
+            reading = self.read(*files)
+        except EhadiagError as error:
+            yield self.failure(files[0], str(error), error.exit_code)
+            return
+        for recording, log in reading.each():
+            yield self.diagnose(
+                [recording],
+                files=reading.files,
+                logs=[log],
+                read_s=reading.seconds,
+                progress=progress,
+            )
+
+    def name(self, log: str, result: Result) -> str:
+        """Return the name of a result's files, without suffix."""
+        of = result.origins[0].log if len(result.origins) == 1 else None
+        number = f"-{of.result}" if of is not None and of.results > 1 else ""
+        return Path(log).stem + number + (f"-{self.label}" if self.label else "")
+
+    @property
+    def _sources_at_hand(self) -> Sources:
+        tests = (self.default,) if self.default else self.tests
+        solver = self.solver.name if "solver" in self.objects else None
+        return Sources(tests_sha256=fingerprint(tests), solver=solver)
+
+    def _not_tested(
+        self, recordings: Sequence[Recording], why: str, elapsed: float = 0.0
+    ) -> Diagnosis:
+        from ehadiag.assess.diagnosis import match_tests, not_tested  # noqa: PLC0415
+
+        tests = match_tests(recordings, self.tests, self.default)
+        return not_tested(recordings, tests, self.actuator, [why], elapsed)
+
+
+def log_of(path: PathLike) -> Log | None:
+    """What can be said of a log without reading it; None where there is none."""
+    try:
+        info = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return Log(
+        path=valid_text(os.path.abspath(os.fspath(path))),
+        bytes=info.st_size,
+        modified=date_text(info.st_mtime_ns),
+        modified_ns=info.st_mtime_ns,
+    )
+
+
+def _silent(_stage: str, _share: float) -> None:
+    """Report nothing."""

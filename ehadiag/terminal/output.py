@@ -1,0 +1,343 @@
+"""Output of a call: results to standard output, all else to standard error, and the exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TextIO, cast
+
+from firmware_iface.errors import (
+    ConfigurationError,
+    InputOutputError,
+    printable,
+    printable_lines,
+    reason_of,
+    valid_text,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from firmware_iface.recording import Recording
+    from firmware_iface.transport.base import Transport
+
+__all__ = [
+    "INPUT_OUTPUT_EXIT_CODE",
+    "counting_bar",
+    "discard_stream",
+    "exit_code_of_inputs",
+    "print_compiling_notice",
+    "print_status",
+    "print_test_list",
+    "print_text",
+    "progress_bar",
+    "render_for_terminal",
+    "report_failure",
+    "transport_losses",
+    "worst_exit_code",
+    "write_output",
+]
+
+
+INPUT_OUTPUT_EXIT_CODE = InputOutputError.exit_code
+EXIT_CODES_WORST_FIRST = (20, 40, INPUT_OUTPUT_EXIT_CODE, 30, 10, 0)
+"""Exit codes, the worst first."""
+
+
+def worst_exit_code(codes: Iterable[int]) -> int:
+    """Return the worst of several exit codes; 0 of none.
+
+    FAULT (20), an alarm (40), an input or output that failed (3, 2), NOT TESTED (30), DEGRADED
+    (10), HEALTHY.
+    """
+    known = {
+        INPUT_OUTPUT_EXIT_CODE if code == ConfigurationError.exit_code else code for code in codes
+    }
+    return next((code for code in EXIT_CODES_WORST_FIRST if code in known), 0)
+
+
+def exit_code_of_inputs(codes: Sequence[int]) -> int:
+    """Return the exit code of a call by those of its inputs: that of one, the worst of several."""
+    return codes[0] if len(codes) == 1 else worst_exit_code(codes)
+
+
+TABLE_COLUMNS = 100
+"""Columns that our widest tables need; a narrower terminal breaks their lines."""
+PIPE_COLUMNS = 10_000
+"""Columns where no terminal bounds them: lines are not broken."""
+
+
+def print_status(text: str) -> None:
+    """Print one line to standard error; a closed one is no error."""
+    try:
+        print(f"ehadiag: {printable(text)}", file=sys.stderr, flush=True)
+    except OSError:
+        discard_stream(sys.stderr)
+
+
+def print_text(text: str) -> None:
+    """Print lines of plain text to standard output.
+
+    Parameters
+    ----------
+    text : str
+        The text to print.
+
+    Raises
+    ------
+    InputOutputError
+        It is closed, or full.
+    """
+    write_output(printable_lines(text) + "\n")
+
+
+def write_output(text: str) -> None:
+    """Write text to standard output; its control characters are replaced already."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError as error:
+        discard_stream(sys.stdout)
+        raise InputOutputError(f"standard output: {reason_of(error)}") from None
+
+
+@contextmanager
+def report_failure(codes: list[int]) -> Iterator[None]:
+    """Print an InputOutputError of the block and add its exit code; the block ends there."""
+    try:
+        yield
+    except InputOutputError as error:
+        codes.append(error.exit_code)
+        print_status(str(error))
+
+
+def discard_stream(stream: TextIO) -> None:
+    """Let the rest of a stream go to the null device: it would fail again at the exit."""
+    with contextlib.suppress(OSError, ValueError):  # a stream of a test has no number
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+def transport_losses(transport: Transport) -> str:
+    """Return the losses of a transport, for the end of a sentence; empty without one."""
+    return f"; {transport.detail}" if transport.detail else ""
+
+
+def print_compiling_notice(*, simulation: bool = False, identification: bool = True) -> None:
+    """Compile kernels that are needed and not there, and print which."""
+    from ehadiag.api import compile_kernels  # noqa: PLC0415 - not for help texts
+
+    compile_kernels(print_status, simulation=simulation, identification=identification)
+
+
+class _EncodedText(io.StringIO):
+    """Text that is to be encoded as standard output is."""
+
+    encoding = "utf-8"
+
+
+def render_for_terminal(draw: Callable[[Console], None], *, least: int = TABLE_COLUMNS) -> str:
+    """Return what is drawn on a console like standard output's, for `write_output`.
+
+    Not written by the console itself, which ends the program where a pipe is closed.
+
+    Parameters
+    ----------
+    draw : Callable[[Console], None]
+        Prints to the console that it is given.
+    least : int
+        Columns also on a narrower terminal.
+
+    Returns
+    -------
+    str
+        The text, with its end of line.
+    """
+    from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
+
+    there = Console()
+    width = max(there.width, least) if there.is_terminal else PIPE_COLUMNS
+    out = _EncodedText()
+    out.encoding = sys.stdout.encoding or "utf-8"
+    # Names of others are no markup.
+    draw(
+        Console(
+            file=out,
+            force_terminal=there.is_terminal,
+            highlight=False,
+            markup=False,
+            emoji=False,
+            width=width,
+        )
+    )
+    return out.getvalue()
+
+
+PROGRESS_LINE_PERIOD_S = 30.0
+"""Time between two lines of progress where standard error is no terminal, s; a log stays short."""
+
+
+class _ProgressLines:
+    """Progress as lines: stage, share done, time left."""
+
+    def __init__(self) -> None:
+        self._began = self._printed = time.monotonic()
+
+    def update(self, stage: str, share: float) -> None:
+        """Print a line if it is time for one."""
+        now = time.monotonic()
+        if now - self._printed < PROGRESS_LINE_PERIOD_S or share <= 0.0:
+            return
+        self._printed = now
+        spent = now - self._began
+        print_status(f"{stage} {share:.0%}, about {spent * (1.0 - share) / share:.0f} s left")
+
+
+@contextmanager
+def progress_bar(*, shown: bool = True) -> Iterator[Callable[[str, float], None]]:
+    """Show stage, share done and time left on standard error, in a log as lines, if `shown`."""
+    if not shown:
+        yield lambda _stage, _share: None
+        return
+    if not sys.stderr.isatty():
+        yield _ProgressLines().update
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import (  # noqa: PLC0415
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left:"),
+        TimeRemainingColumn(),
+    )
+    terminal = Console(file=cast("TextIO", _TolerantStream(sys.stderr)))
+    with Progress(*columns, console=terminal, transient=True) as display:
+        task = display.add_task("", total=1.0)
+        yield lambda stage, share: display.update(task, description=stage, completed=share)
+
+
+@contextmanager
+def counting_bar(total: int) -> Iterator[Callable[[], None]]:
+    """Show how many of so many are done, and how fast, on standard error, in a log as lines."""
+    if not sys.stderr.isatty():
+        lines, done = _ProgressLines(), itertools.count(1)
+        yield lambda: lines.update(f"{total} recordings:", next(done) / total)
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import (  # noqa: PLC0415
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    terminal = Console(file=cast("TextIO", _TolerantStream(sys.stderr)))
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(),
+        TextColumn("{task.fields[rate]}", markup=False),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=terminal, transient=True) as display:
+        task = display.add_task("", total=total, rate="")
+
+        def advance() -> None:
+            speed = display.tasks[0].speed
+            rate = "" if speed is None else f"{speed:.1f} recordings/s"
+            display.update(task, advance=1, rate=rate)
+
+        yield advance
+
+
+class _TolerantStream:
+    """Terminal that may be closed: a test goes on without its progress."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.encoding = stream.encoding
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def isatty(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+
+TESTS_SCHEMA = "ehadiag.tests/1"
+TEST_LIST_COLUMNS = ("no.", "test", "start", "length s", "outcome", "serial", "channel", "remarks")
+
+
+def print_test_list(source: str, recordings: Iterable[Recording], *, as_json: bool) -> None:
+    """Print number, test, start, length, outcome, serial number and channel of each test.
+
+    Parameters
+    ----------
+    source : str
+        Name of the recording.
+    recordings : Iterable[Recording]
+        Its tests, taken one at a time.
+    as_json : bool
+        One JSON object a line instead of a table.
+    """
+    rows = (_test_list_row(item, number) for number, item in enumerate(recordings, start=1))
+    if as_json:
+        for row in rows:
+            print_text(json.dumps({"schema": TESTS_SCHEMA, "source": valid_text(source), **row}))
+        return
+    from rich.table import Table  # noqa: PLC0415 - only who prints tables needs it
+
+    table = Table(*TEST_LIST_COLUMNS, box=None, pad_edge=False, title=None)
+    for row in rows:
+        cells = (row["number"], row["test"], row["start"], row["length_s"], row["outcome"])
+        remarks = "; ".join(row["remarks"])
+        shown = (*cells, row["serial"], row["channel"], remarks)
+        table.add_row(*("-" if cell in (None, "") else printable(str(cell)) for cell in shown))
+    print_text(source)
+    write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
+
+
+def _test_list_row(item: Recording, number: int) -> dict[str, Any]:
+    from ehadiag.core.conventions import start_text  # noqa: PLC0415 - not for help texts
+
+    state, reason = item.outcome.state, item.outcome.reason
+    outcome = None if state is None else state.name.lower()
+    if state is not None and reason:
+        outcome = f"{outcome} ({reason.name.lower().replace('_', ' ')})"
+    return {
+        "number": number,
+        "test": item.test_id,
+        "start": start_text(item.start_ns),
+        "length_s": None if item.samples is None else round(item.duration, 3),
+        "outcome": outcome,
+        "serial": item.serial,
+        "channel": item.channel,
+        "remarks": list(item.quality.refused),
+    }

@@ -1,0 +1,118 @@
+"""Ticks of a live bus whose counters do not tell them: placed some seconds at a time.
+
+A stretch of frames is placed on ticks as that of a recording is. Between two stretches the ticks
+begin anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from firmware_iface.alignment.episodes import Episode
+from firmware_iface.alignment.frame_faults import drop_conflicts
+from firmware_iface.alignment.grid import TickGrid, samples_of
+from firmware_iface.alignment.ticks import place_frames
+from firmware_iface.bus_map import BusMap
+from firmware_iface.codec import channels_in, choose_channel, decode
+from firmware_iface.live_decode import LiveTick
+from firmware_iface.recording import BitOutcome, CommandMode, FloatArray, Samples
+from firmware_iface.transport.frames import ColumnBuilder, Frame
+
+STRETCH_NS = 30_000_000_000
+"""Length of a stretch, ns: after each the model settles for a second."""
+MAX_STRETCH_FRAMES = 500_000
+"""Frames of a stretch, 1: a bus with more is read in shorter ones."""
+MAX_COMMAND_TICKS = 4
+"""Ticks by which commands may come before their samples, 1 (docs/how-to/bare-bus.md)."""
+
+
+class StretchTicks:
+    """Puts frames together into ticks as `LiveTicks` of `firmware_iface.live_decode`, 30 s late.
+
+    Parameters
+    ----------
+    bus_map : BusMap
+        Mapping; any of which a recording can be diagnosed.
+
+    Attributes
+    ----------
+    mode : CommandMode
+        Of the commands of the last stretch.
+    lost : int
+        Ticks without a spool position.
+    breaks : int
+        Times that the ticks began anew.
+    conflicts : int
+        Values that a second sender contradicted.
+    """
+
+    mode: CommandMode
+    lost: int
+    breaks: int
+    conflicts: int
+
+    def __init__(self, bus_map: BusMap) -> None:
+        self._map = bus_map
+        self._frames = ColumnBuilder()
+        self._begin_ns: int | None = None
+        self.mode = bus_map.fixed_mode or CommandMode.CURRENT
+        self.lost = self.breaks = self.conflicts = 0
+
+    def take(self, frame: Frame) -> list[LiveTick]:
+        """Take a frame; returns the ticks of a stretch with the frame behind its end."""
+        begin = frame.time_ns if self._begin_ns is None else self._begin_ns
+        over = frame.time_ns - begin >= STRETCH_NS or len(self._frames) >= MAX_STRETCH_FRAMES
+        out = self.flush() if over else []
+        if self._begin_ns is None:
+            self._begin_ns = frame.time_ns
+        self._frames.add_frame(frame)
+        return out
+
+    def flush(self) -> list[LiveTick]:
+        """Return the ticks of the frames so far."""
+        table, self._frames, self._begin_ns = self._frames.table(), ColumnBuilder(), None
+        channel, ambiguous = choose_channel(self._map.channel, channels_in(table, self._map))
+        if ambiguous or not len(table):
+            return []
+        bus_map = replace(self._map, channel=channel)
+        decoded = decode(table, bus_map)
+        axis = place_frames(decoded, bus_map.tick_ns)
+        decoded, axis, conflicts = drop_conflicts(decoded, axis)
+        if axis is None or not len(axis.tick):
+            return []
+        first, last = int(axis.tick.min()), int(axis.tick.max())
+        whole = Episode(first, last - first + 1, None, None, BitOutcome())
+        samples, _ = samples_of(TickGrid(whole, decoded, axis, bus_map, 0, len(table)))
+        self.mode = samples.mode
+        self.breaks += 1
+        self.conflicts += sum(item.count for item in conflicts.values())
+        self.lost += int(np.isnan(samples.spool).sum())
+        columns = (samples.current, samples.spool, samples.pressure, samples.position)
+        seen = np.where(samples.saturated, np.nan, np.stack(columns))
+        rows = np.column_stack((_commands(samples), *seen))
+        return [LiveTick(*row) for row in rows.tolist()]
+
+
+def _commands(samples: Samples) -> FloatArray:
+    """Commands at the ticks whose current they made; the current itself where there are none."""
+    command, current = samples.command, samples.current
+    if not np.isfinite(command).any():
+        return current
+    seen = np.concatenate(([np.nan], samples.position[:-1]))
+    best, found = np.inf, command
+    for late in range(-1, MAX_COMMAND_TICKS + 1):
+        moved = np.full_like(command, np.nan)
+        part = slice(max(late, 0), len(command) + min(late, 0))
+        moved[part] = command[max(-late, 0) : len(command) - max(late, 0)]
+        acts = moved - seen if samples.mode is CommandMode.POSITION else moved
+        both = np.isfinite(acts) & np.isfinite(current)
+        if both.sum() < 2:
+            continue
+        square = float(acts[both] @ acts[both])
+        gain = float(acts[both] @ current[both]) / square if square > 0.0 else 0.0
+        left = float(np.mean((current[both] - gain * acts[both]) ** 2))
+        if left < best:
+            best, found = left, moved
+    return found

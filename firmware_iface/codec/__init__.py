@@ -1,1 +1,0 @@
-"""Translates between frames and physical values, and checks their end-to-end protection."""

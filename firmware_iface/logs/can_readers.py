@@ -1,0 +1,433 @@
+"""Readers of ASC, CSV, TRC and MF4 logs through python-can, and of candump's own.
+
+Python-can is loaded without asammdf, which MF4 files alone need. Lines that its readers cannot
+read are made readable here.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import logging
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, suppress
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast
+
+from firmware_iface.errors import InputOutputError, install_command
+from firmware_iface.logs.log_files import DamagedLogError, Spending
+from firmware_iface.transport.frames import (
+    MAX_CHANNEL,
+    MAX_PAYLOAD,
+    ColumnBuilder,
+    Frame,
+    FrameTable,
+)
+
+if TYPE_CHECKING:
+    from can import Message
+
+LOG_BLOCK_FRAMES = 50_000
+"""Frames of a table that a text log is read in."""
+MAX_MF4_BYTES = 128 << 20
+"""Bytes of an MF4 file: its library holds all frames in memory, and more than once."""
+
+MF4_LIBRARY = "asammdf"
+
+
+def can_library() -> ModuleType:
+    """Import python-can, unless it is loaded already without asammdf.
+
+    Returns `can`; its MF4 classes may say that asammdf is missing, see `mf4_library`.
+    """
+    modules: dict[str, Any] = sys.modules
+    if "can" in modules or MF4_LIBRARY in modules:
+        return importlib.import_module("can")
+    modules[MF4_LIBRARY] = None  # as if it were not installed
+    try:
+        return importlib.import_module("can")
+    finally:
+        del modules[MF4_LIBRARY]
+
+
+def mf4_library() -> ModuleType:
+    """Import python-can's reader and writer of MF4 files with asammdf, where it is installed.
+
+    Returns `can.io.mf4`.
+    """
+    library = importlib.import_module("can.io.mf4")
+    return library if library.asammdf else importlib.reload(library)
+
+
+class _PythonCanReader:
+    """Reads one kind of log through python-can, see `LogReader`."""
+
+    signature = b""
+    kind = ""
+    """What a readable file is called in errors."""
+    channel_offset = 0
+    """Number of an adapter channel less what python-can makes of it."""
+    resume_line = ""
+    """Line at which python-can's reader goes on to frames when it begins amidst a text log."""
+
+    def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
+        """Ways to make python-can's reader of a file, each for a file that those before fail on."""
+        raise NotImplementedError
+
+    def frames(self, path: Path, spending: Spending) -> Iterator[FrameTable]:
+        """Read a file."""
+        found = False
+        for open_file in self.openers(path, spending):
+            try:
+                for table in self._tables(open_file):
+                    found = True
+                    yield table
+            except DamagedLogError:
+                if found:
+                    raise
+            else:
+                return
+        raise InputOutputError(f"log {path}: not a readable {self.kind}")
+
+    def _tables(self, open_file: Callable[[], Any]) -> Iterator[FrameTable]:
+        reader: Any = None
+        columns = ColumnBuilder()
+        found = bad = 0
+        intact = False
+        try:
+            reader = open_file()
+            while not intact:
+                try:
+                    for message in reader:
+                        self._add(message, columns)
+                        found += 1
+                        if len(columns) >= LOG_BLOCK_FRAMES:
+                            yield columns.table()
+                            columns = ColumnBuilder()
+                    intact = True
+                except InputOutputError:
+                    raise
+                except Exception:
+                    # The readers raise whatever a bad line leads them to, and their texts quote it.
+                    bad += 1
+                    if not self._resumes(reader, found, bad):
+                        break
+                    BAD_LINES.warning("a line that holds no frame")
+        except InputOutputError:
+            raise
+        except Exception:
+            intact = False
+        finally:
+            if reader is not None:
+                with suppress(Exception):
+                    reader.stop()
+        if len(columns):
+            yield columns.table()
+        if not intact:
+            gc.collect()  # or asammdf's destructor fails later, beside something else
+            raise DamagedLogError("the log breaks off or is damaged")
+
+    def _resumes(self, reader: Any, found: int, bad: int) -> bool:
+        """Whether a text log goes on after a bad line, which is then left out."""
+        lines = getattr(reader, "file", None)
+        begun = found or self.signature  # amidst a header nothing tells what a line means
+        if not (begun and self.resume_line and isinstance(lines, _BoundedLines)):
+            return False
+        return bad <= found + MAX_BAD_LINES and lines.push(self.resume_line)
+
+    def _add(self, message: Message, columns: ColumnBuilder) -> None:
+        seconds = math.floor(message.timestamp)
+        number = message.channel
+        channel = number + self.channel_offset if isinstance(number, int) else 0
+        columns.add(
+            seconds * 1_000_000_000 + round((message.timestamp - seconds) * 1e9),
+            message.arbitration_id & 0xFFFFFFFF,
+            bytes(message.data[:MAX_PAYLOAD]),
+            extended=message.is_extended_id,
+            fd=message.is_fd,
+            error=message.is_error_frame,
+            remote=message.is_remote_frame,
+            sent=not message.is_rx,
+            channel=min(max(channel, 0), MAX_CHANNEL),
+        )
+
+
+class AscReader(_PythonCanReader):
+    """Vector's text log."""
+
+    kind = "ASC log"
+    channel_offset = 1  # python-can counts them from 0
+    resume_line = "no internal events logged"
+
+    def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
+        """With its date; without, where python-can does not know the date's language."""
+        for relative in (False, True):
+            yield partial(_open_asc_reader, path, spending, relative)
+
+
+def _open_asc_reader(path: Path, spending: Spending, relative: bool) -> Any:
+    lines = open_asc(path, spending.look_at_clock)
+    return can_library().ASCReader(lines, relative_timestamp=relative)
+
+
+class CsvReader(_PythonCanReader):
+    """The CSV log of python-can: frames, not signals."""
+
+    signature = b"timestamp,arbitration_id"
+    kind = "CSV log of frames, as python-can writes them; are these decoded signals?"
+    resume_line = "timestamp,arbitration_id"
+
+    def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
+        """The one way."""
+        yield lambda: can_library().CSVReader(open_text(path, spending.look_at_clock))
+
+
+class TrcReader(_PythonCanReader):
+    """PEAK's text log."""
+
+    kind = "TRC log"
+    resume_line = ";"
+
+    def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
+        """The one way."""
+        yield lambda: can_library().TRCReader(
+            open_text(path, spending.look_at_clock, TRC_LINE_PATTERN)
+        )
+
+
+class Mf4Reader(_PythonCanReader):
+    """ASAM's log of bus events."""
+
+    kind = "MF4 log"
+
+    def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
+        """The one way, of a file that fits into memory."""
+        spending.look_at_clock()
+        if path.stat().st_size > MAX_MF4_BYTES:
+            raise InputOutputError(
+                f"log {path}: an MF4 file beyond {MAX_MF4_BYTES >> 20} MiB takes too much memory;"
+                " convert it to BLF"
+            )
+        yield lambda: _open_mf4(path)
+
+
+def _open_mf4(path: Path) -> Any:
+    try:
+        return mf4_library().MF4Reader(str(path))
+    except NotImplementedError:
+        raise InputOutputError(f"log {path}: MF4 needs asammdf: {install_command('mf4')}") from None
+
+
+class SkippedLines(logging.Handler):
+    """Counts what python-can's readers skip with no more than a line in its own log.
+
+    And keeps quiet the destructor of asammdf, which fails where its constructor failed.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.count = 0
+        self._hook = sys.unraisablehook
+
+    def emit(self, _: logging.LogRecord) -> None:
+        """Count a complaint."""
+        self.count += 1
+
+    def __enter__(self) -> Self:
+        logging.getLogger("can").addHandler(self)
+        sys.unraisablehook = self._pass_on
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("can").removeHandler(self)
+        sys.unraisablehook = self._hook
+
+    def _pass_on(self, what: Any) -> None:
+        if not getattr(what.object, "__module__", "").startswith("asammdf."):
+            self._hook(what)
+
+
+BAD_LINES = logging.getLogger("can.lines")
+"""Child of python-can's logger, whose complaints the reader of logs counts."""
+MAX_BAD_LINES = 1000
+"""Bad lines, 1, beyond as many as there are frames, at which a text log is no log: each takes
+python-can a new start."""
+MAX_ASC_LINE = 1 << 16
+MAX_HEADER_LINES = 20
+RELATIVE_HEADER_PATTERN = re.compile(
+    r"\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNORECASE
+)
+ASC_LINE_PATTERN = re.compile(
+    r"\s*(?://|(?:date|base|begin|end|previous|(?:no\s+)?internal)\b"
+    r"|\d+\.\d+\s+(?://|\d+\s+\w+\s+(?:Rx|Tx)|CANFD|(?:\d+\s+)?[A-Z]*[G-Z]))",
+    re.IGNORECASE,
+)
+"""Beginning of a comment, a line of the header, a frame, or an event by its name."""
+TRC_LINE_PATTERN = re.compile(
+    r"\s*(?:;|\d+\)?\s+\d+(?:\.\d+)?\s+(?:[A-Z]{2}|[0-9A-F]{4,8}|\d+|Rx|Tx|Warng|Error)\s)"
+)
+"""Beginning of a comment, or number, stamp, and type, identifier or bus of versions 1.0 to 2.1."""
+STAMP_PATTERN = re.compile(r"\s*(\d+\.\d+)(\s.*)", re.DOTALL)
+
+
+class _BoundedLines:
+    """Lines of a read-only text file, none longer than a log can have: noise has no line ends.
+
+    Lines that do not begin by the pattern, which python-can passes over, are counted and left out.
+    """
+
+    def __init__(
+        self, file: TextIO, look: Callable[[], None], pattern: re.Pattern[str] | None = None
+    ) -> None:
+        self._file = file
+        self._look = look
+        self._pattern = pattern
+        self._pushed: list[str] = []
+
+    def push(self, line: str) -> bool:
+        """Give a line before the next one; False at the end of the file, where none follows."""
+        while (following := self.readline()) and not following.strip():
+            pass
+        self._pushed = [following, line + "\n"] if following else []
+        return bool(following)
+
+    def __iter__(self) -> Iterator[str]:
+        while line := self.readline():
+            yield line
+
+    def __next__(self) -> str:
+        line = self.readline()
+        if not line:
+            raise StopIteration
+        return line
+
+    def readline(self) -> str:
+        """Return the next line, or a piece of one; empty at the end."""
+        self._look()  # a file of lines that are no frames must end in time too
+        return self._pushed.pop() if self._pushed else self._next_line()
+
+    def _next_line(self) -> str:
+        line = self._stamped(self._file.readline(MAX_ASC_LINE))
+        if self._pattern is None or not line.strip() or self._pattern.match(line):
+            return line
+        BAD_LINES.warning("a line that holds no frame")
+        return "\n"
+
+    def _stamped(self, line: str) -> str:
+        """Return a line with an absolute stamp."""
+        return line
+
+    def read(self, _size: int = -1) -> str:
+        """Return one line: readers go by lines."""
+        return self.readline()
+
+    def write(self, _text: str) -> int:
+        """Refuse: a recording is never changed."""
+        raise OSError("read only")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class _AbsoluteLines(_BoundedLines):
+    """Lines of an ASC file with relative stamps, made absolute."""
+
+    def __init__(self, file: TextIO, look: Callable[[], None]) -> None:
+        super().__init__(file, look, ASC_LINE_PATTERN)
+        self._elapsed = 0.0
+
+    def _stamped(self, line: str) -> str:
+        stamp = STAMP_PATTERN.match(line)
+        if stamp is None:
+            return line
+        self._elapsed += float(stamp[1])
+        return f"{self._elapsed:.9f}{stamp[2]}"
+
+
+def open_text(
+    path: Path, look: Callable[[], None], pattern: re.Pattern[str] | None = None
+) -> TextIO:
+    """Open a text log for one of python-can's readers; `look` is called at each line."""
+    file = path.open(encoding="utf-8", errors="replace")
+    return cast(TextIO, _BoundedLines(file, look, pattern))
+
+
+def open_asc(path: Path, look: Callable[[], None]) -> TextIO:
+    """Open an ASC file for python-can's reader, its stamps absolute (from the start of the log)."""
+    file = path.open(encoding="utf-8", errors="replace")
+    head = [file.readline(MAX_ASC_LINE) for _ in range(MAX_HEADER_LINES)]
+    file.seek(0)
+    if any(RELATIVE_HEADER_PATTERN.match(line) for line in head):
+        return cast(TextIO, _AbsoluteLines(file, look))
+    return cast(TextIO, _BoundedLines(file, look, ASC_LINE_PATTERN))
+
+
+CANDUMP_LINE_PATTERN = re.compile(
+    r"\s*\((?P<seconds>\d{1,10})\.(?P<fraction>\d{1,9})\)"
+    r"\s+(?P<interface>\S+)"
+    r"\s+(?P<id>[0-9A-F]{3}|[0-9A-F]{8})#"
+    r"(?:(?P<remote>R)[0-8]?|#[0-9A-F](?P<fd>(?:[0-9A-F]{2}){0,64})|(?P<data>(?:[0-9A-F]{2}){0,8}))"
+    r"(?:_[0-9A-F])?(?:\s+(?P<direction>[RT]))?\s*",
+    re.IGNORECASE | re.ASCII,
+)
+"""A frame as can-utils writes it; `_N` is the length code of a classic frame beyond 8."""
+MAX_STAMP_S = (1 << 63) // 1_000_000_000
+"""Nanoseconds are counted in 64 bits."""
+STANDARD_ID_DIGITS = 3
+STANDARD_ID_MASK, EXTENDED_ID_MASK, ERROR_ID_FLAG = 0x7FF, 0x1FFFFFFF, 0x20000000
+
+
+def candump_frames(lines: Iterable[str]) -> Iterator[tuple[Frame, str]]:
+    """Give each frame with the name of its interface; a line that holds none is logged."""
+    for line in lines:
+        match = CANDUMP_LINE_PATTERN.fullmatch(line)
+        if match is not None and int(match["seconds"]) < MAX_STAMP_S:
+            yield _frame(match), match["interface"]
+        elif line.strip():
+            BAD_LINES.warning("a line that holds no frame")
+
+
+def _frame(match: re.Match[str]) -> Frame:
+    number = int(match["id"], 16)
+    extended = len(match["id"]) > STANDARD_ID_DIGITS
+    error = extended and bool(number & ERROR_ID_FLAG)
+    payload = match["data"] or match["fd"] or ""
+    return Frame(
+        time_ns=int(match["seconds"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0")),
+        can_id=number & (EXTENDED_ID_MASK if extended else STANDARD_ID_MASK),
+        data=bytes.fromhex(payload),
+        extended=extended,
+        fd=match["fd"] is not None,
+        error=error,
+        remote=match["remote"] is not None,
+        sent=(match["direction"] or "").upper() == "T",
+    )
+
+
+class CandumpReader:
+    """The log of `candump -l`; interfaces are channels, from 1 in the order in which they come."""
+
+    signature = b""
+
+    def frames(self, path: Path, spending: Spending) -> Iterator[FrameTable]:
+        """Read a file, see `LogReader`."""
+        columns, found = ColumnBuilder(), False
+        channels: dict[str, int] = {}
+        with closing(open_text(path, spending.look_at_clock)) as lines:
+            for frame, interface in candump_frames(lines):
+                channel = channels.setdefault(interface, min(len(channels) + 1, MAX_CHANNEL))
+                columns.add_frame(frame, channel)
+                if len(columns) >= LOG_BLOCK_FRAMES:
+                    found = True
+                    yield columns.table()
+                    columns = ColumnBuilder()
+        if len(columns):
+            yield columns.table()
+        elif not found:
+            raise DamagedLogError("no line as candump -l writes it")

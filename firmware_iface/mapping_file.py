@@ -1,0 +1,231 @@
+"""The schema of a mapping file: which signal of which message plays which role, in which unit."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+import msgspec
+
+from firmware_iface.errors import ConfigurationError
+
+UNIT_SCALES: dict[str, dict[str, tuple[float, float]]] = {
+    "current": {"A": (1.0, 0.0), "mA": (1e-3, 0.0), "uA": (1e-6, 0.0)},
+    "length": {
+        "m": (1.0, 0.0),
+        "cm": (1e-2, 0.0),
+        "mm": (1e-3, 0.0),
+        "um": (1e-6, 0.0),
+        "in": (0.0254, 0.0),
+        "mil": (25.4e-6, 0.0),
+    },
+    "pressure": {
+        "Pa": (1.0, 0.0),
+        "hPa": (1e2, 0.0),
+        "kPa": (1e3, 0.0),
+        "MPa": (1e6, 0.0),
+        "mbar": (1e2, 0.0),
+        "bar": (1e5, 0.0),
+        "psi": (6894.757293168361, 0.0),
+    },
+    # Temperatures are kept in degC, the scale of the viscosity laws.
+    "temperature": {
+        "degC": (1.0, 0.0),
+        "C": (1.0, 0.0),
+        "K": (1.0, -273.15),
+        "degF": (5.0 / 9.0, -160.0 / 9.0),
+    },
+    "time": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0)},
+}
+"""Per dimension: unit text -> (gain, bias), SI value = gain * value + bias."""
+
+UNIT_SPELLINGS = {
+    "µA": "uA",
+    "μA": "uA",
+    "µm": "um",
+    "μm": "um",
+    "µs": "us",
+    "μs": "us",
+    "°C": "degC",
+    "°F": "degF",
+    "deg C": "degC",
+    "deg F": "degF",
+    "inch": "in",
+    "Volts": "V",
+    "sec": "s",
+    "msec": "ms",
+}
+
+
+def si_factor(text: str, dimension: str, where: str) -> tuple[float, float]:
+    """Gain and bias of a unit: SI value = gain · value + bias.
+
+    text: the unit as written; dimension: quantity that it must measure, a key of `UNIT_SCALES`;
+    where: beginning of the error message. ConfigurationError: no unit, or not one of the dimension.
+    """
+    known = UNIT_SCALES[dimension]
+    unit = UNIT_SPELLINGS.get(text.strip(), text.strip())
+    if unit in known:
+        return known[unit]
+    if not unit:
+        raise ConfigurationError(
+            f"{where}: the DBC gives no unit; add unit = … ({', '.join(known)}) to the mapping"
+        )
+    raise ConfigurationError(
+        f"{where}: unit {text.strip()!r} is no {dimension} (known: {', '.join(known)})"
+    )
+
+
+MAX_CAN_ID, MAX_STANDARD_CAN_ID = 0x1FFFFFFF, 0x7FF
+"""Largest identifiers of a frame with 29 bits, and with 11 (ISO 11898-1)."""
+MappingName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+CodeNumber = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
+BitStateName = Literal["idle", "arming", "running", "complete", "aborted", "refused"]
+FaultAction = Literal["drop", "flag", "refuse"]
+FrameShare = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+
+class SignalRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One signal. SI value = SI(unit, physical * scale + offset)."""
+
+    message: MappingName
+    signal: MappingName
+    unit: str | None = None
+    """Overrides the DBC's unit text."""
+    scale: float = 1.0
+    """On top of the DBC's own, e.g. -1 where a sensor is mounted the other way round."""
+    offset: float = 0.0
+
+
+class ChannelRef(SignalRef, frozen=True, forbid_unknown_fields=True):
+    """A measured channel, and what is known of the converter behind it, in the signal's unit."""
+
+    range: tuple[float, float] | None = None
+    """Values at the converter's ends, after scale and offset."""
+    resolution: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    """One step of the converter; a bus signal may be finer."""
+
+
+class ChannelSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The four measured channels."""
+
+    current: ChannelRef
+    spool: ChannelRef
+    pressure: ChannelRef
+    position: ChannelRef
+
+
+class CommandSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the computer commands; at least one of current and position."""
+
+    current: SignalRef | None = None
+    position: SignalRef | None = None
+    mode: SignalRef | None = None
+    test_id: SignalRef | None = None
+    modes: dict[Literal["current", "position"], CodeNumber] = msgspec.field(
+        default_factory=lambda: {"current": 1, "position": 2}
+    )
+
+
+class EnvironmentSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Supply and return pressure, and oil temperature."""
+
+    supply_pressure: SignalRef | None = None
+    return_pressure: SignalRef | None = None
+    oil_temperature: SignalRef | None = None
+
+
+class StatusSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """State of the built-in test."""
+
+    state: SignalRef | None = None
+    reason: SignalRef | None = None
+    test_id: SignalRef | None = None
+    elapsed: SignalRef | None = None
+    serial: SignalRef | None = None
+    states: dict[BitStateName, CodeNumber] = msgspec.field(
+        default_factory=lambda: {name: number for number, name in enumerate(get_args(BitStateName))}
+    )
+
+
+class RequestSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Messages by which a tester requests a test."""
+
+    code: SignalRef | None = None
+    test_id: SignalRef | None = None
+    codes: dict[Literal["start", "abort"], CodeNumber] = msgspec.field(
+        default_factory=lambda: {"start": 1, "abort": 2}
+    )
+
+
+class OnboardSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Result of a computer that identifies by itself."""
+
+    state: SignalRef | None = None
+    test_id: SignalRef | None = None
+    verdict: SignalRef | None = None
+    runs: SignalRef | None = None
+    Kintas: SignalRef | None = None
+    FSS: SignalRef | None = None
+    FDJ: SignalRef | None = None
+    std_Kintas: SignalRef | None = None
+    std_FSS: SignalRef | None = None
+    std_FDJ: SignalRef | None = None
+
+
+class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How one message is guarded."""
+
+    counter: MappingName | None = None
+    counts: Literal["frames", "ticks"] = "frames"
+    """`ticks`: messages of one control tick carry the same number."""
+    crc: MappingName | None = None
+    crc_kind: Literal["crc8-j1850-id"] = "crc8-j1850-id"
+
+
+class PolicyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Share of a message's frames up to which `refuse` does not strike, for each kind."""
+
+    crc: FrameShare = 0.0
+    range: FrameShare = 0.0
+    length: FrameShare = 0.0
+    lost: FrameShare = 0.0
+    repeated: FrameShare = 0.0
+    out_of_order: FrameShare = 0.0
+
+
+class Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What happens to a recording or sample that fails a check.
+
+    `drop`: the sample is left out and counted; `flag`: it is used and counted (and noted where its
+    value may be wrong); `refuse`: left out, and beyond its share in `limits` no verdict is given.
+    """
+
+    crc: FaultAction = "drop"
+    range: FaultAction = "drop"
+    length: Literal["drop", "refuse"] = "drop"
+    lost: Literal["flag", "refuse"] = "flag"
+    repeated: Literal["drop", "refuse"] = "drop"
+    out_of_order: Literal["flag", "refuse"] = "flag"
+    limits: PolicyLimits = PolicyLimits()
+
+
+class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Content of a mapping file."""
+
+    schema: Literal["ehadiag.mapping/1"]
+    dbc: Annotated[str, msgspec.Meta(min_length=1, max_length=255)]
+    """Path of the DBC, in or below the mapping's own folder."""
+    tick_ms: Annotated[float, msgspec.Meta(ge=0.05, le=1000)] = 1.0
+    """Control period, ms."""
+    channel: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None
+    """Adapter channel of a recording that is the actuator's."""
+    id_offset: Annotated[int, msgspec.Meta(ge=-MAX_CAN_ID, le=MAX_CAN_ID)] = 0
+    """Added to the identifiers of all messages."""
+    channels: ChannelSignals
+    command: CommandSignals = CommandSignals()
+    environment: EnvironmentSignals = EnvironmentSignals()
+    status: StatusSignals = StatusSignals()
+    request: RequestSignals = RequestSignals()
+    onboard: OnboardSignals = OnboardSignals()
+    protection: Annotated[dict[MappingName, Protection], msgspec.Meta(max_length=256)] = {}
+    policy: Policy = Policy()

@@ -1,0 +1,420 @@
+"""The recording that is diagnosed: samples per control tick, their converters, their quality."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.errors import NotTestedError, install_command
+
+if TYPE_CHECKING:
+    import pandas
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+DEFAULT_LEVELS: Final = 4096.0
+"""Codes of the 12-bit converters of PHY-21."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One converter channel: mid-tread rounding, saturating at its ends."""
+
+    name: str
+    """Identifier used in tables, files and reports."""
+    full_scale: float
+    """Half range, SI unit of the channel; codes cover [-full_scale, full_scale - lsb]."""
+    unit: str
+    """Engineering unit shown to people."""
+    per_unit: float
+    """SI value of one engineering unit."""
+    levels: float = DEFAULT_LEVELS
+    """Steps in the whole range; no whole number where the step was seen in data."""
+
+    @property
+    def lsb(self) -> float:
+        """One code step, SI unit."""
+        return 2.0 * self.full_scale / self.levels
+
+    @property
+    def half(self) -> int:
+        """Code of zero; the largest code is 2 half - 1."""
+        return round(0.5 * self.levels)
+
+    @property
+    def grain(self) -> float:
+        """Step of a 12-bit converter of this range, or its own where that is coarser, SI unit.
+
+        Limits in LSB that allow for more than rounding are meant in these.
+        """
+        return 2.0 * self.full_scale / min(self.levels, DEFAULT_LEVELS)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Values at and beyond which the converter stands at its lower and upper end, SI unit."""
+        return end_thresholds(-self.full_scale, self.full_scale - self.lsb, self.lsb)
+
+    def encode(self, value: FloatArray) -> IntArray:
+        """Digitise SI values to codes 0 … 2 half - 1 (zero is code half)."""
+        code = np.floor(np.asarray(value) / self.lsb + 0.5) + self.half
+        return np.clip(code, 0, 2 * self.half - 1).astype(np.int64)
+
+    def decode(self, code: IntArray) -> FloatArray:
+        """SI value of each code."""
+        centred: FloatArray = np.asarray(code, dtype=np.float64) - self.half
+        return centred * self.lsb
+
+
+def end_thresholds(low: float, high: float, step: float) -> tuple[float, float]:
+    """Values half a step inside both ends of a range: what is at or beyond one stands at an end."""
+    return low + 0.5 * step, high - 0.5 * step
+
+
+class Channels(NamedTuple):
+    """The four channels, in the order of all tables."""
+
+    current: Channel
+    spool: Channel
+    pressure: Channel
+    position: Channel
+
+
+class StatedConverter(NamedTuple):
+    """What a mapping says of one converter, SI; None: nothing."""
+
+    low: float | None = None
+    """Value at its lower end."""
+    high: float | None = None
+    """Value at its upper end."""
+    step: float | None = None
+    """Resolution."""
+
+
+CURRENT_CHANNEL = Channel("current", 12e-3, "mA", 1e-3)
+SPOOL_CHANNEL = Channel("spool", 0.5e-3, "mm", 1e-3)
+PRESSURE_CHANNEL = Channel("pressure", 25e6, "MPa", 1e6)
+POSITION_CHANNEL = Channel("position", 60e-3, "mm", 1e-3)
+
+CHANNELS = Channels(CURRENT_CHANNEL, SPOOL_CHANNEL, PRESSURE_CHANNEL, POSITION_CHANNEL)
+"""Converters of PHY-23, of a bus and an actuator file that state none."""
+CHANNEL_NAMES = tuple(channel.name for channel in CHANNELS)
+CHANNEL_ROLES = tuple(f"channels.{name}" for name in CHANNEL_NAMES)
+MAX_SAMPLE_GAP_S = 0.25
+"""Longest span of a test without a sample, s; a longer one makes it NOT TESTED."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scales:
+    """How finely, and how far, a flight-control computer sees its actuator and its commands."""
+
+    channels: Channels = CHANNELS
+    """Its converters."""
+    current_step: float = 0.5e-6
+    """Resolution of commanded currents on its bus (BUS-8), A; 0: exact."""
+    position_step: float = 2e-6
+    """Of commanded positions, m; 0: exact."""
+
+
+DEFAULT_SCALES = Scales()
+"""Those of the default bus."""
+
+
+class CommandMode(IntEnum):
+    """What a command is (BUS-4, `CommandMode`)."""
+
+    CURRENT = 1
+    POSITION = 2
+
+
+class BitState(IntEnum):
+    """State of the built-in test (BUS-10, `BitState`)."""
+
+    IDLE = 0
+    ARMING = 1
+    RUNNING = 2
+    COMPLETE = 3
+    ABORTED = 4
+    REFUSED = 5
+
+
+ACTIVE_BIT_STATES = (BitState.ARMING, BitState.RUNNING)
+
+
+class BitReason(IntEnum):
+    """Why the flight-control computer refused (BUS-11, `BitReason`)."""
+
+    NONE = 0
+    UNKNOWN_TEST = 1
+    SUPPLY_PRESSURE_LOW = 2
+    OIL_TOO_COLD = 3
+    NOT_CENTRED = 4
+    ALREADY_RUNNING = 5
+    INTERLOCK_OPEN = 6
+
+
+class OnboardState(IntEnum):
+    """How far the computer's own identification is (BUS-17, `OnboardState`)."""
+
+    NOTHING = 0
+    RECORDING = 1
+    IDENTIFYING = 2
+    DONE = 3
+    GIVEN_UP = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedSignal:
+    """One signal as recorded."""
+
+    time: FloatArray
+    """s, ascending, shape (n,)."""
+    value: FloatArray
+    """SI, finite, shape (n,)."""
+    jitter: float = 0.0
+    """Deviation of the stamps from the even clock that took their place, s; 0: they are as read."""
+
+
+class Acquisition(NamedTuple):
+    """How samples were measured that are not the computer's own.
+
+    Attributes
+    ----------
+    rate : float
+        Samples of each signal, Hz.
+    lead : float
+        Time before the end of each tick at which the channels were sampled, s.
+    lead_std : float
+        Its standard deviation, s.
+    drift_std : float
+        Standard deviation of the clock's rate against the computer's, 1.
+    signals : tuple[RecordedSignal, ...]
+        Spool, pressure and position as they were measured, on the clock of `Samples.host_ns`.
+    """
+
+    rate: float
+    lead: float
+    lead_std: float
+    drift_std: float
+    signals: tuple[RecordedSignal, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Samples of one test on its own tick grid: row k is control tick k of the test.
+
+    All arrays have shape (ticks,). A row that did not arrive, or that failed a check, is NaN:
+    nothing is interpolated. Row k of the four channels holds what the converters read at the
+    *end* of tick k, `command` what was active *during* it.
+
+    Attributes
+    ----------
+    period_ns : int
+        Length of a tick, ns.
+    mode : CommandMode
+        What the command is.
+    current : FloatArray
+        Servovalve current, A.
+    spool : FloatArray
+        Spool position, m.
+    pressure : FloatArray
+        Differential pressure, Pa.
+    position : FloatArray
+        Jack position, m.
+    command : FloatArray
+        Command, A (current mode) or m (position mode).
+    saturated : BoolArray
+        Shape (4, ticks), the channel's converter stood at its end.
+    host_ns : IntArray
+        Host time stamp of each telemetry row, ns; -1 where none arrived.
+    stated : tuple[StatedConverter | None, ...]
+        What the mapping says of each channel's converter; empty: nothing of any.
+    acquired : Acquisition | None
+        How the channels were measured separately; None: these are the computer's own samples.
+    """
+
+    period_ns: int
+    mode: CommandMode
+    current: FloatArray
+    spool: FloatArray
+    pressure: FloatArray
+    position: FloatArray
+    command: FloatArray
+    saturated: BoolArray
+    host_ns: IntArray
+    stated: tuple[StatedConverter | None, ...] = ()
+    acquired: Acquisition | None = None
+
+    @property
+    def ticks(self) -> int:
+        """Number of rows."""
+        return len(self.spool)
+
+    @property
+    def time(self) -> FloatArray:
+        """Start of each tick, s from the start of the test, shape (ticks,)."""
+        return np.arange(self.ticks, dtype=np.float64) * (self.period_ns * 1e-9)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the samples as a data frame, one row a tick.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Index `time`, the start of each tick in s; columns `command`, `current`, `spool`,
+            `pressure`, `position` as the arrays hold them: SI, NaN where nothing arrived.
+
+        Raises
+        ------
+        ImportError
+            pandas is not installed.
+        """
+        try:
+            import pandas  # noqa: PLC0415 - optional, and slow
+        except ImportError:
+            raise ImportError(f"a data frame needs pandas: {install_command('pandas')}") from None
+        names = ("command", "current", "spool", "pressure", "position")
+        return pandas.DataFrame(
+            {name: getattr(self, name) for name in names},
+            index=pandas.Index(self.time, name="time"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Environment:
+    """Median over the test; None where the bus did not say."""
+
+    supply_pressure: float | None = None
+    """Pa."""
+    return_pressure: float | None = None
+    """Pa."""
+    oil_temperature: float | None = None
+    """degC: the scale of the viscosity laws."""
+    temperature_std: float = 0.0
+    """Standard deviation of the oil temperature by its steps on the bus, K."""
+    supply_std: float = 0.0
+    """Standard deviation of supply less return pressure by their steps on the bus, Pa."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageCounts:
+    """Validity of one message over the span of a recording."""
+
+    received: int = 0
+    """Frames with the message's identifier, good or bad."""
+    accepted: int = 0
+    lost: int = 0
+    """Counter gaps, and frames missing at the ends of the test."""
+    repeated: int = 0
+    out_of_order: int = 0
+    conflicts: int = 0
+    """Counter values that came with different payloads; all their frames are dropped, and lost."""
+    crc_errors: int = 0
+    length_errors: int = 0
+    range_errors: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """How good a recording is: counts per message and per channel."""
+
+    messages: Mapping[str, MessageCounts] = field(default_factory=dict)
+    saturated: Mapping[str, int] = field(default_factory=dict)
+    """Samples at a converter's end, per channel."""
+    foreign: int = 0
+    """Frames with other identifiers."""
+    error_frames: int = 0
+    notes: tuple[str, ...] = ()
+    """What else a reader should know, one sentence each."""
+    refused: tuple[str, ...] = ()
+    """Why the user's own policy wants no verdict on this recording, one sentence each."""
+
+    def total(self, count: str) -> int:
+        """Sum of one of the counts of `MessageCounts` over all messages."""
+        return sum(int(getattr(item, count)) for item in self.messages.values())
+
+
+@dataclass(frozen=True, slots=True)
+class BitOutcome:
+    """How the test ended, as the flight-control computer says."""
+
+    state: BitState | None = None
+    """None: no status on the bus."""
+    reason: BitReason = BitReason.NONE
+
+
+@dataclass(frozen=True, slots=True)
+class OnboardResult:
+    """What the flight-control computer says that it has found itself in a test (BUS-18)."""
+
+    test_id: int | None
+    """Number of the test; None where it does not say."""
+    verdict: int | None
+    """0 healthy, 10 degraded, 20 fault, 30 not tested; None where it does not say."""
+    runs: int | None
+    """Runs of the model that it took; None where it does not say."""
+    severities: Mapping[str, float]
+    """Kintas, FSS, FDJ; 0 … 1; NaN where it has no estimate."""
+    std: Mapping[str, float]
+    """Their standard deviations, or NaN."""
+
+    def is_of(self, test_id: int | None) -> bool:
+        """Whether it can be that of a test; None: the test's number is not known."""
+        return None in (test_id, self.test_id) or test_id == self.test_id
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """One test of one actuator, as acquired."""
+
+    source: str
+    """File name or bus."""
+    samples: Samples | None
+    """None: no telemetry of a test was found."""
+    test_id: int | None
+    serial: int | None
+    outcome: BitOutcome
+    environment: Environment
+    quality: Quality
+    channel: int | None = None
+    """Adapter channel of the recording; None where it has only one or does not say."""
+    start_ns: int | None = None
+    """Host time of the test's first sample, ns since the epoch (or the log's start)."""
+    onboard: OnboardResult | None = None
+    """What the computer has found itself; None where it did not say."""
+    by_time: bool = False
+    """No counter told the samples' ticks: one message's may be placed later than another's."""
+    out_of_order: float = 0.0
+    """Share of the ticks whose command is another tick's: the frames' order is not the bus's."""
+    as_measured: Recording | None = None
+    """The same as measured by converters of an acquisition, where the values may be of either."""
+
+    @property
+    def duration(self) -> float:
+        """Length of the test, s; 0 without samples."""
+        return 0.0 if self.samples is None else self.samples.ticks * self.samples.period_ns * 1e-9
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the samples as a data frame, see `Samples.to_frame`.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a tick.
+
+        Raises
+        ------
+        NotTestedError
+            There are no samples.
+        ImportError
+            pandas is not installed.
+        """
+        if self.samples is None:
+            raise NotTestedError(f"{self.source}: no telemetry of a test in it")
+        return self.samples.to_frame()

@@ -1,1 +1,0 @@
-"""Running a built-in test on a bus: handshake, limits, recording, bus report."""

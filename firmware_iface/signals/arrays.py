@@ -1,0 +1,246 @@
+"""Reads decoded signals from files of arrays: MF4, TDMS, HDF5 and with it MATLAB 7.3.
+
+Each channel is an array with a name; times are a channel of their own, the waveform's in TDMS,
+the group's in MF4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.errors import (
+    ConfigurationError,
+    InputOutputError,
+    install_command,
+    printable,
+)
+from firmware_iface.logs.log_files import Budget
+from firmware_iface.recording import FloatArray, RecordedSignal
+from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
+from firmware_iface.signals.tables import MAX_TABLE_ROWS, checked_signals
+
+__all__ = ["HdfReader", "Mf4SignalReader", "TdmsReader"]
+
+UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units", "unit_string")
+MATLAB_REFERENCES = "#"
+"""Begins the names of MATLAB's own groups."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayChannel:
+    """One channel of a file; read when it is needed."""
+
+    length: int
+    unit: str
+    read: Callable[[], FloatArray]
+    times: Callable[[], FloatArray] | None = None
+    """Its own time stamps, s; None: those of another channel."""
+
+
+def array_signals(
+    channels: Mapping[str, ArrayChannel], columns: ColumnMap, path: Path, *, complete: bool
+) -> dict[str, RecordedSignal]:
+    """Take the signals that have a role out of channels by name; see `SignalReader`."""
+    present, where = list(channels), f"log {path}"
+    column = columns.columns.get(TIME_ROLE)
+    stamped = column is not None and (
+        column.column in channels or not any(item.times for item in channels.values())
+    )
+    rest = {role: item for role, item in columns.columns.items() if stamped or role != TIME_ROLE}
+    columns = ColumnMap(rest, columns.tick_ns)
+    found = columns.resolve(present, where)
+    if complete and (lacking := missing_channels(found, present)):
+        raise ConfigurationError(f"{where}: {lacking}")
+    longest = max((channels[item.column].length for item in found.values()), default=0)
+    if longest > MAX_TABLE_ROWS:
+        raise InputOutputError(f"{where}: more than {MAX_TABLE_ROWS} values; cut it about the test")
+    values: dict[str, FloatArray] = {}
+    for role, column in found.items():
+        gain, bias = column_unit(column, channels[column.column].unit, role, where)
+        values[role] = channels[column.column].read() * gain + bias
+    out = {}
+    for role, column in found.items():
+        if role == TIME_ROLE:
+            continue
+        times = channels[column.column].times
+        stamps = values.get(TIME_ROLE) if stamped or times is None else times()
+        if stamps is None:
+            raise ConfigurationError(
+                f"{where}: no channel of time stamps: name it by --column time=NAME:UNIT"
+            )
+        if len(stamps) != len(values[role]):
+            raise InputOutputError(
+                f"{where}: {printable(column.column)!r} has {len(values[role])} values,"
+                f" but {len(stamps)} time stamps"
+            )
+        out[role] = stamps, values[role]
+    return checked_signals(out.items(), path)
+
+
+def _short_names(paths: Mapping[str, ArrayChannel]) -> dict[str, ArrayChannel]:
+    """Channels by the last part of their path, where that is of one channel alone."""
+    last = [path.rpartition("/")[2] for path in paths]
+    return {
+        short if last.count(short) == 1 else path: channel
+        for (path, channel), short in zip(paths.items(), last, strict=True)
+    }
+
+
+@contextmanager
+def _opened_by(library: str, kind: str, path: Path) -> Iterator[None]:
+    """Turn what an optional library raises into one line: any kind, and it quotes the file."""
+    try:
+        yield
+    except (ConfigurationError, InputOutputError):
+        raise
+    except ImportError:
+        raise InputOutputError(
+            f"log {path}: {kind} needs {library}: {install_command('daq')}"
+        ) from None
+    except Exception:
+        raise InputOutputError(f"log {path}: not a readable {kind} file of signals") from None
+
+
+class Mf4SignalReader:
+    """ASAM's measurements; the time of a channel is that of its group, whatever that is called."""
+
+    signature = b""
+
+    def signals(
+        self,
+        path: Path,
+        columns: ColumnMap,
+        budget: Budget,  # noqa: ARG002
+        *,
+        complete: bool,
+    ) -> dict[str, RecordedSignal]:
+        """Read a file, see `SignalReader`."""
+        rest = {role: item for role, item in columns.columns.items() if role != TIME_ROLE}
+        with _opened_by("asammdf", "MF4", path):
+            from asammdf import MDF  # noqa: PLC0415 - optional, and slow
+
+            with closing(MDF(path)) as file:
+                return array_signals(
+                    _Mf4Channels(file), ColumnMap(rest, columns.tick_ns), path, complete=complete
+                )
+
+
+class _Mf4Channels(Mapping[str, ArrayChannel]):
+    """Channels of a measurement, each read when it is looked up."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._names = sorted(file.channels_db)
+        self._read: dict[str, ArrayChannel] = {}
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, name: str) -> ArrayChannel:
+        if name not in self._read:
+            got = self._file.get(name)
+            self._read[name] = ArrayChannel(
+                len(got.samples),
+                str(got.unit or ""),
+                partial(np.asarray, got.samples, dtype=np.float64),
+                partial(np.asarray, got.timestamps, dtype=np.float64),
+            )
+        return self._read[name]
+
+
+class TdmsReader:
+    """Files of LabVIEW; the time of a channel is that of its waveform."""
+
+    signature = b"TDSm"
+
+    def signals(
+        self,
+        path: Path,
+        columns: ColumnMap,
+        budget: Budget,  # noqa: ARG002
+        *,
+        complete: bool,
+    ) -> dict[str, RecordedSignal]:
+        """Read a file, see `SignalReader`."""
+        with _opened_by("npTDMS", "TDMS", path):
+            from nptdms import TdmsFile  # noqa: PLC0415 - optional
+
+            with TdmsFile.open(path) as file:
+                found = {
+                    f"{group.name}/{channel.name}": _tdms_channel(channel)
+                    for group in file.groups()
+                    for channel in group.channels()
+                }
+                return array_signals(_short_names(found), columns, path, complete=complete)
+
+
+def _tdms_channel(channel: Any) -> ArrayChannel:
+    about = channel.properties
+    times = "wf_increment" in about and "wf_start_offset" in about
+    return ArrayChannel(
+        len(channel),
+        str(about.get("unit_string", "")),
+        lambda: np.asarray(channel[:], dtype=np.float64),
+        (lambda: np.asarray(channel.time_track(), dtype=np.float64)) if times else None,
+    )
+
+
+class HdfReader:
+    """Files of HDF5, and of MATLAB from version 7.3 on."""
+
+    signature = b""
+
+    def signals(
+        self,
+        path: Path,
+        columns: ColumnMap,
+        budget: Budget,  # noqa: ARG002
+        *,
+        complete: bool,
+    ) -> dict[str, RecordedSignal]:
+        """Read a file, see `SignalReader`."""
+        with _opened_by("h5py", "HDF5", path):
+            import h5py  # noqa: PLC0415 - optional, and slow
+
+            if not h5py.is_hdf5(path):
+                raise InputOutputError(
+                    f"log {path}: not a file of HDF5; of MATLAB save it as version 7.3 (-v7.3)"
+                )
+            with h5py.File(path, "r") as file:
+                found: dict[str, ArrayChannel] = {}
+
+                def take(name: str, item: Any) -> None:
+                    if isinstance(item, h5py.Dataset) and not name.startswith(MATLAB_REFERENCES):
+                        found.update(_hdf_channels(name, item))
+
+                file.visititems(take)
+                return array_signals(_short_names(found), columns, path, complete=complete)
+
+
+def _hdf_channels(name: str, item: Any) -> dict[str, ArrayChannel]:
+    """Channels of one data set: a row or column of numbers, or a table with named columns."""
+    unit = next((item.attrs[key] for key in UNIT_ATTRIBUTES if key in item.attrs), "")
+    text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+    if item.dtype.names and item.ndim == 1:
+        return {
+            f"{name}/{field}": ArrayChannel(item.size, "", partial(_numbers, item, field))
+            for field in item.dtype.names
+        }
+    line = item.ndim > 0 and item.size == max(item.shape)
+    if not line or item.dtype.kind not in "fiu":
+        return {}
+    return {name: ArrayChannel(item.size, text, partial(_numbers, item, ()))}
+
+
+def _numbers(item: Any, part: Any) -> FloatArray:
+    return np.asarray(item[part], dtype=np.float64).reshape(-1)

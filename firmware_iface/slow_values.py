@@ -1,0 +1,230 @@
+"""Looks for a second sender of a message that brings slow values: supply pressure, oil temperature.
+
+Such a message counts its own frames. A sender with a counter of its own uses no counter twice: it
+is found by the rate, by counters that do not run on, and by values that do not stay together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.bus_map import MessageMap
+from firmware_iface.protection import CONFLICTS
+from firmware_iface.recording import BoolArray, FloatArray, IntArray
+
+__all__ = [
+    "SlowValueWatch",
+    "brings_slow_values",
+    "repeated_frames",
+    "slow_value_conflict",
+    "spread_conflict",
+]
+
+
+class SlowValueLimits(NamedTuple):
+    """Limits beyond which the frames of a slow message are of two senders."""
+
+    excess: float = 1.25
+    """Frames per cycle, 1; clocks differ by less, and a quarter of strange frames leaves the median
+    within the noise of the true ones."""
+    leap: int = 16
+    """Step of a counter, 1, forth or back, that no loss or late frame makes; senders whose counters
+    lie nearer use each other's within as many frames, and `conflicting` finds them."""
+    outliers: float = 0.02
+    """Share of values, 1, that may lie apart: what is borne of conflicts."""
+    watched: int = 256
+    """Frames that the live watch looks back: one turn of eight bits."""
+    repeat: float = 0.25
+    """Cycles, 1, within which the same payload without a counter is a repeat, sent once."""
+    judged: int = 64
+    """Frames, 1, in less than such a time after which the live watch judges again: it takes
+    0.3 ms, and a flood of one message comes at 8000 a second."""
+    late_ns: int = 1_000_000_000
+    """Time, ns, for which a busy computer may hold frames back before the live watch sees them."""
+
+
+SLOW_VALUES = SlowValueLimits()
+MAX_SPREADS = {
+    "environment.supply_pressure": (2e6, 1e-6, "MPa"),
+    "environment.return_pressure": (2e6, 1e-6, "MPa"),
+    "environment.oil_temperature": (5.0, 1.0, "K"),
+}
+"""Role: largest spread within a test, SI, its factor to the unit, and that unit. Pressures: a
+tenth of the usual supply, twice what a pump's ripple and a moving jack take from it. Oil: its tank
+warms by less than 0.1 K in a test."""
+
+
+def brings_slow_values(message: MessageMap) -> bool:
+    """Whether a message brings nothing but values of the environment."""
+    return all(role.name.startswith("environment.") for role in message.roles)
+
+
+def repeated_frames(
+    message: MessageMap, time_ns: IntArray, data: NDArray[np.uint8], *, counted: bool
+) -> BoolArray:
+    """Frames that repeat the one before, as an interface that reports each of them twice makes.
+
+    Parameters
+    ----------
+    message : MessageMap
+        The message.
+    time_ns : IntArray
+        Time stamps in order of arrival, shape (n,).
+    data : NDArray[np.uint8]
+        Payloads, shape (n, width).
+    counted : bool
+        Whether the payloads have a counter.
+
+    Returns
+    -------
+    BoolArray
+        Shape (n,).
+    """
+    same = np.zeros(len(data), dtype=np.bool_)
+    same[1:] = (data[1:] == data[:-1]).all(axis=1)
+    if not counted:
+        same[1:] &= np.diff(time_ns) < SLOW_VALUES.repeat * message.cycle_ns
+    return same
+
+
+def spread_conflict(role: str, values: FloatArray) -> str:
+    """Why values of one role are not those of one sender; empty if they stay together.
+
+    Parameters
+    ----------
+    role : str
+        Such as `environment.oil_temperature`.
+    values : FloatArray
+        SI values of one test; NaN is no value.
+
+    Returns
+    -------
+    str
+        One clause.
+    """
+    limit, factor, unit = MAX_SPREADS[role]
+    found = np.sort(values[np.isfinite(values)])
+    # One damaged value is borne, the shortest span of all the others counts.
+    kept = len(found) - max(math.floor(SLOW_VALUES.outliers * len(found)), 1)
+    if kept < 1:
+        return ""
+    spread = float(np.min(found[kept - 1 :] - found[: len(found) - kept + 1]))
+    if spread <= limit:
+        return ""
+    return (
+        f"{role} differs by {factor * spread:.3g} {unit} within the test"
+        f" ({factor * limit:.3g} {unit} are borne)"
+    )
+
+
+def slow_value_conflict(
+    message: MessageMap,
+    time_ns: IntArray,
+    counter: IntArray | None,
+    values: Mapping[str, FloatArray],
+    span_ns: int,
+) -> str:
+    """Why frames of a slow message are not of one sender; empty if nothing says so.
+
+    Parameters
+    ----------
+    message : MessageMap
+        The message.
+    time_ns : IntArray
+        Time stamps of its sound frames in order of arrival without repeats, shape (n,).
+    counter : IntArray | None
+        Their counters, shape (n,); None where not each of them has one.
+    values : Mapping[str, FloatArray]
+        SI values by role, shape (n,).
+    span_ns : int
+        Time, ns, in which they were sent.
+
+    Returns
+    -------
+    str
+        One clause that names the message.
+    """
+    who = f"a second sender of {message.name} ({message.can_id:#x})"
+    cycle = message.cycle_ns if brings_slow_values(message) else 0
+    usual = span_ns / cycle + 1.0 if cycle else math.inf
+    if len(time_ns) > SLOW_VALUES.excess * usual + CONFLICTS.chance:
+        return (
+            f"{who}, or a wrong cycle time in the DBC: {len(time_ns)} frames in"
+            f" {span_ns / 1e9:.1f} s, {math.ceil(usual)} are usual"
+        )
+    if counter is not None:
+        step = np.diff(counter)
+        leaps = _leaps(step, message.modulus)
+        if cycle:  # a long silence is no leap
+            waited = np.rint(np.diff(time_ns) / cycle).astype(np.int64)
+            leaps &= _leaps(step - waited, message.modulus)
+        if leaps.sum() > CONFLICTS.chance:
+            return f"{who}, two counters in turn: {leaps.sum()} of {len(step)} steps do not run on"
+    for role, value in values.items():
+        if role in MAX_SPREADS and (apart := spread_conflict(role, value)):
+            return f"{who}, or a broken sensor: {apart}"
+    return ""
+
+
+def _leaps(step: IntArray, modulus: int) -> BoolArray:
+    half = modulus // 2
+    return np.asarray(np.abs((step + half) % modulus - half) > SLOW_VALUES.leap)
+
+
+class SlowValueWatch:
+    """Looks for a second sender of one slow message, a frame at a time; memory is constant.
+
+    Parameters
+    ----------
+    message : MessageMap
+        The message; `brings_slow_values`.
+    """
+
+    def __init__(self, message: MessageMap) -> None:
+        self._message = message
+        self._streams: dict[tuple[frozenset[str], bool], deque[_SlowFrame]] = {}
+        self._taken = 0
+        self._judged_ns = 0
+        self._found = ""
+
+    def take(
+        self, time_ns: int, counter: int | None, data: bytes, values: Mapping[str, float]
+    ) -> str:
+        """Take a sound frame; return why there are two senders, empty if nothing says so."""
+        frames = self._streams.setdefault(
+            (frozenset(values), counter is None), deque(maxlen=SLOW_VALUES.watched)
+        )
+        if frames and frames[-1].data == data:
+            near = time_ns - frames[-1].time_ns < SLOW_VALUES.repeat * self._message.cycle_ns
+            if counter is not None or near:
+                return ""
+        frames.append(_SlowFrame(time_ns, counter, data, values))
+        self._taken += 1
+        if (
+            self._taken % SLOW_VALUES.judged
+            and abs(time_ns - self._judged_ns) < SLOW_VALUES.repeat * self._message.cycle_ns
+        ):
+            return self._found
+        self._judged_ns = time_ns
+        stamps = np.array([item.time_ns for item in frames], dtype=np.int64)
+        self._found = slow_value_conflict(
+            self._message,
+            stamps,
+            None if counter is None else np.array([item.counter for item in frames]),
+            {key: np.array([item.values[key] for item in frames]) for key in values},
+            int(np.ptp(stamps)) + SLOW_VALUES.late_ns,
+        )
+        return self._found
+
+
+class _SlowFrame(NamedTuple):
+    time_ns: int
+    counter: int | None
+    data: bytes
+    values: Mapping[str, float]

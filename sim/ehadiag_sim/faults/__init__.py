@@ -1,1 +1,0 @@
-"""Simulated damage: to the harness of a bus, and to the frames on it."""

@@ -1,1 +1,0 @@
-"""Emulated flight-control computer: control law, handshake, telemetry."""

@@ -1,1 +1,0 @@
-"""Detailed simulator of servovalve, jack and sensors."""

@@ -1,0 +1,274 @@
+"""The detailed actuator simulator: plant, sensors and control law, tick by tick or a whole test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ehadiag.compile.jit import Array
+from ehadiag.core.actuator import Actuator
+from ehadiag.core.conversion import actuator_channels
+from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S, PlantDynamics
+from ehadiag_sim.plant_laws import PositionController
+from ehadiag_sim.sensing import ChannelFault, SimulatedConverters
+from firmware_iface.errors import ConfigurationError
+from firmware_iface.recording import (
+    CHANNELS,
+    DEFAULT_SCALES,
+    BitOutcome,
+    BitState,
+    Channels,
+    CommandMode,
+    Environment,
+    MessageCounts,
+    Quality,
+    Recording,
+    Samples,
+    Scales,
+    StatedConverter,
+)
+from firmware_iface.stored_test import StoredTest
+
+
+class Plant:
+    """One actuator with its converters and control law, at rest in the middle to begin with.
+
+    In each tick the control law works on the jack position that was digitised at the end of the
+    tick before, its current is held for the tick, and at the end all channels are digitised.
+
+    actuator: data of the actuator; faults: severities of the three faults; None: as new; effects:
+    effects besides the faults; None: none of them, default oil and supply; sensors: how the
+    converters err; None: the specified noise, no offsets; seed: seed of the noise; the same seed
+    gives the same samples; step: integration step, s; channel_faults: damage to the readings of the
+    channels; None: none; scales: converters, and resolution of commands; None: the converters of
+    the actuator's file, the resolution of the default bus. ConfigurationError: a step that is not
+    finite or not within 1 ns … one tick; sensors sampled a tick early or more.
+    """
+
+    def __init__(
+        self,
+        actuator: Actuator,
+        faults: Faults | None = None,
+        effects: Effects | None = None,
+        sensors: Sensors | None = None,
+        seed: int = 0,
+        *,
+        step: float = DEFAULT_STEP_S,
+        channel_faults: Sequence[ChannelFault] = (),
+        scales: Scales | None = None,
+    ) -> None:
+        self._scales = scales or Scales(actuator_channels(actuator))
+        sensors, effects = sensors or Sensors(), effects or Effects()
+        self._dynamics = PlantDynamics(
+            actuator, faults, effects, step, filter_time=sensors.filter_time, early=sensors.early
+        )
+        self._converters = SimulatedConverters(
+            actuator, sensors, effects.unmodelled, seed, channel_faults, self._scales.channels
+        )
+        self._effects, self._sensors = effects, sensors
+        self._controller = PositionController(actuator.controller)
+        self._current = 0.0
+        self._codes = self._converters.digitise(self._dynamics.seen)
+
+    def tick(self, command: float, mode: CommandMode) -> NDArray[np.int64]:
+        """Advance by one control tick; return the four ADC codes at its end, shape (4,).
+
+        `command` in A (current mode) or m (position mode), taken at the bus's resolution.
+        """
+        command = _rounded(command, _resolution(self._scales, mode))
+        measured = float(self._scales.channels.position.decode(self._codes[3:])[0])
+        self._current = self._controller.current(command, mode, measured)
+        self._dynamics.advance(self._current)
+        self._codes = self._converters.digitise(self._dynamics.seen)
+        return self._codes
+
+    @property
+    def scales(self) -> Scales:
+        """Converters, and resolution of commands."""
+        return self._scales
+
+    @property
+    def codes(self) -> NDArray[np.int64]:
+        """ADC codes of the last tick (before the first: of the plant at rest), shape (4,)."""
+        return self._codes
+
+    @property
+    def truth(self) -> tuple[float, float, float, float]:
+        """Noise-free current (A), spool (m), pressure (Pa), jack position (m) now."""
+        plant = self._dynamics
+        return self._current, plant.spool, plant.pressure, plant.position
+
+    @property
+    def probed(self) -> tuple[float, float, float]:
+        """Supply and return pressure (Pa), oil temperature (degC) as the probes read them."""
+        effects, sensors = self._effects, self._sensors
+        return (
+            effects.supply_pressure + sensors.supply_error,
+            effects.return_pressure,
+            self._dynamics.oil_temperature + sensors.temperature_error,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedRun:
+    """One simulated test: the truth and what the converters made of it."""
+
+    test: StoredTest
+    """The stored test that ran."""
+    effects: Effects
+    """The conditions it ran under."""
+    command: Array
+    """Command of each tick at the bus's resolution, A or m, shape (ticks,)."""
+    current: Array
+    """Noise-free A, m, Pa, m at the end of each tick, (ticks,)."""
+    spool: Array
+    pressure: Array
+    position: Array
+    codes: NDArray[np.int64]
+    """ADC codes of the four channels as sampled in each tick, shape (4, ticks)."""
+    environment: Environment
+    """What the probes read half-way through the test, at the bus's resolution."""
+    channels: Channels = CHANNELS
+    """Converters that made the codes."""
+
+    @property
+    def samples(self) -> Samples:
+        """The samples as a bus without losses delivers them; time stamps from zero."""
+        decoded = [
+            channel.decode(codes) for channel, codes in zip(self.channels, self.codes, strict=True)
+        ]
+        ends = np.array([2 * channel.half - 1 for channel in self.channels])[:, None]
+        period_ns = round(1e9 / self.test.rate)
+        return Samples(
+            period_ns=period_ns,
+            mode=_mode(self.test),
+            current=decoded[0],
+            spool=decoded[1],
+            pressure=decoded[2],
+            position=decoded[3],
+            command=self.command.copy(),
+            saturated=(self.codes == 0) | (self.codes == ends),
+            host_ns=np.arange(1, self.test.ticks + 1, dtype=np.int64) * period_ns,
+            stated=tuple(
+                StatedConverter(-c.full_scale, c.full_scale - c.lsb, c.lsb) for c in self.channels
+            ),
+        )
+
+    def recording(self, source: str, serial: int | None = None) -> Recording:
+        """Return the test as an acquisition without a fault would hand it over.
+
+        `source` names it in results, `serial` is the number of the actuator if the bus says one.
+        """
+        samples = self.samples
+        perfect = MessageCounts(received=samples.ticks, accepted=samples.ticks)
+        counts = samples.saturated.sum(axis=1)
+        return Recording(
+            source=source,
+            samples=samples,
+            test_id=self.test.id,
+            serial=serial,
+            outcome=BitOutcome(state=BitState.COMPLETE),
+            environment=self.environment,
+            quality=Quality(
+                messages={"ServoTelemetry": perfect, "ServoCommand": perfect},
+                saturated={c.name: int(n) for c, n in zip(self.channels, counts, strict=True)},
+            ),
+        )
+
+
+def simulate(
+    actuator: Actuator,
+    test: StoredTest,
+    faults: Faults | None = None,
+    effects: Effects | None = None,
+    sensors: Sensors | None = None,
+    *,
+    seed: int = 0,
+    step: float = DEFAULT_STEP_S,
+    channel_faults: Sequence[ChannelFault] = (),
+    scales: Scales | None = None,
+) -> SimulatedRun:
+    """Run a stored test from rest; the same seed gives the same run.
+
+    Arguments are those of `Plant`; the integration step is shortened so that a whole number makes a
+    tick. A step out of range, or test and controller at different rates, raise ConfigurationError.
+    """
+    if test.rate != actuator.controller.rate:
+        raise ConfigurationError(
+            f"test {test.name!r} runs at {test.rate:g} Hz, the controller of actuator "
+            f"{actuator.name!r} at {actuator.controller.rate:g} Hz"
+        )
+    effects = effects or Effects()
+    plant = Plant(
+        actuator,
+        faults,
+        effects,
+        sensors,
+        seed,
+        step=step,
+        channel_faults=channel_faults,
+        scales=scales,
+    )
+    command, mode = bus_command(test, plant.scales), _mode(test)
+    truth = np.empty((4, test.ticks))
+    codes = np.empty((4, test.ticks), dtype=np.int64)
+    probed = plant.probed
+    for tick, value in enumerate(command.tolist()):
+        codes[:, tick] = plant.tick(value, mode)
+        truth[:, tick] = plant.truth
+        if tick == test.ticks // 2:
+            probed = plant.probed
+    return SimulatedRun(
+        test=test,
+        effects=effects,
+        command=command,
+        current=truth[0],
+        spool=truth[1],
+        pressure=truth[2],
+        position=truth[3],
+        codes=codes,
+        environment=_on_the_bus(*probed),
+        channels=plant.scales.channels,
+    )
+
+
+def bus_command(test: StoredTest, scales: Scales = DEFAULT_SCALES) -> Array:
+    """Command of each tick as the control computer holds it, SI (A or m), shape (ticks,).
+
+    It has the resolution of the bus signal. The reference recordings show this: their currents
+    follow the rounded command, and 2 µm of it are 0.6 LSB of current.
+    """
+    step = _resolution(scales, _mode(test))
+    if step == 0.0:
+        return test.command()
+    rounded: Array = np.rint(test.command() / step) * step
+    return rounded
+
+
+def _on_the_bus(supply: float, drain: float, degc: float) -> Environment:
+    """Probes' readings as the bus carries them: 10 kPa and 0.1 K (`Environment` of the DBC)."""
+    return Environment(
+        supply_pressure=round(supply / 1e4) * 1e4,
+        return_pressure=round(drain / 1e4) * 1e4,
+        oil_temperature=round(10.0 * degc) / 10.0,
+        temperature_std=0.1 / math.sqrt(12.0),
+        supply_std=1e4 / math.sqrt(6.0),
+    )
+
+
+def _mode(test: StoredTest) -> CommandMode:
+    return CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+
+
+def _resolution(scales: Scales, mode: CommandMode) -> float:
+    """Return that of commands, A or m: the computer acts on what its bus shows (BUS-8)."""
+    return scales.current_step if mode is CommandMode.CURRENT else scales.position_step
+
+
+def _rounded(command: float, step: float) -> float:
+    return command if step == 0.0 else round(command / step) * step

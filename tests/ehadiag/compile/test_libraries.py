@@ -1,0 +1,106 @@
+"""Libraries that come with the package: which one is loaded, and which is not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ehadiag.compile import libraries, sources, worker
+from ehadiag.compile.elf import shared_library
+from firmware_iface.errors import ConfigurationError
+
+LEVEL = libraries.processor_level()
+needs_levels = pytest.mark.skipif(LEVEL == libraries.NO_LEVEL, reason="no shared libraries here")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The smallest library for this processor, as a package has it."""
+    folder = tmp_path_factory.mktemp("built")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(libraries, "SHIPPED", ("simulator",))
+        libraries.build(folder, [LEVEL])
+    return folder
+
+
+@pytest.fixture
+def package(built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with that library."""
+    folder = tmp_path / "_kernels"
+    shutil.copytree(built, folder)
+    monkeypatch.setattr(libraries, "PREBUILT", folder)
+    for function in (libraries._manifest, libraries._prebuilt):
+        function.cache_clear()
+        monkeypatch.setattr(libraries, "warn_once", print)
+    yield folder
+    for function in (libraries._manifest, libraries._prebuilt):
+        function.cache_clear()
+
+
+@needs_levels
+def test_a_library_of_the_package_is_that_compiled_here(package: Path) -> None:
+    found = libraries._prebuilt("simulator")
+    assert found == libraries._made("simulator", LEVEL)
+    assert found is not None
+    assert libraries.missing(["simulator"]) == []
+
+
+@needs_levels
+def test_a_damaged_library_is_not_loaded(package: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = package.glob("*.so")
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    assert libraries._prebuilt("simulator") is None
+    assert capsys.readouterr().out == (
+        f"{file}: not the file that the package came with: compiling\n"
+    )
+
+
+@needs_levels
+def test_a_library_of_other_sources_is_not_loaded(
+    package: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(libraries, "_sources", lambda _library: "other")
+    assert libraries._prebuilt("simulator") is None
+    assert "not those of its sources: compiling" in capsys.readouterr().out
+
+
+@needs_levels
+def test_a_processor_without_a_library_compiles(
+    package: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(libraries, "processor_level", lambda: ("m68k", "68060"))
+    assert libraries._prebuilt("simulator") is None
+    assert "without kernels for this processor: compiling" in capsys.readouterr().out
+
+
+@needs_levels
+def test_results_name_the_compiler_that_made_the_library(package: Path) -> None:
+    manifest = package / libraries.MANIFEST
+    content = json.loads(manifest.read_text())
+    content["compiler"]["numba"] = "0.1"
+    manifest.write_text(json.dumps(content))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(libraries, "SHIPPED", ("simulator",))
+        assert libraries.compiler_versions()["numba"] == "0.1"
+
+
+def test_without_a_compiler_the_error_names_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(worker, "find_spec", lambda _name: None)
+    with pytest.raises(ConfigurationError, match=r"needs numba: .*install .*numba"):
+        worker.object_code(worker.ObjectFile((), libraries.HOST))
+
+
+def test_what_is_no_object_file_of_this_kind_is_refused() -> None:
+    with pytest.raises(ValueError, match="no object file of ELF-64"):
+        shared_library(b"\x7fELF\x01\x01".ljust(64, b"\0"), [])
+
+
+def test_the_digests_of_the_sources_come_with_the_package(built: Path) -> None:
+    assert (built / sources.SOURCE_DIGESTS_FILE).stat().st_size > 0

@@ -1,0 +1,67 @@
+"""The history as CSV and Parquet, and diagnoses of another system."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from history_cases import an_entry
+
+from ehadiag.cli.main import main
+from ehadiag.history.store import History
+from ehadiag.history.tables import entries_from_csv, history_csv, history_parquet
+from ehadiag.model.registry import FAULT_NAMES
+from firmware_iface.errors import ConfigurationError
+
+ENTRIES = [
+    an_entry(7, 100.0 * n, (0.1 * n, 0.2, 0.3), number=n, tested=f"2026-03-0{n}T12:00:00.000Z")
+    for n in (1, 2)
+]
+
+
+def test_what_was_exported_can_be_imported() -> None:
+    found = entries_from_csv(history_csv(ENTRIES), "a.csv", FAULT_NAMES)
+    for mine, other in zip(found, ENTRIES, strict=True):
+        for name in ("tested", "actuator", "serial", "test", "verdict", "usage", "severities"):
+            assert getattr(mine, name) == getattr(other, name)
+
+
+def test_parquet_has_the_rows_of_the_csv_file() -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = parquet.read_table(io.BytesIO(history_parquet(ENTRIES))).to_pylist()
+    assert [row["estimate"] for row in rows] == [0.1, 0.2, 0.3, 0.2, 0.2, 0.3]
+    assert rows[0]["serial"] == 7
+    assert rows[0]["cycles"] is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("verdict", "opinion", "has no column verdict"),
+        ("HEALTHY", "FINE", "line 2: verdict: there is HEALTHY"),
+        ("FSS", "spool", "line 2: severity: there is Kintas"),
+        ("2026-03-01", "yesterday ", "line 2: "),
+        (",7,", ",seven,", "line 2: "),
+        ("0.1,", "nan,", "line 2: a number is not finite"),
+    ],
+)
+def test_a_table_that_is_none_is_one_line(old: str, new: str, words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        entries_from_csv(history_csv(ENTRIES).replace(old, new), "a.csv", FAULT_NAMES)
+    assert "\n" not in str(caught.value)
+
+
+def test_import_appends_all_or_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place, table = tmp_path / "h", tmp_path / "a.csv"
+    assert main(["history", "init", "--history", str(place)]) == 0
+    table.write_text(history_csv(ENTRIES))
+    assert main(["history", "import", str(table), "--history", str(place)]) == 0
+    table.write_text(history_csv(ENTRIES).replace("2026-03-02", "later"))
+    assert main(["history", "import", str(table), "--history", str(place)]) == 2
+    with History(place) as history:
+        assert len(history.entries()) == 2
+    assert "2 diagnoses of" in capsys.readouterr().out
+    out = tmp_path / "b.parquet"
+    assert main(["history", "export", "--out", str(out), "--history", str(place)]) == 0
+    assert out.read_bytes()[:4] == b"PAR1"

@@ -1,0 +1,146 @@
+"""A range of the clogging's exponent: the interval holds what each of it makes of the friction."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ehadiag import Levels, Verdict, default_actuator
+from ehadiag.assess.verdict import judge
+from ehadiag.identify.estimates import interval95
+from ehadiag.identify.exponent_range import over_exponents
+from ehadiag.identify.identification_result import (
+    Estimate,
+    Fit,
+    Identification,
+    IdentificationTiming,
+    Nuisance,
+)
+from ehadiag.identify.prior import unit_prior
+from ehadiag.model.plant import plant_constants
+from ehadiag.model.registry import FAULTS, parameter
+
+STD = 1e-3
+NAMES = ("Kintas", "FSS", "FDJ")
+
+
+def with_exponent(exponent):
+    actuator = default_actuator()
+    valve = msgspec.structs.replace(actuator.servovalve, clogging_exponent=exponent)
+    return msgspec.structs.replace(actuator, servovalve=valve)
+
+
+ANY = with_exponent((0.0, 2.0))
+
+
+def identified(*values):
+    """An identification with the largest exponent."""
+    return Identification(
+        estimates=tuple(
+            Estimate(
+                item.name,
+                value,
+                value,
+                value,
+                STD,
+                interval95(value, STD),
+                at_bound=False,
+                shown=True,
+            )
+            for item, value in zip(FAULTS, values, strict=True)
+        ),
+        nuisances={"null_bias": Nuisance(0.0, 1e-6, at_bound=False)},
+        about={},
+        covariance=np.eye(3) * STD**2,
+        fit=Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0),
+        solver="cga",
+        seed=0,
+        evaluations=1,
+        generations=1,
+        cost=1.0,
+        converged=True,
+        attempts=1,
+        timing=IdentificationTiming(0.0, 0.0, 0.0),
+    )
+
+
+@given(kintas=st.floats(0.0, 1.0), friction=st.floats(0.0, 1.0), exponent=st.floats(0.0, 2.0))
+def test_the_interval_holds_the_friction_of_every_exponent(kintas, friction, exponent):
+    constants = plant_constants(ANY)
+    new = constants.FSS / (constants.FSS1 - constants.FSS)
+    seen = (friction + new) * (1.0 - 0.8 * kintas) ** (2.0 - exponent) - new
+    found = over_exponents(identified(kintas, seen, 0.3), constants, (0.0, 2.0))
+    low, high = found.named("FSS").interval95
+    assert low - 1e-9 <= friction <= high + 1e-9
+    assert found.named("Kintas") == identified(kintas, seen, 0.3).named("Kintas")
+    assert found.covariance[1, 1] == pytest.approx(found.named("FSS").std ** 2)
+
+
+@given(kintas=st.floats(0.1, 0.9), friction=st.floats(0.0, 0.5))
+def test_estimate_and_exponent_are_what_was_identified(kintas, friction):
+    """The ratio of friction and pressure gain, which is all that a recording shows, is kept."""
+    constants = plant_constants(ANY)
+    found = over_exponents(identified(kintas, friction, 0.3), constants, (0.0, 2.0))
+    seen = found.constants(constants)
+    free = tuple(parameter(name) for name in ("Kintas", "FSS"))
+    assert {item.name for item in free} < set(found.values)
+    largest = plant_constants(with_exponent(2.0))
+    gain = largest.GPF * (1.0 - 0.8 * kintas) ** 2.0
+    force = largest.FSS + friction * (largest.FSS1 - largest.FSS)
+    assert pytest.approx(force / gain, rel=1e-9) == seen.FSS / seen.GPF
+
+
+def test_a_number_is_no_range():
+    found = identified(0.5, 0.2, 0.3)
+    assert over_exponents(found, plant_constants(with_exponent(1.0)), (1.0, 1.0)) is found
+
+
+def test_the_verdict_covers_both_ends():
+    constants = plant_constants(ANY)
+    verdict, reasons = judge(
+        over_exponents(identified(0.6, 0.3, 0.3), constants, (0.0, 2.0)), Levels()
+    )
+    assert verdict is Verdict.NOT_TESTED
+    assert "clogging_exponent" in reasons[0]
+    verdict, _ = judge(over_exponents(identified(0.8, 0.3, 0.3), constants, (0.0, 2.0)), Levels())
+    assert verdict is Verdict.FAULT, "the filter's clogging alone decides"
+    verdict, _ = judge(over_exponents(identified(0.1, 0.3, 0.3), constants, (0.0, 2.0)), Levels())
+    assert verdict is Verdict.DEGRADED
+
+
+def test_discrepancy_grows_with_wear_and_with_what_is_left():
+    prior = unit_prior(msgspec.structs.replace(ANY, discrepancy=type(ANY.discrepancy)()))
+    size = [
+        np.sqrt(np.diag(prior.discrepancy_covariance(FAULTS, dict.fromkeys(NAMES, w), excess)))
+        for w, excess in ((0.0, 1.0), (0.4, 1.0), (0.8, 1.0), (0.8, 2.0))
+    ]
+    assert not size[0].any()
+    assert size[2] == pytest.approx(2.0 * size[1])
+    assert size[3] == pytest.approx(2.0 * size[2])
+    assert not any(unit_prior(default_actuator()).discrepancy.values()), "the reference's laws hold"
+
+
+def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_pressure():
+    """It passes for clogging, and clogging for less pressure at the spool."""
+    tolerance = type(default_actuator().tolerance)(GQF=0.1)
+    shifts = {}
+    for exponent in (0.0, 2.0):
+        unit = msgspec.structs.replace(with_exponent(exponent), tolerance=tolerance)
+        values = {"Kintas": 0.5, "FSS": 0.4, "FDJ": 0.3}
+        spread = unit_prior(unit).spread(FAULTS, values, plant_constants(unit))
+        shifts[exponent] = np.sqrt(np.diag(spread))
+    assert (
+        shifts[2.0][0] == pytest.approx(shifts[0.0][0]) == pytest.approx(0.6 / 0.8 * 0.1 / 3**0.5)
+    )
+    assert shifts[0.0][1] == 0.0
+    relative = shifts[2.0][1] / (0.4 + 2.0 / 58.0)
+    assert relative == pytest.approx(2.0 * 0.1 / 3**0.5, rel=1e-6)
+
+
+def test_judging_needs_no_effects():
+    assert judge(SimpleNamespace(estimates=(), nuisances={}), Levels())[0] is Verdict.HEALTHY

@@ -1,0 +1,74 @@
+"""Ring of the pressure: it shows the oil's stiffness, and a volume of both chambers together."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from ehadiag import default_actuator
+from ehadiag.identify.experiment import build_experiment
+from ehadiag.identify.prior import ParameterPrior
+from ehadiag.identify.ring import Ring, find_ring, ring_prior
+from ehadiag_sim.conditions import Effects
+from ehadiag_sim.simulation import simulate
+from firmware_iface.stored_test import resolve_test
+
+
+def with_volume(volume):
+    actuator = default_actuator()
+    stage = msgspec.structs.replace(
+        actuator.second_stage, kind="orifice", by_position=True, volume_of_one_chamber=volume
+    )
+    return msgspec.structs.replace(actuator, second_stage=stage)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    test = resolve_test("open")
+    done = simulate(with_volume(0.9e-4), test, effects=Effects(null_bias=1e-4), step=1e-6)
+    return done.recording("simulated")
+
+
+def ring_of(recording, volume):
+    assert recording.samples is not None
+    experiment = build_experiment(
+        recording.samples, recording.environment, resolve_test("open"), with_volume(volume)
+    )
+    # What the rest before the test looks like is taken off: with a bias it is no sensor's error.
+    values = {
+        "null_bias": 1e-4,
+        "spool_offset": -experiment.spool_offset,
+        "pressure_offset": -experiment.pressure_offset,
+    }
+    return find_ring([experiment], values)
+
+
+@pytest.mark.parametrize(("volume", "stiffness"), [(0.9e-4, 0.0), (0.945e-4, 0.05)])
+def test_the_scan_finds_the_stiffness(recording, volume, stiffness):
+    ring = ring_of(recording, volume)
+    assert ring is not None
+    assert ring.stiffness == pytest.approx(stiffness, abs=0.01)
+    assert not ring.is_of_other_volume
+
+
+def test_a_total_volume_is_named(recording):
+    ring = ring_of(recording, 1.8e-4)
+    assert ring is not None
+    assert ring.is_of_other_volume
+    assert "√2 times" in ring.words
+    assert "volume_of_one_chamber is twice the volume of one chamber" in ring.words
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "other"), [(1.0, True), (-0.5, True), (0.0, False), (0.3, False), (-0.3, False)]
+)
+def test_a_factor_of_two_is_another_volume(stiffness, other):
+    assert Ring(stiffness, 80.0).is_of_other_volume == other
+
+
+def test_the_prior_holds_the_ratio_of_stiffness_and_mass():
+    prior = ring_prior(Ring(0.1, 80.0), ParameterPrior(0.0, 0.15), ParameterPrior(0.0, 0.03))
+    ratio = [1.0, -1.1]
+    assert (prior.mean == [0.1, 0.0]).all()
+    assert (prior.covariance @ ratio) @ ratio == pytest.approx(0.004**2)
+    assert prior.covariance[1, 1] == pytest.approx(0.03**2)

@@ -1,0 +1,140 @@
+"""The test of free motion for changes: its values, its threshold, oil and supply that run."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from ehadiag import CommandMode, ConfigurationError, Monitor, default_actuator
+from ehadiag.monitor.change_test import (
+    CAUSES,
+    GUMBEL,
+    PIECE_H,
+    Cause,
+    ChangeTest,
+    alarm_threshold,
+    span_values,
+)
+from ehadiag.monitor.score_bank import BANK, BANK_NAMES, BlockScore, ScoreBank
+from ehadiag_tools.free_motion.motion import Motion, free_motion
+from firmware_iface.recording import Environment
+
+ACTUATOR = default_actuator()
+WORN = (0.3, 0.3, 0.3)
+STEADY = np.array([item.steady / item.step for item in BANK])
+
+
+@pytest.mark.parametrize("hours", [1.0, 10.0, 100.0])
+def test_the_threshold_is_exceeded_once_in_its_hours(hours: float) -> None:
+    """By Gumbel's law of the largest value of a piece."""
+    above = -math.expm1(-math.exp((GUMBEL[0] - alarm_threshold(hours)) / GUMBEL[1]))
+    assert above == pytest.approx(-math.expm1(-PIECE_H / hours), rel=1e-9)
+
+
+@pytest.mark.parametrize("hours", [0.0, math.nan, 1e9])
+def test_hours_out_of_range_are_refused(hours: float) -> None:
+    with pytest.raises(ConfigurationError, match="hours between false alarms"):
+        alarm_threshold(hours)
+
+
+def blocks(rng: np.random.Generator, shift: float, place: int, count: int = 20) -> list[BlockScore]:
+    """Blocks of a linear model with white noise and one parameter off by some steps."""
+    made = []
+    for _ in range(count):
+        slopes = rng.standard_normal((len(BANK), 500))
+        residual = rng.standard_normal(500) + shift * slopes[place]
+        made.append(BlockScore(slopes @ residual, slopes @ slopes.T))
+    return made
+
+
+def test_values_of_noise_are_no_greater_than_normal_deviates() -> None:
+    rng = np.random.default_rng(1)
+    values = np.array([span_values(blocks(rng, 0.0, 0), STEADY)[0] for _ in range(200)])
+    assert np.all(values.std(axis=0) < 1.2)
+    assert np.all(np.abs(values.mean(axis=0)) < 0.3)
+
+
+@pytest.mark.parametrize("cause", range(0, len(CAUSES), 3))
+def test_what_is_off_has_the_greatest_value_and_its_size(cause: int) -> None:
+    rng = np.random.default_rng(cause)
+    values, sizes = span_values(blocks(rng, 1.0, CAUSES[cause]), STEADY)
+    assert np.abs(values).argmax() == cause
+    assert sizes[cause] == pytest.approx(1.0, abs=0.1)
+
+
+def test_one_block_however_large_is_no_change() -> None:
+    rng = np.random.default_rng(3)
+    made = blocks(rng, 0.0, 2)
+    made[7] = blocks(rng, 50.0, 2, 1)[0]
+    assert np.abs(span_values(made, STEADY)[0]).max() < 4.0
+
+
+def test_blocks_without_information_say_nothing() -> None:
+    none = BlockScore(np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK))))
+    assert not span_values([none] * 20, STEADY)[0].any()
+
+
+def test_oil_and_supply_that_run_are_those_of_a_monitor_made_for_them() -> None:
+    """The state goes on: only the laws change."""
+    environment = Environment(18e6, 1e6, 75.0)
+    rows = free_motion(ACTUATOR, Motion("noise", "current", 1.0, WORN, 1)).rows
+    made, tuned = Monitor(ACTUATOR, WORN, environment), Monitor(ACTUATOR, WORN)
+    tuned.tune(environment)
+    for row in rows[:500].tolist():
+        made.push(tuple(row))
+        tuned.push(tuple(row))
+    np.testing.assert_array_equal(made.reading.predicted, tuned.reading.predicted)
+    before = tuned.reading.predicted.copy()
+    tuned.tune(Environment(19e6, 1e6, 20.0))
+    np.testing.assert_array_equal(tuned.reading.predicted, before)
+
+
+def test_a_block_is_what_its_ticks_are() -> None:
+    rows = free_motion(ACTUATOR, Motion("steps", "position", 0.5, WORN, 1)).rows
+    block, single = (Monitor(ACTUATOR, WORN, mode=CommandMode.POSITION) for _ in range(2))
+    found = block.push_block(rows)
+    for row, modelled in zip(rows.tolist(), found, strict=True):
+        reading = single.push(tuple(row))
+        np.testing.assert_array_equal(reading.predicted[[0, 2]], modelled[:2])
+        np.testing.assert_array_equal(reading.residual, modelled[3:])
+
+
+def changes_in(motion: Motion, given: tuple[float, float, float], **options: float) -> list[Cause]:
+    """Likeliest causes of the changes found, the supply not stated."""
+    mode = CommandMode[motion.mode.upper()]
+    test = ChangeTest(ScoreBank(ACTUATOR, given, mode=mode), 1000.0, 10.0, **options)
+    found = [test.push(tuple(row)) for row in free_motion(ACTUATOR, motion).rows.tolist()]
+    return [item.causes[0] for item in found if item is not None and not item.repeated]
+
+
+def test_a_change_is_named_with_its_size_and_an_unchanged_unit_is_silent() -> None:
+    motion = Motion("gusts", "current", 22.0, WORN, 5, exact=True)
+    assert changes_in(motion, WORN) == []
+    (cause,) = changes_in(motion, (0.3, 0.3, 0.2))
+    assert (cause.name, cause.size) == ("FDJ", pytest.approx(0.1, abs=0.02))
+    assert 0.0 < cause.stderr < 0.05
+    assert changes_in(motion, (0.3, 0.3, 0.2), least=0.2) == []
+
+
+def test_supply_that_is_not_stated_is_no_cause_of_small_changes() -> None:
+    bank = ScoreBank(ACTUATOR, WORN)
+    place = BANK_NAMES.index("supply")
+    bank.tune(Environment(20e6, 0.0, 40.0))
+    stated = bank.steady[place]
+    bank.tune(Environment(None, None, 40.0))
+    assert bank.steady[place] > 10.0 * stated
+
+
+@pytest.mark.parametrize(
+    ("cause", "text"),
+    [
+        (Cause("FSS", 0.0412, 0.011), "spool friction +0.04 ± 0.01"),
+        (Cause("spool_offset", 3.1e-6, 0.4e-6), "spool sensor offset +3.1 ± 0.4 µm"),
+        (Cause("supply", -2.04e6, 0.3e6), "supply pressure -2.0 ± 0.3 MPa"),
+        (Cause("load", 412.0, 35.0), "load +412 ± 35 N"),
+    ],
+)
+def test_a_cause_is_a_text_with_its_error(cause: Cause, text: str) -> None:
+    assert str(cause) == text

@@ -1,0 +1,150 @@
+"""A second sender of oil and supply, with counters of its own: named, in a recording and live."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bus_synth import ENVIRONMENT, START, TICK, make_truth, one, play
+from test_live_session_limits import outcome_of
+
+from ehadiag import default_actuator
+from ehadiag.session.bus_monitor import BusMonitor
+from ehadiag.session.unit_state import new_unit_state
+from firmware_iface.bus_map import BusMap, default_map
+from firmware_iface.codec import Encoder
+from firmware_iface.transport.frames import Frame
+
+BUS = default_map()
+TEST_TICKS = 5500
+SENDER = "a second sender of Environment (0x120)"
+
+
+def unguarded(*, counter: bool, cycle: bool) -> BusMap:
+    """The default bus with less that guards its environment."""
+    message = BUS.messages["Environment"]
+    message = replace(
+        message,
+        counter=message.counter if counter else None,
+        cycle_ns=message.cycle_ns if cycle else 0,
+    )
+    return replace(BUS, messages={**BUS.messages, "Environment": message})
+
+
+def second(times_ms: Iterable[float], first: int, degc: float, supply: float) -> list[Frame]:
+    """Frames of another sender, whose counter begins anywhere."""
+    other = Encoder(BUS)
+    other._counters["Environment"] = first
+    return [
+        frame
+        for at in times_ms
+        for frame in other.environment(supply, 0.7e6, degc, START + round(at * TICK) + 30_000)
+    ]
+
+
+def mixed(theirs: list[Frame]) -> list[Frame]:
+    ours = play(Encoder(BUS), make_truth(TEST_TICKS))
+    return sorted([*ours, *theirs], key=lambda item: item.time_ns)
+
+
+ATTACKS = {
+    "more than ours": (np.linspace(3.0, 5490.0, 140), 90),
+    "as many as ours": (np.arange(50.0, 5500.0, 100.0), 120),
+    "fewer than ours": (np.arange(60.0, 5500.0, 300.0), 60),
+    "a burst": (np.linspace(2000.1, 2090.0, 140), 100),
+    "a burst of a whole turn": (np.linspace(2000.2, 2090.0, 256), 21),
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize(("degc", "supply"), [(15.0, 20.7e6), (40.0, 17.0e6), (37.0, 20.0e6)])
+def test_a_second_sender_is_named(attack: str, degc: float, supply: float) -> None:
+    theirs = second(*ATTACKS[attack], degc, supply)
+    recording = one(mixed(theirs), BUS)
+    assert any(SENDER in item for item in recording.quality.refused), recording.quality.refused
+
+
+@pytest.mark.parametrize("counter", [False, True])
+@pytest.mark.parametrize("cycle", [False, True])
+@pytest.mark.parametrize("attack", ["more than ours", "as many as ours", "a burst"])
+def test_values_apart_name_it_on_a_bus_that_says_less(
+    attack: str, counter: bool, cycle: bool
+) -> None:
+    theirs = second(*ATTACKS[attack], 15.0, 20.7e6)
+    recording = one(mixed(theirs), unguarded(counter=counter, cycle=cycle))
+    assert any(SENDER in item for item in recording.quality.refused), recording.quality.refused
+
+
+def damaged(frames: list[Frame], how: str) -> list[Frame]:
+    """What happens to a single sender's frames."""
+    of_environment = [item for item in frames if item.can_id == ENVIRONMENT]
+    if how == "doubled":
+        return [item for frame in frames for item in (frame, frame)]
+    if how == "lost":
+        gone = of_environment[10:40]
+        return [frame for frame in frames if frame not in gone]
+    if how == "late":
+        stamp = of_environment[40].time_ns
+        return [
+            replace(item, time_ns=max(item.time_ns, stamp)) if item in of_environment else item
+            for item in frames
+        ]
+    return frames
+
+
+@pytest.mark.parametrize("how", ["untouched", "doubled", "lost", "late"])
+@pytest.mark.parametrize("counter", [False, True])
+def test_one_sender_is_none(how: str, counter: bool) -> None:
+    bus = unguarded(counter=counter, cycle=True)
+    recording = one(damaged(mixed([]), how), bus)
+    assert recording.quality.refused == ()
+    assert recording.environment.oil_temperature == pytest.approx(40.0)
+
+
+def test_noise_of_a_probe_is_no_second_sender() -> None:
+    rng = np.random.default_rng(5)
+    ours = [item for item in mixed([]) if item.can_id != ENVIRONMENT]
+    encoder = Encoder(BUS)
+    for at in range(0, TEST_TICKS, 100):
+        values = 20.7e6 + 2e5 * rng.normal(), 0.7e6, 40.0 + 0.3 * rng.normal()
+        ours += encoder.environment(*values, START + at * TICK)
+    recording = one(sorted(ours, key=lambda item: item.time_ns), BUS)
+    assert recording.quality.refused == ()
+
+
+def beside_ours(frame: Frame) -> Iterator[Frame]:
+    """Two and a half frames of the environment to each of the computer's."""
+    if frame.can_id == ENVIRONMENT:
+        for index in range(2 + frame.data[6] % 2):
+            later = frame.time_ns + 200_000 * (index + 1)
+            count = (3 * frame.data[6] + index + 90) % 256
+            yield Encoder(BUS)._send(
+                "environment",
+                {
+                    "environment.supply_pressure": 20.7e6,
+                    "environment.return_pressure": 0.7e6,
+                    "environment.oil_temperature": 37.0,
+                },
+                later,
+                count,
+            )[0]
+
+
+def test_live_it_ends_the_test(make_core) -> None:
+    outcome = outcome_of(make_core, beside_ours)
+    assert not outcome.complete
+    assert SENDER in outcome.why
+    assert outcome.abort_confirmed
+
+
+def test_a_monitor_believes_neither() -> None:
+    unit = default_actuator()
+    monitor = BusMonitor(unit, BUS, new_unit_state(unit), (), 100.0, lambda _: None)
+    ours = [item for item in mixed([]) if item.can_id == ENVIRONMENT]
+    theirs = second(np.arange(3050.0, 5400.0, 25.0), 90, 15.0, 20.7e6)
+    for frame in sorted([*ours, *theirs], key=lambda item: item.time_ns):
+        monitor.take(frame)
+    assert monitor.conflicts > 50
+    assert monitor._environment_values == {}

@@ -1,0 +1,81 @@
+"""Recordings by an acquisition with converters and a clock of its own, truth known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas
+import pytest
+
+from ehadiag import bundled_tests, default_actuator
+from ehadiag.identify.experiment import build_experiment
+from ehadiag_tools.rigs.daq import SETTLING_S, DaqCase, perform, recorded_columns
+from firmware_iface.bus_map import default_map
+from firmware_iface.find_test import CandidateTests
+from firmware_iface.signals.recordings import Interpretation, recorded_tests
+
+SOUGHT = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
+
+
+def case(test: str, rate: float, **changes: object) -> DaqCase:
+    usual = {
+        "test": test, "faults": (0.484, 0.841, 0.611), "rate": rate, "bits": 12,
+        "with_command": False, "lead_in_s": 0.357, "phase": 0.3, "drift_ppm": 55.0, "seed": 11,
+    }  # fmt: skip
+    return DaqCase(**(usual | changes))
+
+
+def read(this: DaqCase, folder):
+    path = folder / "daq.csv"
+    pandas.DataFrame(recorded_columns(this)).to_csv(path, index=False, float_format="%.9g")
+    (found,) = recorded_tests([path], Interpretation(default_map(), None, SOUGHT))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("test", "rate", "most_us"),
+    [
+        ("closed", 5000.0, 15.0),
+        ("closed", 10_000.0, 8.0),
+        # The current changes from tick to tick in the sines alone: half a sampling interval.
+        ("open", 5000.0, 100.0),
+        ("open", 10_000.0, 50.0),
+    ],
+)
+def test_the_ticks_are_found_between_samples(tmp_path, test, rate, most_us):
+    this = case(test, rate)
+    found = read(this, tmp_path)
+    assert found.test_id == bundled_tests()[test].id
+    at = found.samples.host_ns * 1e-9
+    true = SETTLING_S + this.lead_in_s + np.arange(len(at)) * 1e-3
+    true = (true - SETTLING_S - this.phase / rate) / (1.0 + this.drift_ppm * 1e-6)
+    middle = len(at) // 2
+    assert (at - true)[middle] * 1e6 == pytest.approx(0.0, abs=most_us)
+    assert found.samples.acquired.rate == pytest.approx(rate)
+
+
+def test_the_codes_of_a_closed_loop_follow_from_the_current(tmp_path):
+    """The law on the acquisition's own positions would be 7 LSB off."""
+    found = read(case("closed", 5000.0), tmp_path)
+    test, actuator = bundled_tests()["closed"], default_actuator()
+    trace = build_experiment(found.samples, found.environment, test, actuator).trace
+    assert trace.residual_lsb < 1.0
+
+
+def test_a_command_of_its_own_is_found_at_the_same_place(tmp_path):
+    """The clock of the held command began with its first change, 0.2 s into the test."""
+    this = case("open", 5000.0, with_command=True)
+    found = read(this, tmp_path)
+    assert np.isfinite(found.samples.spool[:200]).all()
+    assert found.out_of_order == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("test", ["open", "closed"])
+@pytest.mark.parametrize("bits", [12, 16])
+def test_a_verdict_that_holds_the_truth(test, bits):
+    this = case(test, 5000.0, bits=bits)
+    found = perform(this)
+    assert found["verdict"] == "FAULT", found["why"]
+    for (low, high), truth in zip(found["interval95"], this.faults, strict=True):
+        assert low - 1e-3 <= truth <= high + 1e-3
+        assert high - low < 0.02

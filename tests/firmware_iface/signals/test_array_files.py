@@ -1,0 +1,86 @@
+"""Decoded signals in TDMS, HDF5 and MATLAB 7.3: the same as in a table of text."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ehadiag import ConfigurationError, InputOutputError
+from firmware_iface.logs.log_files import Budget
+from firmware_iface.signals.columns import ColumnMap, named_columns
+from firmware_iface.signals.tables import read_signals
+
+TIME = np.arange(200) / 1000.0
+VALUES = {
+    "current": 1e-3 * np.sin(TIME),
+    "spool": 1e-4 * np.cos(TIME),
+    "pressure": 1e6 * np.sin(3.0 * TIME),
+    "position": 1e-2 * np.cos(5.0 * TIME),
+}
+
+
+def assert_read(path, columns=None):
+    found = read_signals(path, columns or ColumnMap(), Budget())
+    for name, values in VALUES.items():
+        assert found[f"channels.{name}"].time == pytest.approx(TIME, abs=1e-9)
+        assert found[f"channels.{name}"].value == pytest.approx(values, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("waveform", [True, False])
+def test_tdms(tmp_path, waveform):
+    nptdms = pytest.importorskip("nptdms")
+    path = tmp_path / "rig.tdms"
+    timing = {"wf_increment": 1e-3, "wf_start_offset": 0.0, "wf_samples": 1}
+    with nptdms.TdmsWriter(path) as writer:
+        for name, values in VALUES.items():
+            scale, unit = (1e3, "mm") if name == "position" else (1.0, None)
+            properties = (timing if waveform else {}) | ({"unit_string": unit} if unit else {})
+            writer.write_segment(
+                [nptdms.ChannelObject("Rig", name, values * scale, properties=properties)]
+            )
+        if not waveform:
+            writer.write_segment([nptdms.ChannelObject("Rig", "time", TIME)])
+    assert_read(path)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("rig.h5", (-1,)), ("rig.mat", (1, -1))])
+def test_hdf5_and_matlab(tmp_path, name, shape):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / name
+    with h5py.File(path, "w") as file:
+        group = file.create_group("run")
+        group["t"] = (TIME * 1e3).reshape(shape)
+        for key, values in VALUES.items():
+            group[key] = values.reshape(shape)
+        group["spool"][...] *= 1e3
+        group["spool"].attrs["unit"] = "mm"
+        group["note"] = "text"
+    assert_read(path, named_columns(["time=t:ms"], ColumnMap()))
+    with pytest.raises(ConfigurationError, match="no channel of time stamps"):
+        read_signals(path, ColumnMap(), Budget())
+
+
+def test_a_table_in_hdf5(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "table.hdf5"
+    table = np.rec.fromarrays([TIME, *VALUES.values()], names=["time", *VALUES])
+    with h5py.File(path, "w") as file:
+        file["data"] = table
+    assert_read(path)
+
+
+def test_an_old_matlab_file_is_one_line(tmp_path):
+    pytest.importorskip("h5py")
+    path = tmp_path / "old.mat"
+    path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(600))
+    with pytest.raises(InputOutputError, match=r"-v7\.3"):
+        read_signals(path, ColumnMap(), Budget())
+
+
+def test_mf4_needs_no_name_of_its_time(tmp_path):
+    asammdf = pytest.importorskip("asammdf")
+    path = tmp_path / "rig.mf4"
+    with asammdf.MDF() as file:
+        file.append([asammdf.Signal(v, TIME, name=k) for k, v in VALUES.items()])
+        file.save(path)
+    assert_read(path, named_columns(["time=t_s:s"], ColumnMap()))

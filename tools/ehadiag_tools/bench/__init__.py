@@ -1,1 +1,0 @@
-"""Benchmarks: speed of the project against others, in one table."""

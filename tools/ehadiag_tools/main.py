@@ -1,0 +1,47 @@
+"""`tools/study NAME …`: the studies behind the documentation's figures."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+from ehadiag_tools.accuracy.paper import CUBE, PAPER_CASES
+from ehadiag_tools.accuracy.pictures import PICTURES
+from ehadiag_tools.accuracy.recorded import RECORDED_UNITS
+from ehadiag_tools.accuracy.units import UNITS
+from ehadiag_tools.accuracy.valves import VALVES
+from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE
+from ehadiag_tools.bench import BENCH
+from ehadiag_tools.free_motion.study import FREE_MOTION
+from ehadiag_tools.onboard.random_units import ONBOARD_UNITS
+from ehadiag_tools.onboard.study import ONBOARD
+from ehadiag_tools.prognosis.study import PROGNOSIS
+from ehadiag_tools.rigs.daq import DAQ_RECORDINGS
+from ehadiag_tools.rigs.many import MANY_RECORDINGS
+from ehadiag_tools.rigs.replay import FOREIGN_BUSES
+from ehadiag_tools.simulator.compare_logs import RECORDINGS
+from ehadiag_tools.soak import SOAK
+from ehadiag_tools.study import Study, run_study
+
+STUDIES: tuple[Study[Any], ...] = (
+    PAPER_CASES, CUBE, UNITS, RECORDED_UNITS, VALVES, ALARMS, HARDWARE, RECORDINGS,
+    FREE_MOTION, FOREIGN_BUSES, DAQ_RECORDINGS, MANY_RECORDINGS, PROGNOSIS, ONBOARD, ONBOARD_UNITS,
+    SOAK, BENCH, PICTURES,
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Perform the study that the command line names; return the exit code."""
+    parser = argparse.ArgumentParser(prog="study", description=__doc__)
+    parser.add_argument("--list", action="store_true", help="list the studies")
+    named = parser.add_subparsers(dest="name", metavar="NAME")
+    for item in STUDIES:
+        item.add_arguments(named.add_parser(item.name, help=item.summary, description=item.summary))
+    options = parser.parse_args(arguments)
+    for item in STUDIES:
+        if options.list or options.name is None:
+            print(f"{item.name:16} {item.summary}")
+        elif item.name == options.name:
+            return run_study(item, options)
+    return 0

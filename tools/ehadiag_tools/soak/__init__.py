@@ -1,1 +1,0 @@
-"""Long runs on a loaded bus: losses, memory, latency."""
