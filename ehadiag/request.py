@@ -19,7 +19,7 @@ from msgspec import Meta
 from ehadiag.assess.verdict import Levels, VerdictRule
 from ehadiag.core.actuator import MAX_TOLERANCE
 from firmware_iface.errors import ConfigurationError
-from firmware_iface.mapping_file import MAX_CAN_ID
+from firmware_iface.recording import MAX_CAN_ID
 
 MOST_SEED = (1 << 32) - 1
 """Largest seed of random numbers, 1."""

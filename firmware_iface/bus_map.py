@@ -14,8 +14,6 @@ from firmware_iface.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, SignalLayou
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import decode_toml, read_small_file, read_toml
 from firmware_iface.mapping_file import (
-    MAX_CAN_ID,
-    MAX_STANDARD_CAN_ID,
     ChannelRef,
     MappingFile,
     OnboardSignals,
@@ -24,7 +22,14 @@ from firmware_iface.mapping_file import (
     SignalRef,
     si_factor,
 )
-from firmware_iface.recording import CHANNELS, BitState, CommandMode, StatedConverter
+from firmware_iface.recording import (
+    CHANNELS,
+    MAX_CAN_ID,
+    MAX_STANDARD_CAN_ID,
+    BitState,
+    CommandMode,
+    StatedConverter,
+)
 from firmware_iface.transport.frames import MAX_PAYLOAD
 
 MAX_MULTIPLEXERS = 8

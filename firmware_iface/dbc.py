@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.errors import ConfigurationError, reason_of
 from firmware_iface.files import Folder, private_folder, warn_once
-from firmware_iface.recording import BoolArray, FloatArray, IntArray
+from firmware_iface.recording import MAX_CAN_ID, BoolArray, FloatArray, IntArray
 
 FLOAT_FORMATS = {16: "<e", 32: "<f", 64: "<d"}
 """Formats of `struct` by the bits of a number."""
@@ -302,7 +302,7 @@ def _check_twice(names: dict[int, str], identifier: int, message: str, name: str
     if identifier in names:
         raise ConfigurationError(
             f"DBC file {name}: messages {names[identifier]} and {message} have the same identifier"
-            f" {identifier & 0x1FFFFFFF:#x}"
+            f" {identifier & MAX_CAN_ID:#x}"
         )
     names[identifier] = message
 

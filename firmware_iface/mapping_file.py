@@ -7,6 +7,7 @@ from typing import Annotated, Literal, get_args
 import msgspec
 
 from firmware_iface.errors import ConfigurationError
+from firmware_iface.recording import MAX_CAN_ID
 
 UNIT_SCALES: dict[str, dict[str, tuple[float, float]]] = {
     "current": {"A": (1.0, 0.0), "mA": (1e-3, 0.0), "uA": (1e-6, 0.0)},
@@ -75,8 +76,6 @@ def si_factor(text: str, dimension: str, where: str) -> tuple[float, float]:
     )
 
 
-MAX_CAN_ID, MAX_STANDARD_CAN_ID = 0x1FFFFFFF, 0x7FF
-"""Largest identifiers of a frame with 29 bits, and with 11 (ISO 11898-1)."""
 MappingName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 CodeNumber = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
 BitStateName = Literal["idle", "arming", "running", "complete", "aborted", "refused"]

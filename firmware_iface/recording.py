@@ -19,6 +19,10 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+MAX_STANDARD_CAN_ID: Final = 0x7FF
+"""Largest identifier of a frame with 11 bits (ISO 11898-1)."""
+MAX_CAN_ID: Final = 0x1FFFFFFF
+"""Largest identifier of a frame with 29 bits (ISO 11898-1)."""
 DEFAULT_LEVELS: Final = 4096.0
 """Codes of the 12-bit converters of PHY-21."""
 

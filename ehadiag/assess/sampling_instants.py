@@ -22,7 +22,8 @@ from ehadiag.identify.experiment import Experiment, unknowns_of
 from ehadiag.identify.identification_result import Identification
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
-from firmware_iface.sampling import SAMPLING, values_at
+from firmware_iface.recording import Acquisition
+from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 
 __all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
 
@@ -61,23 +62,60 @@ INSTANTS = InstantRules()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _SampledTest:
+    """An experiment whose samples an acquisition took within the control ticks."""
+
+    experiment: Experiment
+    acquired: Acquisition
+    left_out: Array
+    """Ticks whose spool or pressure was left out for another reason than its reading, (2, n)."""
+
+    @classmethod
+    def of(cls, experiment: Experiment, acquired: Acquisition) -> _SampledTest:
+        rows = zip(acquired.signals[:2], (experiment.spool, experiment.pressure), strict=True)
+        left_out = [
+            np.isnan(row) & np.isfinite(values_at(recorded, experiment.sampled, experiment.tick)[0])
+            for recorded, row in rows
+        ]
+        return cls(experiment, acquired, np.stack(left_out))
+
+    @property
+    def since_middle(self) -> Array:
+        """Time of each tick since the middle of the test, s, shape (n,)."""
+        ticks = self.experiment.ticks
+        return np.asarray((np.arange(ticks) - 0.5 * ticks) * self.experiment.tick)
+
+    def response(self, severities: Array, before: float) -> Array:
+        """Spool and pressure so long before the ends of the ticks, in deviations of the noise."""
+        experiment = self.experiment
+        constants = unknowns_of([experiment], FAULTS).constants(severities)
+        constants = constants._replace(DLY=self.delay(before))
+        model = model_response(
+            constants, experiment.trace.current, experiment.tick, origin=experiment.origin
+        )
+        spool, pressure = experiment.noise[:2]
+        return np.stack([model.spool / spool, model.pressure / pressure])
+
+    def delay(self, before: float) -> float:
+        """Delay of samples so long before the ends of the ticks, s."""
+        return self.experiment.constants.DLY - self.acquired.lead + before
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Clock:
     """Ticks on the acquisition's clock: lead (s) and drift (1) later than they were found."""
 
     lead: float = 0.0
     drift: float = 0.0
 
-    def ends(self, experiment: Experiment) -> Array:
+    def ends(self, taken: _SampledTest) -> Array:
         """Ends of the ticks, s."""
-        acquired, tick = experiment.acquired, experiment.tick
-        assert acquired is not None
-        since = (np.arange(experiment.ticks) - 0.5 * experiment.ticks) * tick
-        return experiment.sampled + acquired.lead + self.lead + self.drift * since
+        lead = taken.acquired.lead + self.lead
+        return taken.experiment.sampled + lead + self.drift * taken.since_middle
 
-    def instant(self, experiment: Experiment) -> float:
+    def instant(self, taken: _SampledTest) -> float:
         """Time before the ends at which samples are wanted, s."""
-        assert experiment.acquired is not None
-        return (experiment.acquired.lead + self.lead) % experiment.tick
+        return (taken.acquired.lead + self.lead) % taken.experiment.tick
 
 
 class _Samples(NamedTuple):
@@ -89,20 +127,20 @@ class _Samples(NamedTuple):
     """Time before the end of the tick, s, shape (2, n)."""
 
 
-def _sampled(experiment: Experiment, clock: _Clock) -> _Samples:
+def _sampled(taken: _SampledTest, clock: _Clock) -> _Samples:
     """Samples nearest to the instant that is wanted, within each tick."""
-    assert experiment.acquired is not None
-    ends, wanted, tick = clock.ends(experiment), clock.instant(experiment), experiment.tick
+    experiment = taken.experiment
+    ends, wanted, tick = clock.ends(taken), clock.instant(taken), experiment.tick
     values, before = [], []
-    for recorded, row, offset, noise in zip(
-        experiment.acquired.signals[:2],
-        (experiment.spool, experiment.pressure),
+    for recorded, left_out, offset, noise in zip(
+        taken.acquired.signals[:2],
+        taken.left_out,
         (experiment.spool_offset, experiment.pressure_offset),
         experiment.noise[:2],
         strict=True,
     ):
         time, value = recorded.time, recorded.value
-        if tick * len(time) >= SAMPLING.averaged * (time[-1] - time[0]):
+        if tick >= SAMPLING.averaged * sampling_interval(recorded):
             seen, lead = values_at(recorded, ends - wanted, tick)[0], np.full(len(ends), wanted)
         else:
             after = np.clip(np.searchsorted(time, ends - wanted), 1, len(time) - 1)
@@ -113,9 +151,6 @@ def _sampled(experiment: Experiment, clock: _Clock) -> _Samples:
             rows = np.arange(len(ends))
             lead = np.clip(away[best, rows], 0.0, tick)
             seen = np.where(outside.all(axis=0), np.nan, value[choice[best, rows]])
-        # What was left out for another reason than its reading stays out.
-        here = values_at(recorded, experiment.sampled, tick)[0]
-        left_out = np.isnan(row) & np.isfinite(here)
         values.append(np.where(left_out, np.nan, seen - offset) / noise)
         before.append(lead)
     return _Samples(np.stack(values), np.stack(before))
@@ -124,15 +159,15 @@ def _sampled(experiment: Experiment, clock: _Clock) -> _Samples:
 class _Response:
     """Response of the model at some instants of each tick, in deviations of the noise."""
 
-    def __init__(self, experiment: Experiment, severities: Array, before: Array) -> None:
-        low, high = float(before.min()), float(before.max())
-        count = 4 + math.ceil(INSTANTS.instants_per_tick * (high - low) / experiment.tick)
-        high = max(high, low + 1e-3 * experiment.tick)
-        if high > experiment.tick:
-            low, high = experiment.tick - (high - low), experiment.tick
+    def __init__(self, taken: _SampledTest, severities: Array, before: Array) -> None:
+        low, high, tick = float(before.min()), float(before.max()), taken.experiment.tick
+        count = 4 + math.ceil(INSTANTS.instants_per_tick * (high - low) / tick)
+        high = max(high, low + 1e-3 * tick)
+        if high > tick:
+            low, high = tick - (high - low), tick
         self._low, self._step = low, (high - low) / (count - 1)
         self._grid = np.stack(
-            [_at(experiment, severities, low + k * self._step) for k in range(count)]
+            [taken.response(severities, low + k * self._step) for k in range(count)]
         )
 
     def at(self, before: Array) -> tuple[Array, Array]:
@@ -154,19 +189,6 @@ class _Response:
         return value, slope / self._step
 
 
-def _at(experiment: Experiment, severities: Array, before: float) -> Array:
-    """Spool and pressure so long before the ends of the ticks, in deviations of the noise."""
-    acquired = experiment.acquired
-    assert acquired is not None
-    constants = unknowns_of([experiment], FAULTS).constants(severities)
-    constants = constants._replace(DLY=experiment.constants.DLY - acquired.lead + before)
-    model = model_response(
-        constants, experiment.trace.current, experiment.tick, origin=experiment.origin
-    )
-    spool, pressure = experiment.noise[:2]
-    return np.stack([model.spool / spool, model.pressure / pressure])
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     """Severities and clock, and what they leave of the samples."""
@@ -178,22 +200,19 @@ class _Fit:
     """At the samples' instants, shape (2, n)."""
     slope: Array
     """Of the model with the time before the ends, 1/s, shape (2, n)."""
+    cost: float
+    """Mean of Cauchy's cost of the residuals, offsets aside, 1."""
 
     @classmethod
-    def of(cls, experiment: Experiment, severities: Array, clock: _Clock) -> _Fit:
-        samples = _sampled(experiment, clock)
-        response = _Response(experiment, severities, samples.before)
-        return cls(severities, clock, samples, *response.at(samples.before))
-
-    @property
-    def cost(self) -> float:
-        """Mean of Cauchy's cost of the residuals, offsets aside."""
-        total = 0.0
-        for away in self.samples.value - self.model:
+    def of(cls, taken: _SampledTest, severities: Array, clock: _Clock) -> _Fit:
+        samples = _sampled(taken, clock)
+        model, slope = _Response(taken, severities, samples.before).at(samples.before)
+        cost = 0.0
+        for away in samples.value - model:
             left = away[np.isfinite(away)]
             left = left - np.median(left) if left.size else np.full(1, np.inf)
-            total += float(np.mean(np.log1p(left**2 / INSTANTS.cauchy**2)))
-        return total
+            cost += float(np.mean(np.log1p(left**2 / INSTANTS.cauchy**2)))
+        return cls(severities, clock, samples, model, slope, cost)
 
 
 class _Step(NamedTuple):
@@ -216,20 +235,22 @@ def settle_instants(
     from which to start.
     """
     done = [
-        (item, np.zeros(len(FAULT_NAMES))) if item.acquired is None else _settled(item, severities)
+        (item, np.zeros(len(FAULT_NAMES)))
+        if item.acquired is None
+        else _settled(_SampledTest.of(item, item.acquired), severities)
         for item in experiments
     ]
     return [item for item, _ in done], np.max([variance for _, variance in done], axis=0)
 
 
-def _settled(experiment: Experiment, start: Mapping[str, float]) -> tuple[Experiment, Array]:
+def _settled(taken: _SampledTest, start: Mapping[str, float]) -> tuple[Experiment, Array]:
     """One experiment at its own instants, and the variances that they add."""
-    fit = _Fit.of(experiment, np.array([start[name] for name in FAULT_NAMES]), _Clock())
-    step = _step(experiment, fit)
+    fit = _Fit.of(taken, np.array([start[name] for name in FAULT_NAMES]), _Clock())
+    step = _step(taken, fit)
     for _ in range(INSTANTS.steps):
         for share in INSTANTS.shares:
             other = _Fit.of(
-                experiment,
+                taken,
                 np.clip(fit.severities + share * step.severities, 0.0, 1.0),
                 _Clock(fit.clock.lead + share * step.lead, fit.clock.drift + share * step.drift),
             )
@@ -238,30 +259,26 @@ def _settled(experiment: Experiment, start: Mapping[str, float]) -> tuple[Experi
         else:
             break
         gain, fit = fit.cost - other.cost, other
-        step = _step(experiment, fit)
+        step = _step(taken, fit)
         if gain < INSTANTS.settled * fit.cost:
             break
-    return _placed(experiment, fit), step.variance
+    return _placed(taken, fit), step.variance
 
 
-def _placed(experiment: Experiment, fit: _Fit) -> Experiment:
+def _placed(taken: _SampledTest, fit: _Fit) -> Experiment:
     """Samples at one instant of the ticks."""
-    acquired, wanted = experiment.acquired, fit.clock.instant(experiment)
-    assert acquired is not None
-    at = fit.clock.ends(experiment) - wanted
-    there = _at(experiment, fit.severities, wanted)
-    spool, pressure = fit.samples.value - fit.model + there
-    position = values_at(acquired.signals[2], at, experiment.tick)[0]
+    experiment, wanted = taken.experiment, fit.clock.instant(taken)
+    at = fit.clock.ends(taken) - wanted
+    spool, pressure = fit.samples.value - fit.model + taken.response(fit.severities, wanted)
+    position = values_at(taken.acquired.signals[2], at, experiment.tick)[0]
     return replace(
         experiment,
         sampled=at,
         spool=spool * experiment.spool_noise,
         pressure=pressure * experiment.pressure_noise,
         position=position - experiment.position_offset,
-        constants=experiment.constants._replace(
-            DLY=experiment.constants.DLY - acquired.lead + wanted
-        ),
-        acquired=acquired._replace(lead=wanted),
+        constants=experiment.constants._replace(DLY=taken.delay(wanted)),
+        acquired=taken.acquired._replace(lead=wanted),
     )
 
 
@@ -289,21 +306,23 @@ def widen_by_instants(found: Identification, variance: Array) -> Identification:
     return replace(found, estimates=estimates, covariance=found.covariance + np.diag(variance))
 
 
-def _step(experiment: Experiment, fit: _Fit) -> _Step:
+def _step(taken: _SampledTest, fit: _Fit) -> _Step:
     """Gauss-Newton step of severities, clock and offsets together."""
-    acquired = experiment.acquired
-    assert acquired is not None
-    wanted = fit.clock.instant(experiment)
-    here = _at(experiment, fit.severities, wanted)
+    experiment, acquired, wanted = taken.experiment, taken.acquired, fit.clock.instant(taken)
+    here = taken.response(fit.severities, wanted)
     columns: list[Array] = []
     for index, value in enumerate(fit.severities.tolist()):
         side = INSTANTS.severity_step if value < 0.5 else -INSTANTS.severity_step
         other = np.asarray(fit.severities.copy())
         other[index] += side
-        columns.append((_at(experiment, other, wanted) - here) / side)
-    since = (np.arange(experiment.ticks) - 0.5 * experiment.ticks) * experiment.tick
+        columns.append((taken.response(other, wanted) - here) / side)
     ones, none = np.ones(experiment.ticks), np.zeros(experiment.ticks)
-    columns += [fit.slope, fit.slope * since, np.stack([ones, none]), np.stack([none, ones])]
+    columns += [
+        fit.slope,
+        fit.slope * taken.since_middle,
+        np.stack([ones, none]),
+        np.stack([none, ones]),
+    ]
     table = np.stack([column.ravel() for column in columns], axis=1)
     left = (fit.samples.value - fit.model).ravel()
     prior, about = np.zeros(table.shape[1]), np.zeros(table.shape[1])

@@ -208,7 +208,7 @@ class ChangeTest:
             ago = span // STRIDE + 1
             before = self._spans[-ago][place] if len(self._spans) >= ago else None
             if found is not None and before is not None:
-                values[place] = _lasting(found[0], before[0])
+                values[place] = _minmod(found[0], before[0])
                 sizes[place] = 0.5 * (found[1] + before[1])
         self.values = values
         shares = np.abs(values) / HEALTHY_SPREADS / self._threshold
@@ -304,6 +304,6 @@ MAX_SIZES: Final = np.array(
 percent or some tenths of their range; oil and supply by 90 K and 9 MPa."""
 
 
-def _lasting(now: Array, before: Array) -> Array:
+def _minmod(now: Array, before: Array) -> Array:
     """The lesser of two values that agree in sign, else 0."""
     return np.where(now * before > 0.0, np.sign(now) * np.minimum(np.abs(now), np.abs(before)), 0.0)

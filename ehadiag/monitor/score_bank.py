@@ -238,14 +238,14 @@ class ScoreBank:
             self._make("" if name.startswith("current") else name, step) for name, step in names
         ]
         gains = 1.0 + np.array([item.constants.GXJ for item in monitors])
-        closed = self.mode
+        mode = self.mode
         costs = np.zeros(len(names))
         for number, (rows, environment) in enumerate(blocks):
             self.tune(environment)
             for (name, step), monitor in zip(names, monitors, strict=True):
                 self._tune(monitor, name, step)
                 if number == 0:
-                    monitor.follow(closed)
+                    monitor.follow(mode)
                     monitor.reset(float(np.nan_to_num(rows[0, 2])) - self._offset)
             modelled = np.stack([item.push_block(rows) for item in monitors])
             if number < TRIAL_SETTLING:

@@ -249,5 +249,5 @@ def _alarms(snapshot: Snapshot) -> RenderableType:
     for alarm in snapshot.alarms[-MAX_ALARM_ROWS:]:
         during = f" during {alarm.during}" if alarm.during else ""
         recorded = f", recorded in {alarm.recorded}" if alarm.recorded else ""
-        rows.append(_line(f"  {alarm.time[11:19]} {alarm.text}{during}{recorded}"))
+        rows.append(_line(f"  {alarm.time[11:19] or alarm.time} {alarm.text}{during}{recorded}"))
     return Group(*rows)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.errors import InputOutputError, reason_of
 from firmware_iface.logs.log_files import DamagedLogError, Spending
-from firmware_iface.recording import IntArray
+from firmware_iface.recording import MAX_CAN_ID, IntArray
 from firmware_iface.transport.frames import ColumnBuilder, FrameTable
 
 Bytes = NDArray[np.uint8]
@@ -259,7 +259,7 @@ class _BlfParser:
         payload[np.arange(8) >= length[:, None]] = 0
         self._columns.extend(
             time_ns=self._times(data, places),
-            can_id=(can_id & 0x1FFFFFFF).astype(np.uint32),
+            can_id=(can_id & MAX_CAN_ID).astype(np.uint32),
             length=length,
             data=payload,
             extended=can_id >> 31 == 1,
@@ -300,7 +300,7 @@ class _BlfParser:
             return
         self._columns.add(
             time_ns,
-            can_id & 0x1FFFFFFF,
+            can_id & MAX_CAN_ID,
             b"" if remote else payload,
             extended=bool(can_id >> 31),
             fd=fd,

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Self, TextIO, cast
 
 from firmware_iface.errors import InputOutputError, install_command
 from firmware_iface.logs.log_files import DamagedLogError, Spending
+from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID
 from firmware_iface.transport.frames import (
     MAX_CHANNEL,
     MAX_PAYLOAD,
@@ -380,7 +381,7 @@ CANDUMP_LINE_PATTERN = re.compile(
 MAX_STAMP_S = (1 << 63) // 1_000_000_000
 """Nanoseconds are counted in 64 bits."""
 STANDARD_ID_DIGITS = 3
-STANDARD_ID_MASK, EXTENDED_ID_MASK, ERROR_ID_FLAG = 0x7FF, 0x1FFFFFFF, 0x20000000
+ERROR_ID_FLAG = 0x20000000
 
 
 def candump_frames(lines: Iterable[str]) -> Iterator[tuple[Frame, str]]:
@@ -400,7 +401,7 @@ def _frame(match: re.Match[str]) -> Frame:
     payload = match["data"] or match["fd"] or ""
     return Frame(
         time_ns=int(match["seconds"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0")),
-        can_id=number & (EXTENDED_ID_MASK if extended else STANDARD_ID_MASK),
+        can_id=number & (MAX_CAN_ID if extended else MAX_STANDARD_CAN_ID),
         data=bytes.fromhex(payload),
         extended=extended,
         fd=match["fd"] is not None,

@@ -6,8 +6,9 @@ the group's in MF4.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -93,25 +94,14 @@ def _short_names(paths: Mapping[str, ArrayChannel]) -> dict[str, ArrayChannel]:
     }
 
 
-@contextmanager
-def _opened_by(library: str, kind: str, path: Path) -> Iterator[None]:
-    """Turn what an optional library raises into one line: any kind, and it quotes the file."""
-    try:
-        yield
-    except (ConfigurationError, InputOutputError):
-        raise
-    except ImportError:
-        raise InputOutputError(
-            f"log {path}: {kind} needs {library}: {install_command('daq')}"
-        ) from None
-    except Exception:
-        raise InputOutputError(f"log {path}: not a readable {kind} file of signals") from None
-
-
-class Mf4SignalReader:
-    """ASAM's measurements; the time of a channel is that of its group, whatever that is called."""
+class _ArrayReader(ABC):
+    """Reads signals of one kind of file, through an optional library."""
 
     signature = b""
+    library: str
+    """Name of the package that reads the files."""
+    kind: str
+    """Name of the kind of file, for messages."""
 
     def signals(
         self,
@@ -122,14 +112,43 @@ class Mf4SignalReader:
         complete: bool,
     ) -> dict[str, RecordedSignal]:
         """Read a file, see `SignalReader`."""
-        rest = {role: item for role, item in columns.columns.items() if role != TIME_ROLE}
-        with _opened_by("asammdf", "MF4", path):
-            from asammdf import MDF  # noqa: PLC0415 - optional, and slow
+        try:
+            with self._channels(path) as channels:
+                return array_signals(channels, self._needed(columns), path, complete=complete)
+        except (ConfigurationError, InputOutputError):
+            raise
+        except ImportError:
+            raise InputOutputError(
+                f"log {path}: {self.kind} needs {self.library}: {install_command('daq')}"
+            ) from None
+        except Exception:  # any kind, and it quotes the file
+            raise InputOutputError(
+                f"log {path}: not a readable {self.kind} file of signals"
+            ) from None
 
-            with closing(MDF(path)) as file:
-                return array_signals(
-                    _Mf4Channels(file), ColumnMap(rest, columns.tick_ns), path, complete=complete
-                )
+    def _needed(self, columns: ColumnMap) -> ColumnMap:
+        return columns
+
+    @abstractmethod
+    def _channels(self, path: Path) -> AbstractContextManager[Mapping[str, ArrayChannel]]:
+        """Open the file; channels by name while it is open."""
+
+
+class Mf4SignalReader(_ArrayReader):
+    """ASAM's measurements; the time of a channel is that of its group, whatever that is called."""
+
+    library, kind = "asammdf", "MF4"
+
+    def _needed(self, columns: ColumnMap) -> ColumnMap:
+        rest = {role: item for role, item in columns.columns.items() if role != TIME_ROLE}
+        return ColumnMap(rest, columns.tick_ns)
+
+    @contextmanager
+    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+        from asammdf import MDF  # noqa: PLC0415 - optional, and slow
+
+        with closing(MDF(path)) as file:
+            yield _Mf4Channels(file)
 
 
 class _Mf4Channels(Mapping[str, ArrayChannel]):
@@ -158,30 +177,23 @@ class _Mf4Channels(Mapping[str, ArrayChannel]):
         return self._read[name]
 
 
-class TdmsReader:
+class TdmsReader(_ArrayReader):
     """Files of LabVIEW; the time of a channel is that of its waveform."""
 
-    signature = b"TDSm"
+    signature, library, kind = b"TDSm", "npTDMS", "TDMS"
 
-    def signals(
-        self,
-        path: Path,
-        columns: ColumnMap,
-        budget: Budget,  # noqa: ARG002
-        *,
-        complete: bool,
-    ) -> dict[str, RecordedSignal]:
-        """Read a file, see `SignalReader`."""
-        with _opened_by("npTDMS", "TDMS", path):
-            from nptdms import TdmsFile  # noqa: PLC0415 - optional
+    @contextmanager
+    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+        from nptdms import TdmsFile  # noqa: PLC0415 - optional
 
-            with TdmsFile.open(path) as file:
-                found = {
+        with TdmsFile.open(path) as file:
+            yield _short_names(
+                {
                     f"{group.name}/{channel.name}": _tdms_channel(channel)
                     for group in file.groups()
                     for channel in group.channels()
                 }
-                return array_signals(_short_names(found), columns, path, complete=complete)
+            )
 
 
 def _tdms_channel(channel: Any) -> ArrayChannel:
@@ -195,36 +207,28 @@ def _tdms_channel(channel: Any) -> ArrayChannel:
     )
 
 
-class HdfReader:
+class HdfReader(_ArrayReader):
     """Files of HDF5, and of MATLAB from version 7.3 on."""
 
-    signature = b""
+    library, kind = "h5py", "HDF5"
 
-    def signals(
-        self,
-        path: Path,
-        columns: ColumnMap,
-        budget: Budget,  # noqa: ARG002
-        *,
-        complete: bool,
-    ) -> dict[str, RecordedSignal]:
-        """Read a file, see `SignalReader`."""
-        with _opened_by("h5py", "HDF5", path):
-            import h5py  # noqa: PLC0415 - optional, and slow
+    @contextmanager
+    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+        import h5py  # noqa: PLC0415 - optional, and slow
 
-            if not h5py.is_hdf5(path):
-                raise InputOutputError(
-                    f"log {path}: not a file of HDF5; of MATLAB save it as version 7.3 (-v7.3)"
-                )
-            with h5py.File(path, "r") as file:
-                found: dict[str, ArrayChannel] = {}
+        if not h5py.is_hdf5(path):
+            raise InputOutputError(
+                f"log {path}: not a file of HDF5; of MATLAB save it as version 7.3 (-v7.3)"
+            )
+        with h5py.File(path, "r") as file:
+            found: dict[str, ArrayChannel] = {}
 
-                def take(name: str, item: Any) -> None:
-                    if isinstance(item, h5py.Dataset) and not name.startswith(MATLAB_REFERENCES):
-                        found.update(_hdf_channels(name, item))
+            def take(name: str, item: Any) -> None:
+                if isinstance(item, h5py.Dataset) and not name.startswith(MATLAB_REFERENCES):
+                    found.update(_hdf_channels(name, item))
 
-                file.visititems(take)
-                return array_signals(_short_names(found), columns, path, complete=complete)
+            file.visititems(take)
+            yield _short_names(found)
 
 
 def _hdf_channels(name: str, item: Any) -> dict[str, ArrayChannel]:

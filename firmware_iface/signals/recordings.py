@@ -84,7 +84,7 @@ def recordings_of_signals(
     else:
         readings = _readings(signals, period, candidates, start)
     found = [
-        extract_tests(_whole(signals, item, columns.tick_ns, start, source), candidates)
+        extract_tests(_on_ticks(signals, item, columns.tick_ns, start, source), candidates)
         for item in readings
     ]
     if len(found) == 1 or len(found[0]) != len(found[1]):
@@ -105,7 +105,7 @@ class TickReading(NamedTuple):
     """What showed the ticks."""
 
 
-def _whole(
+def _on_ticks(
     signals: Mapping[str, RecordedSignal],
     reading: TickReading,
     tick_ns: int,

@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.recording import BoolArray, IntArray
+from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID, BoolArray, IntArray
 
 MAX_PAYLOAD = 64
 """Bytes of the longest payload (CAN FD)."""
@@ -44,7 +44,7 @@ class Frame:
     """
 
     def __post_init__(self) -> None:
-        limit = 0x1FFFFFFF if self.extended else 0x7FF
+        limit = MAX_CAN_ID if self.extended else MAX_STANDARD_CAN_ID
         if not 0 <= self.can_id <= limit and not self.error:
             raise ValueError(f"identifier {self.can_id:#x} outside 0 … {limit:#x}")
         if len(self.data) > MAX_PAYLOAD:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from firmware_iface.errors import ConfigurationError
+from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID
 from firmware_iface.transport.adapters import BusOptions, one_line, open_bus
 from firmware_iface.transport.base import Transport
 from firmware_iface.transport.frames import MAX_CHANNEL, Frame
@@ -272,10 +273,10 @@ def frame_of(message: can.Message, channel: int = 0) -> Frame:
     a recorded frame reads back with the very stamp it had on the bus. Its mark for sent frames is
     left out: SocketCAN sets it on the frames of every program of this machine.
     """
-    limit = 0x1FFFFFFF if message.is_extended_id else 0x7FF
+    limit = MAX_CAN_ID if message.is_extended_id else MAX_STANDARD_CAN_ID
     return Frame(
         time_ns=round(message.timestamp * 1e6) * 1000,
-        can_id=message.arbitration_id & (0x1FFFFFFF if message.is_error_frame else limit),
+        can_id=message.arbitration_id & (MAX_CAN_ID if message.is_error_frame else limit),
         data=b"" if message.is_remote_frame else bytes(message.data),
         extended=message.is_extended_id,
         fd=message.is_fd,

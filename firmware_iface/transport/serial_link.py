@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from firmware_iface.errors import BusLostError, ConfigurationError, InputOutputError
+from firmware_iface.recording import MAX_STANDARD_CAN_ID
 from firmware_iface.transport.base import Transport
 from firmware_iface.transport.frames import Frame
 
@@ -121,7 +122,7 @@ class Framer:
         can_id, stamp, data = PACKET_BODY.unpack(body)
         if (
             binascii.crc_hqx(body, 0xFFFF) != PACKET_CRC.unpack(packet[PACKET_BODY.size :])[0]
-            or can_id > 0x7FF
+            or can_id > MAX_STANDARD_CAN_ID
         ):
             return None
         if self._last_us is None:
