@@ -96,7 +96,7 @@ PARAMETER_TABLE = re.compile(r"^\| name \|.*?(?=\n\n)", re.MULTILINE | re.DOTALL
 
 def parameter_table() -> str:
     """Return the rows of the registry of parameters, as Markdown."""
-    from ehadiag.model.registry import REGISTRY  # noqa: PLC0415 - loads numba
+    from ehadiag.model.registry import REGISTRY  # noqa: PLC0415 - loads kernels
 
     lines = ["| name | symbol | unit | range | kind | meaning |", "| --- " * 6 + "|"]
     data = [item for item in REGISTRY if item.name == f"datum_{item.symbol.removeprefix('d')}"]

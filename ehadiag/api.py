@@ -473,7 +473,7 @@ def calibrate(
         found += [item] if isinstance(item, Recording) else setup.read(item).recordings
     if not found:
         raise ConfigurationError("nothing to learn from: no recording and no log given")
-    from ehadiag.calibration.calibrate_unit import calibrate as run  # noqa: PLC0415 - loads numba
+    from ehadiag.calibration.calibrate_unit import calibrate as run  # noqa: PLC0415 - loads kernels
     from ehadiag.calibration.calibrate_unit import update_calibration as refine  # noqa: PLC0415
 
     log_if_compiling()

@@ -182,7 +182,7 @@ def _printable(request: Request) -> Request:
 
 def _severities(found: Identification | None, actuator: Actuator) -> dict[str, Severity]:
     """Every fault of the registry, in its order."""
-    from ehadiag.model.registry import FAULTS, parameter  # noqa: PLC0415 - loads numba
+    from ehadiag.model.registry import FAULTS, parameter  # noqa: PLC0415 - loads kernels
 
     advice = {item.name: getattr(actuator.advice, item.name) for item in FAULTS}
     if found is None:

@@ -493,7 +493,7 @@ def _upgraded(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _short(name: str) -> str:
-    from ehadiag.model.registry import parameter  # noqa: PLC0415 - loads numba
+    from ehadiag.model.registry import parameter  # noqa: PLC0415 - loads kernels
 
     try:
         return parameter(name).short

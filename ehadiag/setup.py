@@ -236,7 +236,7 @@ class Setup:
     @cached_property
     def solver(self) -> Solver:
         """The search."""
-        from ehadiag.identify.solvers import make_solver  # noqa: PLC0415 - loads numba
+        from ehadiag.identify.solvers import make_solver  # noqa: PLC0415 - loads kernels
 
         found: Solver = self.objects.get("solver") or make_solver(self.request.solver)
         return found
@@ -262,7 +262,7 @@ class Setup:
 
         tests: that a recording may be of; None: all. Returns for `diagnose`.
         """
-        from ehadiag.assess.diagnosis import DiagnosisSession  # noqa: PLC0415 - loads numba
+        from ehadiag.assess.diagnosis import DiagnosisSession  # noqa: PLC0415 - loads kernels
         from ehadiag.identify.identification_session import NuisanceMode  # noqa: PLC0415
 
         return DiagnosisSession(

@@ -71,7 +71,7 @@ OF_EFFECT: dict[str, Callable[[Effect], Cell]] = {
 @cache
 def result_columns() -> dict[str, type[str] | type[int] | type[float]]:
     """Return names and kinds of the columns, with the severities and effects of the registry."""
-    from ehadiag.model.registry import FAULTS, REGISTRY  # noqa: PLC0415 - loads numba
+    from ehadiag.model.registry import FAULTS, REGISTRY  # noqa: PLC0415 - loads kernels
 
     kinds = [(name, kind) for name, (_, kind) in PATHS.items()]
     effects = [item.name for item in REGISTRY if item not in FAULTS]

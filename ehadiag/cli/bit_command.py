@@ -250,7 +250,7 @@ def _connection(
             )
             recorder = record()
         else:
-            from ehadiag_sim.emulator import (  # noqa: PLC0415 - loads numba
+            from ehadiag_sim.emulator import (  # noqa: PLC0415 - loads kernels
                 EmulatorTransport,
                 emulated_computer,
                 emulator_in_thread,
@@ -283,7 +283,7 @@ def _bit_monitor(
     """
     if not (shown or history is not None or setup.actuator.calibration is not None):
         return None
-    from ehadiag.session.monitor_session import BitMonitor  # noqa: PLC0415 - loads numba
+    from ehadiag.session.monitor_session import BitMonitor  # noqa: PLC0415 - loads kernels
     from ehadiag.session.unit_state import unit_state_from_history  # noqa: PLC0415
 
     find = None

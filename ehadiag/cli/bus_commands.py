@@ -177,7 +177,7 @@ def run_monitor(
         AlarmRecorder,
     )
     from ehadiag.session.bus_calls import watch  # noqa: PLC0415
-    from ehadiag.session.monitor_session import AlarmOutlets  # noqa: PLC0415 - loads numba
+    from ehadiag.session.monitor_session import AlarmOutlets  # noqa: PLC0415 - loads kernels
 
     folder = Path(arguments.record) if arguments.record else None
     outlets = AlarmOutlets(
@@ -453,7 +453,7 @@ def run_sim(arguments: argparse.Namespace) -> int:
     setup = options.setup_of(arguments)
     actuator, tests, bus_map = setup.actuator, setup.tests, setup.bus_map
     print_compiling_notice(simulation=True, identification=False)
-    from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads numba
+    from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads kernels
 
     core = emulated_computer(actuator, tests, bus_map, **simulator_settings(arguments))
     with (

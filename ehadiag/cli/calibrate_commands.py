@@ -203,7 +203,7 @@ def _calibrated(
     recordings: Sequence[Recording],
     digests: Sequence[str],
 ) -> Calibrated:
-    from ehadiag.assess.diagnosis import match_tests  # noqa: PLC0415 - loads numba
+    from ehadiag.assess.diagnosis import match_tests  # noqa: PLC0415 - loads kernels
     from ehadiag.calibration.calibrate_unit import calibrate, update_calibration  # noqa: PLC0415
 
     start, tests, default = setup.actuator, setup.tests, setup.default

@@ -208,7 +208,7 @@ def percent(value: float, *others: float) -> str:
 
 def plain_name(name: str) -> str:
     """Return the plain name of a severity or effect; an unknown name as it is."""
-    from ehadiag.model.registry import parameter  # noqa: PLC0415 - loads numba
+    from ehadiag.model.registry import parameter  # noqa: PLC0415 - loads kernels
 
     try:
         return parameter(name).short

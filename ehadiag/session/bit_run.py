@@ -72,7 +72,7 @@ class BitTest:
         progress: Callable[[str, float], None] | None = None,
         snapshots: Callable[[Snapshot], None] | None = None,
     ) -> None:
-        from ehadiag.identify.identification_session import warm_up  # noqa: PLC0415 - loads numba
+        from ehadiag.identify.identification_session import warm_up  # noqa: PLC0415 - loads kernels
 
         assert setup.default is not None
         self.setup, self.test, self._settings = setup, setup.default, settings

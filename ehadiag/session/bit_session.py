@@ -64,7 +64,7 @@ class EarlyIdentification:
 
     def all_there(self) -> bool:
         """Assemble the complete test; return whether no frame of it can still arrive."""
-        from ehadiag.assess.acceptance import is_complete_recording  # noqa: PLC0415 - loads numba
+        from ehadiag.assess.acceptance import is_complete_recording  # noqa: PLC0415 - loads kernels
 
         self.ended_at = time.perf_counter()
         recording = self._assembler.recording()

@@ -223,8 +223,8 @@ def watch(
         The bus cannot be opened, an alarm not written.
     """
     from ehadiag.live import publish  # noqa: PLC0415
-    from ehadiag.monitor.change_test import LEAST  # noqa: PLC0415 - loads numba
-    from ehadiag.session.monitor_session import (  # noqa: PLC0415 - loads numba
+    from ehadiag.monitor.change_test import LEAST  # noqa: PLC0415 - loads kernels
+    from ehadiag.session.monitor_session import (  # noqa: PLC0415 - loads kernels
         AlarmOutlets,
         MonitorSession,
     )
@@ -430,7 +430,7 @@ def run_simulator(
     InputOutputError
         The bus cannot be opened, or failed.
     """
-    from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads numba
+    from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads kernels
 
     setup = setup_for(request, options)
     core = emulated_computer(setup.actuator, setup.tests, setup.bus_map, **(conditions or {}))
