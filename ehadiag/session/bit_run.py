@@ -163,7 +163,9 @@ class BitTest:
             if outcome is None or not outcome.complete:
                 ahead.abandon()
             if outcome is not None and not outcome.complete:
-                why = settings.own_fault() or why + _traffic_text(recording, bus, listened)
+                why = ("" if stop.is_set() else settings.own_fault()) or (
+                    why + _traffic_text(recording, bus, listened)
+                )
             elif outcome is not None and not _finish_identification(ahead, self._deadline, stop):
                 ahead.abandon()
                 passed = self._deadline.passed
