@@ -128,6 +128,22 @@ def rest_spool_lanes(end: int, origin: float, state: Array, coefficients: Array)
 
 
 @packed
+def _quarter_matrix(coefficients: Array, o: int) -> tuple[Vector, ...]:
+    """Matrix of `_quarter_step`, 4 by 4, row by row."""
+    k = COEFFICIENTS.move * LANES + o
+    return (
+        load(coefficients, k), load(coefficients, k + LANES),
+        load(coefficients, k + 2 * LANES), load(coefficients, k + 3 * LANES),
+        load(coefficients, k + 4 * LANES), load(coefficients, k + 5 * LANES),
+        load(coefficients, k + 6 * LANES), load(coefficients, k + 7 * LANES),
+        load(coefficients, k + 8 * LANES), load(coefficients, k + 9 * LANES),
+        load(coefficients, k + 10 * LANES), load(coefficients, k + 11 * LANES),
+        load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
+        load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
+    )  # fmt: skip
+
+
+@packed
 def _quarter_step(
     m: tuple[Vector, ...], a: Vector, w: Vector, b: Vector, v: Vector,
     bow: float, dry: Vector, slowest: Vector, lowest: Vector, widest: Vector,
@@ -197,17 +213,7 @@ def spool_lanes(
         fine = rests
         if any_lane(d != 0.0):
             # Moving, about the point where both would rest.
-            k = COEFFICIENTS.move * LANES + o
-            m = (
-                load(coefficients, k), load(coefficients, k + LANES),
-                load(coefficients, k + 2 * LANES), load(coefficients, k + 3 * LANES),
-                load(coefficients, k + 4 * LANES), load(coefficients, k + 5 * LANES),
-                load(coefficients, k + 6 * LANES), load(coefficients, k + 7 * LANES),
-                load(coefficients, k + 8 * LANES), load(coefficients, k + 9 * LANES),
-                load(coefficients, k + 10 * LANES), load(coefficients, k + 11 * LANES),
-                load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
-                load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
-            )  # fmt: skip
+            m = _quarter_matrix(coefficients, o)
             base = spool_rest_position(t, deflection, d)
             a, w, b, v = xf * d - dry, wf * d, (xs - base) * d, vs * d
             s, n, x = zero + SPOOL_LIMITS.no_event, zero + SPOOL_LIMITS.no_event, zero
@@ -220,7 +226,7 @@ def spool_lanes(
             a, w, b, v, s, n, x = _quarter_step(m, a, w, b, v, bow, dry, s, n, x)
             b4, u4 = base + d * b, d * maximum(v, SPOOL_LIMITS.velocity)
             loose = d * (xs - wire) < t.backlash - WIRE_TOLERANCE
-            # A spool whose friction falls with its velocity: `ehadiag.model.simd_spool`.
+            # A spool whose friction falls with its velocity: `creep_lanes`.
             plain = free & (t.extra == 0.0)
             moves = (
                 (d != 0.0)
@@ -419,17 +425,7 @@ def creep_lanes(end: int, tick: float, state: Array, path: Array, coefficients: 
         tries = (busy != 0.0) & (d != 0.0) & (load(state, ROWS.clamped * LANES + o) == 0.0)
         tries = tries & (t.extra > 0.0)
         if any_lane(tries):
-            k = COEFFICIENTS.move * LANES + o
-            m = (
-                load(coefficients, k), load(coefficients, k + LANES),
-                load(coefficients, k + 2 * LANES), load(coefficients, k + 3 * LANES),
-                load(coefficients, k + 4 * LANES), load(coefficients, k + 5 * LANES),
-                load(coefficients, k + 6 * LANES), load(coefficients, k + 7 * LANES),
-                load(coefficients, k + 8 * LANES), load(coefficients, k + 9 * LANES),
-                load(coefficients, k + 10 * LANES), load(coefficients, k + 11 * LANES),
-                load(coefficients, k + 12 * LANES), load(coefficients, k + 13 * LANES),
-                load(coefficients, k + 14 * LANES), load(coefficients, k + 15 * LANES),
-            )  # fmt: skip
+            m = _quarter_matrix(coefficients, o)
             xf, wf = (
                 load(state, ROWS.flapper * LANES + o),
                 load(state, ROWS.flapper_rate * LANES + o),
