@@ -69,15 +69,18 @@ class _SampledTest:
     acquired: Acquisition
     left_out: Array
     """Ticks whose spool or pressure was left out for another reason than its reading, (2, n)."""
+    averaged: tuple[bool, ...]
+    """Whether means of the samples of spool and pressure are taken."""
 
     @classmethod
     def of(cls, experiment: Experiment, acquired: Acquisition) -> _SampledTest:
-        rows = zip(acquired.signals[:2], (experiment.spool, experiment.pressure), strict=True)
+        tick, signals = experiment.tick, acquired.signals[:2]
         left_out = [
-            np.isnan(row) & np.isfinite(values_at(recorded, experiment.sampled, experiment.tick)[0])
-            for recorded, row in rows
+            np.isnan(row) & np.isfinite(values_at(recorded, experiment.sampled, tick)[0])
+            for recorded, row in zip(signals, (experiment.spool, experiment.pressure), strict=True)
         ]
-        return cls(experiment, acquired, np.stack(left_out))
+        averaged = (tick >= SAMPLING.averaged * sampling_interval(item) for item in signals)
+        return cls(experiment, acquired, np.stack(left_out), tuple(averaged))
 
     @property
     def since_middle(self) -> Array:
@@ -132,15 +135,16 @@ def _sampled(taken: _SampledTest, clock: _Clock) -> _Samples:
     experiment = taken.experiment
     ends, wanted, tick = clock.ends(taken), clock.instant(taken), experiment.tick
     values, before = [], []
-    for recorded, left_out, offset, noise in zip(
+    for recorded, left_out, averaged, offset, noise in zip(
         taken.acquired.signals[:2],
         taken.left_out,
+        taken.averaged,
         (experiment.spool_offset, experiment.pressure_offset),
         experiment.noise[:2],
         strict=True,
     ):
         time, value = recorded.time, recorded.value
-        if tick >= SAMPLING.averaged * sampling_interval(recorded):
+        if averaged:
             seen, lead = values_at(recorded, ends - wanted, tick)[0], np.full(len(ends), wanted)
         else:
             after = np.clip(np.searchsorted(time, ends - wanted), 1, len(time) - 1)
