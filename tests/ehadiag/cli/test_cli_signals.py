@@ -113,11 +113,11 @@ def test_a_hang_up_that_is_ignored_stays_ignored(
         finally:
             bit.process.kill()
         # The simulator's time is real: on a busy machine the end of the test may come too late.
-        starved = any("too busy to simulate" in reason for reason in found["reasons"])
-        if not starved:
+        if not any("too busy to simulate" in reason for reason in found["reasons"]):
             break
-    # Of a test that a signal stopped the reason is that, also on a busy machine.
-    assert (bit.process.returncode, found["verdict"]) == (0, "HEALTHY") or starved
+    else:
+        pytest.skip(f"this machine was too busy for the simulator {ATTEMPTS} times")
+    assert (bit.process.returncode, found["verdict"]) == (0, "HEALTHY")
 
 
 def send(*numbers: signal.Signals) -> None:
