@@ -8,11 +8,14 @@ of the cache folder, else one is compiled into it. All levels of a processor giv
 from __future__ import annotations
 
 import ctypes
+import dataclasses
+import hashlib
 import json
 import os
 import platform
+import struct
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import cache
 from importlib import import_module
@@ -22,10 +25,10 @@ from typing import Any
 from ehadiag.compile.jit import Kernel
 from ehadiag.compile.sources import (
     KERNEL_DIGEST,
-    MAX_LIBRARY_BYTES,
     PREBUILT,
     SOURCE_DIGESTS_FILE,
-    cache_folder,
+    cached,
+    read_cached,
     source_hash,
     sources_of,
 )
@@ -37,7 +40,6 @@ from ehadiag.compile.worker import (
     object_code,
     tool_versions,
 )
-from firmware_iface.errors import reason_of
 from firmware_iface.files import warn_once
 
 LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -127,7 +129,7 @@ def prepare(names: Iterable[str], progress: Callable[[str], None] = lambda _text
 
 def missing(names: Iterable[str]) -> list[str]:
     """Libraries of these that must be compiled."""
-    return [name for name in names if _prebuilt(name) is None and _kept(name) is None]
+    return [name for name in names if _prebuilt(name) is None and read_cached(_file(name)) is None]
 
 
 def build(folder: Path, levels: Collection[tuple[str, str]]) -> None:
@@ -232,51 +234,10 @@ def _file(library: str) -> str:
     return f"{stem}-{KERNEL_DIGEST(made_by).hexdigest()[:16]}.kernel"
 
 
-def _kept(library: str) -> bytes | None:
-    """A library of the cache folder; one that is damaged is thrown away."""
-    folder = cache_folder()
-    if folder is None:
-        return None
-    name = _file(library)
-    try:
-        content = folder.read(name, MAX_LIBRARY_BYTES)
-        size = KERNEL_DIGEST().digest_size
-        if KERNEL_DIGEST(content[size:]).digest() == content[:size]:
-            return content[size:]
-        why = "damaged"
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        why = reason_of(error)
-    warn_once(f"cache folder {folder.path}: a compiled kernel is {why}; thrown away")
-    try:
-        folder.remove(name)
-    except OSError as error:
-        warn_once(f"cache folder {folder.path}: {reason_of(error)}")
-    return None
-
-
 @cache
 def _content(library: str) -> bytes:
     """A library, wherever it comes from."""
-    folder = cache_folder()
-    found = _prebuilt(library) or _kept(library)
-    if found is not None or folder is None:
-        return found or _made(library, processor_level())
-    from filelock import FileLock  # noqa: PLC0415 - only where something is compiled
-
-    content = b""
-    try:
-        # Another process may be compiling the same.
-        with FileLock(folder.path / f"{_file(library)}.lock"):
-            content = _kept(library) or _made(library, processor_level())
-            folder.write(_file(library), KERNEL_DIGEST(content).digest() + content, synced=False)
-    except OSError as error:
-        warn_once(
-            f"cache folder {folder.path}: {reason_of(error)}; the compiled kernels are"
-            " not kept for the next run"
-        )
-    return content or _made(library, processor_level())
+    return _prebuilt(library) or cached(_file(library), lambda: _made(library, processor_level()))
 
 
 def _made(library: str, level: tuple[str, str]) -> bytes:
@@ -294,6 +255,63 @@ def _made(library: str, level: tuple[str, str]) -> bytes:
     code = object_code(ObjectFile(functions, processor, replaced=replaced))
     names = [item.name for item in functions]
     return code if level == NO_LEVEL else shared_library(code, names)
+
+
+def object_file(wanted: ObjectFile) -> bytes:
+    """Object code with its tables, compiled or from the cache folder.
+
+    Parameters
+    ----------
+    wanted : ObjectFile
+        What is to be in it. The code does not depend on the values in its tables.
+
+    Returns
+    -------
+    bytes
+        The object file, of the format of the target.
+
+    Raises
+    ------
+    EhadiagError
+        The compiler is not installed, or has no such target.
+    """
+    kernels = [item.kernel.py_func for item in wanted.functions]
+    kernels += [item.py_func for item in wanted.replaced.values()]
+    modules = {item.__module__ for item in kernels} | {"ehadiag.compile.object_code"}
+    made_by = (
+        [(item.name, item.arguments) for item in wanted.functions],
+        [f"{item.__module__}.{item.__qualname__}" for item in kernels],
+        sorted(wanted.replaced),
+        sorted(wanted.allowed),
+        sorted(item.py_func.__qualname__ for item in wanted.exact),
+        [(name, len(numbers)) for name, numbers in wanted.tables.items()],
+        [source_hash(item) for item in sorted(modules)],
+        wanted.processor,
+        tool_versions(),
+    )
+    blank = {name: _placeholder(name, len(numbers)) for name, numbers in wanted.tables.items()}
+    code = cached(
+        f"export-{KERNEL_DIGEST(repr(made_by).encode()).hexdigest()[:16]}.kernel",
+        lambda: object_code(dataclasses.replace(wanted, tables=blank)),
+    )
+    for name, numbers in wanted.tables.items():
+        code = _with_table(code, blank[name], numbers)
+    return code
+
+
+def _placeholder(name: str, count: int) -> list[float]:
+    """Numbers that stand for a table in compiled code, and nowhere else."""
+    digits = hashlib.shake_256(name.encode()).digest(6 * count)
+    return [2.0**52 + int.from_bytes(digits[6 * i : 6 * i + 6], "big") for i in range(count)]
+
+
+def _with_table(code: bytes, blank: Sequence[float], numbers: Sequence[float]) -> bytes:
+    """Write a table over its placeholder, in the target's order of bytes."""
+    for order in "<>":
+        kind = f"{order}{len(blank)}d"
+        if code.count(struct.pack(kind, *blank)) == 1:
+            return code.replace(struct.pack(kind, *blank), struct.pack(kind, *numbers))
+    raise RuntimeError("compiled code does not have its table in one piece")
 
 
 @cache

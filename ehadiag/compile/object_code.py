@@ -182,6 +182,8 @@ def emitted(wanted: ObjectFile) -> bytes:
     _optimise(whole, machine, processor)
     if processor.fast:
         whole.link_in(_parsed(_head(machine) + MEMORY_FUNCTIONS, machine))
+    # After the optimisation, and weak for what follows it: no code depends on a table's values.
+    whole.link_in(_parsed(_head(machine) + _definitions(wanted.tables), machine))
     foreign = {item.name for item in whole.functions if item.is_declaration}
     foreign -= RUNTIME_FUNCTIONS | wanted.allowed
     foreign = {name for name in foreign if not name.startswith("llvm.")}
@@ -304,9 +306,9 @@ def _front(
     tables: Mapping[str, Sequence[float]],
     replaced: Mapping[str, Any],
 ) -> str:
-    """The C functions, the tables and the stand-ins, as LLVM's text."""
+    """The C functions, the stand-ins and the declarations of the tables, as LLVM's text."""
     parts = [
-        f"@{name} = constant [{len(values)} x double] [{_doubles(values)}], align 8"
+        f"@{name} = external constant [{len(values)} x double], align 8"
         for name, values in tables.items()
     ]
     parts += [_c_function(item) for item in functions]
@@ -320,6 +322,13 @@ def _front(
             "  %value = load double, ptr %result\n  ret double %value\n}"
         )
     return "\n".join(parts) + "\n"
+
+
+def _definitions(tables: Mapping[str, Sequence[float]]) -> str:
+    return "".join(
+        f"@{name} = weak hidden constant [{len(values)} x double] [{_doubles(values)}], align 8\n"
+        for name, values in tables.items()
+    )
 
 
 def _doubles(values: Sequence[float]) -> str:

@@ -1,4 +1,4 @@
-"""Hashes of kernel sources: what a compiled library was made of.
+"""Hashes of kernel sources, and the cache folder of what was compiled from them.
 
 A hash covers a module and all project modules that it imports, without docstrings and comments.
 """
@@ -11,12 +11,13 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from firmware_iface.files import Folder, private_folder
+from firmware_iface.errors import reason_of
+from firmware_iface.files import Folder, private_folder, warn_once
 
 PACKAGES = ("ehadiag", "firmware_iface", "ehadiag_sim")
 """Packages whose modules hold kernels, or numbers and functions that kernels use."""
@@ -33,6 +34,49 @@ PREBUILT = Path(__file__).parents[1] / "_kernels"
 def cache_folder() -> Folder | None:
     """Folder of compiled libraries, opened once; None where there is none."""
     return private_folder("kernels")
+
+
+def read_cached(file: str) -> bytes | None:
+    """Read compiled code from the cache folder; a damaged file is removed."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    try:
+        content = folder.read(file, MAX_LIBRARY_BYTES)
+        size = KERNEL_DIGEST().digest_size
+        if KERNEL_DIGEST(content[size:]).digest() == content[:size]:
+            return content[size:]
+        why = "damaged"
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        why = reason_of(error)
+    warn_once(f"cache folder {folder.path}: a compiled kernel is {why}; thrown away")
+    try:
+        folder.remove(file)
+    except OSError as error:
+        warn_once(f"cache folder {folder.path}: {reason_of(error)}")
+    return None
+
+
+def cached(file: str, compile_code: Callable[[], bytes]) -> bytes:
+    """Compiled code of the cache folder; code that is not in it is compiled, and kept there."""
+    folder, found = cache_folder(), read_cached(file)
+    if found is not None or folder is None:
+        return found or compile_code()
+    from filelock import FileLock  # noqa: PLC0415 - only where something is compiled
+
+    content = b""
+    try:
+        with FileLock(folder.path / f"{file}.lock"):  # another process may be compiling the same
+            content = read_cached(file) or compile_code()
+            folder.write(file, KERNEL_DIGEST(content).digest() + content, synced=False)
+    except OSError as error:
+        warn_once(
+            f"cache folder {folder.path}: {reason_of(error)}; the compiled kernels are"
+            " not kept for the next run"
+        )
+    return content or compile_code()
 
 
 @cache

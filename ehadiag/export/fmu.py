@@ -14,13 +14,13 @@ from importlib import metadata
 from typing import Any, Final
 
 from ehadiag.compile.elementary import C_FUNCTIONS, ROUNDING_FUNCTIONS
+from ehadiag.compile.libraries import object_file
 from ehadiag.compile.worker import (
     CFunction,
     DoublesArgument,
     ObjectFile,
     PointerArgument,
     TableArgument,
-    object_code,
 )
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
@@ -258,7 +258,7 @@ def export_fmus(
     tick = 1.0 / actuator.controller.rate
     files: dict[str, bytes] = {}
     for model in (_simulator(actuator), _monitor(actuator, hours)):
-        code = object_code(
+        code = object_file(
             ObjectFile(
                 model.functions,
                 HOST,

@@ -16,6 +16,7 @@ from ehadiag.compile.elementary import (
     ROUNDING_FUNCTIONS,
     square_root,
 )
+from ehadiag.compile.libraries import object_file
 from ehadiag.compile.sources import source_hash
 from ehadiag.compile.vector import BYTES_PER_NUMBER
 from ehadiag.compile.worker import (
@@ -24,7 +25,6 @@ from ehadiag.compile.worker import (
     PointerArgument,
     Processor,
     TableArgument,
-    object_code,
     tool_versions,
 )
 from ehadiag.core.actuator import Actuator
@@ -133,7 +133,7 @@ def export_library(
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
     plan = library_plan(actuator, design, tests, single=target.processor.single)
     code = mark_either_convention(
-        object_code(
+        object_file(
             ObjectFile(
                 EXPORTED_FUNCTIONS,
                 target.processor,

@@ -150,8 +150,8 @@ def computes_as_stated(plan: Array, number: float) -> bool:
 
     number: one that no compiler knows, about 1e7.
     """
-    share = plan_identity_of(plan).smallest
     # Sums of what was rounded: a processor without doubles makes them by its own single precision.
+    share = plan_identity_of(plan).smallest + 0.0
     number = 0.5 * (3.0 * number)
     small = number * share * share
     return bool(small > 0.0 and number + small == number and number - small == number)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from ehadiag.compile import libraries, sources, worker
 from ehadiag.compile.elf import shared_library
+from ehadiag.export.targets import find_target
+from ehadiag.monitor.monitor_memory import prepare_monitor
 from firmware_iface.errors import ConfigurationError
+from firmware_iface.files import Folder
 
 LEVEL = libraries.processor_level()
 needs_levels = pytest.mark.skipif(LEVEL == libraries.NO_LEVEL, reason="no shared libraries here")
@@ -95,6 +100,25 @@ def test_without_a_compiler_the_error_names_what_to_install(
     monkeypatch.setattr(worker, "find_spec", lambda _name: None)
     with pytest.raises(ConfigurationError, match=r"needs numba: .*install .*numba"):
         worker.object_code(worker.ObjectFile((), libraries.HOST))
+
+
+def test_one_compilation_serves_all_values_of_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also for 32 bits, the other order of bytes, and where LLVM folds constants late."""
+    arguments = (worker.PointerArgument(), worker.TableArgument("plan"), worker.PointerArgument())
+    functions = (worker.CFunction("prepare", prepare_monitor, arguments),)
+    one, two = ([n + 0.25 * k for n in range(171)] for k in (1, 2))
+    blank = worker.ObjectFile(functions, find_target("powerpc-e500mc").processor)
+    with Folder.at(tmp_path, 0o600) as folder:
+        monkeypatch.setattr(sources, "cache_folder", lambda: folder)
+        first = libraries.object_file(replace(blank, tables={"plan": one}))
+        assert first == worker.object_code(replace(blank, tables={"plan": one}))
+        compiled_again = pytest.fail
+        monkeypatch.setattr(libraries, "object_code", compiled_again)
+        second = libraries.object_file(replace(blank, tables={"plan": two}))
+    assert struct.pack(">171d", *two) in second
+    assert second == first.replace(struct.pack(">171d", *one), struct.pack(">171d", *two))
 
 
 def test_what_is_no_object_file_of_this_kind_is_refused() -> None:
