@@ -75,6 +75,9 @@ class _PythonCanReader:
     """Number of an adapter channel less what python-can makes of it."""
     resume_line = ""
     """Line at which python-can's reader goes on to frames when it begins amidst a text log."""
+    has_destructor = False
+    """Whether a reader that failed must be destroyed at once: later its destructor fails beside
+    something else."""
 
     def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
         """Ways to make python-can's reader of a file, each for a file that those before fail on."""
@@ -130,7 +133,8 @@ class _PythonCanReader:
         if len(columns):
             yield columns.table()
         if not intact:
-            gc.collect()  # or asammdf's destructor fails later, beside something else
+            if self.has_destructor:
+                gc.collect()
             raise DamagedLogError("the log breaks off or is damaged")
 
     def _resumes(self, reader: Any, found: int, bad: int) -> bool:
@@ -205,6 +209,7 @@ class Mf4Reader(_PythonCanReader):
     """ASAM's log of bus events."""
 
     kind = "MF4 log"
+    has_destructor = True
 
     def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
         """The one way, of a file that fits into memory."""

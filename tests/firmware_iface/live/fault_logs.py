@@ -20,8 +20,8 @@ END = 5.5
 """s: length of the stored test."""
 KEPT = 100_000
 """Frames that the assembler of the endless logs keeps."""
-NOISE = 400_000
-"""Foreign frames: four times what is kept. What does not grow with them does not with 10^8."""
+NOISE = 200_000
+"""Foreign frames: twice what is kept. What does not grow with them does not with 10^8."""
 
 
 @dataclass(frozen=True)

@@ -162,7 +162,7 @@ def test_the_memory_of_a_flood_is_that_of_what_is_kept() -> None:
         tracemalloc.stop()
     assert recording.samples is None
     # 64 bytes of payload and 14 of the rest a frame; at the end the columns are copied twice, and
-    # the checks mark each frame. All of the flood would be four times as much.
+    # the checks mark each frame. All of the flood would be twice as much.
     assert peak < 4 * KEPT * 90
 
 
