@@ -75,9 +75,6 @@ class _PythonCanReader:
     """Number of an adapter channel less what python-can makes of it."""
     resume_line = ""
     """Line at which python-can's reader goes on to frames when it begins amidst a text log."""
-    has_destructor = False
-    """Whether a reader that failed must be destroyed at once: later its destructor fails beside
-    something else."""
 
     def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
         """Ways to make python-can's reader of a file, each for a file that those before fail on."""
@@ -133,9 +130,11 @@ class _PythonCanReader:
         if len(columns):
             yield columns.table()
         if not intact:
-            if self.has_destructor:
-                gc.collect()
+            self._release()
             raise DamagedLogError("the log breaks off or is damaged")
+
+    def _release(self) -> None:
+        """Destroy a reader that failed, where that must not be later."""
 
     def _resumes(self, reader: Any, found: int, bad: int) -> bool:
         """Whether a text log goes on after a bad line, which is then left out."""
@@ -209,7 +208,10 @@ class Mf4Reader(_PythonCanReader):
     """ASAM's log of bus events."""
 
     kind = "MF4 log"
-    has_destructor = True
+
+    def _release(self) -> None:
+        """Destroy asammdf's object, whose destructor would fail later, beside something else."""
+        gc.collect()
 
     def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
         """The one way, of a file that fits into memory."""
