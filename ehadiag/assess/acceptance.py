@@ -13,7 +13,7 @@ from ehadiag.core.actuator import WEAR_EXCESS_FACTOR, Actuator, Calibration
 from ehadiag.core.conversion import conversion_of
 from ehadiag.core.criteria import FIT, RECORDING
 from ehadiag.identify.experiment import Experiment
-from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.identification_result import Fit, Identification
 from ehadiag.identify.prior import has_further_effects
 from ehadiag.identify.signals import COMMAND_FRAME_TOLERANCE
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
@@ -265,18 +265,28 @@ def objections_to_estimate(
     """
     fit = identification.fit
     out = []
-    rms = max(fit.spool_rms, fit.pressure_rms)
+    rms = fit.unexplained_rms
     most_outliers, most_rms = residual_limits(calibration)
-    if fit.outliers > most_outliers or not rms <= most_rms:
+    if fit.unexplained_outliers > most_outliers or not rms <= most_rms:
         out.append(
-            f"the model does not explain the recording: {fit.outliers:.1%} of the residuals beyond "
-            f"three times the noise (limit {most_outliers:.1%}), rms residual {rms:.2f} (limit "
-            f"{most_rms:.3g}): other actuator data, or an effect that the three faults leave out"
+            f"the model does not explain the recording: {fit.unexplained_outliers:.1%} of the "
+            f"residuals beyond three times the noise (limit {most_outliers:.1%}), rms residual "
+            f"{rms:.2f} (limit {most_rms:.3g}): other actuator data, or an effect that the three "
+            "faults leave out"
         )
     hidden = [item.name for item in identification.estimates if not item.shown]
     if hidden:
         out.append(f"the test does not show {', '.join(hidden)}")
     return out
+
+
+def is_explained_by_discrepancy_alone(fit: Fit, calibration: Calibration | None = None) -> bool:
+    """Whether residuals beyond the limits are allowed for the discrepancy of the faults' laws.
+
+    Effects of the unit that are estimated with them may stand for that discrepancy.
+    """
+    most_outliers, most_rms = residual_limits(calibration)
+    return fit.outliers > most_outliers or not max(fit.spool_rms, fit.pressure_rms) <= most_rms
 
 
 def residual_limits(calibration: Calibration | None) -> tuple[float, float]:

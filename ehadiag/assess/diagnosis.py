@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ehadiag.assess.acceptance import (
+    is_explained_by_discrepancy_alone,
     notes_on_recording,
     objection_to_current,
     objections_to_conditions,
@@ -254,6 +255,7 @@ class DiagnosisSession:
                 *_notes(recordings, matched, self._actuator),
                 *_notes_on_effects(identification, self._actuator),
                 *late,
+                *_notes_on_discrepancy(identification, self._actuator, verdict),
                 *_notes_on_unchecked_positions(positions),
                 *notes_on_effects(with_limits(effects, self._actuator)),
             ),
@@ -477,6 +479,20 @@ def _notes_on_unchecked_positions(positions: Sequence[PositionFit | None]) -> tu
     if None not in positions:
         return ()
     return ("too few samples of the jack position: its sensor is not checked",)
+
+
+def _notes_on_discrepancy(
+    identification: Identification | None, actuator: Actuator, verdict: Verdict
+) -> tuple[str, ...]:
+    if identification is None or verdict is Verdict.NOT_TESTED:
+        return ()
+    fit = identification.fit
+    if not is_explained_by_discrepancy_alone(fit, actuator.calibration):
+        return ()
+    return (
+        f"{fit.outliers:.1%} of the residuals are beyond three times the noise, as the discrepancy"
+        " of the faults' laws in the actuator file allows; limits of other effects are not judged",
+    )
 
 
 def _notes_on_effects(identification: Identification | None, actuator: Actuator) -> tuple[str, ...]:

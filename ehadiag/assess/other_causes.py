@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ehadiag.assess.acceptance import is_explained_by_discrepancy_alone
 from ehadiag.assess.verdict import Verdict
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
@@ -47,18 +48,20 @@ def effects_of(identification: Identification | None, actuator: Actuator) -> tup
     """Return every effect that was estimated, in the order of the identification.
 
     identification: None where there is none; actuator: data of the unit, with its limits. Returns
-    values, limits, and what was known of them beforehand.
+    values, limits, and what was known of them beforehand. None is beyond its limit where the
+    recording is explained by the discrepancy of the faults' laws alone.
     """
     if identification is None:
         return ()
     prior_of_unit, channels = unit_prior(actuator), actuator_channels(actuator)
+    doubtful = is_explained_by_discrepancy_alone(identification.fit, actuator.calibration)
     out = []
     for name, found in identification.nuisances.items():
         item = scaled_to_channels(parameter(name), channels)
         half, limit = QUANTILE_TWO_SIDED_95 * found.std, item.limit_of(actuator)
         known = math.isfinite(found.value) and math.isfinite(found.std)
         chance = None
-        if limit is not None and known:
+        if limit is not None and known and not doubtful:
             chance = chance_beyond(found.value, found.std, limit)
         prior, source = _prior(item, prior_of_unit)
         out.append(

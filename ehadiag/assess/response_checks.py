@@ -22,6 +22,7 @@ from ehadiag.core.criteria import RESPONSE
 from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment
 from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.prior import has_further_effects
 from ehadiag.model.batch import NO_ANCHOR
 from ehadiag.model.residual_models import ModelResponse, model_response
 from firmware_iface.recording import SPOOL_CHANNEL
@@ -253,9 +254,12 @@ def fit_position(experiment: Experiment, modelled: ModelResponse) -> PositionFit
 def max_position_gain_error(actuator: Actuator) -> float:
     """Largest relative gain error of the sensor that errors of actuator data may explain."""
     calibration = actuator.calibration
+    own_effects = calibration is not None and (
+        calibration.plays > 1 or has_further_effects(calibration)
+    )
     return (
         RESPONSE.max_position_gain_error_calibrated
-        if calibration is not None and calibration.plays > 1
+        if own_effects
         else RESPONSE.max_position_gain_error
     )
 

@@ -7,7 +7,9 @@ residuals (Newey and West, Econometrica 55(3), 1987).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from statistics import NormalDist
+from types import MappingProxyType
 
 import numpy as np
 
@@ -216,10 +218,12 @@ def identification_result(
     attempts: int,
     timing: IdentificationTiming,
     about: Mapping[str, float],
+    discrepancy: Mapping[str, float],
 ) -> Identification:
     """Put together what an identification says.
 
-    spread: covariance of all that was refined, SI; about: effects that the constants already have.
+    spread: covariance of all that was refined, SI; about: effects that the constants already have;
+    discrepancy: of the faults' laws, by name, over the severity, 1.
     """
     deviations = np.sqrt(np.diag(spread)).tolist()
     nuisances = {
@@ -236,7 +240,7 @@ def identification_result(
         nuisances=nuisances,
         about=about,
         covariance=fault_covariance(refined, spread),
-        fit=fit_quality(refined, experiments),
+        fit=fit_quality(refined, experiments, discrepancy),
         solver=solver,
         seed=seed,
         evaluations=evaluations,
@@ -288,13 +292,30 @@ def _bounded_severity(item: Parameter, value: float) -> float:
     return min(max(value, item.lower), item.upper)
 
 
-def fit_quality(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
-    """How well the optimum explains the recordings; noise and offsets are of the first one."""
+def fit_quality(
+    refined: Refinement,
+    experiments: Sequence[Experiment],
+    discrepancy: Mapping[str, float] = MappingProxyType({}),
+) -> Fit:
+    """How well the optimum explains the recordings; noise and offsets are of the first one.
+
+    discrepancy: of the faults' laws, by name, over the severity, 1.
+    """
     first, values = experiments[0], refined.values
+    outliers = refinement_outlier_share(refined)
+    rms = [_rms(refined, row) for row in (SPOOL_ROW, PRESSURE_ROW)]
+    unexplained = outliers, max(rms)
+    if any(discrepancy.values()):
+        share = refined.residuals / explained_deviations(refined, discrepancy)
+        within = replace(refined, residuals=share)
+        unexplained = (
+            refinement_outlier_share(within),
+            max(_rms(within, row) for row in (SPOOL_ROW, PRESSURE_ROW)),
+        )
     return Fit(
-        spool_rms=_rms(refined, SPOOL_ROW),
-        pressure_rms=_rms(refined, PRESSURE_ROW),
-        outliers=refinement_outlier_share(refined),
+        spool_rms=rms[0],
+        pressure_rms=rms[1],
+        outliers=outliers,
         spool_noise=first.spool_noise,
         pressure_noise=first.pressure_noise,
         spool_offset=first.spool_offset + values["spool_offset"],
@@ -302,7 +323,27 @@ def fit_quality(refined: Refinement, experiments: Sequence[Experiment]) -> Fit:
         anchored=refined.anchored,
         spool_rms_uncapped=_rms(refined, SPOOL_ROW, np.inf),
         pressure_rms_uncapped=_rms(refined, PRESSURE_ROW, np.inf),
+        unexplained_outliers=unexplained[0],
+        unexplained_rms=unexplained[1],
     )
+
+
+def explained_deviations(refined: Refinement, discrepancy: Mapping[str, float]) -> Array:
+    """Deviation of each residual by noise and by laws of the faults that are off, over the noise.
+
+    A law that is off by a share of the severity, at one instant otherwise than at another, moves a
+    sample by its sensitivity to the severity times that share: a model discrepancy whose size
+    follows the sensitivities (Kennedy and O'Hagan 2001). Rows that took no part in the fit have no
+    sensitivity: they have that of their neighbours. Shape (signals, N), from 1 up.
+    """
+    variance = np.ones_like(refined.residuals)
+    for item, x, row in zip(refined.parameters, refined.x, refined.jacobian, strict=True):
+        variance += (discrepancy.get(item.name, 0.0) * x * row) ** 2
+    ticks = np.arange(variance.shape[1])
+    for own, used in zip(variance, refined.used, strict=True):
+        if used.any():
+            own[~used] = np.interp(ticks[~used], ticks[used], own[used])
+    return np.asarray(np.sqrt(variance))
 
 
 def refinement_outlier_share(refined: Refinement) -> float:

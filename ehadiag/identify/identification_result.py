@@ -60,6 +60,10 @@ class Fit:
     """Constant errors of the channels, m and Pa."""
     anchored: int
     """How often the model had to be put back on the measured spool."""
+    unexplained_outliers: float
+    unexplained_rms: float
+    """As `outliers`, and the larger `…_rms`, where the faults' laws may be off by the discrepancy
+    of the actuator file (`explained_deviations`)."""
     spool_rms_uncapped: float = math.nan
     pressure_rms_uncapped: float = math.nan
     """Rms residual in units of the signal's own noise, every residual counted in full: far above

@@ -220,7 +220,11 @@ class IdentificationSession:
             )
             freed = freeing.estimated(experiments, hint if near else None, alone_left)
         conclude = partial(
-            identification_result, solver=self.solver.name, seed=self.seed, about=self.prior.about
+            identification_result,
+            solver=self.solver.name,
+            seed=self.seed,
+            about=self.prior.about,
+            discrepancy=self.prior.discrepancy,
         )
         if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
             if (

@@ -14,6 +14,7 @@ import pytest
 from places import LOGS
 
 from ehadiag import Actuator, ConfigurationError, Verdict, bundled_tests, default_actuator
+from ehadiag.assess.acceptance import objections_to_estimate
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.other_causes import (
     chance_beyond,
@@ -23,7 +24,7 @@ from ehadiag.assess.other_causes import (
 )
 from ehadiag.assess.response_checks import identified_response, objections_to_supply
 from ehadiag.core.actuator import actuator_toml
-from ehadiag.identify.identification_result import Nuisance
+from ehadiag.identify.identification_result import Fit, Nuisance
 from ehadiag.records import result_of
 from ehadiag.report.response_signals import result_picture
 from ehadiag_sim.broken_hardware import simulate_broken
@@ -33,10 +34,12 @@ from firmware_iface.files import decode_toml
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.stored_test import resolve_test
 
+NOISE = Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0, 0.003, 1.0)
 
-def found(**values):
+
+def found(fit=NOISE, **values):
     nuisances = {name: Nuisance(*pair, at_bound=False) for name, pair in values.items()}
-    return effects_of(SimpleNamespace(nuisances=nuisances), default_actuator())
+    return effects_of(SimpleNamespace(nuisances=nuisances, fit=fit), default_actuator())
 
 
 @pytest.mark.parametrize(
@@ -58,6 +61,16 @@ def test_the_default_limits(name, value, beyond):
     verdict, reasons = count_other_faults([item], Verdict.HEALTHY, ())
     assert verdict is (Verdict.DEGRADED if beyond else Verdict.HEALTHY)
     assert bool(reasons) is beyond
+
+
+def test_no_limit_is_judged_where_only_a_wrong_law_of_a_fault_explains_the_recording():
+    doubtful = replace(NOISE, outliers=0.15)
+    (item,) = found(doubtful, torque_motor_gain=(-0.19, 1e-3))
+    assert (item.beyond, item.chance) == (None, None)
+    assert item.limit == 0.1
+    assert objections_to_estimate(SimpleNamespace(fit=doubtful, estimates=())) == []
+    unexplained = SimpleNamespace(fit=replace(doubtful, unexplained_outliers=0.15), estimates=())
+    assert "15.0% of the residuals" in objections_to_estimate(unexplained)[0]
 
 
 @pytest.mark.parametrize("verdict", [Verdict.DEGRADED, Verdict.FAULT, Verdict.NOT_TESTED])

@@ -57,7 +57,7 @@ def identified(*values):
         nuisances={"null_bias": Nuisance(0.0, 1e-6, at_bound=False)},
         about={},
         covariance=np.eye(3) * STD**2,
-        fit=Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0),
+        fit=Fit(1.0, 1.0, 0.003, 1e-7, 1e4, 0.0, 0.0, 0, 0.003, 1.0),
         solver="cga",
         seed=0,
         evaluations=1,
