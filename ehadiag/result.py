@@ -117,6 +117,27 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
     results: int = 1
 
 
+class ListedTest(msgspec.Struct, frozen=True, kw_only=True):
+    """One test of a log."""
+
+    number: int
+    """In order of time, from 1."""
+    test: int | None
+    """Number of the stored test; None where the bus does not say and no stored test fits."""
+    start: str | None
+    """UTC, ISO 8601."""
+    length_s: float | None
+    """None without samples."""
+    outcome: str | None
+    """How it ended, by the status frames."""
+    serial: int | None
+    """Of the unit, as the bus says."""
+    channel: int | None
+    """Adapter channel; None where it is not said."""
+    remarks: tuple[str, ...]
+    """Why it cannot be diagnosed; empty where nothing is known against it."""
+
+
 class TestOrigin(msgspec.Struct, frozen=True, kw_only=True):
     """The stored test that a recording is of."""
 

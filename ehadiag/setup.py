@@ -275,28 +275,31 @@ class Setup:
             nuisances=NuisanceMode(self.request.nuisances),
         )
 
-    def open(self, *files: PathLike) -> Iterator[Recording]:
+    def open(self, *files: PathLike, progress: Progress | None = None) -> Iterator[Recording]:
         """Read the tests that one recording holds, in order of time.
 
-        files: files to read; several hold one recording. Returns at least one; without samples
-        where there is no test. InputOutputError: a file cannot be read; ConfigurationError: its
-        kind is unknown.
+        files: files to read; several hold one recording; progress: called with the stage and the
+        share of a file that is read. Returns at least one; without samples where there is no test.
+        InputOutputError: a file cannot be read; ConfigurationError: its kind is unknown.
         """
         from firmware_iface.signals.recordings import Interpretation, recorded_tests  # noqa: PLC0415 - loads cantools
 
         meaning = Interpretation(self.bus_map, self.columns, self.candidate_tests)
-        return iter(recorded_tests([os.fspath(item) for item in files], meaning, self.budget))
+        budget = self.budget
+        if progress is not None:
+            budget = replace(budget, progress=partial(progress, "reading"))
+        return iter(recorded_tests([os.fspath(item) for item in files], meaning, budget))
 
-    def read(self, *files: PathLike) -> Reading:
+    def read(self, *files: PathLike, progress: Progress | None = None) -> Reading:
         """Read what is to be diagnosed of one recording; see `open`.
 
-        files: files to read; several hold one recording. Returns at least one recording, and the
-        time that it took.
+        files: files to read; several hold one recording; progress: called with the stage and the
+        share of a file that is read. Returns at least one recording, and the time that it took.
         """
         from firmware_iface.logs.reader import choose_recording  # noqa: PLC0415 - loads cantools
 
         begin = time.perf_counter()
-        tests = self.open(*files)
+        tests = self.open(*files, progress=progress)
         # Of a long log's tests only one is held, unless all are wanted.
         found = tuple(tests) if self.request.every_test else (choose_recording(tests),)
         if self.label:
@@ -399,7 +402,7 @@ class Setup:
         share of it that is done. Yields at least one; several where every test is asked for.
         """
         try:
-            reading = self.read(*files)
+            reading = self.read(*files, progress=progress)
         except EhadiagError as error:
             yield self.failure(files[0], str(error), error.exit_code)
             return

@@ -263,7 +263,8 @@ class _BatchRun:
                 interrupt_on_signals()
                 if item.why:
                     raise InputOutputError(item.why)
-                reading = setup.read(item.name)
+                with progress_bar() as progress:
+                    reading = setup.read(item.name, progress=progress)
             except EhadiagError as error:
                 self._fail(setup.failure(item.name, str(error), error.exit_code))
                 continue

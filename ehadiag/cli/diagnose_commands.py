@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.assess.verdict import Levels
+from ehadiag.batch.test_list import list_tests
 from ehadiag.batch.workers import LogInput, expand_logs
 from ehadiag.cli import options
 from ehadiag.cli.batch_run import add_batch_options, diagnose_all, diagnose_and_deliver
@@ -41,6 +42,7 @@ from ehadiag.terminal.output import (
     exit_code_of_inputs,
     print_compiling_notice,
     print_status,
+    progress_bar,
     worst_exit_code,
 )
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
@@ -185,7 +187,8 @@ def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInp
         try:
             if item.why:
                 raise InputOutputError(item.why)
-            reading = setup.read(item.name)
+            with progress_bar() as progress:
+                reading = setup.read(item.name, progress=progress)
         except EhadiagError as error:
             print_status(str(error))
             codes.append(error.exit_code)
@@ -207,7 +210,8 @@ def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogIn
     for item in inputs:
         if item.why:
             raise InputOutputError(item.why)
-    reading = setup.read(*(item.name for item in inputs))
+    with progress_bar() as progress:
+        reading = setup.read(*(item.name for item in inputs), progress=progress)
     codes = [
         diagnose_and_deliver(setup, results, [recording], reading.files, [log], reading.seconds)[1]
         for recording, log in reading.each()
@@ -235,7 +239,9 @@ def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
                 if item.why:
                     raise InputOutputError(item.why)
             names = [item.name for item in group]
-            print_test_list(", ".join(names) + of, setup.open(*names), as_json=arguments.json)
+            with progress_bar() as progress:
+                tests = list(list_tests(setup, *names, progress=progress))
+            print_test_list(", ".join(names) + of, tests, as_json=arguments.json)
         except EhadiagError as error:
             print_status(str(error))
             codes.append(error.exit_code)

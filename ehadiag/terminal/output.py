@@ -11,7 +11,9 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, TextIO, cast
+
+import msgspec
 
 from firmware_iface.errors import (
     ConfigurationError,
@@ -25,7 +27,7 @@ from firmware_iface.errors import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from firmware_iface.recording import Recording
+    from ehadiag.result import ListedTest
     from firmware_iface.transport.base import Transport
 
 __all__ = [
@@ -295,49 +297,28 @@ TESTS_SCHEMA = "ehadiag.tests/1"
 TEST_LIST_COLUMNS = ("no.", "test", "start", "length s", "outcome", "serial", "channel", "remarks")
 
 
-def print_test_list(source: str, recordings: Iterable[Recording], *, as_json: bool) -> None:
+def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) -> None:
     """Print number, test, start, length, outcome, serial number and channel of each test.
 
     Parameters
     ----------
     source : str
         Name of the recording.
-    recordings : Iterable[Recording]
+    tests : Iterable[ListedTest]
         Its tests, taken one at a time.
     as_json : bool
         One JSON object a line instead of a table.
     """
-    rows = (_test_list_row(item, number) for number, item in enumerate(recordings, start=1))
     if as_json:
-        for row in rows:
+        for test in tests:
+            row = msgspec.structs.asdict(test)
             print_text(json.dumps({"schema": TESTS_SCHEMA, "source": valid_text(source), **row}))
         return
     from rich.table import Table  # noqa: PLC0415 - only who prints tables needs it
 
     table = Table(*TEST_LIST_COLUMNS, box=None, pad_edge=False, title=None)
-    for row in rows:
-        cells = (row["number"], row["test"], row["start"], row["length_s"], row["outcome"])
-        remarks = "; ".join(row["remarks"])
-        shown = (*cells, row["serial"], row["channel"], remarks)
+    for test in tests:
+        shown = (*msgspec.structs.astuple(test)[:-1], "; ".join(test.remarks))
         table.add_row(*("-" if cell in (None, "") else printable(str(cell)) for cell in shown))
     print_text(source)
     write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
-
-
-def _test_list_row(item: Recording, number: int) -> dict[str, Any]:
-    from ehadiag.core.conventions import start_text  # noqa: PLC0415 - not for help texts
-
-    state, reason = item.outcome.state, item.outcome.reason
-    outcome = None if state is None else state.name.lower()
-    if state is not None and reason:
-        outcome = f"{outcome} ({reason.name.lower().replace('_', ' ')})"
-    return {
-        "number": number,
-        "test": item.test_id,
-        "start": start_text(item.start_ns),
-        "length_s": None if item.samples is None else round(item.duration, 3),
-        "outcome": outcome,
-        "serial": item.serial,
-        "channel": item.channel,
-        "remarks": list(item.quality.refused),
-    }

@@ -120,6 +120,7 @@ class _BlfContent:
                 self.trouble = "the log is damaged"
                 return
             self._spending.look_at_clock()
+            self._spending.report_progress(file.tell())
             if kind == _Kind.CONTAINER:
                 yield from self._container(file, size - OBJECT_HEADER.size)
             else:

@@ -12,8 +12,8 @@ import logging
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -21,12 +21,10 @@ from typing import TYPE_CHECKING, Any, Self, TextIO, cast
 
 from firmware_iface.errors import InputOutputError, install_command
 from firmware_iface.logs.log_files import DamagedLogError, Spending
-from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID
 from firmware_iface.transport.frames import (
     MAX_CHANNEL,
     MAX_PAYLOAD,
     ColumnBuilder,
-    Frame,
     FrameTable,
 )
 
@@ -175,7 +173,7 @@ class AscReader(_PythonCanReader):
 
 
 def _open_asc_reader(path: Path, spending: Spending, relative: bool) -> Any:
-    lines = open_asc(path, spending.look_at_clock)
+    lines = open_asc(path, spending)
     return can_library().ASCReader(lines, relative_timestamp=relative)
 
 
@@ -188,7 +186,7 @@ class CsvReader(_PythonCanReader):
 
     def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
         """The one way."""
-        yield lambda: can_library().CSVReader(open_text(path, spending.look_at_clock))
+        yield lambda: can_library().CSVReader(open_text(path, spending))
 
 
 class TrcReader(_PythonCanReader):
@@ -199,9 +197,7 @@ class TrcReader(_PythonCanReader):
 
     def openers(self, path: Path, spending: Spending) -> Iterator[Callable[[], Any]]:
         """The one way."""
-        yield lambda: can_library().TRCReader(
-            open_text(path, spending.look_at_clock, TRC_LINE_PATTERN)
-        )
+        yield lambda: can_library().TRCReader(open_text(path, spending, TRC_LINE_PATTERN))
 
 
 class Mf4Reader(_PythonCanReader):
@@ -265,7 +261,7 @@ BAD_LINES = logging.getLogger("can.lines")
 MAX_BAD_LINES = 1000
 """Bad lines, 1, beyond as many as there are frames, at which a text log is no log: each takes
 python-can a new start."""
-MAX_ASC_LINE = 1 << 16
+MAX_LINE_CHARACTERS = 1 << 16
 MAX_HEADER_LINES = 20
 RELATIVE_HEADER_PATTERN = re.compile(
     r"\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNORECASE
@@ -290,10 +286,11 @@ class _BoundedLines:
     """
 
     def __init__(
-        self, file: TextIO, look: Callable[[], None], pattern: re.Pattern[str] | None = None
+        self, file: TextIO, spending: Spending, pattern: re.Pattern[str] | None = None
     ) -> None:
         self._file = file
-        self._look = look
+        self._spending = spending
+        self._position = 0
         self._pattern = pattern
         self._pushed: list[str] = []
 
@@ -316,11 +313,15 @@ class _BoundedLines:
 
     def readline(self) -> str:
         """Return the next line, or a piece of one; empty at the end."""
-        self._look()  # a file of lines that are no frames must end in time too
+        # A file of lines that are no frames must end in time too.
+        self._spending.look_at_clock()
         return self._pushed.pop() if self._pushed else self._next_line()
 
     def _next_line(self) -> str:
-        line = self._stamped(self._file.readline(MAX_ASC_LINE))
+        line = self._file.readline(MAX_LINE_CHARACTERS)
+        self._position += len(line)
+        self._spending.report_progress(self._position)
+        line = self._stamped(line)
         if self._pattern is None or not line.strip() or self._pattern.match(line):
             return line
         BAD_LINES.warning("a line that holds no frame")
@@ -346,8 +347,8 @@ class _BoundedLines:
 class _AbsoluteLines(_BoundedLines):
     """Lines of an ASC file with relative stamps, made absolute."""
 
-    def __init__(self, file: TextIO, look: Callable[[], None]) -> None:
-        super().__init__(file, look, ASC_LINE_PATTERN)
+    def __init__(self, file: TextIO, spending: Spending) -> None:
+        super().__init__(file, spending, ASC_LINE_PATTERN)
         self._elapsed = 0.0
 
     def _stamped(self, line: str) -> str:
@@ -358,84 +359,17 @@ class _AbsoluteLines(_BoundedLines):
         return f"{self._elapsed:.9f}{stamp[2]}"
 
 
-def open_text(
-    path: Path, look: Callable[[], None], pattern: re.Pattern[str] | None = None
-) -> TextIO:
-    """Open a text log for one of python-can's readers; `look` is called at each line."""
+def open_text(path: Path, spending: Spending, pattern: re.Pattern[str] | None = None) -> TextIO:
+    """Open a text log for one of python-can's readers."""
     file = path.open(encoding="utf-8", errors="replace")
-    return cast(TextIO, _BoundedLines(file, look, pattern))
+    return cast(TextIO, _BoundedLines(file, spending, pattern))
 
 
-def open_asc(path: Path, look: Callable[[], None]) -> TextIO:
+def open_asc(path: Path, spending: Spending) -> TextIO:
     """Open an ASC file for python-can's reader, its stamps absolute (from the start of the log)."""
     file = path.open(encoding="utf-8", errors="replace")
-    head = [file.readline(MAX_ASC_LINE) for _ in range(MAX_HEADER_LINES)]
+    head = [file.readline(MAX_LINE_CHARACTERS) for _ in range(MAX_HEADER_LINES)]
     file.seek(0)
     if any(RELATIVE_HEADER_PATTERN.match(line) for line in head):
-        return cast(TextIO, _AbsoluteLines(file, look))
-    return cast(TextIO, _BoundedLines(file, look, ASC_LINE_PATTERN))
-
-
-CANDUMP_LINE_PATTERN = re.compile(
-    r"\s*\((?P<seconds>\d{1,10})\.(?P<fraction>\d{1,9})\)"
-    r"\s+(?P<interface>\S+)"
-    r"\s+(?P<id>[0-9A-F]{3}|[0-9A-F]{8})#"
-    r"(?:(?P<remote>R)[0-8]?|#[0-9A-F](?P<fd>(?:[0-9A-F]{2}){0,64})|(?P<data>(?:[0-9A-F]{2}){0,8}))"
-    r"(?:_[0-9A-F])?(?:\s+(?P<direction>[RT]))?\s*",
-    re.IGNORECASE | re.ASCII,
-)
-"""A frame as can-utils writes it; `_N` is the length code of a classic frame beyond 8."""
-MAX_STAMP_S = (1 << 63) // 1_000_000_000
-"""Nanoseconds are counted in 64 bits."""
-STANDARD_ID_DIGITS = 3
-ERROR_ID_FLAG = 0x20000000
-
-
-def candump_frames(lines: Iterable[str]) -> Iterator[tuple[Frame, str]]:
-    """Give each frame with the name of its interface; a line that holds none is logged."""
-    for line in lines:
-        match = CANDUMP_LINE_PATTERN.fullmatch(line)
-        if match is not None and int(match["seconds"]) < MAX_STAMP_S:
-            yield _frame(match), match["interface"]
-        elif line.strip():
-            BAD_LINES.warning("a line that holds no frame")
-
-
-def _frame(match: re.Match[str]) -> Frame:
-    number = int(match["id"], 16)
-    extended = len(match["id"]) > STANDARD_ID_DIGITS
-    error = extended and bool(number & ERROR_ID_FLAG)
-    payload = match["data"] or match["fd"] or ""
-    return Frame(
-        time_ns=int(match["seconds"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0")),
-        can_id=number & (MAX_CAN_ID if extended else MAX_STANDARD_CAN_ID),
-        data=bytes.fromhex(payload),
-        extended=extended,
-        fd=match["fd"] is not None,
-        error=error,
-        remote=match["remote"] is not None,
-        sent=(match["direction"] or "").upper() == "T",
-    )
-
-
-class CandumpReader:
-    """The log of `candump -l`; interfaces are channels, from 1 in the order in which they come."""
-
-    signature = b""
-
-    def frames(self, path: Path, spending: Spending) -> Iterator[FrameTable]:
-        """Read a file, see `LogReader`."""
-        columns, found = ColumnBuilder(), False
-        channels: dict[str, int] = {}
-        with closing(open_text(path, spending.look_at_clock)) as lines:
-            for frame, interface in candump_frames(lines):
-                channel = channels.setdefault(interface, min(len(channels) + 1, MAX_CHANNEL))
-                columns.add_frame(frame, channel)
-                if len(columns) >= LOG_BLOCK_FRAMES:
-                    found = True
-                    yield columns.table()
-                    columns = ColumnBuilder()
-        if len(columns):
-            yield columns.table()
-        elif not found:
-            raise DamagedLogError("no line as candump -l writes it")
+        return cast(TextIO, _AbsoluteLines(file, spending))
+    return cast(TextIO, _BoundedLines(file, spending, ASC_LINE_PATTERN))

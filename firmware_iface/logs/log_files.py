@@ -13,9 +13,9 @@ import stat
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
@@ -48,6 +48,12 @@ class Budget:
     """Frames held in memory at once, some 25 bytes each and ten times as many while they are
     decoded; a test that is longer is cut off and said to be.
     """
+    progress: Callable[[float], None] | None = field(default=None, compare=False)
+    """Is called now and then with the share of the file that is read, 0 … 1."""
+
+
+PROGRESS_PERIOD_S = 0.1
+"""Time between two reports of progress, s."""
 
 
 class Spending:
@@ -63,6 +69,8 @@ class Spending:
         self._deadline = time.monotonic() + budget.seconds
         self.frames = 0
         self._bytes = 0
+        self._size = 0
+        self._reported = 0.0
 
     def add_frames(self, count: int) -> None:
         """Count frames, and look at the clock."""
@@ -78,8 +86,16 @@ class Spending:
             self._refuse(f"unpacks to more than {_mebibytes(self._budget.size)}", "--max-log-size")
         self.look_at_clock()
 
+    def report_progress(self, position: int) -> None:
+        """Report how far the file is read, bytes."""
+        report, now = self._budget.progress, time.monotonic()
+        if report is not None and self._size and now - self._reported >= PROGRESS_PERIOD_S:
+            self._reported = now
+            report(min(position / self._size, 1.0))
+
     def check_size(self, size: int) -> None:
-        """Compare the size of the file, bytes."""
+        """Compare the size of the file, bytes; progress is a share of it."""
+        self._size = size
         if size > self._budget.size:
             self._refuse(f"larger than {_mebibytes(self._budget.size)}", "--max-log-size")
 
@@ -203,7 +219,7 @@ FRAME_READERS: Mapping[str, str] = {
     ".csv": "firmware_iface.logs.can_readers:CsvReader",
     ".trc": "firmware_iface.logs.can_readers:TrcReader",
     ".mf4": "firmware_iface.logs.can_readers:Mf4Reader",
-    ".log": "firmware_iface.logs.can_readers:CandumpReader",
+    ".log": "firmware_iface.logs.candump:CandumpReader",
 }
 """The package's own readers of frames, by suffix; each is imported when it is needed."""
 SIGNAL_READERS: Mapping[str, str] = {

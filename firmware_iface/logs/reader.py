@@ -84,6 +84,7 @@ class FrameLog:
             unpacked_log(self.path, self._budget.size) as plain,
             SkippedLines() as complaints,
         ):
+            self._spending.check_size(log_size(plain.path))
             trouble = yield from self._tables(plain.path, stamps)
             trouble = plain.trouble or trouble
         frames = self._spending.frames

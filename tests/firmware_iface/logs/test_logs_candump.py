@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -20,10 +21,10 @@ from hypothesis import strategies as st
 from places import LOGS
 
 from ehadiag import InputOutputError
-from firmware_iface.logs.can_readers import candump_frames
+from firmware_iface.logs.candump import candump_frames
 from firmware_iface.logs.reader import FrameLog, read_frames, read_recording
 from firmware_iface.logs.recorder import Recorder
-from firmware_iface.transport.frames import Frame
+from firmware_iface.transport.frames import Frame, FrameTable
 
 
 def frame_of(line: str) -> Frame:
@@ -219,3 +220,47 @@ def test_lines_that_cannot_be_read_are_counted(tmp_path: Path) -> None:
     reader = FrameLog(path)
     assert sum(map(len, reader)) == 19
     assert reader.notes == ("1 lines of the log could not be read",)
+
+
+LINES = st.sampled_from(
+    [
+        "(1700000000.000001) can0 101#0011223344556677",
+        "(1700000000.000002) can0 101#00112233445566FF",
+        "(1700000000.000003) can1 101#AABBCCDDEEFF0011",
+        "(1700000000.000004) can0 102#AABB",
+        "(1700000000.000005) can0 102#aabb",
+        "(1700000000.000006) can0 102#aabb T",
+        "(1700000000.000007) can0 102#aabb R",
+        "(1700000000.00000a) can0 102#aabb",
+        "(9999999999.000008) can0 102#aabb",
+        "(1700000000.000009) can0 00000102#aabb",
+        "(1700000000.000010) can0 20000102#aabb",
+        "(1700000000.000011) can0 102#R",
+        "(1700000000.000012) can0 102##0" + "1F" * 20,
+        "(1700000000.000013) can0 102#xabb",
+        "noise",
+        "",
+        "\ufffd(1700000000.000014) can0 102#aabb",
+    ]
+)
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(LINES, st.integers(1, 12)), min_size=1, max_size=40), st.booleans())
+def test_lines_parsed_together_are_those_parsed_singly(
+    tmp_path: Path, runs: list[tuple[str, int]], windows: bool
+) -> None:
+    lines = [line for line, count in runs for _ in range(count)]
+    path = tmp_path / "mixed.log"
+    path.write_text(("\r\n" if windows else "\n").join(lines), newline="")
+    names: dict[str, int] = {}
+    expected = [
+        replace(frame, channel=names.setdefault(name, len(names) + 1))
+        for frame, name in candump_frames(lines)
+    ]
+    if expected:
+        table, singly = read_frames(path), FrameTable.from_frames(expected)
+        for column in ("time_ns", "can_id", "length", "extended", "fd", "error", "remote", "sent"):
+            np.testing.assert_array_equal(getattr(table, column), getattr(singly, column))
+        np.testing.assert_array_equal(table.channel, singly.channel)
+        np.testing.assert_array_equal(table.data, singly.data)
