@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,31 @@ def run(
     return outcome, assemble(FrameTable.from_frames(frames), BUS, "here")[0]
 
 
+ATTEMPTS = 3
+STARVED_S = 0.2
+"""Time, s, that a process waited for a processor in a test and may have lost telemetry by it."""
+
+
+def waited_for_processor(pid: int) -> float:
+    """Time that the threads of a process could run and did not, s; 0 where the system says none."""
+    waited = 0
+    for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        with suppress(OSError):
+            waited += int(file.read_text().split()[1])
+    return waited * 1e-9
+
+
+def run_whole(transport: Transport, peer: int) -> tuple[tester.RequestOutcome, Recording]:
+    """Run a test; run it again where peer or tester got no processor, and skip in the end."""
+    for _ in range(ATTEMPTS):
+        before = [waited_for_processor(pid) for pid in (peer, os.getpid())]
+        outcome, recording = run(transport, 1)
+        after = [waited_for_processor(pid) for pid in (peer, os.getpid())]
+        if not outcome.why or max(np.subtract(after, before)) < STARVED_S:
+            return outcome, recording
+    pytest.skip(f"no processor for this test {ATTEMPTS} times")
+
+
 def assert_whole(outcome: tester.RequestOutcome, recording: Recording) -> None:
     assert outcome.why == ""
     assert outcome.outcome.state is BitState.COMPLETE
@@ -108,10 +134,10 @@ class TestSerialLink:
     def test_a_whole_test(self, c_build: Path, wire: tuple[str, str]) -> None:
         with (
             SerialTransport(wire[0], transmit=True) as transport,
-            running(c_build / "fcc-serial", wire[1], "--serial", "4711"),
+            running(c_build / "fcc-serial", wire[1], "--serial", "4711") as process,
         ):
             wait_for_frames(transport)
-            assert_whole(*run(transport, 1))
+            assert_whole(*run_whole(transport, process.pid))
             assert transport.bad_packets == 0
 
     def test_an_abort_is_obeyed(self, c_build: Path, wire: tuple[str, str]) -> None:
@@ -161,9 +187,9 @@ class TestSocketCan:
             yield transport
 
     def test_a_whole_test(self, c_build: Path, transport: Transport) -> None:
-        with running(c_build / "fcc-can", "vcan0", "--serial", "4711"):
+        with running(c_build / "fcc-can", "vcan0", "--serial", "4711") as process:
             wait_for_frames(transport)
-            assert_whole(*run(transport, 1))
+            assert_whole(*run_whole(transport, process.pid))
 
     def test_an_abort_is_obeyed(self, c_build: Path, transport: Transport) -> None:
         with running(c_build / "fcc-can", "vcan0"):
