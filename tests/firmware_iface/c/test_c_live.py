@@ -6,7 +6,7 @@ import os
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -84,14 +84,27 @@ def waited_for_processor(pid: int) -> float:
     return waited * 1e-9
 
 
-def run_whole(transport: Transport, peer: int) -> tuple[tester.RequestOutcome, Recording]:
-    """Run a test; run it again where peer or tester got no processor, and skip in the end."""
+@contextmanager
+def starvation(*pids: int) -> Iterator[list[float]]:
+    """List, once the block has ended, how long each process waited for a processor in it, s."""
+    waited = [waited_for_processor(pid) for pid in pids]
+    waits: list[float] = []
+    yield waits
+    waits += [waited_for_processor(pid) - before for pid, before in zip(pids, waited, strict=True)]
+
+
+def assert_whole_test(
+    ends: Callable[[], AbstractContextManager[tuple[Transport, subprocess.Popen[str]]]],
+) -> None:
+    """Run a test from new ends on; again where one got no processor, skipped in the end."""
     for _ in range(ATTEMPTS):
-        before = [waited_for_processor(pid) for pid in (peer, os.getpid())]
-        outcome, recording = run(transport, 1)
-        after = [waited_for_processor(pid) for pid in (peer, os.getpid())]
-        if not outcome.why or max(np.subtract(after, before)) < STARVED_S:
-            return outcome, recording
+        with ends() as (transport, process):
+            wait_for_frames(transport)
+            with starvation(process.pid, os.getpid()) as waits:
+                outcome, recording = run(transport, 1)
+            if not outcome.why or max(waits) < STARVED_S:
+                assert_whole(outcome, recording)
+                return
     pytest.skip(f"no processor for this test {ATTEMPTS} times")
 
 
@@ -132,13 +145,16 @@ def abort(transport: Transport) -> tuple[tester.RequestOutcome, Recording]:
 
 class TestSerialLink:
     def test_a_whole_test(self, c_build: Path, wire: tuple[str, str]) -> None:
-        with (
-            SerialTransport(wire[0], transmit=True) as transport,
-            running(c_build / "fcc-serial", wire[1], "--serial", "4711") as process,
-        ):
-            wait_for_frames(transport)
-            assert_whole(*run_whole(transport, process.pid))
-            assert transport.bad_packets == 0
+        @contextmanager
+        def ends() -> Iterator[tuple[Transport, subprocess.Popen[str]]]:
+            with (
+                SerialTransport(wire[0], transmit=True) as transport,
+                running(c_build / "fcc-serial", wire[1], "--serial", "4711") as process,
+            ):
+                yield transport, process
+                assert transport.bad_packets == 0
+
+        assert_whole_test(ends)
 
     def test_an_abort_is_obeyed(self, c_build: Path, wire: tuple[str, str]) -> None:
         with (
@@ -187,9 +203,12 @@ class TestSocketCan:
             yield transport
 
     def test_a_whole_test(self, c_build: Path, transport: Transport) -> None:
-        with running(c_build / "fcc-can", "vcan0", "--serial", "4711") as process:
-            wait_for_frames(transport)
-            assert_whole(*run_whole(transport, process.pid))
+        @contextmanager
+        def ends() -> Iterator[tuple[Transport, subprocess.Popen[str]]]:
+            with running(c_build / "fcc-can", "vcan0", "--serial", "4711") as process:
+                yield transport, process
+
+        assert_whole_test(ends)
 
     def test_an_abort_is_obeyed(self, c_build: Path, transport: Transport) -> None:
         with running(c_build / "fcc-can", "vcan0"):
