@@ -277,6 +277,10 @@ class CalibrationSession:
             for index in self._indices(part)
         ]
 
+    def _sliding(self, actuator: Actuator, part: RecordingSelection) -> list[Experiment]:
+        """Experiments to learn from."""
+        return [item.sliding for item in self.build(actuator, part)]
+
     def _indices(self, part: RecordingSelection) -> list[int]:
         known = [(index, test) for index, test in enumerate(self._tests) if test is not None]
         if part is RecordingSelection.ALL:
@@ -312,7 +316,7 @@ class CalibrationSession:
         """
         found = learn_model(
             model,
-            partial(self.build, part=part),
+            partial(self._sliding, part=part),
             self.start,
             new=new,
             nearly_new=nearly_new,
@@ -385,7 +389,7 @@ class CalibrationSession:
             start=self.start,
             actuator=unit,
             reasons=(),
-            notes=(*self._notes(), *_unexplained(learned, self.start), *self._ring_notes()),
+            notes=(*self._notes(), *_unexplained(learned, self.start), *self._ring_notes(learned)),
             severities=learned_severities(checked.estimated),
             values=calibrated_values(self.start, unit, lesson),
             tried=_evidence(tried),
@@ -395,9 +399,14 @@ class CalibrationSession:
             elapsed=time.perf_counter() - self._begin,
         )
 
-    def _ring_notes(self) -> tuple[str, ...]:
-        """What the ring of the pressure says of the file's volume."""
-        return (self.ring.words,) if self.ring and self.ring.is_of_other_volume else ()
+    def _ring_notes(self, learned: LearnedModel | None = None) -> tuple[str, ...]:
+        """What the ring says of the file's volume, unless what was learned contradicts it."""
+        ring = self.ring
+        if ring is None or not ring.is_of_other_volume:
+            return ()
+        if learned is not None and not ring.agrees_with(learned.estimated.refined.values):
+            return ()
+        return (ring.words,)
 
     def _notes(self) -> tuple[str, ...]:
         """What the recordings say of themselves, each once."""

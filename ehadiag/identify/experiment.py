@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -60,6 +61,15 @@ class RestRules(NamedTuple):
     friction takes 0.1 s on a ramp of the closed test."""
     motionless_ticks: int = 10
     """Ticks in which the jack has not yet left its middle, 1."""
+    slow_ticks: int = 25
+    """Ticks, 1, over which the jack's mean position is taken before and after one to see whether
+    it slides: two periods of a ring at 80 Hz."""
+    slow_noise_lsb: float = 4.0
+    """Range of a jack's position by the noise of half a step of the converter, LSB: four
+    deviations to either side."""
+    slow_ratio: float = 1.5
+    """Speed below which a jack slips in steps, over friction / (mass, ring), 1: of four units
+    of other components three rang on at 1.1, 0.9 and 0.6 of it, one did not at 2."""
     min_held_ticks: int = 100
     """Least number of ticks of a hold, 1: a null bias lets the spool settle for 71 (a unit of
     `test_few_effects` with data 5 % off); a pressure that rings on its oil at 80 Hz turns within
@@ -126,6 +136,21 @@ class Experiment:
         """Return how a model of it is re-anchored, by the thresholds of `Anchor`, LSB."""
         small, large = (value * self.spool_noise / ESTIMATION.noise_lsb for value in thresholds_lsb)
         return Anchor(ANCHORING.gain, small, large, JACK_ANCHOR_SHARE)
+
+    @property
+    def sliding(self) -> Experiment:
+        """The same without the pressure on a jack that stands or slides too slowly.
+
+        Friction holds any pressure of its band on a standing jack: which one is decided by 0.1 µm
+        of the spool. A slow one slips in steps, and rings on: the phase is decided by as little.
+        Without oil in the second stage nothing rings, and nothing is left out.
+        """
+        c = self.constants
+        if c.OIL == 0.0:
+            return self
+        slips = REST.slow_ratio * c.FDJ / (c.AJ * math.sqrt(c.OIL * c.MJ))
+        slow = _slow(self.position, self.channels.position, slips * self.tick)
+        return replace(self, pressure=np.where(slow, np.nan, self.pressure))
 
     def with_noise(self, noise: tuple[float, ...]) -> Experiment:
         """Return the same with other standard deviations, see `noise`."""
@@ -217,6 +242,20 @@ def build_experiment(
         acquired=acquired,
         sampled=np.empty(0) if acquired is None else _sampling_instants(samples, acquired),
     )
+
+
+def _slow(position: Array, channel: Channel, least: float) -> NDArray[np.bool_]:
+    """Ticks, shape (n,), around which the jack moves by less than `least`, m, a tick."""
+    count = REST.slow_ticks
+    seen = np.isfinite(position)
+    if not seen.any():
+        return np.zeros(len(position), dtype=np.bool_)
+    ticks = np.arange(len(position))
+    whole = np.pad(np.interp(ticks, ticks[seen], position[seen]), count, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(whole, 2 * count)[: len(position)]
+    step = around[:, count:].mean(axis=1) - around[:, :count].mean(axis=1)
+    limit = 2.0 * count * least + REST.slow_noise_lsb * channel.lsb
+    return np.asarray((np.abs(step) < count * least) & (np.ptp(around, axis=1) < limit))
 
 
 def _sampling_instants(samples: Samples, acquired: Acquisition) -> Array:

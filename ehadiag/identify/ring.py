@@ -71,6 +71,15 @@ class Ring:
         ratio = 1.0 + self.stiffness
         return min(abs(ratio / 2.0 - 1.0), abs(2.0 * ratio - 1.0)) < SCAN.max_factor_error
 
+    def agrees_with(self, values: Mapping[str, float]) -> bool:
+        """Whether an estimate has this stiffness of the oil.
+
+        values: relative changes by the parameters' names; 0 of those that are missing.
+        """
+        volume, mass = values.get("datum_volume_of_one_chamber", 0.0), values.get("datum_MJ", 0.0)
+        estimated = (1.0 + values.get("bulk_modulus", 0.0)) / (1.0 + volume) / (1.0 + mass)
+        return abs(estimated / (1.0 + self.stiffness) - 1.0) < SCAN.max_factor_error
+
     @property
     def words(self) -> str:
         """What is wrong with the volume."""

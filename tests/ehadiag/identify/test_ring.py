@@ -1,8 +1,9 @@
-"""Ring of the pressure: it shows the oil's stiffness, and a volume of both chambers together."""
+"""Ring of the pressure: what it shows of oil and volume, and where it is left out."""
 
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 import pytest
 
 from ehadiag import default_actuator
@@ -72,3 +73,39 @@ def test_the_prior_holds_the_ratio_of_stiffness_and_mass():
     assert (prior.mean == [0.1, 0.0]).all()
     assert (prior.covariance @ ratio) @ ratio == pytest.approx(0.004**2)
     assert prior.covariance[1, 1] == pytest.approx(0.03**2)
+
+
+@pytest.mark.parametrize(
+    ("values", "agrees"),
+    [
+        ({"bulk_modulus": 1.1}, True),
+        ({"bulk_modulus": 0.0}, False),
+        ({"bulk_modulus": 1.0, "datum_volume_of_one_chamber": 0.05, "datum_MJ": -0.1}, True),
+        ({"bulk_modulus": 1.0, "datum_volume_of_one_chamber": 0.3}, False),
+        ({}, False),
+    ],
+)
+def test_a_ring_that_the_estimate_contradicts(values, agrees):
+    assert Ring(1.0, 126.0).agrees_with(values) is agrees
+
+
+def missing(actuator, name, begin, end):
+    """Share of the pressure between two instants, s, that is not learned from."""
+    test = resolve_test(name)
+    recording = simulate(actuator, test, step=1e-6).recording("simulated")
+    experiment = build_experiment(recording.samples, recording.environment, test, actuator)
+    return float(
+        np.isnan(experiment.sliding.pressure)[round(1e3 * begin) : round(1e3 * end)].mean()
+    )
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "share"), [(0.4, 1.1, 0.0), (1.3, 1.6, 1.0), (2.6, 3.2, 0.0), (4.6, 5.4, 0.0)]
+)
+def test_pressure_on_a_standing_jack_is_left_out(begin, end, share):
+    """Ramps at 10 mm/s and fast sines are learned from, holds are not."""
+    assert missing(with_volume(0.9e-4), "closed", begin, end) == share
+
+
+def test_a_second_stage_without_oil_leaves_nothing_out():
+    assert missing(default_actuator(), "closed", 0.0, 5.5) == 0.0
