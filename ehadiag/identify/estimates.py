@@ -6,6 +6,7 @@ residuals (Newey and West, Econometrica 55(3), 1987).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from statistics import NormalDist
@@ -15,6 +16,7 @@ import numpy as np
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_NOISE_EXCESS, WEAR_EXCESS_FACTOR, FitQuality
+from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
 from ehadiag.core.criteria import FIT, GIVE_UP
 from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.identify.experiment import Experiment
@@ -31,7 +33,9 @@ from ehadiag.identify.solvers import SearchResult
 from ehadiag.identify.staged_search import FirstApproximation
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.parameter import Parameter, ParameterKind
+from ehadiag.model.plant import PlantConstants
 from ehadiag.model.registry import FAULTS
+from ehadiag.model.severities import FAULT_LAWS
 
 STANDARD_NORMAL = NormalDist()
 
@@ -360,3 +364,62 @@ def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) ->
     """Rms residual of a signal, squares capped; NaN without a sample."""
     residuals = refined.residuals[row, refined.weighted[row]]
     return float(np.sqrt(np.mean(np.minimum(residuals**2, cap)))) if residuals.size else np.nan
+
+
+def over_exponents(
+    found: Identification, constants: PlantConstants, exponents: tuple[float, float]
+) -> Identification:
+    """Return an identification with the friction that any exponent of a range makes of it.
+
+    The spool breaks away and creeps by the ratio of its friction and the first stage's pressure
+    gain, GPF k^m (PHY-45). So a recording shows FSS / k^m, and hardly m: with each exponent there
+    is a friction that explains it as well. The estimate is the middle of these, its interval holds
+    them all.
+
+    Parameters
+    ----------
+    found : Identification
+        With the largest exponent.
+    constants : PlantConstants
+        Of the unit as new, the exponent in the middle of the range.
+    exponents : tuple[float, float]
+        Least and largest exponent.
+
+    Returns
+    -------
+    Identification
+        The same where the range is a number.
+    """
+    low, high = exponents
+    if low == high:
+        return found
+    share = 1.0 + FAULT_LAWS["Kintas"].change * found.named("Kintas").value
+    new = float(constants.FSS / (constants.FSS1 - constants.FSS))
+    friction = found.named(FRICTION_NAME)
+    least = max(friction.value + new, 1e-9)
+    ends = [min(max(least * share ** (m - high) - new, 0.0), 1.0) for m in (high, low)]
+    value = sum(ends) / 2.0
+    ratio = (value + new) / least
+    std = ratio * friction.std + (ends[1] - ends[0]) / 2.0 / STANDARD_NORMAL.inv_cdf(0.975)
+    exponent = high + (math.log(ratio) / math.log(share) if share < 1.0 else 0.0)
+    estimate = replace(
+        friction,
+        value=value,
+        std=std,
+        interval95=interval95(value, std),
+        at_bound=not 0.0 < value < 1.0,
+        shown=std < FIT.max_shown_std,
+    )
+    place = [item.name for item in found.estimates].index(FRICTION_NAME)
+    covariance = found.covariance.copy()
+    covariance[place] *= std / friction.std
+    covariance[:, place] *= std / friction.std
+    nuisance = Nuisance(
+        exponent - (low + high) / 2.0, (high - low) / math.sqrt(12.0), at_bound=False
+    )
+    return replace(
+        found,
+        estimates=tuple(estimate if item is friction else item for item in found.estimates),
+        nuisances={**found.nuisances, EXPONENT_NAME: nuisance},
+        covariance=covariance,
+    )

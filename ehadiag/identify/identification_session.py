@@ -24,10 +24,10 @@ from ehadiag.identify.estimates import (
     identification_result,
     independent_covariance,
     is_pressure_misfit,
+    over_exponents,
     refinement_outlier_share,
 )
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, share_offsets
-from ehadiag.identify.exponent_range import over_exponents
 from ehadiag.identify.identification_result import Identification, IdentificationTiming
 from ehadiag.identify.least_squares import Refinement
 from ehadiag.identify.nuisance_estimate import NuisanceEstimate, NuisanceEstimator

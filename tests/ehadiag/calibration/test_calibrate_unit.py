@@ -22,8 +22,7 @@ from ehadiag.calibration.model_choice import select_significant
 from ehadiag.core.actuator import actuator_toml
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.prior import faults_below_zero
-from ehadiag.model.nuisances import NUISANCE_PARAMETERS
-from ehadiag.model.registry import FAULTS, unit_constants
+from ehadiag.model.registry import FAULTS, NUISANCE_PARAMETERS, unit_constants
 from ehadiag_sim.conditions import DataErrors, Effects, Faults, UnmodelledEffects
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
 

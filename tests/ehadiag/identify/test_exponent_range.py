@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from ehadiag import Levels, Verdict, default_actuator
 from ehadiag.assess.verdict import judge
-from ehadiag.identify.estimates import interval95
-from ehadiag.identify.exponent_range import over_exponents
+from ehadiag.identify.estimates import interval95, over_exponents
 from ehadiag.identify.identification_result import (
     Estimate,
     Fit,
