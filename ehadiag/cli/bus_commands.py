@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,10 +33,11 @@ from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import write_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from ehadiag.live import Snapshot
     from ehadiag.session.unit_state import UnitState
+    from ehadiag_sim.control import SimulatorControl
     from firmware_iface.transport.base import Transport
 
 ALARM_EXIT_CODE = 40
@@ -423,6 +425,13 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--duration", type=options.positive_number, metavar="S", help="stop after so many seconds"
     )
+    parser.add_argument(
+        "--control",
+        type=options.port_number,
+        metavar="PORT",
+        help="take changes of the simulated unit as lines of JSON on this port of the loopback"
+        " address; 0: any free one",
+    )
     options.add_request_options(parser, "actuator")
     options.add_request_options(parser, *options.BUS)
     option_values.add_bus_options(parser)
@@ -433,6 +442,8 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         "--channel",
         "--port",
         "--simulate",
+        "--script",
+        "--control",
         "--Kintas",
         "--FSS",
         "--FDJ",
@@ -442,9 +453,23 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         examples=(
             "ehadiag sim --interface socketcan --channel vcan0 --FSS 0.6",
             "ehadiag sim --interface virtual --channel 1 --simulate scenario.toml",
+            "ehadiag sim --interface socketcan --channel vcan0 --script wear.toml --control 4711",
         ),
     )
     parser.set_defaults(run=run_sim)
+
+
+@contextmanager
+def _control_port(control: SimulatorControl | None, port: int | None) -> Iterator[None]:
+    """Open the control port, if one is wanted, and print its number."""
+    if control is None or port is None:
+        yield
+        return
+    from ehadiag_sim.control import control_port  # noqa: PLC0415 - loads numpy
+
+    with control_port(control, port) as number:
+        print_status(f"control port {number} of the loopback address takes lines of JSON")
+        yield
 
 
 def run_sim(arguments: argparse.Namespace) -> int:
@@ -455,8 +480,10 @@ def run_sim(arguments: argparse.Namespace) -> int:
     print_compiling_notice(simulation=True, identification=False)
     from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads kernels
 
-    core = emulated_computer(actuator, tests, bus_map, **simulator_settings(arguments))
+    settings = simulator_settings(arguments)
+    core = emulated_computer(actuator, tests, bus_map, **settings)
     with (
+        _control_port(settings["control"], arguments.control),
         option_values.open_transport(arguments, transmit=True) as transport,
         stop_on_signals(after_s=arguments.duration) as stop,
     ):

@@ -43,6 +43,13 @@ def unit_number(text: str) -> int:
     return int(text)
 
 
+def port_number(text: str) -> int:
+    """Read the number of a TCP port."""
+    if text.isdecimal() and text.isascii() and len(text) < 6 and int(text) < 1 << 16:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r}: need a port, 0 … 65535")
+
+
 def seed_number(text: str) -> int:
     """Read a seed of random numbers."""
     if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:

@@ -40,7 +40,7 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--http-port",
-        type=_port_number,
+        type=options.port_number,
         default=DEFAULT_PORT,
         metavar="N",
         help=f"0: any that is free ({DEFAULT_PORT})",
@@ -191,9 +191,3 @@ def _with_options(
             several = isinstance(getattr(session, name), list) and not isinstance(value, list)
             setattr(session, name, [value] if several else value)
     return session
-
-
-def _port_number(text: str) -> int:
-    if text.isdecimal() and text.isascii() and len(text) < 6 and int(text) < 1 << 16:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r}: need a port, 0 … 65535")

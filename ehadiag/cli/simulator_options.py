@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ehadiag.cli.options import seed_number
 from ehadiag_sim.conditions import (
@@ -24,6 +24,9 @@ from ehadiag_sim.conditions import (
 )
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import read_toml
+
+if TYPE_CHECKING:
+    from ehadiag_sim.control import SimulatorControl
 
 DATA_ERROR_NAMES = tuple(item.name for item in fields(DataErrors))
 OTHER_KEYS = ("data_error", "broken")
@@ -49,6 +52,11 @@ def add_simulator_options(parser: argparse.ArgumentParser) -> None:
             elif item.basic:
                 _add_condition(group, item)
     group.add_argument(
+        "--script",
+        metavar="FILE",
+        help="changes of the simulated unit while it runs, with their times (TOML)",
+    )
+    group.add_argument(
         "--simulator-seed",
         type=seed_number,
         default=1,
@@ -66,15 +74,15 @@ def add_simulator_options(parser: argparse.ArgumentParser) -> None:
 
 def scenario_keys() -> tuple[str, ...]:
     """Return the keys that a scenario file may have."""
-    return (*(_key(item) for kind in CONDITIONS for item in condition_options(kind)), *OTHER_KEYS)
+    return (*(item.key for kind in CONDITIONS for item in condition_options(kind)), *OTHER_KEYS)
 
 
 def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the keyword arguments of `ehadiag_sim.emulator.emulated_computer`.
 
     arguments: the parsed command line. Returns severities, effects, errors of sensors, broken
-    hardware, seed and serial number. ConfigurationError: a value out of its range, a key that no
-    scenario has. InputOutputError: the scenario file cannot be read.
+    hardware, seed, serial number and changes while it runs. ConfigurationError: a value out of its
+    range, a key that no scenario has. InputOutputError: scenario or script cannot be read.
     """
     scenario: Mapping[str, Any] = {}
     where = ""
@@ -94,11 +102,18 @@ def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "broken": scenario.get("broken"),
         "seed": arguments.simulator_seed,
         "serial": arguments.unit,
+        "control": _control(arguments),
     }
 
 
-def _key(item: ConditionOption) -> str:
-    return item.flag.removeprefix("--").replace("-", "_")
+def _control(arguments: argparse.Namespace) -> SimulatorControl | None:
+    """Return what changes the unit while it runs; None where neither option asks for it."""
+    if arguments.script is None and getattr(arguments, "control", None) is None:
+        return None
+    from ehadiag_sim.control import SimulatorControl, read_script  # noqa: PLC0415 - loads numpy
+
+    changes = read_script(arguments.script) if arguments.script else ()
+    return SimulatorControl(changes, seed=arguments.simulator_seed)
 
 
 def _refuse_unknown_keys(scenario: Mapping[str, Any], where: str) -> None:
@@ -131,7 +146,7 @@ def _condition_values(
     for item in condition_options(kind):
         value: Any = getattr(arguments, item.field, None)
         if value is None:
-            value = scenario.get(_key(item), item.default)
+            value = scenario.get(item.key, item.default)
             _refuse_other_kinds(value, item, where)
         value = tuple(value) if isinstance(value, list) else value
         number = isinstance(item.default, float)
@@ -148,9 +163,9 @@ def _refuse_other_kinds(value: Any, item: ConditionOption, where: str) -> None:
     if isinstance(item.default, int):
         sound = sound and all(isinstance(number, int) for number in numbers)
     if not sound or isinstance(value, list | tuple) != (count is not None):
-        raise ConfigurationError(f"{where}: {_key(item)}: {value!r} is no such number")
+        raise ConfigurationError(f"{where}: {item.key}: {value!r} is no such number")
     if count is not None and len(numbers) != count:
-        raise ConfigurationError(f"{where}: {_key(item)}: need {count} numbers")
+        raise ConfigurationError(f"{where}: {item.key}: need {count} numbers")
 
 
 def _data_errors(table: Any, where: str) -> DataErrors:

@@ -13,8 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO, cast
 
-import msgspec
-
 from firmware_iface.errors import (
     ConfigurationError,
     InputOutputError,
@@ -309,16 +307,18 @@ def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) 
     as_json : bool
         One JSON object a line instead of a table.
     """
+    from msgspec.structs import asdict, astuple  # noqa: PLC0415 - not for help texts
+
     if as_json:
         for test in tests:
-            row = msgspec.structs.asdict(test)
+            row = asdict(test)
             print_text(json.dumps({"schema": TESTS_SCHEMA, "source": valid_text(source), **row}))
         return
     from rich.table import Table  # noqa: PLC0415 - only who prints tables needs it
 
     table = Table(*TEST_LIST_COLUMNS, box=None, pad_edge=False, title=None)
     for test in tests:
-        shown = (*msgspec.structs.astuple(test)[:-1], "; ".join(test.remarks))
+        shown = (*astuple(test)[:-1], "; ".join(test.remarks))
         table.add_row(*("-" if cell in (None, "") else printable(str(cell)) for cell in shown))
     print_text(source)
     write_output(render_for_terminal(lambda console: console.print(table, crop=False)))

@@ -27,6 +27,11 @@ class ConditionOption(NamedTuple):
     basic: bool
     """Whether the option stands with the severities, not with the rest of its class."""
 
+    @property
+    def key(self) -> str:
+        """Name in a scenario."""
+        return self.flag.removeprefix("--").replace("-", "_")
+
 
 def condition_field(
     default: Any,

@@ -14,6 +14,7 @@ import numpy as np
 from ehadiag.core.actuator import Actuator
 from ehadiag_sim.broken_hardware import Hardware, break_hardware
 from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.control import Conditions, SimulatorControl
 from ehadiag_sim.scales import scales_of
 from ehadiag_sim.sensing import ChannelFault
 from ehadiag_sim.simulation import Plant
@@ -62,9 +63,9 @@ class FccCore:
     serial number of the actuator, 0 … 65535; preconditions: what a test must find to be started;
     None: the defaults; idle_telemetry: whether telemetry is sent between tests too; start_ns: time
     of the first tick, ns; bus_map: messages to send and accept; None: the default bus;
-    channel_faults: damage to the readings of the channels; None: none. ConfigurationError: two
-    tests with one number, a test at another rate than the controller; a serial number, a
-    converter's range or the rated current that the bus cannot carry.
+    channel_faults: damage to the readings of the channels; None: none; control: changes while it
+    runs; None: none. ConfigurationError: two tests with one number, a test at another rate than the
+    controller; a serial number, a converter's range or the rated current that the bus cannot carry.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class FccCore:
         start_ns: int = 0,
         bus_map: BusMap | None = None,
         channel_faults: Sequence[ChannelFault] = (),
+        control: SimulatorControl | None = None,
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL_NUMBER:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL_NUMBER}")
@@ -90,6 +92,10 @@ class FccCore:
         self._faults, self._sensors = faults, sensors
         self._channel_faults = tuple(channel_faults)
         self._effects = effects or Effects()
+        self._control = control
+        if control is not None:
+            given = Conditions(faults or Faults(), self._effects, sensors or Sensors())
+            control.begin(given, actuator.controller.rate)
         self._seed, self._serial = seed, serial
         self._demands = preconditions or Preconditions()
         self._idle_telemetry = idle_telemetry
@@ -141,6 +147,10 @@ class FccCore:
 
     def step(self) -> list[Frame]:
         """Run one control tick; return the frames that the computer sends at its end."""
+        if self._control is not None and (changed := self._control.advance()) is not None:
+            self._faults, self._effects = changed.faults, changed.effects
+            self._sensors = changed.sensors
+            self._plant.change(changed.faults, changed.effects, changed.sensors)
         while self._pending:
             request = self._pending.popleft()
             if request.code == "start":
@@ -166,6 +176,8 @@ class FccCore:
         if (self._tick - 1) % round(self._rate / ENVIRONMENT_RATE_HZ) == 0:
             supply, drain, degc = self._plant.probed
             frames += self._encoder.environment(supply, drain, degc, 0)
+        if self._control is not None:
+            frames = self._control.frames(frames)
         return [
             _stamped(frame, self.now_ns + i * FRAME_LENGTH_NS) for i, frame in enumerate(frames)
         ]
@@ -295,6 +307,7 @@ def emulated_computer(
     broken: str | None = None,
     seed: int = 0,
     serial: int = 1,
+    control: SimulatorControl | None = None,
 ) -> FccCore:
     """Return a computer with an actuator that may be broken, its kernels loaded.
 
@@ -302,7 +315,8 @@ def emulated_computer(
     own; bus_map: see `FccCore`, as for the parameters that follow; faults: severities of the
     faults; effects: effects beside the faults; sensors: errors of the converters; broken: kind of
     broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
-    noise; serial: serial number of the actuator. Returns the emulated computer; its first tick has
+    noise; serial: serial number of the actuator; control: changes while it runs. Returns the
+    emulated computer; its first tick has
     the present date, also in simulated time. ConfigurationError: see `FccCore`; an unknown kind of
     broken hardware.
     """
@@ -319,6 +333,7 @@ def emulated_computer(
         serial=serial,
         bus_map=bus_map,
         channel_faults=item.channel_faults,
+        control=control,
         start_ns=time.time_ns(),
     )
     core.step()

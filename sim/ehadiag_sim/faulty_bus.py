@@ -120,6 +120,21 @@ class BitFlips:
 
 
 @dataclass(slots=True)
+class SecondSender:
+    """Another device sends the same messages, with counters of its own and valid check sums."""
+
+    share: float
+
+    def __call__(self, frame: Frame, at: FrameMoment) -> Iterable[Frame]:
+        """Add its frame by chance."""
+        if len(frame.data) <= CRC_BYTE_INDEX or at.rng.random() >= self.share:
+            return (frame,)
+        data = bytearray(frame.data)
+        data[COUNTER_BYTE_INDEX] = (data[COUNTER_BYTE_INDEX] + 128) % 256
+        return (frame, _with_valid_crc(replace(frame, data=bytes(data))))
+
+
+@dataclass(slots=True)
 class WrongLength:
     """Payloads lose their last byte."""
 

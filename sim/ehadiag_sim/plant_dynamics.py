@@ -330,6 +330,12 @@ class PlantDynamics:
         self._motor = TorqueMotor(self._coefficients.GM, actuator.controller.IM, self._effects)
         self._seen = (0.0, 0.0, 0.0, 0.0)
 
+    def change(self, faults: Faults, effects: Effects) -> None:
+        """Take other severities and effects from now on; where the actuator is stays."""
+        self._faults, self._effects = faults, effects
+        self._take_coefficients()
+        self._motor.change(self._coefficients.GM, self._actuator.controller.IM, effects)
+
     def advance(self, current: float) -> None:
         """Hold `current` (A) for one control tick."""
         if self._effects.unmodelled.oil_drift and self._ticks % OIL_DRIFT_UPDATE_TICKS == 0:

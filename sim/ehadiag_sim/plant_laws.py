@@ -340,12 +340,16 @@ class TorqueMotor:
     """
 
     def __init__(self, gain: float, rated: float, effects: Effects) -> None:
-        count = int(effects.plays)
+        self._held = [0.0] * int(effects.plays)
+        self.change(gain, rated, effects)
+
+    def change(self, gain: float, rated: float, effects: Effects) -> None:
+        """Take other sizes from now on; the number of plays stays."""
+        count = len(self._held)
         places = (np.arange(count) + 0.5) / count
         weights = np.exp(-effects.unmodelled.play_skew * places)
         self._widths: list[float] = (effects.hysteresis * rated * places).tolist()
         self._weights: list[float] = (weights / weights.sum()).tolist()
-        self._held = [0.0] * count
         self._gain, self._rated = gain, rated
         self._bias = effects.null_bias
         self._cubic = effects.unmodelled.torque_cubic

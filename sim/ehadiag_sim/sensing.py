@@ -50,10 +50,18 @@ class SimulatedConverters:
         self._lsb = np.array([channel.lsb for channel in channels])
         self._half = np.array([channel.half for channel in channels])
         self._top = 2 * self._half - 1
+        self._stops = actuator.servovalve.XSM, actuator.jack.XJM
+        self.change(sensors, unmodelled)
+        self._faults = copy.deepcopy(tuple(faults))
+        self._ticks = 0
+        self._noise = np.random.default_rng(seed)
+
+    def change(self, sensors: Sensors, unmodelled: UnmodelledEffects) -> None:
+        """Take other offsets, gains, bends and another noise from now on."""
         self._noise_lsb = sensors.noise_lsb
         self._offsets = np.array(sensors.offsets_lsb)
         self._gains = 1.0 + np.array(sensors.gains)
-        stops = actuator.servovalve.XSM, actuator.jack.XJM
+        stops = self._stops
         self._bent = any(
             (
                 unmodelled.spool_bend_2,
@@ -73,9 +81,6 @@ class SimulatedConverters:
                 unmodelled.jack_bend_3 / stops[1] ** 2,
             ]
         )
-        self._faults = copy.deepcopy(tuple(faults))
-        self._ticks = 0
-        self._noise = np.random.default_rng(seed)
 
     def read(self, seen: tuple[float, float, float, float]) -> Array:
         """Current (A), spool (m), pressure (Pa), jack (m) as read without noise, shape (4,)."""

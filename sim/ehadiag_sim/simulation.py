@@ -75,6 +75,15 @@ class Plant:
         self._current = 0.0
         self._codes = self._converters.digitise(self._dynamics.seen)
 
+    def change(self, faults: Faults, effects: Effects, sensors: Sensors) -> None:
+        """Take other conditions from now on.
+
+        Number of plays, time constant of the filters and instant of sampling stay.
+        """
+        self._effects, self._sensors = effects, sensors
+        self._dynamics.change(faults, effects)
+        self._converters.change(sensors, effects.unmodelled)
+
     def tick(self, command: float, mode: CommandMode) -> NDArray[np.int64]:
         """Advance by one control tick; return the four ADC codes at its end, shape (4,).
 

@@ -45,7 +45,7 @@ def test_an_error_of_the_program_costs_one_recording_only(
 ) -> None:
     read = Setup.read
 
-    def failing(setup: Setup, *logs: str) -> object:
+    def failing(setup: Setup, *logs: str, progress: object) -> object:
         if logs[0] == "a.blf":
             raise IndexError("out of bounds")
         return read(setup, *logs)

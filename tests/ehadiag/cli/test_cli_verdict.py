@@ -258,7 +258,9 @@ def test_tests_of_one_recording(
     """Two tests of one recording; their verdicts are put in their place."""
     ended, read = iter(codes), Setup.read
     monkeypatch.setattr(
-        Setup, "read", lambda self, log, _: Reading(read(self, log).recordings * 2, (), None, 0.0)
+        Setup,
+        "read",
+        lambda self, log, *_, **__: Reading(read(self, log).recordings * 2, (), None, 0.0),
     )
     monkeypatch.setattr(command, "diagnose_and_deliver", lambda *_: (None, next(ended)))
     assert run("diagnose", "--merge", "--all", HEALTHY, CLOSED).code == worst
