@@ -452,8 +452,7 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         "--help-all",
         examples=(
             "ehadiag sim --interface socketcan --channel vcan0 --FSS 0.6",
-            "ehadiag sim --interface virtual --channel 1 --simulate scenario.toml",
-            "ehadiag sim --interface socketcan --channel vcan0 --script wear.toml --control 4711",
+            "ehadiag sim --interface virtual --channel 1 --simulate scenario.toml --script wear.toml",
         ),
     )
     parser.set_defaults(run=run_sim)
