@@ -452,7 +452,7 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         "--help-all",
         examples=(
             "ehadiag sim --interface socketcan --channel vcan0 --FSS 0.6",
-            "ehadiag sim --interface virtual --channel 1 --simulate scenario.toml --script wear.toml",
+            "ehadiag sim -i virtual -c 1 --simulate scenario.toml --script wear.toml",
         ),
     )
     parser.set_defaults(run=run_sim)
