@@ -209,12 +209,7 @@ def _printable_tree(tree: Any) -> Any:
     return tree
 
 
-TRACE_LENGTH_S = 10.0
 TRACE_SPACING_S = 0.05
-SIGNAL_DISPLAY_SCALES = (1e3, 1e3, 1e-6, 1e3)
-"""From A, m, Pa, m to mA, mm, MPa, mm."""
-COMMAND_DISPLAY_SCALE = 1e3
-"""From A to mA, from m to mm."""
 TraceRow = tuple[float | None, ...]
 """As the fields of `Signals`."""
 
@@ -226,7 +221,7 @@ class SignalTrace:
     """
 
     def __init__(self) -> None:
-        self._rows: deque[TraceRow] = deque(maxlen=2 * round(TRACE_LENGTH_S / TRACE_SPACING_S))
+        self._rows: deque[TraceRow] = deque(maxlen=2 * round(10.0 / TRACE_SPACING_S))
         self._span: list[TraceRow] = []
         self._due_s = TRACE_SPACING_S
 
@@ -243,7 +238,8 @@ class SignalTrace:
             span, self._span = self._span, []
             if span:
                 self._rows.extend(_extremes(span))
-        sent = finite(command * COMMAND_DISPLAY_SCALE)
+        # To mA or mm.
+        sent = finite(command * 1e3)
         self._span.append(
             (
                 time_s,
@@ -251,7 +247,8 @@ class SignalTrace:
                 sent if mode is CommandMode.POSITION else None,
                 *(
                     finite(value * scale)
-                    for value, scale in zip(signals, SIGNAL_DISPLAY_SCALES, strict=True)
+                    # To mA, mm, MPa, mm.
+                    for value, scale in zip(signals, (1e3, 1e3, 1e-6, 1e3), strict=True)
                 ),
             )
         )
@@ -281,10 +278,6 @@ def _extremes(span: Sequence[TraceRow]) -> tuple[TraceRow, TraceRow]:
 STANDARD_FRAME_OVERHEAD_BITS = 47
 """Of a data frame beside its data, the pause behind it included, stuff bits not (ISO 11898-1)."""
 EXTENDED_FRAME_OVERHEAD_BITS = 67
-MIN_BUS_SILENCE_S = 1.0
-"""Without a frame for so long a bus is silent."""
-MIN_RATE_SPAN_S = 0.5
-"""Over less time no rate is told."""
 
 
 class BusTraffic:
@@ -317,18 +310,14 @@ class BusTraffic:
         """
         now, frames, bits = time.monotonic(), self.frames, self._bits
         then, frames_then, bits_then = self._before
-        if now - then >= MIN_RATE_SPAN_S:
+        if now - then >= 0.5:
             self._rate = (frames - frames_then) / (now - then)
             if self._bitrate:
                 self._load = min((bits - bits_then) / (now - then) / self._bitrate, 1.0)
             self._before = (now, frames, bits)
         if frames != self._changed[1]:
             self._changed = (now, frames)
-        return self._rate, self._load, now - self._changed[0] >= MIN_BUS_SILENCE_S
-
-
-SNAPSHOT_PERIOD_S = 0.25
-"""Between two snapshots: each costs the thread that reads the bus its caches for a tick or two."""
+        return self._rate, self._load, now - self._changed[0] >= 1.0
 
 
 class Publisher:
@@ -342,9 +331,7 @@ class Publisher:
     snapshots.
     """
 
-    def __init__(
-        self, look: Callable[[int], Snapshot], period_s: float = SNAPSHOT_PERIOD_S
-    ) -> None:
+    def __init__(self, look: Callable[[int], Snapshot], period_s: float = 0.25) -> None:
         self._look = look
         self._period_s = period_s
         self._latest: Snapshot | None = None
@@ -404,12 +391,6 @@ class Publisher:
             self.refresh()
 
 
-SNAPSHOT_WAIT_S = 1.0
-"""Longest wait of a reader for a snapshot, s."""
-READER_END_TIMEOUT_S = 5.0
-"""Longest wait at the end of a session for its reader, s."""
-
-
 @contextmanager
 def publish(
     look: Callable[[int], Snapshot], take: Callable[[Snapshot], None] | None
@@ -426,7 +407,7 @@ def publish(
     def read() -> None:
         latest = 0
         while True:
-            snapshot = publisher.wait(latest, SNAPSHOT_WAIT_S)
+            snapshot = publisher.wait(latest, 1.0)
             if snapshot is not None:
                 latest = snapshot.number
                 take(snapshot)
@@ -440,4 +421,4 @@ def publish(
             reader.start()
             yield publisher.refresh
     finally:
-        reader.join(READER_END_TIMEOUT_S)
+        reader.join(5.0)

@@ -23,8 +23,6 @@ from firmware_iface.recording import MAX_CAN_ID
 
 MOST_SEED = (1 << 32) - 1
 """Largest seed of random numbers, 1."""
-MIB = 1 << 20
-"""Bytes of one MiB, 1."""
 TEST = "open|closed|NUMBER|FILE"
 """How every command lets a test be named."""
 
@@ -243,7 +241,7 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def max_log_bytes(self) -> int:
         """Size of a recording that is read, bytes."""
-        return round(self.max_log_size_MiB * MIB)
+        return round(self.max_log_size_MiB * (1 << 20))
 
 
 class Option(NamedTuple):

@@ -43,8 +43,6 @@ Progress = Callable[[str, float], None]
 """Is called with a stage and its share done, 0 … 1."""
 MAX_OVERTIME_S = 0.5
 """Seconds after its time in which a computation may end by itself, at its next report."""
-DEADLINE_POLL_S = 0.1
-"""Seconds between two looks at the clock: on Windows a longer wait holds up Ctrl-C."""
 
 T = TypeVar("T")
 
@@ -111,7 +109,8 @@ class Deadline:
 
         threading.Thread(target=compute, name=COMPUTING_THREAD_NAME, daemon=True).start()
         try:
-            while not wait([result], DEADLINE_POLL_S).done:
+            # On Windows a longer wait holds up Ctrl-C.
+            while not wait([result], 0.1).done:
                 if self._clock() > self._end + MAX_OVERTIME_S:
                     raise NotTestedError(self.reason(stages[0]))
         finally:

@@ -32,9 +32,6 @@ from firmware_iface.recording import (
 )
 from firmware_iface.transport.frames import MAX_PAYLOAD
 
-MAX_MULTIPLEXERS = 8
-"""Multiplexers of multiplexers."""
-
 MIN_SCALE, MAX_SCALE = 1e-12, 1e12
 """Magnitudes of scales that a physical quantity can have; beyond them arithmetic overflows."""
 
@@ -389,7 +386,7 @@ def signal_layout(signal: DbcSignal, message: DbcMessage, at: str, depth: int = 
             f"{at}: the DBC gives signal {signal.name!r} a scale outside {MIN_SCALE:g} …"
             f" {MAX_SCALE:g}, or an offset beyond"
         )
-    if depth > MAX_MULTIPLEXERS:
+    if depth > 8:
         raise ConfigurationError(f"{at}: the multiplexers of {message.name!r} go in a circle")
     selectors: tuple[tuple[SignalLayout, frozenset[int]], ...] = ()
     if signal.multiplexer is not None and signal.multiplexer_ids:

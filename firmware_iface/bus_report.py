@@ -53,10 +53,6 @@ def bit_state_text(messages: Mapping[str, Decoded], bus_map: BusMap) -> str:
     return words
 
 
-MAX_LISTED_FOREIGN = 20
-"""Foreign identifiers that are listed, the most frequent ones."""
-
-
 @dataclass(frozen=True, slots=True)
 class MessageReport:
     """One mapped message."""
@@ -226,7 +222,7 @@ def _ranges(item: Decoded, table: FrameTable) -> list[RangeUse]:
 def _foreign(table: FrameTable, rows: IntArray) -> tuple[tuple[int, bool, int], ...]:
     marked = table.can_id[rows].astype(np.int64) << 1 | table.extended[rows]
     ids, counts = np.unique(marked, return_counts=True)
-    order = np.argsort(-counts, kind="stable")[:MAX_LISTED_FOREIGN]
+    order = np.argsort(-counts, kind="stable")[:20]
     return tuple((int(ids[i]) >> 1, bool(ids[i] & 1), int(counts[i])) for i in order)
 
 

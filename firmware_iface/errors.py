@@ -74,12 +74,8 @@ class NotTestedError(EhadiagError):
     exit_code: ClassVar[int] = 30
 
 
-MAX_FILE_NAME_BYTES = 200
-"""Bytes: room for a number and a suffix in the usual 255."""
 FORBIDDEN_NAME_CHARACTERS = '/\\:*?"<>|'
 """The separators of paths, and what some file systems refuse."""
-SURROGATE_BYTES = range(0xDC80, 0xDD00)
-"""How Python holds the bytes of a file name that is not UTF-8."""
 
 
 def printable(text: str) -> str:
@@ -111,13 +107,15 @@ def plain_name(text: str) -> str:
         item if item.isprintable() and item not in FORBIDDEN_NAME_CHARACTERS else "_"
         for item in text
     )
-    kept = kept.encode()[:MAX_FILE_NAME_BYTES].decode(errors="ignore").strip()
+    # Room for a number and a suffix in the usual 255 bytes.
+    kept = kept.encode()[:200].decode(errors="ignore").strip()
     return f"_{kept.lstrip('.-')}" if kept[:1] in ("", ".", "-") else kept
 
 
 def _escaped(item: str) -> str:
     code = ord(item)
-    if code in SURROGATE_BYTES:
+    # How Python holds the bytes of a file name that is not UTF-8.
+    if code in range(0xDC80, 0xDD00):
         code -= 0xDC00
     if code <= 0xFF:
         return f"\\x{code:02x}"

@@ -126,15 +126,20 @@ CACHE_MODE = 0o600
 
 HAS_FOLDER_DESCRIPTORS = {os.open, os.rename, os.unlink, os.stat} <= os.supports_dir_fd
 """Not on Windows: there the folder's path stands for it, and folders have access lists."""
-OPEN_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-OPEN_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | OPEN_NO_LINK
+
+
+def _flags(*names: str) -> int:
+    """Flags of `os.open`, those that this system has."""
+    return sum(getattr(os, name, 0) for name in names)
+
+
+OPEN_NO_LINK = _flags("O_NOFOLLOW")
+OPEN_FOLDER = OPEN_NO_LINK | _flags("O_RDONLY", "O_DIRECTORY")
 # A FIFO in the place of a file must not make anybody wait.
-OPEN_READ = os.O_RDONLY | OPEN_NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-OPEN_READ_WRITE = (
-    os.O_RDWR | OPEN_NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-)
-OPEN_APPEND = (OPEN_READ_WRITE & ~os.O_RDWR) | os.O_WRONLY | os.O_APPEND | os.O_CREAT
-OPEN_CREATE = os.O_RDWR | os.O_CREAT | os.O_EXCL | OPEN_NO_LINK | getattr(os, "O_BINARY", 0)
+OPEN_READ = OPEN_NO_LINK | _flags("O_RDONLY", "O_NONBLOCK", "O_BINARY")
+OPEN_READ_WRITE = OPEN_NO_LINK | _flags("O_RDWR", "O_NONBLOCK", "O_BINARY")
+OPEN_APPEND = OPEN_NO_LINK | _flags("O_WRONLY", "O_APPEND", "O_CREAT", "O_NONBLOCK", "O_BINARY")
+OPEN_CREATE = OPEN_NO_LINK | _flags("O_RDWR", "O_CREAT", "O_EXCL", "O_BINARY")
 
 
 class Folder:
@@ -394,7 +399,6 @@ def refuse_foreign(info: os.stat_result, right_kind: Callable[[int], bool]) -> N
             raise PermissionError("others may write to it")
 
 
-CACHE_FOLDER_MODE = 0o700
 CACHE_FOLDER_ADVICE = "name a folder of your own by EHADIAG_CACHE_DIR"
 
 
@@ -470,7 +474,7 @@ def _enter_folder(at: int, name: str, path: Path) -> int:
             return os.open(name, OPEN_FOLDER, dir_fd=at)
         except FileNotFoundError:
             with contextlib.suppress(FileExistsError):  # another process was quicker
-                os.mkdir(name, CACHE_FOLDER_MODE, dir_fd=at)
+                os.mkdir(name, 0o700, dir_fd=at)
             return os.open(name, OPEN_FOLDER, dir_fd=at)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EMLINK, errno.ENOTDIR):

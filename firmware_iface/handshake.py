@@ -109,12 +109,6 @@ END_TEXTS = {
 }
 MIN_CONTRADICTIONS = 2
 """Times a status must contradict those before, 1: one damaged or late frame does it once."""
-MAX_EARLY_S = 0.1
-"""Time, s, by which a test may seem to be complete too early; statuses are late by less."""
-MAX_TIME_REVERSAL_S = 0.1
-"""s by which the elapsed time of late status frames goes back."""
-MAX_JOIN_DELAY_S = 0.1
-"""A listener that comes later to a test waits for the next one: it has missed the start."""
 
 
 class Phase(Enum):
@@ -270,7 +264,8 @@ class Handshake:
                     return self._end(f"test {status.test_id} of another tester is running")
             case Phase.WAITING:
                 wanted = self.test_id is None or self._ours(status)
-                fresh = status.elapsed <= MAX_JOIN_DELAY_S
+                # A later listener has missed the start, and waits for the next test.
+                fresh = status.elapsed <= 0.1
                 if status.state in ACTIVE_BIT_STATES and wanted and fresh:
                     self._follow(now, status)
             case Phase.REQUESTED:
@@ -339,7 +334,8 @@ class Handshake:
                     " sender on the bus"
                 )
         both_run = before.state is BitState.RUNNING is status.state
-        if both_run and status.elapsed < before.elapsed - MAX_TIME_REVERSAL_S:
+        # Late status frames go back by no more.
+        if both_run and status.elapsed < before.elapsed - 0.1:
             self._went_back += 1
             if self._went_back >= MIN_CONTRADICTIONS:
                 back = before.elapsed - status.elapsed
@@ -410,7 +406,8 @@ class Handshake:
     def _complete(self, now: int) -> list[HandshakeAction]:
         """Listen for frames still under way; longer where the test cannot be over yet."""
         since = self.running_since
-        if since is not None and (now - since) / 1e9 < self.duration - MAX_EARLY_S:
+        # Statuses are late by less than 0.1 s.
+        if since is not None and (now - since) / 1e9 < self.duration - 0.1:
             return self._close("", now)
         self._enter(Phase.TRAILING, now)
         return []

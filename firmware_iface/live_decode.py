@@ -56,8 +56,6 @@ class BitRequest:
 REASON_NUMBERS = frozenset(BitReason)
 SAMPLE_FIELDS = dict(zip(CHANNEL_ROLES, CHANNEL_NAMES, strict=True))
 """Roles in the order of `Sample`'s fields."""
-DEFAULT_CYCLE_NS = 20_000_000
-"""Between two frames of a message whose cycle the DBC does not tell."""
 
 
 class LiveDecoder:
@@ -199,7 +197,7 @@ def _period_ns(message: MessageMap, bus_map: BusMap) -> int:
     """Usual time between two counts."""
     if message.counts_ticks or message.measures:
         return bus_map.tick_ns
-    return message.cycle_ns or DEFAULT_CYCLE_NS
+    return message.cycle_ns or 20_000_000
 
 
 def checked_values(message: MessageMap, data: bytes) -> dict[str, float] | None:

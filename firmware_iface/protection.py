@@ -16,7 +16,6 @@ from firmware_iface.bus_map import MessageMap
 from firmware_iface.recording import BoolArray, FloatArray, IntArray
 from firmware_iface.transport.frames import FrameTable
 
-CRC_POLYNOMIAL = 0x1D
 CRC_INITIAL = 0xFF
 CRC_FINAL_XOR = 0xFF
 CRC_KINDS = ("crc8-j1850-id",)
@@ -53,7 +52,7 @@ def _crc_table() -> tuple[int, ...]:
     for byte in range(256):
         value = byte
         for _ in range(8):
-            value = ((value << 1) ^ CRC_POLYNOMIAL if value & 0x80 else value << 1) & 0xFF
+            value = ((value << 1) ^ 0x1D if value & 0x80 else value << 1) & 0xFF
         table.append(value)
     return tuple(table)
 

@@ -21,8 +21,6 @@ from firmware_iface.recording import FloatArray
 MAX_TEST_DURATION_S = 600.0
 MIN_TEST_TICKS, MAX_TEST_TICKS = 100, 60_000
 """Bounds what an identification costs: a minute at 1 kHz, as long as the default bus can tell."""
-MAX_SEARCH_WINDOWS = 32
-"""Of each search."""
 MAX_COMMAND = 10.0
 """A or m."""
 RATE_TOLERANCE = 1e-6
@@ -99,9 +97,7 @@ class Sine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="k
         return self.amplitude * np.sin(2.0 * np.pi * self.frequency * (time - self.start))
 
 
-SearchSpans = Annotated[
-    tuple[TimeWindow, ...], msgspec.Meta(min_length=1, max_length=MAX_SEARCH_WINDOWS)
-]
+SearchSpans = Annotated[tuple[TimeWindow, ...], msgspec.Meta(min_length=1, max_length=32)]
 
 
 class SearchWindows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -86,8 +86,6 @@ TESTER_POLL_S = 0.02
 MIN_STALL_NS = 100_000_000
 """A wait so much longer than `TESTER_POLL_S`: this process did not run, which is no silence of the
 bus."""
-PROGRESS_INTERVAL_NS = 20_000_000
-"""Between two progress reports of one phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +311,7 @@ class _BitSession:
     def _report(self, now: int) -> None:
         machine = self._machine
         same = machine.phase is self._shown_phase
-        if self.progress is None or (same and now - self._shown < PROGRESS_INTERVAL_NS):
+        if self.progress is None or (same and now - self._shown < 20_000_000):
             return
         self._shown, self._shown_phase = now, machine.phase
         since = machine.running_since

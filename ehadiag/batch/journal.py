@@ -44,8 +44,6 @@ def lock_result_file(path: Path) -> Iterator[None]:
         yield
 
 
-MAX_DIFFERENCES_NAMED = 3
-"""Reasons that are told of one result."""
 CONFIGURATION_WORDS = {
     "levels": "level of verdicts",
     "nuisances": "choice of nuisances",
@@ -255,7 +253,7 @@ class ResultJournal:
         if there in self._own:
             return self._own.index(there)
         nearest = min(self._own, key=lambda own: len(_differing_options(own, there)))
-        self._others[" and ".join(_differing_options(nearest, there)[:MAX_DIFFERENCES_NAMED])] += 1
+        self._others[" and ".join(_differing_options(nearest, there)[:3])] += 1
         return None
 
     def _line(self, at: int, size: int) -> str:

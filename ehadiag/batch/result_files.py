@@ -120,8 +120,6 @@ CSV_HEADER_START = ",".join(list(PATHS)[:HEAD]).encode()
 
 ResultSink = Callable[[Result], None]
 """Is handed each result."""
-PARQUET_GROUP_ROWS = 256
-"""Rows that a Parquet file has in one group: so many are held at once."""
 FORMULA_PREFIXES = ("=", "+", "-", "@")
 """What a spreadsheet takes for a formula at the beginning of a text."""
 
@@ -187,7 +185,8 @@ def parquet_table(name: str) -> Iterator[ResultSink]:
 
         def take(result: Result) -> None:
             rows.append(result_row(result))
-            if len(rows) == PARQUET_GROUP_ROWS:
+            # A group of rows of the file: so many are held at once.
+            if len(rows) == 256:
                 flush()
 
         def flush() -> None:

@@ -26,8 +26,6 @@ MIN_READ_S = 0.5
 """Time of reading, s, from which on a log gets an index; below it the next reading is as fast."""
 MAX_INDEXES = 1000
 """Indexes, 1, that are kept; some 200 bytes a test each, the oldest go first."""
-MAX_INDEX_BYTES = 16 << 20
-"""Bytes of an index that is read: some 80 000 tests."""
 
 
 def list_tests(
@@ -113,7 +111,8 @@ def _index_name(setup: Setup, files: tuple[PathLike, ...]) -> str:
 def _read_index(folder: Folder, name: str) -> list[ListedTest] | None:
     """Return what an index holds; None without one, or where it is damaged or another user's."""
     with contextlib.suppress(OSError, msgspec.MsgspecError):
-        return msgspec.json.decode(folder.read(name, MAX_INDEX_BYTES), type=list[ListedTest])
+        # Some 80 000 tests.
+        return msgspec.json.decode(folder.read(name, 16 << 20), type=list[ListedTest])
     return None
 
 

@@ -114,13 +114,6 @@ def _names_on_standard_input() -> list[str]:
     return [line for line in lines if line.strip()]
 
 
-MAX_INPUTS_PER_WORKER = 128
-"""Inputs a worker that are under way, or wait for those before them, at the most."""
-MIN_INPUTS_PER_WORKER = 8
-"""Inputs that make a worker of one's own worth its start."""
-SCHEDULER_TIMEOUT_S = 10
-"""For a scheduler to answer."""
-
 Given = TypeVar("Given")
 Made = TypeVar("Made")
 
@@ -129,7 +122,8 @@ def worker_count(count: int) -> int:
     """Return how many workers so many inputs are worth on this machine; 1: none beside this."""
     from joblib import cpu_count  # noqa: PLC0415
 
-    return max(1, min(int(cpu_count()), count // MIN_INPUTS_PER_WORKER))
+    # Inputs that make a worker of one's own worth its start.
+    return max(1, min(int(cpu_count()), count // 8))
 
 
 class Workers:
@@ -179,7 +173,8 @@ class Workers:
         """
         at = 0
         while at < len(inputs):
-            part = inputs[at : at + MAX_INPUTS_PER_WORKER * self._jobs]
+            # Under way, or waiting for those before them.
+            part = inputs[at : at + 128 * self._jobs]
             try:
                 for made in self._run(work, part):
                     at += 1
@@ -223,7 +218,7 @@ def _dask_client(address: str) -> Any:
     except ImportError:
         raise ConfigurationError(f"--cluster: needs Dask: {install_command('dask')}") from None
     try:
-        return Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
+        return Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:  # OSError is also that nobody answers in time
         why = " ".join(str(error).split())
         raise InputOutputError(f"cluster {address}: {why or 'no scheduler answers'}") from None

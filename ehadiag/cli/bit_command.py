@@ -194,10 +194,6 @@ def _setups(arguments: argparse.Namespace, test: StoredTest) -> Sequence[Setup]:
     return setups
 
 
-MAX_SIMULATION_DELAY_S = 0.25
-"""Delay of the simulated computer, s; telemetry that is later than this counts as lost."""
-
-
 @dataclass
 class _Simulation:
     """The simulated computer of a call, if any."""
@@ -206,7 +202,8 @@ class _Simulation:
 
     def own_fault(self) -> str:
         """Say whether this computer is too busy to simulate."""
-        if self.pace is None or self.pace.behind_s < MAX_SIMULATION_DELAY_S:
+        # Telemetry that is later than this counts as lost.
+        if self.pace is None or self.pace.behind_s < 0.25:
             return ""
         return (
             "this computer is too busy to simulate in real time: the simulated actuator fell"

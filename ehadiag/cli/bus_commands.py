@@ -22,6 +22,7 @@ from ehadiag.core.interruption import stop_on_signals
 from ehadiag.report.rendering import isolated_png
 from ehadiag.request import TEST
 from ehadiag.terminal.output import (
+    INPUT_OUTPUT_EXIT_CODE,
     print_compiling_notice,
     print_status,
     print_text,
@@ -39,10 +40,6 @@ if TYPE_CHECKING:
     from ehadiag.session.unit_state import UnitState
     from ehadiag_sim.control import SimulatorControl
     from firmware_iface.transport.base import Transport
-
-ALARM_EXIT_CODE = 40
-NOT_MONITORED_EXIT_CODE = 30
-BUS_LOST_EXIT_CODE = 3
 
 
 def define_monitor(parser: argparse.ArgumentParser) -> None:
@@ -209,11 +206,11 @@ def run_monitor(
         f" {found.alarm_count} alarms" + (f", {found.repeated} repeated" if found.repeated else "")
     )
     if found.alarm_count:
-        return ALARM_EXIT_CODE
+        return 40
     if found.bus_lost:
-        return BUS_LOST_EXIT_CODE
+        return INPUT_OUTPUT_EXIT_CODE
     enough = found.monitored and found.share >= arguments.least_monitored
-    return 0 if enough else NOT_MONITORED_EXIT_CODE
+    return 0 if enough else 30
 
 
 def _initial_unit_state(
@@ -261,9 +258,6 @@ def _command_words(command: str | list[str] | None) -> list[str]:
         return shlex.split(command)
     except ValueError as error:
         raise ConfigurationError(f"--on-alarm {command}: {error}") from None
-
-
-NOT_USABLE_EXIT_CODE = 30
 
 
 def define_check_bus(parser: argparse.ArgumentParser) -> None:
@@ -333,7 +327,7 @@ def run_check_bus(arguments: argparse.Namespace) -> int:
         )
         write_file(Path(arguments.plot), isolated_png(picture), "picture")
         print_status(f"wrote {arguments.plot}")
-    return 0 if found.usable else NOT_USABLE_EXIT_CODE
+    return 0 if found.usable else 30
 
 
 def define_replay(parser: argparse.ArgumentParser) -> None:

@@ -255,10 +255,6 @@ def _write_page(folder: Folder, name: str, found: Calibrated) -> None:
         folder.write(name, calibration_html_page(found))
 
 
-LIMIT_MARGIN = 1.001
-"""Where no limit is given it is what the test itself does, and a little for rounding."""
-DESIGNED_ID_OFFSET = 100
-"""Added to a test's number, so that both can be known at once."""
 MAX_TEST_ID = 255
 
 
@@ -391,7 +387,8 @@ def _design_limits(
     new = play_stored_test(test, actuator, (0.0,) * len(FAULTS), typical_effects())
 
     def limit(given: float | None, unit: float, *does: float) -> float:
-        return LIMIT_MARGIN * max(does) if given is None else given * unit
+        # What the test itself does, and a little for rounding.
+        return 1.001 * max(does) if given is None else given * unit
 
     return MotionLimits(
         travel=limit(arguments.max_travel, 1e-3, scored.travel, new.travel),
@@ -403,7 +400,8 @@ def _design_limits(
 
 def _name_and_number(arguments: argparse.Namespace, test: StoredTest) -> tuple[str, int]:
     """Name and number of the better test."""
-    number = arguments.id or (test.id + DESIGNED_ID_OFFSET - 1) % MAX_TEST_ID + 1
+    # Another number than the given test: both can be known at once.
+    number = arguments.id or (test.id + 100 - 1) % MAX_TEST_ID + 1
     name = arguments.name or f"{test.name[:55]}-designed"
     if not 1 <= number <= MAX_TEST_ID:
         raise ConfigurationError(f"--id {number}: need 1 … {MAX_TEST_ID}")

@@ -250,10 +250,6 @@ def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
     return exit_code_of_inputs(codes)
 
 
-MAX_ESTIMATE_DIFFERENCE = 1e-3
-"""Difference of an estimate from the stored one above which the recording is another's."""
-
-
 def define_report(parser: argparse.ArgumentParser) -> None:
     """Add description and options of the command."""
     parser.description = (
@@ -396,6 +392,7 @@ def _is_same_diagnosis(found: Result, stored: Result) -> bool:
         other = stored.severities.get(name)
         if other is None or (item.estimate is None) != (other.estimate is None):
             return False
-        if item.estimate is not None and abs(item.value - other.value) >= MAX_ESTIMATE_DIFFERENCE:
+        # A larger difference from the stored estimate: the recording is another's.
+        if item.estimate is not None and abs(item.value - other.value) >= 1e-3:
             return False
     return True

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from ehadiag.history.records import Entry, MaintenanceEvent
 
 WITHDRAWABLE_KINDS = (DIAGNOSIS_TABLE, EVENT_TABLE)
-MAX_IMPORT_BYTES = 200_000_000
-"""Size, bytes, of a table that is read: a million rows."""
 REPLACED_PARTS = {
     "filter": ("Kintas",),
     "valve": ("Kintas", "FSS"),
@@ -212,7 +210,8 @@ def _import(arguments: argparse.Namespace) -> None:
     from ehadiag.history.tables import entries_from_csv  # noqa: PLC0415
     from ehadiag.model.registry import FAULT_NAMES  # noqa: PLC0415 - loads numpy
 
-    content = read_small_file(Path(arguments.file), MAX_IMPORT_BYTES, "table")
+    # A million rows.
+    content = read_small_file(Path(arguments.file), 200_000_000, "table")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -96,8 +96,6 @@ def _mapping_labels(mappings: list[str | None]) -> list[str]:
 
 
 DEFAULT_BAUD_RATE = 921600
-DEFAULT_BUS_BITRATE = 1e6
-"""Of the default bus (BUS-1)."""
 
 
 def add_bus_options(parser: argparse.ArgumentParser) -> None:
@@ -164,7 +162,8 @@ def bitrate_from_options(arguments: argparse.Namespace, bus_map: BusMap) -> floa
         return None
     from firmware_iface.bus_map import default_map  # noqa: PLC0415
 
-    default = DEFAULT_BUS_BITRATE if bus_map.name == default_map().name else None
+    # BUS-1.
+    default = 1e6 if bus_map.name == default_map().name else None
     return arguments.bitrate or default
 
 

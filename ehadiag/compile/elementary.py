@@ -11,12 +11,6 @@ import math
 
 from ehadiag.compile.jit import inlined_exact
 
-INVERSE_LN2 = 1.4426950408889634
-LN2_HIGH = 6.93147180369123816490e-01
-"""ln 2 cut to 32 bits, so that its product with a whole number is exact."""
-LN2_LOW = 1.90821492927058770002e-10
-MIN_EXPONENT, MAX_EXPONENT = -708.0, 709.0
-EXPM1_SERIES_LIMIT = 0.34
 INVERSE_FACTORIALS = (
     1.0 / 2, 1.0 / 6, 1.0 / 24, 1.0 / 120, 1.0 / 720, 1.0 / 5040, 1.0 / 40320, 1.0 / 362880,
     1.0 / 3628800, 1.0 / 39916800, 1.0 / 479001600, 1.0 / 6227020800,
@@ -34,12 +28,13 @@ def exponential(x: float) -> float:
     """
     if math.isnan(x):
         return x
-    if x < MIN_EXPONENT:
+    if x < -708.0:
         return 0.0
-    if x > MAX_EXPONENT:
+    if x > 709.0:
         return float("inf")
-    k = int(x * INVERSE_LN2 + (0.5 if x >= 0.0 else -0.5))
-    high, low = x - k * LN2_HIGH, k * LN2_LOW
+    k = int(x * 1.4426950408889634 + (0.5 if x >= 0.0 else -0.5))
+    # ln 2 cut to 32 bits, so that its product with a whole number is exact.
+    high, low = x - k * 6.93147180369123816490e-01, k * 1.90821492927058770002e-10
     r = high - low
     series = 0.0
     for i in range(len(INVERSE_FACTORIALS)):
@@ -63,7 +58,7 @@ def exponential_less_one(x: float) -> float:
     Near 0 by the series of `exponential`, further off by the difference, which cancels at most 1.8
     bits.
     """
-    if abs(x) > EXPM1_SERIES_LIMIT:
+    if abs(x) > 0.34:
         return exponential(x) - 1.0
     series = 0.0
     for i in range(len(INVERSE_FACTORIALS)):
@@ -72,12 +67,9 @@ def exponential_less_one(x: float) -> float:
 
 
 LN2 = 0.6931471805599453
-SQRT_HALF, SQRT_TWO = 0.7071067811865476, 1.4142135623730951
 LOGARITHM_TERMS = 14
 """Of the series of the logarithm: the next is below 1e-20."""
 TWO_PI = 6.283185307179586
-COSINE_ORDER = 28
-"""Highest power in the series of the cosine: the next is below 2e-15."""
 
 TWO_POWER_52 = 4503599627370496.0
 """2^52: a number from there on is whole, and so is one that it was added to."""
@@ -141,10 +133,10 @@ def square_root(x: float) -> float:
 def logarithm(x: float) -> float:
     """Return the natural logarithm of a positive normal number, within 1e-15 of itself or of 1."""
     k = 0
-    while x < SQRT_HALF:
+    while x < 0.7071067811865476:
         x *= 2.0
         k -= 1
-    while x > SQRT_TWO:
+    while x > 1.4142135623730951:
         x *= 0.5
         k += 1
     s = (x - 1.0) / (x + 1.0)
@@ -159,7 +151,8 @@ def cosine(x: float) -> float:
     """Return the cosine of an angle within two turns of 0, within 1e-13."""
     y = x - TWO_PI * math.floor(x / TWO_PI + 0.5)
     series = 1.0
-    for i in range(COSINE_ORDER, 0, -2):
+    # The next term is below 2e-15.
+    for i in range(28, 0, -2):
         series = 1.0 - series * y * y / (i * (i - 1))
     return series
 

@@ -130,7 +130,6 @@ end:
 """
 """The functions of a C library that LLVM calls for what it takes them for; for a library that has
 no other beside it."""
-OPTIMISATION_LEVEL, FAST_OPTIMISATION_LEVEL = 2, 3
 EXCEPTION = re.compile(r'store ptr @"?\.const\.picklebuf[^,]*, ptr')
 """Where a function of numpy that a kernel uses would raise an error: its status says that, too."""
 FAST_MATH_FLAGS = re.compile(
@@ -410,4 +409,4 @@ def _optimise(module: Any, machine: _Machine, processor: Processor) -> None:
 
 
 def _level(processor: Processor) -> int:
-    return FAST_OPTIMISATION_LEVEL if processor.fast else OPTIMISATION_LEVEL
+    return 3 if processor.fast else 2

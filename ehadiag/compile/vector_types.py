@@ -48,7 +48,6 @@ class _MaskType(types.Type):
 
 _VECTOR, _MASK = _VectorType(), _MaskType()
 _DOUBLES = ir.VectorType(ir.DoubleType(), VECTOR_WIDTH)
-_BITS = ir.VectorType(ir.IntType(1), VECTOR_WIDTH)
 
 
 @register_model(_VectorType)
@@ -60,7 +59,7 @@ class _VectorModel(models.PrimitiveModel):
 @register_model(_MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _BITS)
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), VECTOR_WIDTH))
 
 
 def _wide(builder: Any, value: Any) -> Any:

@@ -13,8 +13,6 @@ FRICTION_NAME = "FSS"
 """Effect and severity that a recording shows by their ratio alone."""
 MAX_RESULT_BYTES = 1 << 20
 """Size of the largest JSON result that is read, bytes."""
-FIRST_DATED_NS = 10**17
-"""Stamps beyond are times of day, those before it seconds since a log without a date began."""
 
 
 def date_text(time_ns: int | None) -> str | None:
@@ -23,7 +21,8 @@ def date_text(time_ns: int | None) -> str | None:
     time_ns: nanoseconds since 1970, or since a log without a date began. Returns such as
     `2026-03-01T12:00:00.000Z`.
     """
-    if time_ns is None or time_ns < FIRST_DATED_NS:
+    # Smaller ones are seconds since a log without a date began.
+    if time_ns is None or time_ns < 10**17:
         return None
     try:
         moment = datetime.fromtimestamp(time_ns / 1e9, UTC)

@@ -72,10 +72,6 @@ def observed_step(values: NDArray[np.float64]) -> float | None:
     return step if float(np.quantile(off, STEPS.share)) <= STEPS.deviation else None
 
 
-RANGE_MARGIN = 1.25
-"""Range over the actuator's own reach, of a converter of which nothing is known."""
-
-
 class Conversion(NamedTuple):
     """The converters of a recording."""
 
@@ -172,9 +168,7 @@ def _filed_channel(actuator: Actuator, usual: Channel) -> Channel:
     if item is not None:
         return replace(usual, full_scale=item.full_scale, levels=float(1 << item.bits))
     largest = largest_value(actuator, usual)
-    return (
-        usual if largest <= usual.full_scale else replace(usual, full_scale=RANGE_MARGIN * largest)
-    )
+    return usual if largest <= usual.full_scale else replace(usual, full_scale=1.25 * largest)
 
 
 def _with_statement(stated: StatedConverter | None, channel: Channel) -> Channel:

@@ -28,8 +28,6 @@ def is_computing(timeout_s: float = 0.5) -> bool:
 
 
 SignalHandler = Callable[[int, FrameType | None], Any]
-SIGNALS_TO_INTERRUPT = 2
-"""Number of the signal that interrupts where the first one only sets an event."""
 INTERRUPTED_EXIT_CODE = 130
 """Exit code of an interrupted command, as of a shell."""
 
@@ -113,7 +111,8 @@ def _counting_handler(first: threading.Event) -> SignalHandler:
         nonlocal count
         count += 1
         first.set()
-        if count == SIGNALS_TO_INTERRUPT:
+        # The first one only sets an event.
+        if count == 2:
             raise KeyboardInterrupt
 
     return handle

@@ -104,10 +104,6 @@ def _samples(
 
 SCORED_SEVERITIES = ((0.05, 0.05, 0.05), (0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
 """Severities at which a test is scored: nearly as new, degraded, worn."""
-MIN_CORRELATION_CONFUSABLE = 0.9
-"""Correlation of two estimates, 1, from which on the test hardly separates them."""
-MAX_STD_RATIO_SHOWN = 0.7
-"""Deviation over the one known beforehand, 1; above it the test does not show a parameter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,7 +209,8 @@ def bound_of(played: PlayedTest, actuator: Actuator, point: tuple[float, ...]) -
         unseen=tuple(
             name
             for k, name in enumerate(names[known:], start=known)
-            if spread[k] > MAX_STD_RATIO_SHOWN * before[k]
+            # Of what was known beforehand: above it the test does not show a parameter.
+            if spread[k] > 0.7 * before[k]
         ),
     )
 
@@ -226,6 +223,7 @@ def _confusable_pairs(
         (names[i], names[j], float(correlation[i, j]))
         for i in range(len(FAULTS))
         for j in range(i + 1, len(names))
-        if abs(correlation[i, j]) >= MIN_CORRELATION_CONFUSABLE
+        # From there on the test hardly separates them.
+        if abs(correlation[i, j]) >= 0.9
     ]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))

@@ -29,8 +29,6 @@ from ehadiag.onboard.onboard_memory import (
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.stored_test import StoredTest, TimeWindow, bundled_tests
 
-DIGEST_BITS = 48
-"""Bits of a plan's digest in an object, 1: a double holds 53."""
 SMALLEST = {False: 2.0**-540, True: 2.0**-82}
 """Root of what makes of a pressure in Pa a number that is lost where small ones are flushed to
 zero, by whether results are rounded to single precision, 1."""
@@ -57,7 +55,8 @@ def library_plan(
         *directions,
     ]
     numbers = np.array([*begin, *end], dtype="<f8")
-    digest = int.from_bytes(hashlib.sha256(numbers.tobytes()).digest()[: DIGEST_BITS // 8], "big")
+    # 48 bits: a double holds 53.
+    digest = int.from_bytes(hashlib.sha256(numbers.tobytes()).digest()[:6], "big")
     return np.array([*begin, *identity_of(actuator, float(digest), single=single), *end])
 
 

@@ -20,8 +20,6 @@ __all__ = ["FLEET_HEAD", "Cell", "FleetUnit", "fleet_rows"]
 
 FLEET_HEAD = ("unit", "verdict", "worst", "trend", "time left", "last test", "actuator", "")
 WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
-MAX_SPARK_VALUES = 30
-"""Number of diagnoses in a sparkline, the newest ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +110,7 @@ def _left(prognosis: Prognosis | None) -> str:
 
 def _sparkline(values: Sequence[float], levels: Levels) -> str:
     """Draw severities between 0 and 1 with both levels; numbers only, so no text of others."""
-    shown = values[-MAX_SPARK_VALUES:]
+    shown = values[-30:]
     if len(shown) < 2:
         return ""
     step = 100.0 / (len(shown) - 1)

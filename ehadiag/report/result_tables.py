@@ -53,8 +53,6 @@ STATE_STYLES = {
 }
 TEXT_COLUMNS = 10_000
 """Columns of a text that no terminal bounds: nothing of ours is cut."""
-MAX_BAR_COLUMNS = 48
-"""Columns of a severity's bar; 2 % each."""
 FLAG_REMARKS = {AT_BOUND: "at its bound", NOT_SHOWN: "not shown by the test"}
 """What the table says of a severity's flags."""
 
@@ -148,7 +146,8 @@ def _print_head(head: Head, result: Result, console: Console) -> None:
 
 def _bar(bar: Bar, head: Head, console: Console) -> Text:
     """Draw a severity: plain name, percent, bar with a mark at each level."""
-    length = max(min(console.width - 30, MAX_BAR_COLUMNS), 8)
+    # At most 2 % a column.
+    length = max(min(console.width - 30, 48), 8)
     full, empty = ("█", "·") if _unicode(console) else ("#", ".")
     value = bar.value or 0.0
     done = round(min(value, 1.0) * length)

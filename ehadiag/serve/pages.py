@@ -36,13 +36,8 @@ __all__ = ["Pages"]
 
 MAX_PAGE_ROWS = 500
 """Of a list, newest first."""
-MAX_REPORT_BYTES = 16 << 20
 REPORT_CONTENT_POLICY = "sandbox allow-scripts"
 """A report may be anybody's file: its scripts run, but not in the name of this server."""
-
-
-MAX_FORECASTS = 20
-"""Number of units whose remaining life the front page shows; a forecast takes some 0.3 s."""
 
 
 class Pages:
@@ -150,7 +145,8 @@ class Pages:
         levels = (self._levels.advisory, self._levels.limit)
         futures = {
             serial: prognosis_of(serial, entries, events, levels)
-            for serial in known[:MAX_FORECASTS]
+            # Some 0.3 s each.
+            for serial in known[:20]
         }
         return [
             FleetUnit(
@@ -218,9 +214,7 @@ class Pages:
         found = next((path for path in self._reports() if path.name == name), None)
         if found is None:
             return None
-        return Page(
-            read_small_file(found, MAX_REPORT_BYTES, "report"), policy=REPORT_CONTENT_POLICY
-        )
+        return Page(read_small_file(found, 16 << 20, "report"), policy=REPORT_CONTENT_POLICY)
 
     def _reports(self) -> list[Path]:
         """Reports of the folder, newest first; no links."""

@@ -34,10 +34,6 @@ MAX_LIVE_STREAMS = 16
 """Number of readers of the live view at a time."""
 MAX_REQUEST_BYTES = 1024
 """Size of the largest request to start or abort a test, bytes."""
-KEEP_ALIVE_INTERVAL_S = 10.0
-"""Time after which a comment keeps a stream open, s."""
-REQUEST_TIMEOUT_S = 30.0
-"""Longest time for a request, s."""
 HTML_CONTENT_TYPE = "text/html; charset=utf-8"
 JSON_CONTENT_TYPE = "application/json"
 
@@ -118,7 +114,7 @@ class _Handler(BaseHTTPRequestHandler):
     site: Site
     streams: threading.BoundedSemaphore
     port: int
-    timeout = REQUEST_TIMEOUT_S
+    timeout = 30.0
     server_version = "ehadiag"
     sys_version = ""
 
@@ -223,7 +219,7 @@ class _Handler(BaseHTTPRequestHandler):
         with contextlib.suppress(OSError):
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             while not sessions.ended:
-                news = sessions.wait(seen, KEEP_ALIVE_INTERVAL_S)
+                news = sessions.wait(seen, 10.0)
                 if news is None:
                     self.wfile.write(b": still here\n\n")
                 else:

@@ -38,12 +38,8 @@ __all__ = [
 ]
 
 
-MAX_OUTPUT_LINES_KEPT = 20
-"""Number of a session's printed lines that the page shows."""
 WATCH_RESTART_PAUSE_S = 3.0
 """Time before a watch that ended by itself begins again, s."""
-ABORT_TIMEOUT_S = 15.0
-"""Longest time in which a stopped test aborts and writes its result, s."""
 
 
 NO_SNAPSHOT = b"null"
@@ -113,7 +109,7 @@ class SessionRunner:
         self._running: str | None = None
         self._number = 1
         self._snapshot = NO_SNAPSHOT
-        self._lines: deque[str] = deque(maxlen=MAX_OUTPUT_LINES_KEPT)
+        self._lines: deque[str] = deque(maxlen=20)
         self._thread = threading.Thread(target=self._run, name="ehadiag-sessions", daemon=True)
 
     def __enter__(self) -> SessionRunner:
@@ -210,7 +206,8 @@ class SessionRunner:
             self._requested = None
             self._interrupt()
             self._notify()
-        self._thread.join(ABORT_TIMEOUT_S)
+        # A stopped test aborts and writes its result.
+        self._thread.join(15.0)
         process = self._process
         if process is not None and process.is_alive():
             process.kill()

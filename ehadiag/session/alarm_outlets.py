@@ -75,10 +75,6 @@ def utc_now_text() -> str:
     return utc_text(datetime.now(UTC))
 
 
-ALARM_COMMAND_TIMEOUT_S = 5.0
-"""Longest wait at the end of the session for a call that still runs, s."""
-
-
 class AlarmCommand:
     """Runs a command with the alarm's JSON object on its standard input, one call at a time.
 
@@ -119,7 +115,7 @@ class AlarmCommand:
     def close(self) -> None:
         """Wait for a call that runs, but not for long."""
         if self._thread is not None:
-            self._thread.join(ALARM_COMMAND_TIMEOUT_S)
+            self._thread.join(5.0)
         if self.failed:
             self._report(f"--on-alarm {self._arguments[0]}: {self.failed}")
 
@@ -138,12 +134,6 @@ class AlarmCommand:
             self.failed = reason_of(error)
 
 
-MAX_ALARM_RECORDINGS = 1000
-"""Number of recordings of one session: a rig that alarms all night does not fill the disk."""
-MAX_FRAMES_IN_MEMORY = 200_000
-"""Number of frames that are kept for the seconds before an alarm."""
-
-
 class AlarmRecorder:
     """Keeps the newest frames, and writes them and what follows to a BLF when an alarm comes.
 
@@ -159,7 +149,7 @@ class AlarmRecorder:
         self._folder = folder
         self._span_ns = round(seconds * 1e9)
         self._channel = channel
-        self._kept: deque[Frame] = deque(maxlen=MAX_FRAMES_IN_MEMORY)
+        self._kept: deque[Frame] = deque(maxlen=200_000)
         self._recorder: Recorder | None = None
         self._name = ""
         self._until_ns = 0
@@ -198,7 +188,8 @@ class AlarmRecorder:
         self._until_ns = time_ns + self._span_ns
         if self._recorder is not None:
             return self._name
-        if self._count >= MAX_ALARM_RECORDINGS:
+        # A rig that alarms all night does not fill the disk.
+        if self._count >= 1000:
             return ""
         from firmware_iface.logs.recorder import Recorder  # noqa: PLC0415 - loads python-can
 

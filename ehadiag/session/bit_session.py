@@ -30,11 +30,6 @@ if TYPE_CHECKING:
     from firmware_iface.transport.base import Transport
     from firmware_iface.transport.frames import Frame, FrameTable
 
-IDENTIFICATION_POLL_S = 0.05
-"""Time between two looks at a thread that identifies, s."""
-FRAME_DELAY_S = 0.02
-"""Time after a tick, s, in which its frames arrive."""
-
 
 class EarlyIdentification:
     """Identifies from the frames of a running test, in a thread of its own."""
@@ -56,7 +51,8 @@ class EarlyIdentification:
     def watch(self, progress: BitProgress) -> None:
         """Begin a stage once its frames are there; in the thread that collects frames."""
         due = False
-        while self._due and progress.elapsed >= self._due[0] + FRAME_DELAY_S:
+        # Frames arrive within 20 ms after their tick.
+        while self._due and progress.elapsed >= self._due[0] + 0.02:
             self._due.pop(0)
             due = True
         if due:
@@ -82,7 +78,7 @@ class EarlyIdentification:
             self._work.put(newest)
         self._work.put(None)
         while self._thread.is_alive() and not (deadline.passed or stop.is_set()):
-            self._thread.join(IDENTIFICATION_POLL_S)
+            self._thread.join(0.05)
         return not self._thread.is_alive()
 
     def abandon(self) -> None:

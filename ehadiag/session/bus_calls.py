@@ -43,8 +43,6 @@ Progress: TypeAlias = Callable[[str, float], None]
 """Called with a stage and the share of it that is done, 0 … 1."""
 ONBOARD_WAIT_S = 60.0
 """Time after a test, s, in which the computer's own result is awaited by default."""
-BUS_POLL_S = 0.05
-"""Longest wait for a frame before the stop is looked at, s."""
 
 
 @contextmanager
@@ -449,7 +447,7 @@ def collect_frames(
     progress: Progress | None = None,
 ) -> float:
     """Hand over the frames of a bus until the time is over; return the time listened, s."""
-    from firmware_iface.transport.base import open_source  # noqa: PLC0415
+    from firmware_iface.transport.base import RECEIVE_POLL_S, open_source  # noqa: PLC0415
 
     end = threading.Event() if stop is None else stop
     sink, idle = (None, None) if recorder is None else (recorder.write, recorder.idle)
@@ -457,7 +455,7 @@ def collect_frames(
     with open_source(transport, sink=sink, idle=idle) as source:
         started = source.now_ns()
         while not end.is_set() and not source.at_end:
-            frame = source.receive(BUS_POLL_S)
+            frame = source.receive(RECEIVE_POLL_S)
             if frame is not None:
                 take(frame)
             if duration_s is None:

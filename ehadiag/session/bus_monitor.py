@@ -40,14 +40,6 @@ if TYPE_CHECKING:
 
 CUSUM_SIDES = (("spool", "above"), ("spool", "below"), ("pressure", "above"), ("pressure", "below"))
 """Signal and side of the four sums, in the order of `Reading.alarmed`."""
-RESETTLE_LOST_TICKS = 20
-"""Number of ticks lost in a row after which the monitor settles again."""
-ENVIRONMENT_TIMEOUT_S = 1.0
-"""Longest wait for oil and supply on the bus before those of the actuator's file hold, s."""
-ENVIRONMENT_SPAN_S = 0.5
-"""Time over which oil and supply are averaged before the model takes them, s."""
-ALARM_REPEAT_S = 10.0
-"""Time after an alarm of one sum in which another one only repeats it, s."""
 ENVIRONMENT_KEYS = ("supply_pressure", "return_pressure", "oil_temperature")
 MessageKey = tuple[int, bool]
 """Identifier of a message, and whether it is extended."""
@@ -108,7 +100,7 @@ class BusMonitor:
         }
         self._environment_conflicts = 0
         self._averaged: dict[str, list[float]] = {}
-        self._environment_span = round(ENVIRONMENT_SPAN_S * self._rate)
+        self._environment_span = round(0.5 * self._rate)
         self._made_for = Environment()
         self._monitor: FreeMotionMonitor | None = None
         self._changes: ChangeTest | None = None
@@ -263,7 +255,7 @@ class BusMonitor:
             self._tune(monitor)
         lost = math.isnan(tick.spool)
         self._missing = self._missing + 1 if lost else 0
-        if live.breaks != self._breaks or self._missing == RESETTLE_LOST_TICKS:
+        if live.breaks != self._breaks or self._missing == 20:
             self._breaks, self._fresh = live.breaks, True
         if self._fresh and not lost:
             self._fresh = False
@@ -306,7 +298,8 @@ class BusMonitor:
         self._sums[place] = self._threshold
         last = self._last.get(place)
         self._last[place] = self.ticks
-        if last is not None and self.ticks - last < ALARM_REPEAT_S * self._rate:
+        # Within ten seconds of an alarm of one sum another one only repeats it.
+        if last is not None and self.ticks - last < 10.0 * self._rate:
             self.repeated += 1
             return
         self._alarm(*CUSUM_SIDES[place], (), time_ns)
@@ -327,7 +320,8 @@ class BusMonitor:
             environment.supply_pressure,
             environment.oil_temperature,
         )
-        if waits and self.ticks < ENVIRONMENT_TIMEOUT_S * self._rate and self.ticks:
+        # After a second those of the actuator's file hold.
+        if waits and self.ticks < 1.0 * self._rate and self.ticks:
             return
         actuator, effects = self.unit.unit(self._actuator)
         noise, channels = self.unit.noise, stated_channels(self._map.stated, actuator)

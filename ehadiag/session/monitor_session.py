@@ -5,11 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Self
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, utc_text
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, date_text
 from ehadiag.live import Alarm, BusState, BusTraffic, Ending, Residuals, SignalTrace, Snapshot
 from ehadiag.monitor.change_test import LEAST
 from ehadiag.session.alarm_outlets import AlarmCommand, AlarmLog, AlarmRecorder, utc_now_text
@@ -18,17 +17,11 @@ from ehadiag.session.unit_state import UnitState, new_unit_state
 from firmware_iface.bus_map import BusMap
 from firmware_iface.errors import BusLostError, EhadiagError
 from firmware_iface.stored_test import StoredTest
+from firmware_iface.transport.base import RECEIVE_POLL_S
 
 if TYPE_CHECKING:
     from firmware_iface.transport.base import FrameSource
     from firmware_iface.transport.frames import Frame
-
-MONITOR_POLL_S = 0.05
-"""Longest wait for a frame before the stop is looked at, s."""
-FIRST_TIME_OF_DAY_NS = 10**18
-"""Stamp from which on it is a time of day (2001), ns: those of a log may begin at 0."""
-MAX_SNAPSHOT_ALARMS = 8
-"""Number of alarms that a snapshot holds, the newest ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +136,7 @@ class MonitorSession:
         )
         count, newest = self._alarms
         # One object: a thread that makes a snapshot sees both or neither.
-        self._alarms = count + 1, (*newest, alarm)[-MAX_SNAPSHOT_ALARMS:]
+        self._alarms = count + 1, (*newest, alarm)[-8:]
         outlets.command.call(event)
         if self._on_alarm is not None:
             self._on_alarm(alarm)
@@ -154,9 +147,7 @@ class MonitorSession:
         """Time of a frame: of a log its own, where that is a time of day; else that of now."""
         if not self._of_log:
             return utc_now_text()
-        if time_ns < FIRST_TIME_OF_DAY_NS:
-            return f"{time_ns / 1e9:.3f} s"
-        return utc_text(datetime.fromtimestamp(time_ns / 1e9, UTC))
+        return date_text(time_ns) or f"{time_ns / 1e9:.3f} s"
 
     def run(
         self,
@@ -183,7 +174,7 @@ class MonitorSession:
         begin = source.now_ns()
         try:
             while not stop.is_set():
-                frame = source.receive(MONITOR_POLL_S)
+                frame = source.receive(RECEIVE_POLL_S)
                 if frame is None:
                     outlets.surroundings.idle()
                     if source.at_end:

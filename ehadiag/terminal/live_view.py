@@ -35,10 +35,6 @@ ENDING_STYLES = {
     "ALARM": "bold red",
 }
 BAR_COLUMNS = 20
-TEST_BAR_COLUMNS = 10
-RESIDUAL_TEXT_COLUMNS = 54
-"""Columns of a residual's texts beside its bar."""
-MAX_ALARM_ROWS = 4
 FULL_BAR = 1.0
 
 
@@ -161,7 +157,7 @@ def _test(test: RunningTest, mode: str | None, *, unicode: bool) -> Text:
     share = 0.0
     if test.duration_s and test.phase == "running":
         share = test.elapsed_s / test.duration_s
-    bar = _bar(share, unicode=unicode, length=TEST_BAR_COLUMNS) if share else ""
+    bar = _bar(share, unicode=unicode, length=10) if share else ""
     left = "" if test.left_s is None else f"  {test.left_s:.1f} s left"
     name = f" {printable(test.name)}" if test.name else ""
     number = "" if test.number is None else f" ({test.number})"
@@ -208,7 +204,8 @@ def _residuals(found: Residuals | None, width: int, *, unicode: bool) -> Rendera
     if found is None:
         return _line("residuals: settling", "dim")
     table = Table.grid(padding=(0, 1))
-    length = min(BAR_COLUMNS, max(width - RESIDUAL_TEXT_COLUMNS, 0))
+    # 54 columns of texts stand beside the bar.
+    length = min(BAR_COLUMNS, max(width - 54, 0))
     for residual, name, above, below in (
         (found.spool, "spool", found.spool_above, found.spool_below),
         (found.pressure, "pressure", found.pressure_above, found.pressure_below),
@@ -246,7 +243,7 @@ def _alarms(snapshot: Snapshot) -> RenderableType:
     if not snapshot.alarm_count:
         return _line("no alarm")
     rows: list[RenderableType] = [_line(f"{snapshot.alarm_count} alarms", "bold red")]
-    for alarm in snapshot.alarms[-MAX_ALARM_ROWS:]:
+    for alarm in snapshot.alarms[-4:]:
         during = f" during {alarm.during}" if alarm.during else ""
         recorded = f", recorded in {alarm.recorded}" if alarm.recorded else ""
         rows.append(_line(f"  {alarm.time[11:19] or alarm.time} {alarm.text}{during}{recorded}"))

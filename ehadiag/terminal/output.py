@@ -181,10 +181,6 @@ def render_for_terminal(draw: Callable[[Console], None], *, least: int = TABLE_C
     return out.getvalue()
 
 
-PROGRESS_LINE_PERIOD_S = 30.0
-"""Time between two lines of progress where standard error is no terminal, s; a log stays short."""
-
-
 class _ProgressLines:
     """Progress as lines: stage, share done, time left."""
 
@@ -194,7 +190,8 @@ class _ProgressLines:
     def update(self, stage: str, share: float) -> None:
         """Print a line if it is time for one."""
         now = time.monotonic()
-        if now - self._printed < PROGRESS_LINE_PERIOD_S or share <= 0.0:
+        # Seldom, so that a log stays short.
+        if now - self._printed < 30.0 or share <= 0.0:
             return
         self._printed = now
         spent = now - self._began

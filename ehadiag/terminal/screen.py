@@ -79,8 +79,6 @@ def _alarm_text(alarm: Alarm) -> str:
     return f"ALARM {alarm.time}: {alarm.text}{during}{recorded}"
 
 
-SCREEN_CLOSE_TIMEOUT_S = 5.0
-"""Longest wait at the end of a session for the screen, s."""
 MIN_SCREEN_COLUMNS, MIN_SCREEN_LINES = 60, 20
 """Columns and lines of the smallest terminal with a live view; a smaller one gets plain lines."""
 
@@ -182,7 +180,7 @@ class _ScreenProcess:
         with contextlib.suppress(OSError):
             self._process.stdin.close()
         try:
-            self._process.wait(SCREEN_CLOSE_TIMEOUT_S)
+            self._process.wait(5.0)
         except subprocess.TimeoutExpired:  # a terminal that takes nothing
             self._process.kill()
             self._process.wait()

@@ -14,10 +14,6 @@ __all__ = [
 ]
 
 
-ECHO_COLUMNS = 2
-"""Columns left free: the terminal shows `^C` at the end of the last line, which must not wrap."""
-
-
 def run_screen() -> int:
     """Draw each snapshot of standard input on standard error; the last one stays.
 
@@ -44,7 +40,8 @@ def run_screen() -> int:
         with Live(console=console, auto_refresh=False, redirect_stderr=False) as live:
             for line in sys.stdin.buffer:
                 snapshot = Snapshot.from_json(line)
-                width = console.width - ECHO_COLUMNS
+                # The terminal shows `^C` at the end of the last line, which must not wrap.
+                width = console.width - 2
                 live.update(draw_snapshot(snapshot, width, unicode=unicode), refresh=True)
     except OSError:
         return 0  # the terminal has gone

@@ -49,9 +49,6 @@ from firmware_iface.recording import (
 from firmware_iface.transport.frames import FrameTable, concatenate
 
 MIN_STUCK_FRAMES = 20
-MIN_MODES = 2
-SEARCH_MARGIN_TICKS = 100
-"""Ticks around a test, as the status tells it, in which its command is looked for."""
 LATE_FRAME_MARGIN_ROWS = 1000
 """Rows around a test in which late frames of messages without a counter are looked for."""
 
@@ -96,7 +93,8 @@ def assemble(
     looked_for = (
         candidates if axis is not None and not _has_test_timing(decoded, axis, bus_map) else None
     )
-    margin = SEARCH_MARGIN_TICKS if looked_for is not None else 0
+    # Ticks around a test, as the status has it, in which its command is looked for.
+    margin = 100 if looked_for is not None else 0
     found: list[Recording] = []
     own = onboard_results(table, bus_map)
     for item, after in zip(episodes, (*episodes[1:], None), strict=True):
@@ -142,7 +140,7 @@ def _in_each_mode(
     margin: int,
 ) -> list[Recording]:
     """The tests in a stretch, each among the commands of its own mode."""
-    if len(modes) < MIN_MODES:
+    if len(modes) < 2:
         return list(_matched_in(cut(None), episode, candidates, margin))
     found: list[Recording] = []
     for mode in modes:
@@ -354,8 +352,6 @@ def _rounding_std(bus_map: BusMap, *quantities: str) -> float:
 
 MIN_WINDOW_FRAMES = 200_000
 """Frames from which on a window is closed where no test runs: two minutes of the default bus."""
-MIN_QUIET_FRAMES = 1000
-"""Frames in a row that tell of no test, half a second or less: a window may end in their midst."""
 
 
 def windowed_recordings(
@@ -459,7 +455,8 @@ class _WindowReader:
         edges = np.concatenate(([half], test_rows, [len(window)]))
         quiet = np.diff(edges)
         longest = int(quiet.argmax())
-        if quiet[longest] < MIN_QUIET_FRAMES:
+        # Half a second or less.
+        if quiet[longest] < 1000:
             return 0
         return int(edges[longest] + quiet[longest] // 2)
 

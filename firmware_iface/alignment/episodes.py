@@ -18,8 +18,6 @@ from firmware_iface.codec import DecodedTable
 from firmware_iface.protection import NO_POSITION
 from firmware_iface.recording import BitOutcome, BitReason, BitState, IntArray
 
-MAX_BLIP_FRAMES = 2
-"""A run of other test ids this short inside a test is corruption, not another test."""
 MAX_GRID_TICKS = 1_000_000
 """Longest test that is unfolded onto a tick grid."""
 
@@ -129,7 +127,7 @@ def _runs(ids: IntArray) -> list[tuple[int, int]]:
         begin, end = bounds[index], bounds[index + 1]
         while (
             index + 3 < len(bounds)
-            and bounds[index + 2] - bounds[index + 1] <= MAX_BLIP_FRAMES
+            and bounds[index + 2] - bounds[index + 1] <= 2
             and ids[bounds[index + 2]] == ids[begin]
         ):
             index += 2

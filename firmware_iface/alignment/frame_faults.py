@@ -16,11 +16,6 @@ from firmware_iface.protection import CONFLICTS, NO_POSITION, conflicting, event
 from firmware_iface.recording import BoolArray, FloatArray, IntArray, MessageCounts
 from firmware_iface.slow_values import repeated_frames, slow_value_conflict
 
-MAX_FRAMES_PER_TICK = 1.25
-"""Different frames in a tick beyond which a message without a counter has two senders."""
-MIN_COUNTER_DISTANCE = 16
-"""Counts between two successive frames that a reordered one does not make."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conflicts:
@@ -93,7 +88,8 @@ def _conflicts(item: Decoded, bad: BoolArray, position: IntArray) -> Conflicts:
         raise AssertionError("no conflict without a counter")
     modulus = item.message.modulus
     step = np.diff(item.counter, prepend=item.counter[:1]) % modulus
-    apart = np.minimum(step, modulus - step) > MIN_COUNTER_DISTANCE
+    # A reordered frame does not make so large a step.
+    apart = np.minimum(step, modulus - step) > 16
     return Conflicts(item.row[bad], position[bad], apart[bad])
 
 
@@ -158,7 +154,8 @@ def crowding_reason(item: Decoded, tick_ns: int, begin: int, end: int) -> str:
             continue
         changes = int((item.data[mine[1:]] != item.data[mine[:-1]]).any(axis=1).sum())
         span = int(item.time_ns[mine].max() - item.time_ns[mine].min()) / tick_ns
-        if changes > CONFLICTS.chance and changes > MAX_FRAMES_PER_TICK * (span + 1.0):
+        # More different frames in a tick: a message without a counter has two senders.
+        if changes > CONFLICTS.chance and changes > 1.25 * (span + 1.0):
             return (
                 f"{item.message.name}: {changes} different frames in {span:.0f} ticks, and no"
                 " counter to tell them apart: a second sender, or a wrong tick_ms"

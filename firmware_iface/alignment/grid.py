@@ -64,10 +64,6 @@ class RowBounds:
 
 
 MIN_FROZEN_TICKS = 100
-MIN_LIVELY_SHARE = 0.2
-"""Share of ticks, outside a frozen stretch, in which a live channel changes its code."""
-MIN_MODE_COMMANDS = 50
-"""Commands of a mode from which on a test may have been played in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +170,8 @@ def _frozen(value: FloatArray, saturated: BoolArray) -> int:
     run = int(lengths[longest])
     others = len(known) - run
     span = int(known[bounds[longest + 1]] - known[bounds[longest] + 1]) + 1
-    lively = others > MIN_FROZEN_TICKS and len(edges) >= MIN_LIVELY_SHARE * others
+    # Share of ticks in which a live channel changes its code.
+    lively = others > MIN_FROZEN_TICKS and len(edges) >= 0.2 * others
     return span if run >= MIN_FROZEN_TICKS and lively else 0
 
 
@@ -190,7 +187,8 @@ def command_modes(grid: TickGrid) -> tuple[CommandMode, ...]:
     found = {
         grid.bus_map.modes[int(value)]
         for value, times in zip(values, count, strict=True)
-        if times >= MIN_MODE_COMMANDS and int(value) in grid.bus_map.modes
+        # So many commands of a mode: a test may have been played in it.
+        if times >= 50 and int(value) in grid.bus_map.modes
     }
     return tuple(sorted(found))
 

@@ -137,8 +137,6 @@ def resolve_turns(axis: TickAxis, status: StatusTable) -> TickAxis:
 
 MIN_REPEATS = 2
 """Times a value must be told to count: a damaged frame whose check sum fits tells it once."""
-MAX_SENDER_TURNS = 2
-"""Changes to and fro beyond which two senders speak in turn."""
 START_SCATTER_TICKS = 20
 """Ticks by which the first tick that status frames imply may scatter."""
 
@@ -242,7 +240,8 @@ def _one_value(what: str, values: IntArray, expected: int | None, ends: bool) ->
     if ends and last >= 0 and last != usual and last not in odd:
         odd.append(last)
     if odd:
-        if np.count_nonzero(np.diff(known[np.isin(known, [usual, *odd])])) > MAX_SENDER_TURNS:
+        # More changes to and fro: two senders in turn.
+        if np.count_nonzero(np.diff(known[np.isin(known, [usual, *odd])])) > 2:
             return (
                 f"the status tells {what} {usual} and {odd[0]} in turn: a second sender of the"
                 " status"

@@ -20,13 +20,6 @@ from firmware_iface.live_decode import LiveTick
 from firmware_iface.recording import BitOutcome, CommandMode, FloatArray, Samples
 from firmware_iface.transport.frames import ColumnBuilder, Frame
 
-STRETCH_NS = 30_000_000_000
-"""Length of a stretch, ns: after each the model settles for a second."""
-MAX_STRETCH_FRAMES = 500_000
-"""Frames of a stretch, 1: a bus with more is read in shorter ones."""
-MAX_COMMAND_TICKS = 4
-"""Ticks by which commands may come before their samples, 1 (docs/how-to/bare-bus.md)."""
-
 
 class StretchTicks:
     """Puts frames together into ticks as `LiveTicks` of `firmware_iface.live_decode`, 30 s late.
@@ -63,7 +56,8 @@ class StretchTicks:
     def take(self, frame: Frame) -> list[LiveTick]:
         """Take a frame; returns the ticks of a stretch with the frame behind its end."""
         begin = frame.time_ns if self._begin_ns is None else self._begin_ns
-        over = frame.time_ns - begin >= STRETCH_NS or len(self._frames) >= MAX_STRETCH_FRAMES
+        # 30 s: after each stretch the model settles for a second.
+        over = frame.time_ns - begin >= 30_000_000_000 or len(self._frames) >= 500_000
         out = self.flush() if over else []
         if self._begin_ns is None:
             self._begin_ns = frame.time_ns
@@ -102,7 +96,8 @@ def _commands(samples: Samples) -> FloatArray:
         return current
     seen = np.concatenate(([np.nan], samples.position[:-1]))
     best, found = np.inf, command
-    for late in range(-1, MAX_COMMAND_TICKS + 1):
+    # Commands come at most 4 ticks before their samples (docs/how-to/bare-bus.md).
+    for late in range(-1, 5):
         moved = np.full_like(command, np.nan)
         part = slice(max(late, 0), len(command) + min(late, 0))
         moved[part] = command[max(-late, 0) : len(command) - max(late, 0)]

@@ -52,10 +52,6 @@ CONTAINER_PIECE_BYTES = 256 << 10
 """Bytes that are read from a container and handed to the unpacker at once."""
 PARSE_BATCH_BYTES = 2 << 20
 """Unpacked bytes that are parsed at once: whatever a container unpacks to, no more is held."""
-MAX_OBJECT_BYTES = 16 << 20
-"""Bytes of an object other than a container: an embedded text or picture, never a frame."""
-MAX_CONTAINER_BYTES = 1 << 30
-"""Bytes of a container as packed: loggers write 128 KiB."""
 MAX_STAMP_NS = 1 << 62
 """Nanoseconds from 1970 to the start, at most, and from there to a frame: 146 years."""
 MIN_RUN_OBJECTS = 16
@@ -116,7 +112,8 @@ class _BlfContent:
                 self.trouble = "the log breaks off"
                 return
             signature, _, _, size, kind = OBJECT_HEADER.unpack(header)
-            if signature != b"LOBJ" or not OBJECT_HEADER.size <= size <= MAX_CONTAINER_BYTES:
+            # As packed: loggers write 128 KiB.
+            if signature != b"LOBJ" or not OBJECT_HEADER.size <= size <= 1 << 30:
                 self.trouble = "the log is damaged"
                 return
             self._spending.look_at_clock()
@@ -217,7 +214,8 @@ class _BlfParser:
                     break
                 at = found
                 continue
-            if size < OBJECT_HEADER.size or size > MAX_OBJECT_BYTES:
+            # An embedded text or picture, never a frame.
+            if size < OBJECT_HEADER.size or size > 16 << 20:
                 self.trouble = "the log is damaged"
                 break
             if at + size > end:

@@ -31,8 +31,6 @@ from firmware_iface.transport.frames import (
 if TYPE_CHECKING:
     from can import Message
 
-LOG_BLOCK_FRAMES = 50_000
-"""Frames of a table that a text log is read in."""
 MAX_MF4_BYTES = 128 << 20
 """Bytes of an MF4 file: its library holds all frames in memory, and more than once."""
 
@@ -105,7 +103,7 @@ class _PythonCanReader:
                     for message in reader:
                         self._add(message, columns)
                         found += 1
-                        if len(columns) >= LOG_BLOCK_FRAMES:
+                        if len(columns) >= 50_000:
                             yield columns.table()
                             columns = ColumnBuilder()
                     intact = True
@@ -262,7 +260,6 @@ MAX_BAD_LINES = 1000
 """Bad lines, 1, beyond as many as there are frames, at which a text log is no log: each takes
 python-can a new start."""
 MAX_LINE_CHARACTERS = 1 << 16
-MAX_HEADER_LINES = 20
 RELATIVE_HEADER_PATTERN = re.compile(
     r"\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNORECASE
 )
@@ -368,7 +365,7 @@ def open_text(path: Path, spending: Spending, pattern: re.Pattern[str] | None = 
 def open_asc(path: Path, spending: Spending) -> TextIO:
     """Open an ASC file for python-can's reader, its stamps absolute (from the start of the log)."""
     file = path.open(encoding="utf-8", errors="replace")
-    head = [file.readline(MAX_LINE_CHARACTERS) for _ in range(MAX_HEADER_LINES)]
+    head = [file.readline(MAX_LINE_CHARACTERS) for _ in range(20)]
     file.seek(0)
     if any(RELATIVE_HEADER_PATTERN.match(line) for line in head):
         return cast(TextIO, _AbsoluteLines(file, spending))

@@ -58,15 +58,6 @@ def _frame(match: re.Match[str]) -> Frame:
     )
 
 
-TEXT_BLOCK_BYTES = 1 << 20
-"""Bytes of a candump log that are parsed at once."""
-MAX_LINE_FORMS = 64
-"""Layouts of lines, 1, that are parsed in bulk in one block; lines of others are parsed singly."""
-MIN_FORM_LINES = 8
-"""Lines of one layout, 1, from which on parsing them together is faster."""
-MAX_DIGIT = 9
-
-
 @cache
 def _digit_values() -> NDArray[np.int64]:
     """Value of each character, shape (256,), as a hexadecimal digit; -1 of others."""
@@ -120,7 +111,8 @@ class _CandumpBlock:
         forms = 0
         for length in np.unique(self._lengths):
             rows = np.flatnonzero(self._lengths == length)
-            while len(rows) >= MIN_FORM_LINES and forms < MAX_LINE_FORMS:
+            # From 8 lines of one layout on parsing them together is faster.
+            while len(rows) >= 8 and forms < 64:
                 forms += 1
                 alike = self._parse_like_first(rows)
                 alike[0] = True  # what the first line alone holds is found by itself
@@ -140,7 +132,7 @@ class _CandumpBlock:
         alike: BoolArray = (characters[:, fixed] == characters[0, fixed]).all(axis=1)
         alike &= (digits[:, ~fixed] >= 0).all(axis=1)
         for name in ("seconds", "fraction"):
-            alike &= (digits[:, slice(*form.span(name))] <= MAX_DIGIT).all(axis=1)
+            alike &= (digits[:, slice(*form.span(name))] <= 9).all(axis=1)
         seconds = _number(digits[:, slice(*form.span("seconds"))], 10)
         fraction = _number(digits[:, slice(*form.span("fraction"))], 10)
         number = _number(digits[:, slice(*form.span("id"))], 16)
@@ -220,7 +212,7 @@ class CandumpReader:
 def _whole_lines(file: BinaryIO, spending: Spending) -> Iterator[bytes]:
     """Blocks of whole lines; one that is longer than a block is cut: noise has no line ends."""
     rest = b""
-    while piece := file.read(TEXT_BLOCK_BYTES):
+    while piece := file.read(1 << 20):
         spending.look_at_clock()
         spending.report_progress(file.tell())
         text = rest + piece.replace(b"\r", b"\n")

@@ -113,8 +113,6 @@ def _mebibytes(size: int) -> str:
 
 
 GZIP_SUFFIX = ".gz"
-GZIP_PIECE_BYTES = 1 << 20
-"""Bytes unpacked at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +198,7 @@ def _unpack(source: gzip.GzipFile, target: BinaryIO, path: Path, most: int) -> b
     size = 0
     while True:
         try:
-            piece = source.read1(GZIP_PIECE_BYTES)
+            piece = source.read1(1 << 20)
         except (gzip.BadGzipFile, EOFError, zlib.error):
             return True
         if not piece:

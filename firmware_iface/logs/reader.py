@@ -121,8 +121,6 @@ class FrameLog:
             yield table
 
 
-MIN_BACKWARD_NS = 1_000_000
-"""Least step back, ns, that is counted: frames of several channels are sorted less exactly."""
 MAX_STANDING = 0.5
 """Largest share of stamps, 1, that may equal the one before; bursts of a serial adapter have less
 than half of their frames in one stamp, a clock that stands all of them."""
@@ -143,7 +141,8 @@ class _StampCounts:
         step = np.diff(time_ns, prepend=time_ns[0] if self._last is None else self._last)
         self._steps += len(step) - (self._last is None)
         self._standing += int((step == 0).sum()) - (self._last is None)
-        self._back += int((step <= -MIN_BACKWARD_NS).sum())
+        # Frames of several channels are sorted less exactly than 1 ms.
+        self._back += int((step <= -1_000_000).sum())
         self._farthest = min(self._farthest, int(step.min()))
         self._last = int(time_ns[-1])
 

@@ -31,8 +31,6 @@ from firmware_iface.transport.python_can import message_of
 RECORDER_SUFFIXES = (".blf", ".asc", ".csv", ".trc", ".mf4")
 DEFERRED_SUFFIX = ".mf4"
 """Its library writes when the file is closed, nothing before."""
-FLUSH_INTERVAL_S = 0.5
-"""s between flushes; a second is the most that may be lost."""
 MAX_RECORDER_FILES = 10_000
 MIN_RECORDER_FILE_BYTES = 65_536
 """Bytes below which rotation makes no sense."""
@@ -171,7 +169,8 @@ class Recorder:
                 path.unlink()
 
     def _due(self) -> bool:
-        return time.monotonic() - self._flushed >= FLUSH_INTERVAL_S
+        # A second is the most that may be lost.
+        return time.monotonic() - self._flushed >= 0.5
 
     def _flush(self) -> None:
         self._flushed = time.monotonic()

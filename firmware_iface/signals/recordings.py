@@ -52,8 +52,6 @@ from firmware_iface.transport.frames import FrameTable, concatenate
 
 MAX_SIGNAL_TICKS = 1_000_000
 """About a quarter of an hour at 1 kHz; what is behind it is not looked at."""
-PLACED_MISFIT = 0.25
-"""Misfit of a command that is some ticks late, 1: it is judged again once it is placed."""
 MEASURED_ROLES = ("channels.spool", "channels.pressure", "channels.position")
 
 
@@ -158,7 +156,8 @@ def _readings(
     clock = TickClock(begins[begins <= last + length])
     readings: list[TickReading] = []
     held = bus_signals(signals, period)
-    tests, _ = search_tests(samples, candidates, most=PLACED_MISFIT)
+    # A late command misfits; it is judged again once it is placed.
+    tests, _ = search_tests(samples, candidates, most=0.25)
     if held and tests:
         placed = held_by_test(held, clock, tests, candidates.controller)
         if placed is not None:

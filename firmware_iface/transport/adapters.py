@@ -68,8 +68,6 @@ INTERFACE_ADVICE: Mapping[str, str] = {
 DEFAULT_INTERFACE_ADVICE = (
     "install the driver of the interface and, where it has one, its Python module"
 )
-DAEMON_TIMEOUT_S = 2.0
-"""s; python-can itself asks for ten, without a pause and with a line on the terminal each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +151,8 @@ def _check_daemon(arguments: Mapping[str, Any], name: str) -> None:
             f"{name}: name the daemon, such as --bus-kwargs host=192.0.2.7 port=29536"
         )
     try:
-        socket.create_connection((str(host), port), DAEMON_TIMEOUT_S).close()
+        # python-can itself asks for ten seconds, with a line on the terminal each time.
+        socket.create_connection((str(host), port), 2.0).close()
     except OSError as error:
         raise InputOutputError(
             f"{name}: no daemon at {host}:{port}: {one_line(error)}; "

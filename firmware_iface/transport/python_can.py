@@ -22,14 +22,10 @@ from firmware_iface.transport.frames import MAX_CHANNEL, Frame
 if TYPE_CHECKING:
     import can
 
-RECEIVE_BUFFER_BYTES = 4 << 20
-"""Bytes asked of the kernel for a socket's receive buffer: a second of a full bus and more."""
 SO_MEMINFO = 55
 """Linux: counts of a socket (linux/sock_diag.h); Python's socket module does not name it."""
 MEMINFO_DROPS = 8
 """Place of the number of dropped frames among them."""
-DROP_CHECK_CALLS = 1024
-"""Calls between two looks at that number while the bus is busy."""
 
 
 class BusTimes(NamedTuple):
@@ -137,7 +133,8 @@ class PythonCanTransport(Transport):
             # Drivers raise what they like; all of it means that this bus gives no more frames.
             raise self._fail(one_line(error)) from None
         self._received += 1
-        if message is None or self._received % DROP_CHECK_CALLS == 0:
+        # A look now and then while the bus is busy.
+        if message is None or self._received % 1024 == 0:
             self._look_for_drops()
         if message is None:
             return None
@@ -342,7 +339,8 @@ def _widen_buffer(bus: can.BusABC) -> None:
     """Ask the kernel for room, so that a reader that waits for a processor loses no frame."""
     absent = contextlib.suppress(NotImplementedError, OSError, AttributeError, TypeError)
     with absent, _socket_of(bus) as duplicate:
-        duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        # A second of a full bus and more.
+        duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
 
 
 def _kernel_drops(bus: can.BusABC) -> int | None:

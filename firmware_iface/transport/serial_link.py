@@ -29,7 +29,6 @@ PACKET_BYTES = PACKET_BODY.size + PACKET_CRC.size
 MAX_CODED_BYTES = PACKET_BYTES + 1
 """COBS adds one byte to packets below 254 bytes."""
 TIME_WRAP_US = 1 << 32
-READ_BYTES = 4096
 
 
 class PortTimes(NamedTuple):
@@ -194,7 +193,7 @@ class SerialTransport(Transport):
             # Wait for a first byte, then take what has come: a read of many would wait for all.
             chunk = self._port.read(self._first_read)
             if chunk:
-                chunk += self._port.read(min(self._port.in_waiting, READ_BYTES))
+                chunk += self._port.read(min(self._port.in_waiting, 4096))
         except Exception as error:
             raise self._lost(error) from None
         for frame in self._framer.feed(chunk):

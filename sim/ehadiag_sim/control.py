@@ -38,8 +38,6 @@ from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import read_toml
 from firmware_iface.transport.frames import Frame
 
-RAMP_PERIOD_TICKS = 10
-"""Ticks, 1, between two steps of a ramp: the plant's coefficients take 0.1 ms to compute."""
 MAX_LINE_BYTES = 1 << 16
 """Bytes of a request to the control port."""
 LOOPBACK = "127.0.0.1"
@@ -169,7 +167,8 @@ class SimulatorControl:
             before = self._conditions
             for change in due:
                 self._begin(change)
-            if self._ramps and self._tick % RAMP_PERIOD_TICKS == 0:
+            # Each step of a ramp costs 0.1 ms: the plant's coefficients.
+            if self._ramps and self._tick % 10 == 0:
                 self._move()
             return self._conditions if self._conditions is not before else None
 

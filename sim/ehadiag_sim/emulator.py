@@ -24,16 +24,9 @@ from firmware_iface.errors import ConfigurationError, EhadiagError
 from firmware_iface.live_decode import BitRequest, LiveDecoder
 from firmware_iface.recording import BitReason, BitState, CommandMode
 from firmware_iface.stored_test import StoredTest
-from firmware_iface.transport.base import Transport, TransportState
+from firmware_iface.transport.base import RECEIVE_POLL_S, Transport, TransportState
 from firmware_iface.transport.frames import Frame
 
-FRAME_LENGTH_NS = 130_000
-"""Length of an 8-byte frame at 1 Mbit/s, stuff bits included: frames of a tick follow so."""
-STATUS_RATE_HZ = 50.0
-ENVIRONMENT_RATE_HZ = 10.0
-ARMING_TIME_S = 0.1
-END_STATE_TIME_S = 0.5
-"""How long an end of a test, or a refusal, stays on the bus before the state is idle again."""
 MAX_SERIAL_NUMBER = 0xFFFF
 
 
@@ -173,13 +166,15 @@ class FccCore:
         if running or self._idle_telemetry:
             frames += self._encoder.command(mode, command, test_id, 0)
             frames += self._encoder.telemetry(codes.tolist(), 0)
-        if (self._tick - 1) % round(self._rate / ENVIRONMENT_RATE_HZ) == 0:
+        if (self._tick - 1) % round(self._rate / 10.0) == 0:
             supply, drain, degc = self._plant.probed
             frames += self._encoder.environment(supply, drain, degc, 0)
         if self._control is not None:
             frames = self._control.frames(frames)
         return [
-            _stamped(frame, self.now_ns + i * FRAME_LENGTH_NS) for i, frame in enumerate(frames)
+            # An 8-byte frame at 1 Mbit/s with stuff bits: frames of a tick follow so.
+            _stamped(frame, self.now_ns + i * 130_000)
+            for i, frame in enumerate(frames)
         ]
 
     def _start(self, test_id: int) -> None:
@@ -223,7 +218,7 @@ class FccCore:
     def _advance(self) -> None:
         """Change state when its time is up, before the tick is computed."""
         elapsed = self._tick - self._since
-        if self._state is BitState.ARMING and elapsed >= ARMING_TIME_S * self._rate:
+        if self._state is BitState.ARMING and elapsed >= 0.1 * self._rate:
             self._count += 1
             self._plant = self._fresh_plant()
             self._enter(BitState.RUNNING, self._test_id)
@@ -232,7 +227,7 @@ class FccCore:
             self._enter(BitState.COMPLETE, self._test_id)
         elif (
             self._state in (BitState.COMPLETE, BitState.ABORTED, BitState.REFUSED)
-            and elapsed >= END_STATE_TIME_S * self._rate
+            and elapsed >= 0.5 * self._rate
         ):
             self._elapsed = 0
             self._enter(BitState.IDLE, 0)
@@ -255,7 +250,7 @@ class FccCore:
             if running or self._state is BitState.IDLE:
                 self._refused, reason = None, BitReason.NONE
         present = (self._state, self._since)
-        due = (self._tick - 1) % round(self._rate / STATUS_RATE_HZ) == 0
+        due = (self._tick - 1) % round(self._rate / 50.0) == 0
         if due or present != self._sent_state or frames:
             self._sent_state = present
             frames += self._encoder.status(
@@ -340,12 +335,6 @@ def emulated_computer(
     return core
 
 
-MAX_RECEIVE_WAIT_S = 0.05
-"""s; how fast a stop is noticed."""
-MAX_FRAMES_READ_PER_TICK = 64
-"""Frames read from the bus in one tick: a flooded bus must not stop the control law."""
-
-
 @dataclass(slots=True)
 class Pace:
     """Whether a simulation keeps to real time."""
@@ -380,12 +369,13 @@ def run_emulator(
         if real_time:
             due = started + (ticks + 1) * period
             while (left := due - time.monotonic_ns()) > 0 and not stop.is_set():
-                frame = transport.receive(min(left / 1e9, MAX_RECEIVE_WAIT_S))
+                frame = transport.receive(min(left / 1e9, RECEIVE_POLL_S))
                 if frame is not None:
                     core.take(frame)
             if pace is not None:
                 pace.behind_s = max(pace.behind_s, (time.monotonic_ns() - due) / 1e9)
-        for _ in range(MAX_FRAMES_READ_PER_TICK):
+        # A flooded bus must not stop the control law.
+        for _ in range(64):
             frame = transport.receive(0.0)
             if frame is None:
                 break

@@ -284,11 +284,8 @@ def advance_plant(
 
 DEFAULT_STEP_S = 0.25e-6
 """Integration step, s: errors below a fiftieth of a converter's step (detailed-model.md)."""
-MIN_STEP_S = 1e-9
 MAX_LAG_PIECE_S = 50e-6
 """Pieces of constant torque into which a current that lags divides a tick, s."""
-OIL_DRIFT_UPDATE_TICKS = 10
-"""A drifting oil temperature is brought into the coefficients so often."""
 
 
 class PlantDynamics:
@@ -312,7 +309,7 @@ class PlantDynamics:
         early: float = 0.0,
     ) -> None:
         self._period = 1.0 / actuator.controller.rate
-        if not (math.isfinite(step) and MIN_STEP_S <= step <= self._period):
+        if not (math.isfinite(step) and 1e-9 <= step <= self._period):
             raise ConfigurationError(f"integration step {step:g} s: need 1e-9 … {self._period:g} s")
         if not 0.0 <= early < self._period:
             raise ConfigurationError(
@@ -338,7 +335,7 @@ class PlantDynamics:
 
     def advance(self, current: float) -> None:
         """Hold `current` (A) for one control tick."""
-        if self._effects.unmodelled.oil_drift and self._ticks % OIL_DRIFT_UPDATE_TICKS == 0:
+        if self._effects.unmodelled.oil_drift and self._ticks % 10 == 0:
             self._take_coefficients()
         for index, span in enumerate(self._spans):
             if self._effects.unmodelled.driver_lag > 0.0:
