@@ -18,14 +18,6 @@ from firmware_iface.bus_map import MessageMap
 from firmware_iface.protection import CONFLICTS
 from firmware_iface.recording import BoolArray, FloatArray, IntArray
 
-__all__ = [
-    "SlowValueWatch",
-    "brings_slow_values",
-    "repeated_frames",
-    "slow_value_conflict",
-    "spread_conflict",
-]
-
 
 class SlowValueLimits(NamedTuple):
     """Limits beyond which the frames of a slow message are of two senders."""

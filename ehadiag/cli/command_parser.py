@@ -8,8 +8,6 @@ from typing import Any, NoReturn
 
 from firmware_iface.errors import printable
 
-__all__ = ["CommandParser", "FullHelpAction", "refuse_former_options", "show_usual"]
-
 FORMER_OPTIONS = {
     "--serial": "--port URL for a serial port, --unit N for the unit",
     "--serial-number": "--unit N",

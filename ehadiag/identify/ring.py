@@ -22,8 +22,6 @@ from ehadiag.model.batch import PRESSURE_ROW
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
 
-__all__ = ["SPOOL_PARAMETERS", "Ring", "find_ring", "ring_prior"]
-
 
 class RingScan(NamedTuple):
     """Scan of the oil's stiffness."""

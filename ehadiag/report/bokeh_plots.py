@@ -21,8 +21,6 @@ from bokeh.plotting import figure
 
 from ehadiag.report.picture import BAND_COLOURS, STYLES, Band, Panel, PictureColumn
 
-__all__ = ["MAX_PAGE_VALUES", "plot_column", "plot_live_signals"]
-
 MAX_PAGE_VALUES = 16_000
 """Number of values of each curve in all plots together, for a page below three megabytes."""
 TEXT_COLOUR = STYLES["event"].colour

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from ehadiag.estimate import Severity
     from ehadiag.prognosis.units import Prognosis
 
-__all__ = ["FLEET_HEAD", "Cell", "FleetUnit", "fleet_rows"]
-
 FLEET_HEAD = ("unit", "verdict", "worst", "trend", "time left", "last test", "actuator", "")
 WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
 

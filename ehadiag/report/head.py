@@ -22,17 +22,6 @@ if TYPE_CHECKING:
     from ehadiag.prognosis.units import Prognosis
     from ehadiag.result import Result
 
-__all__ = [
-    "Bar",
-    "Head",
-    "Reason",
-    "head_of",
-    "percent",
-    "plain_name",
-    "remaining_sentences",
-    "verdict_word",
-]
-
 INCONCLUSIVE = "INCONCLUSIVE"
 """Word for a test that ran and was identified, but not explained; its verdict is NOT TESTED."""
 

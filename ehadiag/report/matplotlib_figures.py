@@ -22,8 +22,6 @@ from ehadiag.report.picture import (
     PictureColumn,
 )
 
-__all__ = ["NotebookFigure", "draw_picture", "picture_png"]
-
 LINE_STYLES = {"": "", "solid": "-", "dashed": "--", "dotdash": "-.", "dotted": ":"}
 MARKERS = {"": "", "circle": "o", "square": "s", "triangle": "^", "x": "x"}
 

@@ -19,8 +19,6 @@ from markupsafe import Markup
 
 from firmware_iface.errors import printable
 
-__all__ = ["embed_plots", "render_template", "script_sources", "templates_of"]
-
 
 def embed_plots(plots: Mapping[str, LayoutDOM]) -> tuple[list[str], dict[str, str]]:
     """Return the scripts of the page, bokeh's own first, and an element for each plot."""

@@ -12,22 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "BAND_COLOURS",
-    "STYLES",
-    "Area",
-    "Band",
-    "Curve",
-    "CurveStyle",
-    "CurveValues",
-    "Panel",
-    "Picture",
-    "PictureColumn",
-    "ReferenceLine",
-    "marked_spans",
-    "thin_to_extremes",
-]
-
 CurveValues = NDArray[np.float64]
 
 

@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from ehadiag.prognosis.forecast import Forecast, RemainingLife
     from ehadiag.prognosis.units import Prognosis
 
-__all__ = [
-    "named_levels", "print_prognosis", "print_urgencies", "prognosis_tree", "remaining_text",
-]  # fmt: skip
-
 PROGNOSIS_SCHEMA = "ehadiag.rul/2"
 LEVEL_NAMES = ("advisory", "limit")
 SHORT_NAMES = {"Kintas": "filter clogging", "FSS": "spool friction", "FDJ": "jack friction"}

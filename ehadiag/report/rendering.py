@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from ehadiag.report.report_pages import UnitTrend
     from ehadiag.result import Result
 
-__all__ = [
-    "calibration_html_page",
-    "diagnosis_html_page",
-    "diagnosis_png",
-    "index_html_page",
-    "isolated_png",
-]
-
 
 @contextlib.contextmanager
 def _isolated_matplotlib() -> Iterator[None]:

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from ehadiag.report.picture import PictureColumn
     from ehadiag.result import Result
 
-__all__ = ["MAX_PAGE_RESPONSES", "UnitTrend", "calibration_page", "diagnosis_page"]
-
 MAX_PAGE_RESPONSES = 4
 """Number of responses drawn: two seconds of processor time, and less than three megabytes."""
 

@@ -38,18 +38,6 @@ from firmware_iface.errors import printable
 from firmware_iface.recording import CommandMode, Recording, Samples
 from firmware_iface.stored_test import RATE_TOLERANCE, StoredTest
 
-__all__ = [
-    "MotionEvents",
-    "calibration_columns",
-    "calibration_picture",
-    "modelled_column",
-    "motion_events",
-    "response_columns",
-    "result_picture",
-    "sensed_response",
-]
-
-
 MotionEvents = dict[str, NDArray[np.intp]]
 """Ascending ticks of a body's break-aways, reversals without a rest, and arrivals at a stop."""
 

@@ -32,19 +32,6 @@ if TYPE_CHECKING:
     from ehadiag.result import Onboard, Result
     from firmware_iface.stored_test import StoredTest
 
-__all__ = [
-    "CALIBRATION_SCHEMA",
-    "DESIGN_SCHEMA",
-    "calibration_json",
-    "diagnosis_html",
-    "diagnosis_text",
-    "print_calibration",
-    "print_result",
-    "print_score",
-    "score_tree",
-]
-
-
 STATE_STYLES = {
     "HEALTHY": "bold green",
     "DEGRADED": "bold yellow",

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from ehadiag.prognosis.forecast import Forecast
     from ehadiag.prognosis.units import Prognosis
 
-__all__ = ["bus_picture", "history_picture", "trend_column"]
-
 
 def history_picture(
     entries: Sequence[Entry], events: Sequence[MaintenanceEvent], prognosis: Prognosis

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
     from ehadiag.history.records import Entry, MaintenanceEvent
 
-__all__ = ["Pages"]
-
 MAX_PAGE_ROWS = 500
 """Of a list, newest first."""
 REPORT_CONTENT_POLICY = "sandbox allow-scripts"

@@ -20,14 +20,6 @@ from urllib.parse import unquote, urlsplit
 from ehadiag.serve.sessions import NO_SNAPSHOT, BusyError, SessionRunner
 from firmware_iface.errors import ConfigurationError, EhadiagError, reason_of
 
-__all__ = [
-    "LOOPBACK_ADDRESS",
-    "Page",
-    "Site",
-    "serve",
-]
-
-
 LOOPBACK_ADDRESS = "127.0.0.1"
 LOOPBACK_NAMES = (LOOPBACK_ADDRESS, "localhost")
 MAX_LIVE_STREAMS = 16

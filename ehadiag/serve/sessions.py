@@ -30,14 +30,6 @@ from ehadiag.core.interruption import (
 from ehadiag.live import Snapshot
 from firmware_iface.errors import EhadiagError, printable
 
-__all__ = [
-    "BusyError",
-    "Session",
-    "SessionRunner",
-    "SessionsStatus",
-]
-
-
 WATCH_RESTART_PAUSE_S = 3.0
 """Time before a watch that ended by itself begins again, s."""
 

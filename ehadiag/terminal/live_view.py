@@ -15,13 +15,6 @@ from ehadiag.estimate import Severity
 from ehadiag.live import BusState, Residuals, RunningTest, Signals, Snapshot
 from firmware_iface.errors import printable
 
-__all__ = [
-    "MIN_WIDE_COLUMNS",
-    "draw_snapshot",
-    "sparkline",
-]
-
-
 MIN_WIDE_COLUMNS = 140
 """Columns from which on two parts stand beside each other."""
 SPARK_BLOCKS = " ▁▂▃▄▅▆▇█"

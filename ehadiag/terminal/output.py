@@ -28,24 +28,6 @@ if TYPE_CHECKING:
     from ehadiag.result import ListedTest
     from firmware_iface.transport.base import Transport
 
-__all__ = [
-    "INPUT_OUTPUT_EXIT_CODE",
-    "counting_bar",
-    "discard_stream",
-    "exit_code_of_inputs",
-    "print_compiling_notice",
-    "print_status",
-    "print_test_list",
-    "print_text",
-    "progress_bar",
-    "render_for_terminal",
-    "report_failure",
-    "transport_losses",
-    "worst_exit_code",
-    "write_output",
-]
-
-
 INPUT_OUTPUT_EXIT_CODE = InputOutputError.exit_code
 EXIT_CODES_WORST_FIRST = (20, 40, INPUT_OUTPUT_EXIT_CODE, 30, 10, 0)
 """Exit codes, the worst first."""

@@ -14,13 +14,6 @@ from ehadiag.estimate import Severity
 from ehadiag.live import Alarm, Snapshot
 from ehadiag.terminal.output import print_status
 
-__all__ = [
-    "SessionScreen",
-    "StatusLines",
-    "can_show_screen",
-]
-
-
 UNPRINTED_BUS_STATES = ("connecting", "closed")
 """States of the bus at both ends of a session, which are not printed."""
 

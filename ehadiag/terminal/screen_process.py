@@ -9,10 +9,6 @@ import io
 import signal
 import sys
 
-__all__ = [
-    "run_screen",
-]
-
 
 def run_screen() -> int:
     """Draw each snapshot of standard input on standard error; the last one stays.

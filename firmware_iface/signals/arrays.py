@@ -27,8 +27,6 @@ from firmware_iface.recording import FloatArray, RecordedSignal
 from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
 from firmware_iface.signals.tables import MAX_TABLE_ROWS, checked_signals
 
-__all__ = ["HdfReader", "Mf4SignalReader", "TdmsReader"]
-
 UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units", "unit_string")
 MATLAB_REFERENCES = "#"
 """Begins the names of MATLAB's own groups."""

@@ -19,8 +19,6 @@ from firmware_iface.recording import BoolArray, FloatArray, IntArray, RecordedSi
 from firmware_iface.sampling import sampling_interval
 from firmware_iface.stored_test import Controller
 
-__all__ = ["FittedClock", "fit_clock"]
-
 
 class ClockFit(NamedTuple):
     """How the phase of a logger's clock is fitted to a test."""

@@ -12,8 +12,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GRID_H", "HELD_OUT", "LAWS", "LONGEST_H", "TUNED"]
-
 Array = NDArray[np.float64]
 GRID_H, LONGEST_H = 2.0, 20_000.0
 """Step of a simulated life, h, and its longest length."""

@@ -10,8 +10,6 @@ from scipy.optimize import minimize
 
 from ehadiag.prognosis.lives import Life
 
-__all__ = ["QUANTILES", "age_alone", "life_end", "similar_lives"]
-
 Array = NDArray[np.float64]
 QUANTILES = (0.1, 0.5, 0.9)
 LIBRARY_LIVES = 10

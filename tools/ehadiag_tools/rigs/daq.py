@@ -38,8 +38,6 @@ from firmware_iface.recording import CHANNELS, Channels, CommandMode
 from firmware_iface.signals.recordings import Interpretation, recorded_tests
 from firmware_iface.stored_test import bundled_tests
 
-__all__ = ["DAQ_RECORDINGS", "DaqCase", "perform", "recorded_columns"]
-
 PLANT_RATE = 10_000.0
 """Samples of the plant a second, Hz; a whole number of them makes a control tick."""
 SETTLING_S, AFTER_S = 0.2, 0.3
