@@ -76,22 +76,8 @@ def ehadiag_unit(request: pytest.FixtureRequest, ehadiag_bus: Any) -> RunTest:
 def exceeded_limits(result: Result, limits: dict[str, float]) -> list[str]:
     """Say which severities are not below their limits, their intervals included.
 
-    Parameters
-    ----------
-    result : Result
-        With a verdict.
-    limits : dict[str, float]
-        By name of the severity.
-
-    Returns
-    -------
-    list[str]
-        One clause each; empty where all are below.
-
-    Raises
-    ------
-    ValueError
-        A limit of no severity.
+    result: with a verdict; limits: by name of the severity. Returns one clause each; empty where
+    all are below. ValueError: a limit of no severity.
     """
     if strangers := limits.keys() - result.severities.keys():
         raise ValueError(f"{LIMITS_MARKER}: no severity {', '.join(sorted(strangers))}")

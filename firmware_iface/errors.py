@@ -21,15 +21,7 @@ def install_command(extra: str) -> str:
     It names the packages themselves: right after an installation from a folder, a wheel or an
     index. The installer is the environment's own: pipx, pip, or uv where there is no pip.
 
-    Parameters
-    ----------
-    extra : str
-        Name of the feature in the package's metadata.
-
-    Returns
-    -------
-    str
-        To be typed.
+    extra: name of the feature in the package's metadata.
     """
     from importlib.metadata import PackageNotFoundError, requires  # noqa: PLC0415 - 20 ms to load
     from importlib.util import find_spec  # noqa: PLC0415

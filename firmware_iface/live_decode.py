@@ -64,15 +64,8 @@ class LiveDecoder:
     Keeps the last value of each channel, for buses that spread a sample over several messages.
     Telemetry whose counter was just used with another payload is left out, and said to be.
 
-    Parameters
-    ----------
-    bus_map : BusMap | None
-        Which message and signal plays which role.
-
-    Attributes
-    ----------
-    second_sender : str
-        What gives away that somebody else sends as the computer does; empty if nothing.
+    bus_map: which message and signal plays which role. second_sender: what gives away that somebody
+    else sends as the computer does; empty if nothing.
     """
 
     second_sender: str
@@ -271,31 +264,14 @@ class LiveTicks:
     A tick is given out when its telemetry and its command are there, a tick without a command when
     the next telemetry comes. Memory is constant. Use it from one thread.
 
-    Parameters
-    ----------
-    bus_map : BusMap | None
-        Mapping; all channels must come in one frame, and its counter and that of the command
-        must count ticks.
-    mode : CommandMode | None
-        Of the commands to take; those of the other mode count as lost. None: both, and `mode` says
-        which the last command had.
-
-    Attributes
-    ----------
-    mode : CommandMode
-        Of the commands; a tick that `take` gives out has that of the command before it.
-    lost : int
-        Ticks whose telemetry did not come, or was damaged.
-    breaks : int
-        Silences so long that the ticks began anew after them.
-    conflicts : int
-        Counter values that came with different payloads: a second sender. The `DOUBTFUL_TICKS`
-        ticks after each are given out as lost: nothing tells which sender is right.
-
-    Raises
-    ------
-    ConfigurationError
-        A bus whose ticks cannot be told from single frames.
+    bus_map: mapping; all channels must come in one frame, and its counter and that of the command
+    must count ticks; mode: of the commands to take; those of the other mode count as lost. None:
+    both, and `mode` says which the last command had. mode: of the commands; a tick that `take`
+    gives out has that of the command before it; lost: ticks whose telemetry did not come, or was
+    damaged; breaks: silences so long that the ticks began anew after them; conflicts: counter
+    values that came with different payloads: a second sender. The `DOUBTFUL_TICKS` ticks after each
+    are given out as lost: nothing tells which sender is right. ConfigurationError: a bus whose
+    ticks cannot be told from single frames.
     """
 
     mode: CommandMode

@@ -339,17 +339,8 @@ def event_positions(
 class SenderWatch:
     """Looks for a second sender under one identifier, a frame at a time; memory is constant.
 
-    Parameters
-    ----------
-    modulus : int
-        Counts per turn.
-    period_ns : int
-        Usual time between two counts.
-
-    Attributes
-    ----------
-    conflicts : int
-        Counter values that came with two payloads within half a turn.
+    modulus: counts per turn; period_ns: usual time between two counts. conflicts: counter values
+    that came with two payloads within half a turn.
     """
 
     conflicts: int

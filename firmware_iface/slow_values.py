@@ -62,21 +62,8 @@ def repeated_frames(
 ) -> BoolArray:
     """Frames that repeat the one before, as an interface that reports each of them twice makes.
 
-    Parameters
-    ----------
-    message : MessageMap
-        The message.
-    time_ns : IntArray
-        Time stamps in order of arrival, shape (n,).
-    data : NDArray[np.uint8]
-        Payloads, shape (n, width).
-    counted : bool
-        Whether the payloads have a counter.
-
-    Returns
-    -------
-    BoolArray
-        Shape (n,).
+    message: the message; time_ns: time stamps in order of arrival, shape (n,); data: payloads,
+    shape (n, width); counted: whether the payloads have a counter. Returns shape (n,).
     """
     same = np.zeros(len(data), dtype=np.bool_)
     same[1:] = (data[1:] == data[:-1]).all(axis=1)
@@ -88,17 +75,8 @@ def repeated_frames(
 def spread_conflict(role: str, values: FloatArray) -> str:
     """Why values of one role are not those of one sender; empty if they stay together.
 
-    Parameters
-    ----------
-    role : str
-        Such as `environment.oil_temperature`.
-    values : FloatArray
-        SI values of one test; NaN is no value.
-
-    Returns
-    -------
-    str
-        One clause.
+    role: such as `environment.oil_temperature`; values: SI values of one test; NaN is no value.
+    Returns one clause.
     """
     limit, factor, unit = MAX_SPREADS[role]
     found = np.sort(values[np.isfinite(values)])
@@ -124,23 +102,10 @@ def slow_value_conflict(
 ) -> str:
     """Why frames of a slow message are not of one sender; empty if nothing says so.
 
-    Parameters
-    ----------
-    message : MessageMap
-        The message.
-    time_ns : IntArray
-        Time stamps of its sound frames in order of arrival without repeats, shape (n,).
-    counter : IntArray | None
-        Their counters, shape (n,); None where not each of them has one.
-    values : Mapping[str, FloatArray]
-        SI values by role, shape (n,).
-    span_ns : int
-        Time, ns, in which they were sent.
-
-    Returns
-    -------
-    str
-        One clause that names the message.
+    message: the message; time_ns: time stamps of its sound frames in order of arrival without
+    repeats, shape (n,); counter: their counters, shape (n,); None where not each of them has one;
+    values: SI values by role, shape (n,); span_ns: time, ns, in which they were sent. Returns one
+    clause that names the message.
     """
     who = f"a second sender of {message.name} ({message.can_id:#x})"
     cycle = message.cycle_ns if brings_slow_values(message) else 0
@@ -170,13 +135,7 @@ def _leaps(step: IntArray, modulus: int) -> BoolArray:
 
 
 class SlowValueWatch:
-    """Looks for a second sender of one slow message, a frame at a time; memory is constant.
-
-    Parameters
-    ----------
-    message : MessageMap
-        The message; `brings_slow_values`.
-    """
+    """Looks for a second sender of one slow message, a frame at a time; memory is constant."""
 
     def __init__(self, message: MessageMap) -> None:
         self._message = message

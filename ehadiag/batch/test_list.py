@@ -35,26 +35,10 @@ def list_tests(
 
     The list of unchanged files is taken from the cache folder where reading them took long before.
 
-    Parameters
-    ----------
-    setup : Setup
-        What the frames mean and which tests there are.
-    *files : PathLike
-        Files to read; several hold one recording.
-    progress : Progress | None
-        Is called with the stage and the share of the file that is read.
-
-    Yields
-    ------
-    ListedTest
-        Each test, in order of time.
-
-    Raises
-    ------
-    InputOutputError
-        A file cannot be read.
-    ConfigurationError
-        Its kind is unknown.
+    setup: what the frames mean and which tests there are; *files: files to read; several hold one
+    recording; progress: is called with the stage and the share of the file that is read. Yields
+    each test, in order of time. InputOutputError: a file cannot be read; ConfigurationError: its
+    kind is unknown.
     """
     name = _index_name(setup, files)
     folder = private_folder(INDEX_FOLDER)

@@ -112,8 +112,9 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
     option_values.add_bus_options(parser)
     add_simulator_options(parser)
     show_usual(
-        parser, "--test", "--simulate", "--fast", "--FSS", "--interface", "--channel", "--out",
-        "--report", "--actuator", "--history", "--help-all",
+        parser,
+        "--test --simulate --fast --FSS --interface --channel --out --report --actuator "
+        "--history --help-all",
         examples=(
             "ehadiag bit --test closed --simulate --FSS 0.6",
             "ehadiag bit --test closed --interface socketcan --channel can0 --report",

@@ -135,17 +135,8 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
     option_values.add_bus_options(parser)
     show_usual(
         parser,
-        "--interface",
-        "--channel",
-        "--port",
-        "--from",
-        "--history",
-        "--actuator",
-        "--mapping",
-        "--log-file",
-        "--record",
-        "--on-alarm",
-        "--help-all",
+        "--interface --channel --port --from --history --actuator --mapping --log-file "
+        "--record --on-alarm --help-all",
         examples=(
             "ehadiag monitor --interface socketcan --channel can0 --history fleet.sqlite",
             "ehadiag monitor --log flight.blf --from results/flight.json",
@@ -285,15 +276,7 @@ def define_check_bus(parser: argparse.ArgumentParser) -> None:
     option_values.add_bus_options(parser)
     show_usual(
         parser,
-        "--interface",
-        "--channel",
-        "--port",
-        "--log",
-        "--duration",
-        "--mapping",
-        "--plot",
-        "--json",
-        "--help-all",
+        "--interface --channel --port --log --duration --mapping --plot --json --help-all",
         examples=(
             "ehadiag check-bus --interface socketcan --channel can0",
             "ehadiag check-bus --log recording.blf --mapping rig.toml",
@@ -355,13 +338,7 @@ def define_replay(parser: argparse.ArgumentParser) -> None:
     option_values.add_bus_options(parser)
     show_usual(
         parser,
-        "log",
-        "--interface",
-        "--channel",
-        "--port",
-        "--speed",
-        "--with-requests",
-        "--help-all",
+        "log --interface --channel --port --speed --with-requests --help-all",
         examples=(
             "ehadiag replay recording.blf --interface socketcan --channel vcan0",
             "ehadiag replay recording.blf --interface socketcan --channel vcan0 --speed 2",
@@ -432,18 +409,8 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
     add_simulator_options(parser)
     show_usual(
         parser,
-        "--interface",
-        "--channel",
-        "--port",
-        "--simulate",
-        "--script",
-        "--control",
-        "--Kintas",
-        "--FSS",
-        "--FDJ",
-        "--unit",
-        "--duration",
-        "--help-all",
+        "--interface --channel --port --simulate --script --control --Kintas --FSS --FDJ "
+        "--unit --duration --help-all",
         examples=(
             "ehadiag sim --interface socketcan --channel vcan0 --FSS 0.6",
             "ehadiag sim -i virtual -c 1 --simulate scenario.toml --script wear.toml",

@@ -78,15 +78,7 @@ def define_calibrate(parser: argparse.ArgumentParser) -> None:
     options.add_report_option(parser, "beside the actuator file, also where nothing was learned")
     show_usual(
         parser,
-        "logs",
-        "--out",
-        "--test",
-        "--actuator",
-        "--mapping",
-        "--update",
-        "--compare",
-        "--report",
-        "--help-all",
+        "logs --out --test --actuator --mapping --update --compare --report --help-all",
         examples=(
             "ehadiag calibrate new-open.blf new-closed.blf --out unit.toml --report",
             "ehadiag calibrate later.blf --actuator unit.toml --update --out unit.toml",
@@ -303,13 +295,7 @@ def define_design(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     show_usual(
         parser,
-        "--test",
-        "--actuator",
-        "--out",
-        "--max-travel",
-        "--max-rate",
-        "--max-duration",
-        "--help-all",
+        "--test --actuator --out --max-travel --max-rate --max-duration --help-all",
         examples=(
             "ehadiag design --test closed",
             "ehadiag design --test closed --max-travel 5 --out gentle.toml",

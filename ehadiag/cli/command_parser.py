@@ -86,35 +86,17 @@ class FullHelpAction(argparse.Action):
         parser.exit()
 
 
-def show_usual(parser: argparse.ArgumentParser, *usual: str, examples: Sequence[str]) -> None:
-    """Let `--help` show the usual options and examples only, and `--help-all` the rest too.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of a command.
-    *usual : str
-        Options and positional arguments.
-    examples : Sequence[str]
-        Command lines.
-    """
+def show_usual(parser: argparse.ArgumentParser, usual: str, *, examples: Sequence[str]) -> None:
+    """Let `--help` show the usual options, words of a text, and examples."""
     assert isinstance(parser, CommandParser)
-    parser.usual, parser.examples = usual, examples
+    parser.usual, parser.examples = usual.split(), examples
     parser.add_argument(
         "--help-all", action=FullHelpAction, nargs=0, help="show all options and exit"
     )
 
 
 def refuse_former_options(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
-    """End where an option of an earlier version is given; the error names the new ones.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command that is called.
-    given : Sequence[str]
-        The command line.
-    """
+    """End where an option of an earlier version is given; the error names the new ones."""
     for word in given:
         name = word.split("=", 1)[0]
         if name in FORMER_OPTIONS:

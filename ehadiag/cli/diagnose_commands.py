@@ -87,18 +87,8 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
     add_batch_options(parser)
     show_usual(
         parser,
-        "logs",
-        "--test",
-        "--list",
-        "--out",
-        "--report",
-        "--json",
-        "--actuator",
-        "--mapping",
-        "--history",
-        "--jobs",
-        "--summary",
-        "--help-all",
+        "logs --test --list --out --report --json --actuator --mapping --history --jobs "
+        "--summary --help-all",
         examples=(
             "ehadiag diagnose recording.blf --out results --report",
             "ehadiag diagnose recordings/*.blf --jobs 4 --results all.csv",
@@ -267,12 +257,7 @@ def define_report(parser: argparse.ArgumentParser) -> None:
     )
     show_usual(
         parser,
-        "results",
-        "--history",
-        "--test",
-        "--actuator",
-        "--mapping",
-        "--help-all",
+        "results --history --test --actuator --mapping --help-all",
         examples=(
             "ehadiag report results/recording.json",
             "ehadiag report results/*.json --history fleet.sqlite",

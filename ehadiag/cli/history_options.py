@@ -88,24 +88,9 @@ def open_named_history(arguments: argparse.Namespace) -> History:
 def named_actuator(history: History, serial: int, named: str | None) -> str | None:
     """Return the actuator of a serial number; None where the history does not know the number.
 
-    Parameters
-    ----------
-    history : History
-        An open history.
-    serial : int
-        Of the unit.
-    named : str | None
-        The actuator that was named, if any.
-
-    Returns
-    -------
-    str | None
-        The one named, else the only one that has this serial number.
-
-    Raises
-    ------
-    ConfigurationError
-        Several have it and none was named, or the one named has not.
+    history: an open history; serial: of the unit; named: the actuator that was named, if any.
+    Returns the one named, else the only one that has this serial number. ConfigurationError:
+    several have it and none was named, or the one named has not.
     """
     known = [actuator for actuator, number in history.units() if number == serial]
     if named is not None and known and named not in known:

@@ -64,15 +64,7 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object a unit")
     show_usual(
         parser,
-        "--unit",
-        "--all",
-        "--in",
-        "--before",
-        "--history",
-        "--advisory",
-        "--limit",
-        "--json",
-        "--help-all",
+        "--unit --all --in --before --history --advisory --limit --json --help-all",
         examples=(
             "ehadiag rul --unit 7 --history fleet.sqlite",
             "ehadiag rul --all --before 200 --history fleet.sqlite",

@@ -77,17 +77,8 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
     options.add_request_options(parser, *options.LEVELS)
     show_usual(
         parser,
-        "--interface",
-        "--channel",
-        "--port",
-        "--allow-tests",
-        "--simulate",
-        "--test",
-        "--history",
-        "--out",
-        "--http-port",
-        "--actuator",
-        "--help-all",
+        "--interface --channel --port --allow-tests --simulate --test --history --out "
+        "--http-port --actuator --help-all",
         examples=(
             "ehadiag serve --simulate --allow-tests",
             "ehadiag serve --interface socketcan --channel can0 --history fleet.sqlite",

@@ -39,22 +39,9 @@ class Section(NamedTuple):
 def shared_library(code: bytes, names: Sequence[str]) -> bytes:
     """Make a shared library of an object file.
 
-    Parameters
-    ----------
-    code : bytes
-        The object file: ELF-64 for x86-64 or AArch64.
-    names : Sequence[str]
-        Functions that are found by their names.
-
-    Returns
-    -------
-    bytes
-        The library.
-
-    Raises
-    ------
-    ValueError
-        The object file needs what this linker does not do; the text says what.
+    code: the object file: ELF-64 for x86-64 or AArch64; names: functions that are found by their
+    names. Returns the library. ValueError: the object file needs what this linker does not do; the
+    text says what.
     """
     head = struct.unpack_from(HEADER, code)
     machine, table, size, count = head[2], head[6], head[11], head[12]

@@ -112,12 +112,7 @@ def entry_address(kernel: Kernel) -> int:
 def prepare(names: Iterable[str], progress: Callable[[str], None] = lambda _text: None) -> None:
     """Find or make libraries, several at a time.
 
-    Parameters
-    ----------
-    names : Iterable[str]
-        Of the libraries.
-    progress : Callable[[str], None]
-        Is given a line of text when one has been compiled.
+    names: of the libraries; progress: is given a line of text when one has been compiled.
     """
     absent = missing(names)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -135,12 +130,7 @@ def missing(names: Iterable[str]) -> list[str]:
 def build(folder: Path, levels: Collection[tuple[str, str]]) -> None:
     """Write all libraries for levels of instructions into a folder, with their manifest.
 
-    Parameters
-    ----------
-    folder : Path
-        Where to; it is made.
-    levels : Collection[tuple[str, str]]
-        Keys of LEVELS.
+    folder: where to; it is made; levels: keys of LEVELS.
     """
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [(name, level) for name in SHIPPED for level in levels]
@@ -260,20 +250,9 @@ def _made(library: str, level: tuple[str, str]) -> bytes:
 def object_file(wanted: ObjectFile) -> bytes:
     """Object code with its tables, compiled or from the cache folder.
 
-    Parameters
-    ----------
-    wanted : ObjectFile
-        What is to be in it. The code does not depend on the values in its tables.
-
-    Returns
-    -------
-    bytes
-        The object file, of the format of the target.
-
-    Raises
-    ------
-    EhadiagError
-        The compiler is not installed, or has no such target.
+    wanted: what is to be in it. The code does not depend on the values in its tables. Returns the
+    object file, of the format of the target. EhadiagError: the compiler is not installed, or has no
+    such target.
     """
     kernels = [item.kernel.py_func for item in wanted.functions]
     kernels += [item.py_func for item in wanted.replaced.values()]

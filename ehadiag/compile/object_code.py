@@ -151,20 +151,8 @@ class _Machine:
 def emitted(wanted: ObjectFile) -> bytes:
     """Emit an object file.
 
-    Parameters
-    ----------
-    wanted : ObjectFile
-        What is to be in it.
-
-    Returns
-    -------
-    bytes
-        The object file, of the format of the target.
-
-    Raises
-    ------
-    ConfigurationError
-        The compiler has no such target.
+    wanted: what is to be in it. Returns the object file, of the format of the target.
+    ConfigurationError: the compiler has no such target.
     """
     processor, replaced = wanted.processor, wanted.replaced
     machine = _machine(processor)

@@ -108,22 +108,8 @@ BEGIN = (
 def object_code(wanted: ObjectFile) -> bytes:
     """Make an object file in a process of its own.
 
-    Parameters
-    ----------
-    wanted : ObjectFile
-        What is to be in it.
-
-    Returns
-    -------
-    bytes
-        The object file, of the format of the target.
-
-    Raises
-    ------
-    EhadiagError
-        The compiler is not installed, or has no such target.
-    RuntimeError
-        The compiler has failed.
+    wanted: what is to be in it. Returns the object file, of the format of the target. EhadiagError:
+    the compiler is not installed, or has no such target; RuntimeError: the compiler has failed.
     """
     if find_spec("numba") is None:
         raise ConfigurationError(

@@ -42,20 +42,7 @@ def utc_text(moment: datetime) -> str:
 def utc_time_text(text: str) -> str:
     """Write a time of ISO 8601 in UTC; without a zone it is UTC already.
 
-    Parameters
-    ----------
-    text : str
-        Such as `2026-03-01T13:00+01:00`.
-
-    Returns
-    -------
-    str
-        As `utc_text`.
-
-    Raises
-    ------
-    ValueError
-        It is none.
+    text: such as `2026-03-01T13:00+01:00`. Returns as `utc_text`. ValueError: it is none.
     """
     moment = datetime.fromisoformat(text)
     try:

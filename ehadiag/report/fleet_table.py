@@ -56,17 +56,8 @@ class FleetUnit:
 def fleet_rows(units: Sequence[FleetUnit], levels: Levels) -> list[list[Cell]]:
     """Return the lines of the table, worst first.
 
-    Parameters
-    ----------
-    units : Sequence[FleetUnit]
-        In any order.
-    levels : Levels
-        Advisory level and limit, for the sparklines.
-
-    Returns
-    -------
-    list[list[Cell]]
-        Cells under `FLEET_HEAD`.
+    units: in any order; levels: advisory level and limit, for the sparklines. Returns cells under
+    `FLEET_HEAD`.
     """
     ordered = sorted(units, key=lambda unit: (WORST_FIRST.index(unit.verdict), -_worst(unit)[1]))
     return [_row(unit, levels) for unit in ordered]

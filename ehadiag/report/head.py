@@ -110,15 +110,8 @@ def _explanations() -> tuple[_Explanation, ...]:
 def verdict_word(result: Result) -> str:
     """Return the word for a verdict that people see; NOT TESTED has two.
 
-    Parameters
-    ----------
-    result : Result
-        What was found.
-
-    Returns
-    -------
-    str
-        INCONCLUSIVE: the test ran and was identified, but cannot be explained.
+    result: what was found. Returns INCONCLUSIVE: the test ran and was identified, but cannot be
+    explained.
     """
     if result.verdict is Verdict.NOT_TESTED and result.identified:
         return INCONCLUSIVE
@@ -126,22 +119,7 @@ def verdict_word(result: Result) -> str:
 
 
 def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) -> Head:
-    """Return the content of a result's head.
-
-    Parameters
-    ----------
-    result : Result
-        What was found.
-    levels : Levels
-        Advisory level and limit.
-    prognosis : Prognosis | None
-        Remaining life of the unit; None: not known.
-
-    Returns
-    -------
-    Head
-        To be laid out.
-    """
+    """Return the content of a result's head."""
     bars = sorted(
         (_bar(item, levels) for item in result.severities.values()),
         key=lambda bar: -1.0 if bar.value is None else bar.value,

@@ -32,19 +32,8 @@ def embed_plots(plots: Mapping[str, LayoutDOM]) -> tuple[list[str], dict[str, st
 def render_template(template: str, plots: Mapping[str, LayoutDOM], **texts: Any) -> str:
     """Write a page that loads nothing.
 
-    Parameters
-    ----------
-    template : str
-        Name of its file.
-    plots : Mapping[str, LayoutDOM]
-        Plots by the names that the template gives them.
-    **texts : Any
-        Values of the template's other places; the template escapes them.
-
-    Returns
-    -------
-    str
-        HTML.
+    template: name of its file; plots: plots by the names that the template gives them; **texts:
+    values of the template's other places; the template escapes them. Returns HTML.
     """
     templates = templates_of("ehadiag.report")
     scripts, elements = embed_plots(plots)

@@ -28,14 +28,8 @@ def print_prognosis(
 ) -> None:
     """Print a prognosis.
 
-    Parameters
-    ----------
-    prognosis : Prognosis
-        What the history says.
-    console : Console
-        Console to print to.
-    before : tuple[str, float] | None
-        The next inspection: as it was named, and hours, cycles or days until it.
+    prognosis: what the history says; console: console to print to; before: the next inspection: as
+    it was named, and hours, cycles or days until it.
     """
     head = f"serial {prognosis.serial}, actuator {printable(prognosis.actuator or 'unknown')}"
     used = f"{prognosis.used} of {prognosis.diagnoses} diagnoses say {prognosis.unit}"
@@ -65,14 +59,8 @@ def print_urgencies(
 ) -> None:
     """Print one line for each unit, those that reach the limit first at the top.
 
-    Parameters
-    ----------
-    found : Sequence[Prognosis]
-        Of the units, in the order of the table.
-    console : Console
-        Console to print to.
-    before : Sequence[float] | None
-        Hours, cycles or days of each until the next inspection.
+    found: of the units, in the order of the table; console: console to print to; before: hours,
+    cycles or days of each until the next inspection.
     """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
     heads = ("serial", "actuator", "first", "to the limit", "about")
@@ -152,17 +140,8 @@ def named_levels(prognosis: Prognosis) -> list[tuple[str, float]]:
 def prognosis_tree(prognosis: Prognosis, before: tuple[str, float] | None = None) -> dict[str, Any]:
     """Return a prognosis as a JSON object.
 
-    Parameters
-    ----------
-    prognosis : Prognosis
-        What the history says.
-    before : tuple[str, float] | None
-        The next inspection: as it was named, and hours, cycles or days until it.
-
-    Returns
-    -------
-    dict[str, Any]
-        Plain values, null where there is no number.
+    prognosis: what the history says; before: the next inspection: as it was named, and hours,
+    cycles or days until it. Returns plain values, null where there is no number.
     """
     first = prognosis.first()
     return {

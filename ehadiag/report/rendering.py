@@ -83,21 +83,9 @@ def index_html_page(
 ) -> bytes:
     """Return a page with a line for each result and a link to its report, as UTF-8.
 
-    Parameters
-    ----------
-    results : Sequence[tuple[Result, Path]]
-        Results with the files of their reports.
-    place : Path
-        Where the page goes; links are relative to it.
-    levels : Levels
-        Advisory level and limit.
-    history : Path | None
-        Health history, for trends and remaining life; None: none is drawn.
-
-    Returns
-    -------
-    bytes
-        HTML.
+    results: results with the files of their reports; place: where the page goes; links are relative
+    to it; levels: advisory level and limit; history: health history, for trends and remaining life;
+    None: none is drawn. Returns HTML.
     """
     from ehadiag.report.fleet_table import FLEET_HEAD, FleetUnit, fleet_rows  # noqa: PLC0415
     from ehadiag.report.head import verdict_word  # noqa: PLC0415

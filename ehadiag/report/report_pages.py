@@ -56,23 +56,9 @@ def diagnosis_page(
 ) -> str:
     """Write the page of a diagnosis.
 
-    Parameters
-    ----------
-    result : Result
-        Responses are drawn where its diagnosis is at hand.
-    levels : Levels
-        Advisory level and limit.
-    version : str
-        Of the program.
-    made : str
-        When the page is made: UTC, ISO 8601.
-    trend : UnitTrend | None
-        History of the unit.
-
-    Returns
-    -------
-    str
-        HTML.
+    result: responses are drawn where its diagnosis is at hand; levels: advisory level and limit;
+    version: of the program; made: when the page is made: UTC, ISO 8601; trend: history of the unit.
+    Returns HTML.
     """
     plots: dict[str, LayoutDOM] = {}
     responses = _draw_responses(response_columns(result.diagnosis) if result.at_hand else (), plots)

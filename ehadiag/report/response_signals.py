@@ -63,17 +63,9 @@ def sensed_response(
 ) -> tuple[CurveValues, CurveValues, CurveValues]:
     """Run the model from rest, and read its response by sensors with these errors.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        The recorded test.
-    constants : PlantConstants
-        Of the actuator, with the offsets and gains of its sensors.
-
-    Returns
-    -------
-    tuple[CurveValues, CurveValues, CurveValues]
-        Spool (m), differential pressure (Pa) and jack position (m), shape (ticks,) each.
+    experiment: the recorded test; constants: of the actuator, with the offsets and gains of its
+    sensors. Returns spool (m), differential pressure (Pa) and jack position (m), shape (ticks,)
+    each.
     """
     current = experiment.trace.current
     model = model_response(constants, current, experiment.tick, origin=experiment.origin)

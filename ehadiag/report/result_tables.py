@@ -66,15 +66,9 @@ def diagnosis_html(result: Result) -> str:
 def print_result(result: Result, console: Console, *, verbose: bool = False) -> None:
     """Print a result: its head, then the numbers.
 
-    Parameters
-    ----------
-    result : Result
-        What was found.
-    console : Console
-        Console to print to.
-    verbose : bool
-        The course of the search, reasons in terms of the field, and every effect that was
-        estimated, not only those that are not 0 beyond doubt.
+    result: what was found; console: console to print to; verbose: the course of the search, reasons
+    in terms of the field, and every effect that was estimated, not only those that are not 0 beyond
+    doubt.
     """
     head = head_of(result, Levels(result.request.advisory, result.request.limit))
     _print_head(head, result, console)
@@ -271,18 +265,7 @@ CALIBRATION_SCHEMA = "ehadiag.calibration/1"
 
 
 def calibration_json(found: Calibrated) -> str:
-    """Return one line without its end, strict JSON.
-
-    Parameters
-    ----------
-    found : Calibrated
-        What was learned, or why nothing.
-
-    Returns
-    -------
-    str
-        The object (docs/reference/json.md).
-    """
+    """Return one line without its end, strict JSON (docs/reference/json.md)."""
     unit = found.actuator
     calibration = unit.calibration if unit else None
     tree: dict[str, Any] = {
@@ -331,15 +314,7 @@ def calibration_json(found: Calibrated) -> str:
 
 
 def print_calibration(found: Calibrated, console: Console) -> None:
-    """Print a calibration.
-
-    Parameters
-    ----------
-    found : Calibrated
-        What was learned, or why nothing.
-    console : Console
-        Console to print to.
-    """
+    """Print a calibration."""
     unit = found.actuator
     calibration = unit.calibration if unit else None
     head = "CALIBRATED" if unit else "NOT CALIBRATED"
@@ -409,14 +384,7 @@ DESIGN_SCHEMA = "ehadiag.design/1"
 
 
 def print_score(test: StoredTest, score: Score, console: Console) -> None:
-    """Print what a test shows and asks.
-
-    Parameters
-    ----------
-    test : StoredTest
-    score : Score
-    console : Console
-    """
+    """Print what a test shows and asks."""
     console.print(
         f"test {printable(test.name)}: {100.0 * score.figure:.4f} % "
         "(geometric mean of all bounds; less is better)"
@@ -445,20 +413,7 @@ def print_score(test: StoredTest, score: Score, console: Console) -> None:
 
 
 def score_tree(test: StoredTest, score: Score) -> dict[str, Any]:
-    """Return the same as an object of plain values, SI.
-
-    Parameters
-    ----------
-    test : StoredTest
-        The test.
-    score : Score
-        What it shows.
-
-    Returns
-    -------
-    dict[str, Any]
-        For JSON.
-    """
+    """Return the same as an object of plain values for JSON, SI."""
     return {
         "test": test.name,
         "figure": score.figure,

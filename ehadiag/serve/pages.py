@@ -41,18 +41,9 @@ REPORT_CONTENT_POLICY = "sandbox allow-scripts"
 class Pages:
     """Makes the page of a path.
 
-    Parameters
-    ----------
-    folder : Path
-        Where results and reports go.
-    history : Path | None
-        Health history; None: none is kept.
-    levels : Levels
-        Advisory level and limit.
-    tests : Sequence[str]
-        That the page offers to start.
-    simulated : bool
-        Whether tests run on a simulated unit.
+    folder: where results and reports go; history: health history; None: none is kept; levels:
+    advisory level and limit; tests: that the page offers to start; simulated: whether tests run on
+    a simulated unit.
     """
 
     def __init__(
@@ -75,20 +66,8 @@ class Pages:
     def __call__(self, path: str) -> Page | None:
         """Return the page of a path; None where there is none.
 
-        Parameters
-        ----------
-        path : str
-            Decoded, such as `/history/7`.
-
-        Returns
-        -------
-        Page | None
-            The page.
-
-        Raises
-        ------
-        EhadiagError
-            The history or a file cannot be read.
+        path: decoded, such as `/history/7`. Returns the page. EhadiagError: the history or a file
+        cannot be read.
         """
         if path == "/session":
             # Made once: a plotting library of a megabyte is in it.

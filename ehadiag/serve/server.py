@@ -44,14 +44,9 @@ class Page:
 class Site:
     """What is served.
 
-    Attributes
-    ----------
-    pages : Callable[[str], Page | None]
-        Gives the page of a path such as `/history/7`; None: there is none.
-    sessions : SessionRunner
-        Whose snapshots are shown.
-    token : str | None
-        That a request to start or abort a test must carry; None: no test is ever started here.
+    pages: gives the page of a path such as `/history/7`; None: there is none; sessions: whose
+    snapshots are shown; token: that a request to start or abort a test must carry; None: no test is
+    ever started here.
     """
 
     pages: Callable[[str], Page | None]
@@ -62,22 +57,8 @@ class Site:
 def serve(site: Site, port: int) -> ThreadingHTTPServer:
     """Bind to the loopback address; the caller runs `serve_forever` and closes.
 
-    Parameters
-    ----------
-    site : Site
-        What is served.
-    port : int
-        0: any that is free.
-
-    Returns
-    -------
-    ThreadingHTTPServer
-        The bound server; its `server_port` is the port.
-
-    Raises
-    ------
-    ConfigurationError
-        The port is taken, or may not be used.
+    site: what is served; port: 0: any that is free. Returns the bound server; its `server_port` is
+    the port. ConfigurationError: the port is taken, or may not be used.
     """
 
     class Handler(_Handler):

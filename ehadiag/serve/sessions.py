@@ -60,16 +60,8 @@ class Session(NamedTuple):
 class SessionsStatus:
     """State of the sessions.
 
-    Attributes
-    ----------
-    number : int
-        Counts the changes.
-    snapshot : bytes
-        The newest one, a line of JSON; `null` before the first.
-    running : str | None
-        Name of the test that runs.
-    lines : tuple[str, ...]
-        Latest lines that sessions printed, fit for a page.
+    number: counts the changes; snapshot: the newest one, a line of JSON; `null` before the first;
+    running: name of the test that runs; lines: latest lines that sessions printed, fit for a page.
     """
 
     number: int
@@ -81,12 +73,8 @@ class SessionsStatus:
 class SessionRunner:
     """Watches the bus while no test runs, and runs a test when it is started.
 
-    Parameters
-    ----------
-    watch : Session | None
-        Session that only listens; None: nothing is watched between tests.
-    tests : Mapping[str, Session]
-        Session for each test that may be started, by name.
+    watch: session that only listens; None: nothing is watched between tests; tests: session for
+    each test that may be started, by name.
     """
 
     def __init__(self, watch: Session | None, tests: Mapping[str, Session]) -> None:
@@ -124,17 +112,8 @@ class SessionRunner:
     def wait(self, after: int, timeout_s: float) -> SessionsStatus | None:
         """Wait for a change.
 
-        Parameters
-        ----------
-        after : int
-            Number of the last change; 0: none yet.
-        timeout_s : float
-            Longest wait.
-
-        Returns
-        -------
-        SessionsStatus | None
-            The newest; None where there was no change.
+        after: number of the last change; 0: none yet; timeout_s: longest wait. Returns the newest;
+        None where there was no change.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._number > after or self._ending, timeout_s)
@@ -145,21 +124,9 @@ class SessionRunner:
     def start(self, test: str, severities: Mapping[str, float] | None = None) -> None:
         """Start a test once the watch has left the bus.
 
-        Parameters
-        ----------
-        test : str
-            Name among `tests`.
-        severities : Mapping[str, float] | None
-            Of the simulated unit, by the names of the faults; None: as it is.
-
-        Raises
-        ------
-        ValueError
-            The unit is a real one, or has no such fault.
-        KeyError
-            It may not be started.
-        BusyError
-            Another one is under way.
+        test: name among `tests`; severities: of the simulated unit, by the names of the faults;
+        None: as it is. ValueError: the unit is a real one, or has no such fault; KeyError: it may
+        not be started; BusyError: another one is under way.
         """
         if test not in self.tests:
             raise KeyError(test)
@@ -178,10 +145,7 @@ class SessionRunner:
     def abort(self) -> None:
         """Abort the running test.
 
-        Raises
-        ------
-        BusyError
-            No test is under way.
+        BusyError: no test is under way.
         """
         with self._changed:
             if self._requested is not None:

@@ -34,19 +34,8 @@ FULL_BAR = 1.0
 def draw_snapshot(snapshot: Snapshot, width: int, *, unicode: bool = True) -> RenderableType:
     """Return what a console of that width prints.
 
-    Parameters
-    ----------
-    snapshot : Snapshot
-        What is to be seen.
-    width : int
-        Columns.
-    unicode : bool
-        Whether the terminal's encoding has block characters.
-
-    Returns
-    -------
-    RenderableType
-        Texts of others stand in it as text, never as markup.
+    unicode: whether the terminal's encoding has block characters. Texts of others stand in it as
+    text, never as markup.
     """
     monitored = snapshot.residuals is not None or snapshot.command == "monitor"
     inner = width // 2 - 4 if width >= MIN_WIDE_COLUMNS else width - 4
@@ -77,19 +66,8 @@ def draw_snapshot(snapshot: Snapshot, width: int, *, unicode: bool = True) -> Re
 def sparkline(values: Sequence[float | None], width: int, *, unicode: bool = True) -> str:
     """Draw the newest values as blocks between the least and the most of them.
 
-    Parameters
-    ----------
-    values : Sequence[float | None]
-        None where there is none.
-    width : int
-        Characters.
-    unicode : bool
-        Whether the terminal's encoding has block characters.
-
-    Returns
-    -------
-    str
-        So many characters at most; a blank for None.
+    values: None where there is none; width: characters; unicode: whether the terminal's encoding
+    has block characters. Returns so many characters at most; a blank for None.
     """
     chosen = values[-width:] if width > 0 else ()
     seen = [value for value in chosen if value is not None]

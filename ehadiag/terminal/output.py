@@ -65,18 +65,7 @@ def print_status(text: str) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print lines of plain text to standard output.
-
-    Parameters
-    ----------
-    text : str
-        The text to print.
-
-    Raises
-    ------
-    InputOutputError
-        It is closed, or full.
-    """
+    """Print lines of plain text to standard output. InputOutputError: it is closed, or full."""
     write_output(printable_lines(text) + "\n")
 
 
@@ -131,17 +120,8 @@ def render_for_terminal(draw: Callable[[Console], None], *, least: int = TABLE_C
 
     Not written by the console itself, which ends the program where a pipe is closed.
 
-    Parameters
-    ----------
-    draw : Callable[[Console], None]
-        Prints to the console that it is given.
-    least : int
-        Columns also on a narrower terminal.
-
-    Returns
-    -------
-    str
-        The text, with its end of line.
+    draw: prints to the console that it is given; least: columns also on a narrower terminal.
+    Returns the text, with its end of line.
     """
     from rich.console import Console  # noqa: PLC0415 - only who prints tables needs it
 
@@ -277,14 +257,8 @@ TEST_LIST_COLUMNS = ("no.", "test", "start", "length s", "outcome", "serial", "c
 def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) -> None:
     """Print number, test, start, length, outcome, serial number and channel of each test.
 
-    Parameters
-    ----------
-    source : str
-        Name of the recording.
-    tests : Iterable[ListedTest]
-        Its tests, taken one at a time.
-    as_json : bool
-        One JSON object a line instead of a table.
+    source: name of the recording; tests: its tests, taken one at a time; as_json: one JSON object a
+    line instead of a table.
     """
     from msgspec.structs import asdict, astuple  # noqa: PLC0415 - not for help texts
 

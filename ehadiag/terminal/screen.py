@@ -93,12 +93,8 @@ class SessionScreen:
     It begins with the first snapshot: until then lines may be printed. `take` is called in the
     thread of a reader, never in that of the bus. The context ends the live view.
 
-    Parameters
-    ----------
-    plain : bool
-        Plain lines also on a terminal.
-    snapshots : bool
-        Write snapshots to standard output; whatever else is printed then goes to standard error.
+    plain: plain lines also on a terminal; snapshots: write snapshots to standard output; whatever
+    else is printed then goes to standard error.
     """
 
     def __init__(self, *, plain: bool, snapshots: bool = False) -> None:

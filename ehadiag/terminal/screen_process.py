@@ -11,13 +11,7 @@ import sys
 
 
 def run_screen() -> int:
-    """Draw each snapshot of standard input on standard error; the last one stays.
-
-    Returns
-    -------
-    int
-        Exit code 0.
-    """
+    """Draw each snapshot of standard input on standard error; the last one stays. Exit code 0."""
     # Ctrl-C is for the session: it ends, and with it what is read here.
     for name in ("SIGINT", "SIGHUP", "SIGTERM", "SIGBREAK"):
         if hasattr(signal, name):

@@ -168,21 +168,9 @@ def slow_values(
 ) -> tuple[Mapping[str, FloatArray], tuple[str, ...]]:
     """Values of the environment that a message brings in the rows [begin, end), each frame once.
 
-    Parameters
-    ----------
-    item : Decoded
-        Its frames.
-    begin : int
-        Rows of the table that belong to the test.
-    end : int
-        See `begin`.
-    span_ns : int
-        Duration of the test, ns; the stamps tell it where it is 0.
-
-    Returns
-    -------
-    tuple[Mapping[str, FloatArray], tuple[str, ...]]
-        SI values by role, and why they are not of one sender (empty: nothing says so).
+    item: its frames; begin: rows of the table that belong to the test; end: see `begin`; span_ns:
+    duration of the test, ns; the stamps tell it where it is 0. Returns SI values by role, and why
+    they are not of one sender (empty: nothing says so).
     """
     roles = [role for role in item.values if role.startswith("environment.")]
     inside = slice(*np.searchsorted(item.row, [begin, end]))

@@ -261,15 +261,8 @@ class OnboardReader:
 
     The severities count that come while the computer says that it is done.
 
-    Parameters
-    ----------
-    bus_map : BusMap
-        Which message and signal plays which role.
-
-    Attributes
-    ----------
-    result : OnboardResult | None
-        The last whole result; None when a later test has begun.
+    bus_map: which message and signal plays which role. result: the last whole result; None when a
+    later test has begun.
     """
 
     result: OnboardResult | None

@@ -24,21 +24,9 @@ from firmware_iface.transport.frames import ColumnBuilder, Frame
 class StretchTicks:
     """Puts frames together into ticks as `LiveTicks` of `firmware_iface.live_decode`, 30 s late.
 
-    Parameters
-    ----------
-    bus_map : BusMap
-        Mapping; any of which a recording can be diagnosed.
-
-    Attributes
-    ----------
-    mode : CommandMode
-        Of the commands of the last stretch.
-    lost : int
-        Ticks without a spool position.
-    breaks : int
-        Times that the ticks began anew.
-    conflicts : int
-        Values that a second sender contradicted.
+    bus_map: mapping; any of which a recording can be diagnosed. mode: of the commands of the last
+    stretch; lost: ticks without a spool position; breaks: times that the ticks began anew;
+    conflicts: values that a second sender contradicted.
     """
 
     mode: CommandMode

@@ -67,18 +67,9 @@ CLOCK = ClockFit()
 class FittedClock(NamedTuple):
     """Ticks on the clock of a logger.
 
-    Attributes
-    ----------
-    begin : float
-        Of one tick, near the test's middle, s.
-    rate : float
-        Length of a tick over the nominal one, less 1.
-    std : float
-        Standard deviation of the begin, s.
-    rate_std : float
-        Standard deviation of the rate.
-    by : str
-        What showed it.
+    begin: of one tick, near the test's middle, s; rate: length of a tick over the nominal one, less
+    1; std: standard deviation of the begin, s; rate_std: standard deviation of the rate; by: what
+    showed it.
     """
 
     begin: float
@@ -106,23 +97,8 @@ def fit_clock(
 ) -> FittedClock | None:
     """Find the ticks of a test.
 
-    Parameters
-    ----------
-    signals : Mapping[str, RecordedSignal]
-        By role.
-    begin : float
-        Of the test, roughly, s.
-    period : float
-        Nominal length of a tick, s.
-    found : MatchedTest
-        The test.
-    controller : Controller
-        Of the actuator.
-
-    Returns
-    -------
-    FittedClock | None
-        None where nothing recorded shows them.
+    signals: by role; begin: of the test, roughly, s; period: nominal length of a tick, s; found:
+    the test; controller: of the actuator. Returns None where nothing recorded shows them.
     """
     span = found.test.ticks * period
     command = "command.position" if found.test.closed_loop else "command.current"

@@ -358,22 +358,8 @@ def checked_signals(
 ) -> dict[str, RecordedSignal]:
     """Put signals in order of time, once for each instant, numbers alone.
 
-    Parameters
-    ----------
-    found : Iterable[tuple[str, tuple[FloatArray, FloatArray]]]
-        Role, time stamps (s) and values (SI) of each.
-    path : Path
-        File, for errors.
-
-    Returns
-    -------
-    dict[str, RecordedSignal]
-        By role.
-
-    Raises
-    ------
-    InputOutputError
-        Too few numbers of a channel.
+    found: role, time stamps (s) and values (SI) of each; path: file, for errors. Returns by role.
+    InputOutputError: too few numbers of a channel.
     """
     out: dict[str, RecordedSignal] = {}
     for role, (stamps, value) in found:
