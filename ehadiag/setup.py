@@ -123,7 +123,7 @@ class Deadline:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reading:
+class RecordedTest:
     """What was read of one recording's files."""
 
     recordings: tuple[Recording, ...]
@@ -289,7 +289,7 @@ class Setup:
             budget = replace(budget, progress=partial(progress, "reading"))
         return iter(recorded_tests([os.fspath(item) for item in files], meaning, budget))
 
-    def read(self, *files: PathLike, progress: Progress | None = None) -> Reading:
+    def read(self, *files: PathLike, progress: Progress | None = None) -> RecordedTest:
         """Read what is to be diagnosed of one recording; see `open`.
 
         files: files to read; several hold one recording; progress: called with the stage and the
@@ -304,7 +304,7 @@ class Setup:
         if self.label:
             found = tuple(self.labelled(item) for item in found)
         names = tuple(os.fspath(item) for item in files)
-        return Reading(found, names, log_of(names[0]), time.perf_counter() - begin)
+        return RecordedTest(found, names, log_of(names[0]), time.perf_counter() - begin)
 
     def labelled(self, recording: Recording) -> Recording:
         """Return a recording with a note that tells it from those of other units on its bus."""

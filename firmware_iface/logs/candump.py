@@ -199,7 +199,7 @@ class CandumpReader:
         found = False
         channels: dict[str, int] = {}
         with path.open("rb") as file:
-            for text in _whole_lines(file, spending):
+            for text in _complete_lines(file, spending):
                 columns = ColumnBuilder()
                 _CandumpBlock(text).append_to(columns, channels)
                 if len(columns):
@@ -209,7 +209,7 @@ class CandumpReader:
             raise DamagedLogError("no line as candump -l writes it")
 
 
-def _whole_lines(file: BinaryIO, spending: Spending) -> Iterator[bytes]:
+def _complete_lines(file: BinaryIO, spending: Spending) -> Iterator[bytes]:
     """Blocks of whole lines; one that is longer than a block is cut: noise has no line ends."""
     rest = b""
     while piece := file.read(1 << 20):

@@ -20,8 +20,11 @@ from firmware_iface.errors import (
     ConfigurationError,
     EhadiagError,
     InputOutputError,
+    install_command,
     reason_of,
 )
+from firmware_iface.files import create_file
+from firmware_iface.logs.can_readers import mf4_library
 from firmware_iface.logs.log_files import Budget
 from firmware_iface.logs.reader import FrameLog
 from firmware_iface.transport.base import QUEUE_CAPACITY, RECEIVE_POLL_S, Transport
@@ -34,6 +37,51 @@ DEFERRED_SUFFIX = ".mf4"
 MAX_RECORDER_FILES = 10_000
 MIN_RECORDER_FILE_BYTES = 65_536
 """Bytes below which rotation makes no sense."""
+
+
+def _open_writer(path: Path) -> Any:
+    """Create a file, which must not exist, and return python-can's (or asammdf's) writer for it."""
+    import can  # noqa: PLC0415 - half a second, only where a recording is written
+
+    class FlushingBlfWriter(can.BLFWriter):
+        """A BLF file that is readable up to its last flush.
+
+        python-can's own keeps up to 128 KiB in memory and writes the true header at its end;
+        without the header's start time a reader takes frame times as relative ones.
+        """
+
+        def flush(self) -> None:
+            """Write all frames so far and a header that fits them."""
+            while self._buffer_size:
+                self._flush()
+            end = self.file.tell()
+            self.file.seek(0)
+            self._write_header(end)
+            self.file.seek(end)
+            self.file.flush()
+
+    descriptor = create_file(path)
+
+    def begin(mode: Any, **text: Any) -> Any:
+        # More than comes between two flushes: each is one write, and a killed process leaves no
+        # half line or half container.
+        return open(path, mode, 1 << 20, opener=lambda *_: descriptor, **text)
+
+    suffix = path.suffix.lower()
+    if suffix == ".mf4":
+        file = begin("w+b")
+        try:
+            return mf4_library().MF4Writer(file)
+        except (ImportError, NotImplementedError):
+            file.close()
+            path.unlink()
+            raise ConfigurationError(
+                f"recording {path}: MF4 needs asammdf: {install_command('mf4')}"
+            ) from None
+    if suffix == ".blf":
+        return FlushingBlfWriter(begin("wb"))
+    kinds: dict[str, Any] = {".asc": can.ASCWriter, ".csv": can.CSVWriter, ".trc": can.TRCWriter}
+    return kinds[suffix](begin("w", encoding="utf-8", newline=""))
 
 
 class Recorder:
@@ -145,13 +193,11 @@ class Recorder:
         self.close()
 
     def _begin(self) -> None:
-        from firmware_iface.logs.writers import open_writer  # noqa: PLC0415 - costs half a second
-
         number = len(self._paths) + 1
         path = self._first
         if number > 1:
             path = path.with_name(f"{path.stem}-{number}{path.suffix}")
-        self._writer = open_writer(path)
+        self._writer = _open_writer(path)
         self._paths.append(path)
         self._flush()
 

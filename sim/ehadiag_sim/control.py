@@ -289,7 +289,7 @@ def control_port(control: SimulatorControl, port: int) -> Iterator[int]:
     ConfigurationError: it is in use, or not allowed.
     """
 
-    class Handler(socketserver.StreamRequestHandler):
+    class LineHandler(socketserver.StreamRequestHandler):
         timeout = 60.0
 
         def handle(self) -> None:
@@ -307,7 +307,7 @@ def control_port(control: SimulatorControl, port: int) -> Iterator[int]:
             """A connection that breaks off is the other end's business."""
 
     try:
-        server = Server((LOOPBACK, port), Handler)
+        server = Server((LOOPBACK, port), LineHandler)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ConfigurationError(f"control port {port}: {reason}; choose another") from None
