@@ -23,6 +23,8 @@ from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.stored_test import bundled_tests
 
+__all__ = ["VALVES", "ValveCase", "is_wrong", "perform", "random_valve"]
+
 STATEMENTS: dict[str, float | tuple[float, float] | None] = {
     "stated": None,
     "unknown": (0.0, 2.0),

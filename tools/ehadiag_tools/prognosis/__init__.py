@@ -1,1 +1,1 @@
-"""Remaining life on simulated units: what the prognosis is measured by, and its rivals."""
+"""Remaining life on simulated units: what the prognosis is measured by."""

@@ -1,4 +1,4 @@
-"""Study of the prognosis of remaining life on simulated units, against its rivals."""
+"""Study of the prognosis of remaining life on simulated units."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from ehadiag.prognosis.averaging import Fleet, learn_fleet
 from ehadiag.prognosis.forecast import forecast
 from ehadiag.prognosis.lives import Life, lives_of
 from ehadiag_tools.prognosis.laws import HELD_OUT, LAWS, TUNED
-from ehadiag_tools.prognosis.rivals import QUANTILES, age_alone, similar_lives
 from ehadiag_tools.prognosis.units import LIMIT, WornUnit, read_noise, simulate_unit
 from ehadiag_tools.study import Options, Record, Study, markdown
 
@@ -23,10 +22,6 @@ SHARES = (0.3, 0.5, 0.7, 0.9)
 SETS = {"tuned": tuple(TUNED), "held-out": tuple(HELD_OUT), "all": tuple(LAWS)}
 CENSORED_SHARE = (0.3, 0.8)
 """Shares of its last life at which a unit of a censored fleet is taken out, 1."""
-RIVALS = {"similar lives": similar_lives, "age alone": age_alone}
-OURS = "ehadiag"
-REPLICATES = 1000
-"""Number of resamples of the units, for the interval of a difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +38,13 @@ class LifeCase:
 def perform(case: LifeCase) -> Record:
     """Forecast a unit's remaining life at each of `SHARES`.
 
-    For each method the quantiles of the remaining life over the life's length, None where there is
-    no number, beside the true one; and whether the forecast's check raised an alarm.
+    Of each: the share, the true remaining life over the life's length, whether the check raised an
+    alarm, and the quantiles of the forecast; None where there is no number.
     """
     unit = simulate_unit(case.law, case.unit, read_noise(), case.seed)
     lives, fleet = _fleet(case.law, case.fleet, case.censored, case.seed)
     length = unit.end - unit.born
-    out: Record = {"true": [], "alarm": [], OURS: [], **{name: [] for name in RIVALS}}
+    asked = []
     for share in SHARES:
         life, earlier = _lives_until(unit, share)
         if len(life.age) < 2:
@@ -57,14 +52,12 @@ def perform(case: LifeCase) -> Record:
         own = learn_fleet([*lives, *earlier], fleet.scale, case.seed) if earlier else fleet
         found = forecast(unit.name, "hours", life, own, (LIMIT,), case.seed)
         (left,) = found.remaining
-        numbers = None if left.median is None else [left.low, left.median, left.high]
-        out["true"].append((unit.end - life.born - life.age[-1]) / length)
-        out["alarm"].append(bool(found.alarm))
-        out[OURS].append(None if numbers is None else (np.array(numbers) / length).tolist())
-        for name, rival in RIVALS.items():
-            guess = rival(life, [*lives, *earlier], LIMIT)
-            out[name].append(None if guess is None else (guess / length).tolist())
-    return out
+        numbers = None
+        if left.median is not None:
+            numbers = [value / length for value in (left.low, left.median, left.high)]
+        true = (unit.end - life.born - life.age[-1]) / length
+        asked.append((share, true, bool(found.alarm), numbers))
+    return {"asked": asked}
 
 
 @cache
@@ -107,83 +100,40 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     fleet = f"{options.fleet}{' taken out early' if options.censored else ''}"
     yield f"{options.cases} units, laws {options.laws}, seed {options.seed}, fleet of {fleet}\n"
-    heads = ("", "questions", "answered", "covered", "too late", "score", "alarms")
-    rows: list[tuple[str, ...]] = [("all", *_cells(records, OURS))]
+    rows: list[tuple[str, ...]] = [("all", *_cells(records))]
     for law in SETS[options.laws]:
         part = [item for item in records if item["law"] == law]
-        rows += [(law, *_cells(part, OURS))] if part else []
-    for index, share in enumerate(SHARES):
-        rows.append((f"{share:.0%} of the life", *_cells(records, OURS, index)))
-    rows += [(name, *_cells(records, name)) for name in RIVALS]
+        rows += [(law, *_cells(part))] if part else []
+    for share in SHARES:
+        rows.append((f"{share:.0%} of the life", *_cells(records, share)))
+    heads = ("", "questions", "answered", "covered", "too late", "score", "alarms")
     yield from markdown(heads, rows)
-    yield ""
-    shown = ("rival", "its score less ours", "95 %", "questions that both answer")
-    yield from markdown(shown, ((name, *_paired(records, name)) for name in RIVALS))
 
 
-def _questions(
-    records: Sequence[Record], method: str, place: int | None = None
-) -> list[tuple[float, NDArray[np.float64] | None]]:
-    out = []
-    for record in records:
-        first = len(SHARES) - len(record["true"])
-        for index, (true, found) in enumerate(zip(record["true"], record[method], strict=True)):
-            if place in (None, index + first):
-                out.append((true, None if found is None else np.array(found)))
-    return out
-
-
-def _cells(records: Sequence[Record], method: str, place: int | None = None) -> tuple[str, ...]:
-    asked = _questions(records, method, place)
-    given = [(true, found) for true, found in asked if found is not None]
+def _cells(records: Sequence[Record], share: float | None = None) -> tuple[str, ...]:
+    """Cells of the answers at a share of the life; None: at all of them."""
+    asked = [item for record in records for item in record["asked"] if share in (None, item[0])]
+    given = [(true, np.array(found)) for _, true, _, found in asked if found is not None]
     if not given:
         return (str(len(asked)), "0.0%", "–", "–", "–", "–")
     covered = np.mean([found[0] <= true <= found[2] for true, found in given])
     late = np.mean([true < found[0] for true, found in given])
     score = np.mean([quantile_score(true, found) for true, found in given])
-    alarms = np.mean(
-        [
-            alarm
-            for record in records
-            for index, alarm in enumerate(record["alarm"], len(SHARES) - len(record["alarm"]))
-            if place in (None, index)
-        ]
-    )
+    alarms = np.mean([alarm for _, _, alarm, _ in asked])
     return (
         str(len(asked)), f"{len(given) / len(asked):.1%}", f"{covered:.3f}", f"{late:.3f}",
-        f"{score:.4f}", f"{alarms:.1%}" if method == OURS else "–",
+        f"{score:.4f}", f"{alarms:.1%}",
     )  # fmt: skip
 
 
 def quantile_score(true: float, found: NDArray[np.float64]) -> float:
     """Continuous ranked probability score by three quantiles: twice their mean pinball loss."""
-    levels = np.array(QUANTILES)
+    levels = np.array((0.1, 0.5, 0.9))
     return float(2.0 * np.mean(np.maximum(levels * (true - found), (levels - 1) * (true - found))))
-
-
-def _paired(records: Sequence[Record], rival: str) -> tuple[str, ...]:
-    """Mean difference of scores, and its interval by resampling units."""
-    each, number = [], 0
-    for record in records:
-        pairs = zip(_questions([record], OURS), _questions([record], rival), strict=True)
-        off = [
-            quantile_score(true, theirs) - quantile_score(true, ours)
-            for (true, ours), (_, theirs) in pairs
-            if ours is not None and theirs is not None
-        ]
-        number += len(off)
-        each += [off] if off else []
-    if not each:
-        return ("–", "–", "0")
-    sums, counts = np.array([sum(off) for off in each]), np.array([len(off) for off in each])
-    picks = np.random.default_rng(0).integers(0, len(each), (REPLICATES, len(each)))
-    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return (f"{sums.sum() / number:+.4f}", f"{low:+.4f} … {high:+.4f}", str(number))
 
 
 PROGNOSIS = Study(
     "prognosis",
-    "Remaining life of simulated units that wear by laws unknown to the forecast, and rivals.",
+    "Remaining life of simulated units that wear by laws unknown to the forecast.",
     _cases, perform, _report, add_options=_add_options, counted="units",
 )  # fmt: skip
