@@ -55,7 +55,7 @@ def test_figures_of_two_records() -> None:
     ]
     assert holds_truth(records).tolist() == [[True] * 3, [False, True, True]]
     np.testing.assert_allclose(percent_errors(records), [[0.1, 0.0, -0.1], [0.3, 0.0, 0.0]])
-    kintas, _, jack = severity_rows("open", records)
+    kintas, _, jack = severity_rows([{"test": "open", **item} for item in records])
     assert kintas[2:] == (2, "+0.2000", "0.2000", "0.2236", "0.3000", "50.0", "22.36")
     assert jack[2:] == (2, "-0.0500", "0.0500", "0.0707", "0.1000", "100.0", "10.00")
 

@@ -205,6 +205,15 @@ def _progress() -> Progress:
     )
 
 
+def grouped(records: Iterable[Record], *names: str) -> dict[tuple[Any, ...], list[Record]]:
+    """Records by their values of these names, in the order in which these come."""
+    out: dict[tuple[Any, ...], list[Record]] = {}
+    for record in records:
+        key = tuple(tuple(v) if isinstance(v, list) else v for v in map(record.get, names))
+        out.setdefault(key, []).append(record)
+    return out
+
+
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
     """Lines of a table."""
     yield "| " + " | ".join(headings) + " |"

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
+from ehadiag.assess.verdict import Verdict
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
 from ehadiag_sim.conditions import Sensors
 from ehadiag_tools.damaged import damaged
-from ehadiag_tools.study import Record
+from ehadiag_tools.study import Record, grouped
 from firmware_iface.errors import EhadiagError
 from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
 
@@ -58,6 +59,23 @@ def holds_truth(records: Sequence[Record]) -> NDArray[np.bool_]:
     return np.asarray((low <= truth + ROUNDING) & (truth - ROUNDING <= high))
 
 
+def stated_of(records: Sequence[Record]) -> list[Record]:
+    """Records with a verdict and estimates."""
+    without = ("error", Verdict.NOT_TESTED.name)
+    return [item for item in records if item["verdict"] not in without and item["value"]]
+
+
+ERROR_HEADINGS = ("mean", "largest", "intervals that hold")
+
+
+def error_cells(stated: Sequence[Record]) -> list[str]:
+    """Mean and largest of the records' largest errors in percent, and coverage."""
+    if not stated:
+        return ["", "", "0 of 0"]
+    largest, held = np.abs(percent_errors(stated)).max(axis=1), holds_truth(stated)
+    return [f"{largest.mean():.3f} %", f"{largest.max():.3f} %", f"{held.sum()} of {held.size}"]
+
+
 def percent_widths(records: Sequence[Record]) -> Array:
     """Width of the 95 % interval of each severity in percent, shape (n, 3)."""
     low, high = _ends(records)
@@ -75,19 +93,20 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
-def severity_rows(test: str, records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+def severity_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
     """Rows of a table with `SEVERITY_HEADINGS`; the bound's ratio is of truths inside 0 … 1."""
-    error, held = percent_errors(records), holds_truth(records)
-    truth = np.array([record["faults"] for record in records])
-    bound = 100.0 * np.array([record["bound"] for record in records], dtype=np.float64)
-    ratio = np.where((truth > 0.0) & (truth < 1.0), error / bound, np.nan)
-    for j, name in enumerate(FAULT_NAMES):
-        part = error[:, j]
-        yield (
-            test, name, len(records), f"{part.mean():+.4f}", f"{np.abs(part).mean():.4f}",
-            f"{rms(part):.4f}", f"{np.abs(part).max():.4f}", f"{100.0 * held[:, j].mean():.1f}",
-            f"{rms(ratio[:, j]):.2f}",
-        )  # fmt: skip
+    for (test,), part in grouped(records, "test").items():
+        error, held = percent_errors(part), holds_truth(part)
+        truth = np.array([record["faults"] for record in part])
+        bound = 100.0 * np.array([record["bound"] for record in part], dtype=np.float64)
+        ratio = np.where((truth > 0.0) & (truth < 1.0), error / bound, np.nan)
+        for j, name in enumerate(FAULT_NAMES):
+            mine = error[:, j]
+            yield (
+                test, name, len(part), f"{mine.mean():+.4f}", f"{np.abs(mine).mean():.4f}",
+                f"{rms(mine):.4f}", f"{np.abs(mine).max():.4f}", f"{100.0 * held[:, j].mean():.1f}",
+                f"{rms(ratio[:, j]):.2f}",
+            )  # fmt: skip
 
 
 def cramer_rao(experiments: Sequence[Experiment], faults: Sequence[float]) -> Array:

@@ -26,7 +26,7 @@ from ehadiag_tools.accuracy.figures import (
     severity_rows,
 )
 from ehadiag_tools.simulator.compare_logs import read_truth
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError
 
 STAGES = {"first": "first approximation", "search": "genetic search", "value": "final"}
@@ -74,13 +74,13 @@ def _paper_report(records: Sequence[Record], options: Options) -> Iterator[str]:
             yield ""
             yield from _bound_table(test, part)
             yield ""
-    yield from markdown(SEVERITY_HEADINGS, _all_severity_rows(records))
+    yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
 
 
 def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
     """Errors of each constant after each stage, and the paper's."""
     rows = []
-    for faults, part in _by_faults(records).items():
+    for (faults,), part in grouped(records, "faults").items():
         published = _paper_case(test, faults)
         for stage, name in STAGES.items():
             cell = "–"
@@ -103,7 +103,7 @@ def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
 def _bound_table(test: str, records: Sequence[Record]) -> Iterator[str]:
     """Rms errors of each case against its Cramér–Rao bound."""
     rows = []
-    for faults, part in _by_faults(records).items():
+    for (faults,), part in grouped(records, "faults").items():
         published = _paper_case(test, faults)
         if published is not None:
             bound = 100.0 * np.array(part[0]["bound"])
@@ -113,13 +113,6 @@ def _bound_table(test: str, records: Sequence[Record]) -> Iterator[str]:
             rows.append((f"{test} {published.number}", len(part), *cells))
     headings = [cell for name in FAULT_NAMES for cell in (f"{name}: bound, %", "rms / bound")]
     yield from markdown(("case", "runs", *headings), rows)
-
-
-def _by_faults(records: Sequence[Record]) -> dict[tuple[float, ...], list[Record]]:
-    out: dict[tuple[float, ...], list[Record]] = {}
-    for record in records:
-        out.setdefault(tuple(record["faults"]), []).append(record)
-    return out
 
 
 def _label(faults: Sequence[float]) -> str:
@@ -134,11 +127,6 @@ def _cells(error: NDArray[np.float64]) -> list[str]:
 
 def _paper_case(test: str, faults: Sequence[float]) -> PaperCase | None:
     return next((c for c in PAPER if c.test == test and c.faults == tuple(faults)), None)
-
-
-def _all_severity_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for test in dict.fromkeys(record["test"] for record in records):
-        yield from severity_rows(test, [item for item in records if item["test"] == test])
 
 
 def _cube_options(parser: argparse.ArgumentParser) -> None:
@@ -157,9 +145,8 @@ def _cube_cases(options: Options) -> list[Case]:
 
 def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
-    yield from markdown(SEVERITY_HEADINGS, _all_severity_rows(records))
-    for test in dict.fromkeys(record["test"] for record in records):
-        part = [record for record in records if record["test"] == test]
+    yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+    for (test,), part in grouped(records, "test").items():
         yield f"\n{test}\n"
         yield from markdown(("figure", "value"), _summary_rows(part))
         yield f"\n{test}, largest errors\n"

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import ehadiag
 from ehadiag.identify.experiment import Experiment
@@ -41,82 +40,58 @@ def draw_method(case: PictureCase) -> Record:
     """Draw a picture of the method."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     METHOD_PICTURES[case.picture](figure)
-    return {"path": str(_save(figure, Path(case.folder) / f"method-{case.picture}.png"))}
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    mpl.use("Agg")
+    path = Path(case.folder) / f"method-{case.picture}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
-    return path
+    return {"path": str(path)}
 
 
-def _spool_friction(figure: Figure) -> None:
-    left, right = figure.subplots(1, 2)
-    for current, spool, _, _, style, label in _responses("FSS"):
-        window = slice(0, 2300)
-        left.plot(_time(window), 1e3 * spool[window], **style, label=label)
-        right.plot(1e3 * current[window], 1e3 * spool[window], **style)
-    left.set(xlabel="time, s", ylabel="spool position, mm", title="slow ramps of current")
-    right.set(xlabel="current, mA", ylabel="spool position, mm", title="the same over the current")
-    left.legend(title="FSS")
+class _Plot(NamedTuple):
+    """A part of the open-loop test, ticks, one quantity over another."""
+
+    horizontal: str
+    vertical: str
+    title: str
+    ticks: slice
+    marker: str = ""
 
 
-def _filter_clogging(figure: Figure) -> None:
+TIME, CURRENT, SPOOL, JACK = "time, s", "current, mA", "spool position, mm", "jack position, mm"
+PRESSURE = "differential pressure, MPa"
+RAMPS = slice(0, 2300)
+EFFECTS = {
+    "FSS": (
+        _Plot(TIME, SPOOL, "slow ramps of current", RAMPS),
+        _Plot(CURRENT, SPOOL, "the same over the current", RAMPS),
+    ),
+    "Kintas": (
+        _Plot(TIME, SPOOL, "step of current at 2.4 s", slice(2395, 2440), "."),
+        _Plot(TIME, JACK, "what the jack makes of it", slice(2350, 3000)),
+    ),
+    "FDJ": (
+        _Plot(TIME, PRESSURE, "slow ramps of current", RAMPS),
+        _Plot(TIME, JACK, "the jack meanwhile", RAMPS),
+    ),
+}
+"""What a fault alone does, by its name."""
+
+
+def _effects(figure: Figure, name: str) -> None:
     axes = figure.subplots(1, 2)
-    for _, spool, _, place, style, label in _responses("Kintas"):
-        near, far = slice(2395, 2440), slice(2350, 3000)
-        axes[0].plot(_time(near), 1e3 * spool[near], **style, marker=".", label=label)
-        axes[1].plot(_time(far), 1e3 * place[far], **style)
-    axes[0].set(xlabel="time, s", ylabel="spool position, mm", title="step of current at 2.4 s")
-    axes[1].set(xlabel="time, s", ylabel="jack position, mm", title="what the jack makes of it")
-    axes[0].legend(title="Kintas")
-
-
-def _jack_friction(figure: Figure) -> None:
-    left, right = figure.subplots(1, 2)
-    for _, _, pressure, place, style, label in _responses("FDJ"):
-        window = slice(0, 2300)
-        left.plot(_time(window), 1e-6 * pressure[window], **style, label=label)
-        right.plot(_time(window), 1e3 * place[window], **style)
-    left.set(xlabel="time, s", ylabel="differential pressure, MPa", title="slow ramps of current")
-    right.set(xlabel="time, s", ylabel="jack position, mm", title="the jack meanwhile")
-    left.legend(title="FDJ")
-
-
-class _Response(NamedTuple):
-    """An open-loop test, SI, and how to draw it."""
-
-    current: NDArray[np.float64]
-    spool: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    place: NDArray[np.float64]
-    style: dict[str, Any]
-    label: str
-
-
-def _responses(name: str) -> list[_Response]:
-    """One for each severity of a fault alone."""
-    out = []
     for value, colour, dash in zip((0.0, 0.5, 1.0), COLOURS, DASHES, strict=True):
-        samples = ehadiag.simulate("open", faults=Faults(**{name: value}), noise_lsb=0.0).samples
-        assert samples is not None
-        style = {"color": colour, "ls": dash, "lw": 1.3}
-        out.append(
-            _Response(
-                samples.current,
-                samples.spool,
-                samples.pressure,
-                samples.position,
-                style,
-                f"{value:g}",
-            )
-        )
-    return out
-
-
-def _time(window: slice) -> NDArray[np.float64]:
-    return np.arange(window.start, window.stop) * 1e-3
+        s = ehadiag.simulate("open", faults=Faults(**{name: value}), noise_lsb=0.0).samples
+        assert s is not None
+        seen = {
+            TIME: np.arange(s.ticks) * 1e-3, CURRENT: 1e3 * s.current, SPOOL: 1e3 * s.spool,
+            PRESSURE: 1e-6 * s.pressure, JACK: 1e3 * s.position,
+        }  # fmt: skip
+        for axis, plot in zip(axes, EFFECTS[name], strict=True):
+            axis.plot(
+                seen[plot.horizontal][plot.ticks], seen[plot.vertical][plot.ticks],
+                color=colour, ls=dash, lw=1.3, marker=plot.marker, label=f"{value:g}",
+            )  # fmt: skip
+            axis.set(xlabel=plot.horizontal, ylabel=plot.vertical, title=plot.title)
+    axes[0].legend(title=name)
 
 
 def _searches(figure: Figure) -> None:
@@ -182,9 +157,7 @@ def _intervals(figure: Figure) -> None:
 
 
 METHOD_PICTURES: dict[str, Callable[[Figure], None]] = {
-    "FSS": _spool_friction,
-    "Kintas": _filter_clogging,
-    "FDJ": _jack_friction,
+    **{name: partial(_effects, name=name) for name in EFFECTS},
     "searches": _searches,
     "intervals": _intervals,
 }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -38,7 +37,7 @@ from ehadiag_tools.accuracy.figures import (
     severity_rows,
 )
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, add_group, record, unit_with
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
@@ -165,17 +164,12 @@ def _unit_cases(options: Options) -> list[UnitCase]:
 
 
 def _unit_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    groups: dict[tuple[str, str, str], list[Record]] = {}
-    for item in records:
-        key = item["test"], item["data"], item["nuisances"]
-        groups.setdefault(key, []).append(item)
+    groups = grouped(records, "test", "data", "nuisances")
     yield from markdown(HEADINGS, ((*key, *unit_row(part)) for key, part in groups.items()))
     bounded = [item for item in records if item["bound"] is not None]
     if bounded:
         yield "\nBeside the Cramér–Rao bound of the same unknowns:\n"
-        tests = dict.fromkeys(item["test"] for item in bounded)
-        rows = [severity_rows(t, [i for i in bounded if i["test"] == t]) for t in tests]
-        yield from markdown(SEVERITY_HEADINGS, itertools.chain.from_iterable(rows))
+        yield from markdown(SEVERITY_HEADINGS, severity_rows(bounded))
 
 
 def unit_row(records: Sequence[Record]) -> list[str]:

@@ -20,7 +20,7 @@ from ehadiag_sim.broken_hardware import HARDWARE_FAULTS, simulate_broken
 from ehadiag_sim.conditions import Faults
 from ehadiag_tools.accuracy.figures import holds_truth, outcome, percent_errors, percent_widths
 from ehadiag_tools.simulator.units import COARSE_STEP, add_group, record, unit_with
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
@@ -240,10 +240,7 @@ def _hardware_cases(options: Options) -> list[HardwareCase]:
 
 def hardware_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     """Verdicts and times of each kind, and of all."""
-    groups: dict[tuple[str, str], list[Record]] = {}
-    for item in records:
-        groups.setdefault((item["test"], item["kind"]), []).append(item)
-    groups["all", "all"] = list(records)
+    groups = grouped(records, "test", "kind") | {("all", "all"): list(records)}
     verdicts = [verdict.name.replace("_", " ") for verdict in Verdict]
     yield from markdown(
         ("test", "kind", *verdicts, "not allowed", "median, s", "longest, s"),

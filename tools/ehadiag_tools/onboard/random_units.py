@@ -28,7 +28,7 @@ from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD, OnboardOutcome
 from ehadiag_tools.accuracy.units import UnitCase, draw_unit, record_worn
 from ehadiag_tools.onboard.replay import surrounded, ticks_of
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.files import RESULT_MODE, Folder
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import resolve_test
@@ -140,8 +140,7 @@ def _cases(options: Options) -> list[OnboardUnit]:
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     rows, far = [], []
-    for test in dict.fromkeys(item["test"] for item in records):
-        part = [item for item in records if item["test"] == test]
+    for (test,), part in grouped(records, "test").items():
         stated = [item for item in part if item["verdict"] != NOT_TESTED]
         errors = [_errors(item) for item in stated]
         off = np.array([error / _stds(item) for error, item in zip(errors, stated, strict=True)])

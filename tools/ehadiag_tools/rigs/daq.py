@@ -8,15 +8,11 @@ sees their codes.
 from __future__ import annotations
 
 import argparse
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
-import pandas
 from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 
@@ -28,14 +24,11 @@ from ehadiag_sim.plant_dynamics import PlantDynamics
 from ehadiag_sim.plant_laws import PositionController
 from ehadiag_sim.sensing import SimulatedConverters
 from ehadiag_sim.simulation import bus_command
-from ehadiag_tools.accuracy.figures import holds_truth, outcome, percent_errors
-from ehadiag_tools.study import Options, Record, Study, markdown
-from firmware_iface.bus_map import default_map
+from ehadiag_tools.accuracy.figures import ERROR_HEADINGS, error_cells, outcome, stated_of
+from ehadiag_tools.rigs.rerecord import TESTS, read_columns
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import EhadiagError
-from firmware_iface.find_test import CandidateTests
-from firmware_iface.logs.reader import choose_recording
 from firmware_iface.recording import CHANNELS, Channels, CommandMode
-from firmware_iface.signals.recordings import Interpretation, recorded_tests
 from firmware_iface.stored_test import bundled_tests
 
 PLANT_RATE = 10_000.0
@@ -147,16 +140,10 @@ def _channels(bits: int) -> Channels:
 
 def perform(case: DaqCase) -> Record:
     """Record, read, diagnose: verdict, estimates, why."""
-    actuator, tests = default_actuator(), tuple(bundled_tests().values())
-    meaning = Interpretation(default_map(), None, CandidateTests(tests, actuator.controller))
-    with tempfile.TemporaryDirectory(prefix="ehadiag-") as folder:
-        path = Path(folder) / "daq.csv"
-        pandas.DataFrame(recorded_columns(case)).to_csv(path, index=False, float_format="%.9g")
-        try:
-            found = diagnose([choose_recording(recorded_tests([path], meaning))], actuator, tests)
-        except EhadiagError as error:
-            return outcome(error)
-    return outcome(found)
+    try:
+        return outcome(diagnose([read_columns(recorded_columns(case))], default_actuator(), TESTS))
+    except EhadiagError as error:
+        return outcome(error)
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -188,14 +175,10 @@ def _cases(options: Options) -> list[DaqCase]:
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     """One line for each kind; errors and coverage are of what has a verdict."""
-    groups: dict[tuple[Any, ...], list[Record]] = {}
-    for item in records:
-        groups.setdefault((item["test"], item["rate"], item["bits"]), []).append(item)
-    headings = ("test", "rate", "bits", "verdicts", "mean", "largest", "intervals that hold")
     yield from markdown(
-        headings,
+        ("test", "rate", "bits", "verdicts", *ERROR_HEADINGS),
         ((test, f"{rate:g} Hz", bits, *_cells(items))
-         for (test, rate, bits), items in groups.items()),
+         for (test, rate, bits), items in grouped(records, "test", "rate", "bits").items()),
     )  # fmt: skip
     for item in records:
         if item["verdict"] in ("error", Verdict.NOT_TESTED.name):
@@ -206,17 +189,8 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
 
 def _cells(records: Sequence[Record]) -> list[str]:
     """Verdicts given, mean and largest error in percent, coverage."""
-    stated = [
-        item for item in records
-        if item["verdict"] not in ("error", Verdict.NOT_TESTED.name) and item["value"]
-    ]  # fmt: skip
-    counts = f"{len(stated)} of {len(records)}"
-    if not stated:
-        return [counts, "", "", "0 of 0"]
-    largest, held = np.abs(percent_errors(stated)).max(axis=1), holds_truth(stated)
-    return [
-        counts, f"{largest.mean():.3f} %", f"{largest.max():.3f} %", f"{held.sum()} of {held.size}"
-    ]  # fmt: skip
+    stated = stated_of(records)
+    return [f"{len(stated)} of {len(records)}", *error_cells(stated)]
 
 
 DAQ_RECORDINGS = Study(

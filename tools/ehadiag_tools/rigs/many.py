@@ -16,7 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -91,9 +91,10 @@ def diagnose_folder(folder: Path, *options: str) -> Record:
     begin = time.perf_counter()
     with out.open("wb") as stdout, errors.open("wb") as stderr:
         process = subprocess.Popen([*COMMAND, str(folder), *options], stdout=stdout, stderr=stderr)
-        usage = _Usage(process.pid)
+        spent: dict[int, float] = {}
+        memory = 0.0
         while process.poll() is None:
-            usage.measure()
+            memory = max(memory, _usage(process.pid, spent))
             time.sleep(POLL_S)
     wall = time.perf_counter() - begin
     if not out.stat().st_size:
@@ -102,41 +103,24 @@ def diagnose_folder(folder: Path, *options: str) -> Record:
     return {
         "recordings": count,
         "wall_s": wall,
-        "processor_s": usage.processor_s,
-        "memory_mb": usage.memory_mb,
+        "processor_s": sum(spent.values()),
+        "memory_mb": memory,
         "sources": [str(item["source"]) for item in results],
         "verdicts": [str(item["verdict"] or "null") for item in results],
     }
 
 
-class _Usage:
-    """Memory and processor time of a process and those that it has started."""
-
-    def __init__(self, pid: int) -> None:
-        self._root = psutil.Process(pid)
-        self._spent: dict[int, float] = {}
-        self.memory_mb = 0.0
-
-    @property
-    def processor_s(self) -> float:
-        """As of the last measurement of each."""
-        return sum(self._spent.values())
-
-    def measure(self) -> None:
-        """Measure both."""
-        together = 0
-        try:
-            family = [self._root, *self._root.children(recursive=True)]
-        except psutil.Error:
-            return
-        for item in family:
-            try:
+def _usage(pid: int, spent: dict[int, float]) -> float:
+    """Memory, MB, of a process and those that it has started; `spent`: their processor time, s."""
+    together = 0
+    with suppress(psutil.Error):
+        root = psutil.Process(pid)
+        for item in (root, *root.children(recursive=True)):
+            with suppress(psutil.Error):
                 times = item.cpu_times()
-                self._spent[item.pid] = times.user + times.system
+                spent[item.pid] = times.user + times.system
                 together += item.memory_info().rss
-            except psutil.Error:
-                continue
-        self.memory_mb = max(self.memory_mb, together / 2**20)
+    return together / 2**20
 
 
 def _options(parser: argparse.ArgumentParser) -> None:

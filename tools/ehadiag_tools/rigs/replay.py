@@ -4,33 +4,35 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pandas
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag_tools.accuracy.figures import holds_truth, outcome, percent_errors
+from ehadiag_tools.accuracy.figures import ERROR_HEADINGS, error_cells, outcome, stated_of
 from ehadiag_tools.rigs.buses import BUSES, ForeignBus
-from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, logged, played
+from ehadiag_tools.rigs.rerecord import (
+    TESTS,
+    Disturbance,
+    frames_on,
+    logged,
+    played,
+    read_columns,
+)
 from ehadiag_tools.simulator.compare_logs import read_rows
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.alignment.align import windowed_recordings
-from firmware_iface.bus_map import default_map
 from firmware_iface.errors import EhadiagError
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs.reader import choose_recording, read_recording
 from firmware_iface.recording import Recording, Samples
-from firmware_iface.signals.recordings import Interpretation, recorded_tests
-from firmware_iface.stored_test import StoredTest, bundled_tests
+from firmware_iface.stored_test import StoredTest
 
 DAQ = "daq"
 """Name of the decoded signals."""
@@ -59,7 +61,7 @@ def perform(case: BusReplay) -> Record:
     """Play, read, diagnose: verdict, estimates, why."""
     actuator, recording = _actuator(case.actuator), read_recording(Path(case.recording))
     try:
-        found = diagnose([_played(case, recording, actuator)], actuator, _tests())
+        found = diagnose([_played(case, recording, actuator)], actuator, TESTS)
     except EhadiagError as error:
         return outcome(error)
     return outcome(found)
@@ -68,16 +70,11 @@ def perform(case: BusReplay) -> Record:
 def _played(case: BusReplay, recording: Recording, actuator: Actuator) -> Recording:
     if case.bus == DEFAULT:
         return recording
-    test = next(item for item in _tests() if item.id == recording.test_id)
+    test = next(item for item in TESTS if item.id == recording.test_id)
     if case.bus == DAQ:
         return on_daq(recording, test, case.how, actuator, case.seed, case.rate)
     bus = next(item for item in BUSES if item.name == case.bus)
     return on_bus(bus, recording, test, case.how, actuator, case.seed)
-
-
-@cache
-def _tests() -> tuple[StoredTest, ...]:
-    return tuple(bundled_tests().values())
 
 
 @cache
@@ -96,7 +93,7 @@ def on_bus(
     """Play a recording on a bus, and read it there as a log of that bus is read."""
     this = played(_samples_of(recording), as_sent(test), how.lead_in_s)
     table, bus_map = frames_on(bus, recording, this, how, seed)
-    candidates = CandidateTests(_tests(), actuator.controller)
+    candidates = CandidateTests(TESTS, actuator.controller)
     name = f"{Path(recording.source).stem} on {bus.name}"
     return choose_recording(
         windowed_recordings([table], bus_map, name, len(table) + 1, candidates=candidates)
@@ -118,13 +115,7 @@ def on_daq(
     around = recording.environment
     for name in ("supply_pressure", "return_pressure", "oil_temperature"):
         columns[name] = np.full(len(columns["time"]), getattr(around, name))
-    candidates = CandidateTests(_tests(), actuator.controller)
-    with tempfile.TemporaryDirectory(prefix="ehadiag-") as folder:
-        path = Path(folder) / f"{Path(recording.source).stem}.csv"
-        pandas.DataFrame(columns).to_csv(path, index=False, float_format="%.9g")
-        return choose_recording(
-            recorded_tests([path], Interpretation(default_map(), None, candidates))
-        )
+    return read_columns(columns, actuator, Path(recording.source).stem)
 
 
 def _samples_of(recording: Recording) -> Samples:
@@ -197,29 +188,21 @@ def _foreign_cases(case: BusReplay, options: Options) -> Iterator[BusReplay]:
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     """One line for each bus and jitter; errors and coverage are of what has a verdict."""
     usual = {item["recording"]: item["verdict"] for item in records if item["bus"] == DEFAULT}
-    groups: dict[tuple[str, float], list[Record]] = {}
-    for item in records:
-        groups.setdefault((item["bus"], item["how"]["jitter_ms"]), []).append(item)
+    items = ({**item, "jitter": item["how"]["jitter_ms"]} for item in records)
+    groups = grouped(items, "bus", "jitter")
     order = sorted(groups, key=lambda key: ((DEFAULT, *NAMES).index(key[0]), key[1]))
     yield from markdown(
-        ("bus", "jitter", "verdicts", "wrong", "mean", "largest", "intervals that hold"),
+        ("bus", "jitter", "verdicts", "wrong", *ERROR_HEADINGS),
         ((bus, f"{jitter:g} ms", *_cells(groups[bus, jitter], usual)) for bus, jitter in order),
     )
 
 
 def _cells(records: Sequence[Record], usual: dict[str, str]) -> list[str]:
     """Verdicts that agree with the default bus, wrong ones, mean and largest error, coverage."""
-    stated = [
-        item for item in records if item["verdict"] != Verdict.NOT_TESTED.name and item["value"]
-    ]
+    stated = stated_of(records)
     same = sum(item["verdict"] == usual[item["recording"]] for item in records)
     wrong = sum(item["verdict"] != usual[item["recording"]] for item in stated)
-    counts = [f"{same} of {len(records)}", str(wrong)]
-    if not stated:
-        return [*counts, "", "", "0 of 0"]
-    largest, held = np.abs(percent_errors(stated)).max(axis=1), holds_truth(stated)
-    sizes = [f"{largest.mean():.3f} %", f"{largest.max():.3f} %"]
-    return [*counts, *sizes, f"{held.sum()} of {held.size}"]
+    return [f"{same} of {len(records)}", str(wrong), *error_cells(stated)]
 
 
 FOREIGN_BUSES = Study(

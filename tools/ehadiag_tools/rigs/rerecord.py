@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
 
+from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag_tools.rigs.buses import ForeignBus
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
+from firmware_iface.find_test import CandidateTests
+from firmware_iface.logs.reader import choose_recording
 from firmware_iface.recording import CHANNELS, BitState, CommandMode, Recording, Samples
+from firmware_iface.signals.recordings import Interpretation, recorded_tests
+from firmware_iface.stored_test import bundled_tests
 from firmware_iface.transport.frames import Frame, FrameTable
 
+TESTS = tuple(bundled_tests().values())
 START_NS = 1_700_000_000_000_000_000
 REST_S = 0.15
 """Beginning of each test in which nothing moves; it is what lies before and after the test too."""
@@ -181,3 +191,15 @@ def logged(
     columns = {"time": np.arange(len(true)) / rate}
     columns |= {name: values[sample] for name, values in channels.items()}
     return columns | {f"{this.mode.name.lower()}_command": this.command[heard]}
+
+
+def read_columns(
+    columns: Mapping[str, NDArray[np.float64]], actuator: Actuator | None = None, name: str = "daq"
+) -> Recording:
+    """Write columns as a decoded CSV, and read its best test as `diagnose` does."""
+    controller = (actuator or default_actuator()).controller
+    meaning = Interpretation(default_map(), None, CandidateTests(TESTS, controller))
+    with tempfile.TemporaryDirectory(prefix="ehadiag-") as folder:
+        path = Path(folder) / f"{name}.csv"
+        pandas.DataFrame(dict(columns)).to_csv(path, index=False, float_format="%.9g")
+        return choose_recording(recorded_tests([path], meaning))
