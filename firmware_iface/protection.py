@@ -18,7 +18,6 @@ from firmware_iface.transport.frames import FrameTable
 
 CRC_INITIAL = 0xFF
 CRC_FINAL_XOR = 0xFF
-CRC_KINDS = ("crc8-j1850-id",)
 """Check sums by name. `crc8-j1850-id`: CRC-8 SAE J1850 over the low byte of the identifier, its
 next byte, and the payload without the check sum's own byte (BUS-6)."""
 

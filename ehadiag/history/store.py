@@ -37,7 +37,6 @@ __all__ = [
 
 WRITER_TIMEOUT_S = 30.0
 """Time, s, that one writer waits for the others."""
-WAL_POLL_INTERVAL_S = 0.02
 MIN_FLEET_UNITS, MAX_FLEET_UNITS = 10, 60
 """Number of other units that a forecast reads, whatever their diagnoses: a fleet, and half as many
 again as it learns from, since some show no growth."""

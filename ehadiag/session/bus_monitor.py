@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 CUSUM_SIDES = (("spool", "above"), ("spool", "below"), ("pressure", "above"), ("pressure", "below"))
 """Signal and side of the four sums, in the order of `Reading.alarmed`."""
 ENVIRONMENT_KEYS = ("supply_pressure", "return_pressure", "oil_temperature")
-MessageKey = tuple[int, bool]
-"""Identifier of a message, and whether it is extended."""
 
 
 @dataclass(frozen=True, slots=True)
