@@ -129,9 +129,7 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
         help="further test that the computer may run, to call it by its name; repeatable",
     )
     options.add_screen_options(parser)
-    options.add_request_options(parser, "actuator")
-    options.add_request_options(parser, *options.BUS)
-    options.add_request_options(parser, *options.READING)
+    options.add_request_options(parser, "actuator", *options.BUS, *options.READING)
     option_values.add_bus_options(parser)
     show_usual(
         parser,
@@ -270,9 +268,7 @@ def define_check_bus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plot", metavar="FILE", help="draw each channel over time, PNG; a file there is replaced"
     )
-    options.add_request_options(parser, "actuator")
-    options.add_request_options(parser, *options.BUS)
-    options.add_request_options(parser, *options.READING)
+    options.add_request_options(parser, "actuator", *options.BUS, *options.READING)
     option_values.add_bus_options(parser)
     show_usual(
         parser,
@@ -333,8 +329,7 @@ def define_replay(parser: argparse.ArgumentParser) -> None:
         help="also send the recording's request frames; a flight-control computer on the bus starts"
         " the test, and the surface moves",
     )
-    options.add_request_options(parser, *options.BUS)
-    options.add_request_options(parser, *options.READING)
+    options.add_request_options(parser, *options.BUS, *options.READING)
     option_values.add_bus_options(parser)
     show_usual(
         parser,
@@ -403,8 +398,7 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         help="take changes of the simulated unit as lines of JSON on this port of the loopback"
         " address; 0: any free one",
     )
-    options.add_request_options(parser, "actuator")
-    options.add_request_options(parser, *options.BUS)
+    options.add_request_options(parser, "actuator", *options.BUS)
     option_values.add_bus_options(parser)
     add_simulator_options(parser)
     show_usual(

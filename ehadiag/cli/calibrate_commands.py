@@ -70,10 +70,7 @@ def define_calibrate(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="try each second stage and hysteresis; print the evidence",
     )
-    options.add_request_options(parser, "actuator")
-    options.add_request_options(parser, *options.BUS)
-    options.add_request_options(parser, *options.READING)
-    options.add_request_options(parser, "seed")
+    options.add_request_options(parser, "actuator", *options.BUS, *options.READING, "seed")
     options.add_json_option(parser)
     options.add_report_option(parser, "beside the actuator file, also where nothing was learned")
     show_usual(
@@ -264,8 +261,7 @@ def define_design(parser: argparse.ArgumentParser) -> None:
         metavar="open|closed|FILE",
         help="stored test, or test file, to score and to begin with (default: open)",
     )
-    options.add_request_options(parser, "actuator")
-    options.add_request_options(parser, "tolerance")
+    options.add_request_options(parser, "actuator", "tolerance")
     parser.add_argument("--out", metavar="FILE", help="search a better test and write it here")
     limits = parser.add_argument_group(
         "limits of the better test (default: what the scored test itself does)"

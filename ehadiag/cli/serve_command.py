@@ -70,8 +70,7 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="recordings, results and reports (default ehadiag-out)",
     )
-    options.add_request_options(parser, "actuator")
-    options.add_request_options(parser, *options.BUS)
+    options.add_request_options(parser, "actuator", *options.BUS)
     option_values.add_bus_options(parser)
     add_history_options(parser)
     options.add_request_options(parser, *options.LEVELS)
