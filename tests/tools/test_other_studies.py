@@ -16,11 +16,13 @@ from ehadiag_tools.bench import tiled
 from ehadiag_tools.free_motion.motion import (
     KINDS,
     Motion,
+    MotionCase,
     changed,
     free_motion,
+    garwood,
+    perform,
     random_command,
 )
-from ehadiag_tools.free_motion.study import MotionCase, garwood, perform
 from ehadiag_tools.prognosis.laws import LAWS
 from ehadiag_tools.prognosis.units import LIMIT, TABLE, read_noise, simulate_unit
 from ehadiag_tools.rigs.many import prepare

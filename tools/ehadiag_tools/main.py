@@ -6,17 +6,16 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from ehadiag_tools.accuracy.paper import CUBE, PAPER_CASES
+from ehadiag_tools.accuracy.cases import CUBE, PAPER_CASES
 from ehadiag_tools.accuracy.pictures import PICTURES
 from ehadiag_tools.accuracy.recorded import RECORDED_UNITS
 from ehadiag_tools.accuracy.units import UNITS
 from ehadiag_tools.accuracy.valves import VALVES
 from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE
 from ehadiag_tools.bench import BENCH
-from ehadiag_tools.free_motion.study import FREE_MOTION
-from ehadiag_tools.onboard.random_units import ONBOARD_UNITS
-from ehadiag_tools.onboard.study import ONBOARD
-from ehadiag_tools.prognosis.study import PROGNOSIS
+from ehadiag_tools.free_motion.motion import FREE_MOTION
+from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
+from ehadiag_tools.prognosis.units import PROGNOSIS
 from ehadiag_tools.rigs.daq import DAQ_RECORDINGS
 from ehadiag_tools.rigs.many import MANY_RECORDINGS
 from ehadiag_tools.rigs.replay import FOREIGN_BUSES

@@ -1,25 +1,35 @@
-"""One identification with known truth: the paper's cases, seeded random ones, and their records."""
+"""Studies of severities alone: the paper's cases, and random cases of the unit cube."""
 
 from __future__ import annotations
 
+import argparse
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.identification_session import identify
+from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
 from ehadiag_sim.conditions import Faults, Sensors
 from ehadiag_sim.simulation import simulate
-from ehadiag_tools.accuracy.figures import cramer_rao
+from ehadiag_tools.accuracy.figures import (
+    SEVERITY_HEADINGS,
+    cramer_rao,
+    holds_truth,
+    percent_errors,
+    severity_rows,
+)
 from ehadiag_tools.damaged import damaged_unit
-from ehadiag_tools.study import Record
-from firmware_iface.errors import InputOutputError
+from ehadiag_tools.simulator.compare_logs import read_truth
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
+from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL, Environment, Samples
 from firmware_iface.stored_test import resolve_test
@@ -174,3 +184,178 @@ def _monitoring(test: str, faults: Severities, seed: int) -> tuple[Samples, Envi
         volts = clean + noise * channel.lsb * rng.standard_normal(len(clean))
         measured.append(channel.decode(channel.encode(volts)))
     return replace(samples, spool=measured[0], pressure=measured[1]), environment
+
+
+STAGES = {"first": "first approximation", "search": "genetic search", "value": "final"}
+TITLES = {"open": "Table 1, open loop", "closed": "Table 2, closed loop"}
+
+
+def _paper_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--recordings", type=Path, metavar="FOLDER", help="recordings and their truth.csv instead")
+    add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
+
+
+def _paper_cases(options: Options) -> list[Case]:
+    if options.recordings is None:
+        seeds = range(options.seed - 1, options.seed - 1 + options.cases)
+        return [
+            Case(case.test, case.faults, noise_seed=seed, plant=options.plant)
+            for case in PAPER
+            for seed in seeds
+        ]
+    found = _recorded_cases(options.recordings)
+    if not found:
+        raise ConfigurationError(
+            f"{options.recordings / 'truth.csv'}: no recording of {', '.join(TITLES)}"
+        )
+    return found
+
+
+def _recorded_cases(folder: Path) -> list[Case]:
+    cases = []
+    for row in read_truth(folder / "truth.csv"):
+        if row.test in TITLES:
+            faults = (row.faults.Kintas, row.faults.FSS, row.faults.FDJ)
+            cases.append(Case(row.test, faults, recordings=(str(folder / row.file),)))
+    return cases
+
+
+def _paper_report(records: Sequence[Record], options: Options) -> Iterator[str]:
+    source = options.recordings or f"plant {options.plant}"
+    for test, title in TITLES.items():
+        part = [record for record in records if record["test"] == test]
+        if part:
+            yield f"{title}: mean absolute error in percent, {source}\n"
+            yield from _stage_table(test, part)
+            yield ""
+            yield from _bound_table(test, part)
+            yield ""
+    yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+
+
+def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
+    """Errors of each constant after each stage, and the paper's."""
+    rows = []
+    for (faults,), part in grouped(records, "faults").items():
+        published = _paper_case(test, faults)
+        for stage, name in STAGES.items():
+            cell = "–"
+            if published is not None and stage != "search":
+                cell = f"{published.first if stage == 'first' else published.final:.4f}"
+            error = np.abs(percent_errors(part, stage))
+            rows.append((_label(faults), len(part), name, *_cells(error), cell))
+    shared = [item for item in records if _paper_case(test, tuple(item["faults"])) is not None]
+    error = np.abs(percent_errors(shared)) if shared else np.full((1, 3), np.nan)
+    paper = float(np.mean([case.final for case in PAPER if case.test == test]))
+    rows.append(("the paper's cases", len(shared), "final", *_cells(error), f"{paper:.4f}"))
+    yield from markdown(
+        ("case (Kintas, FSS, FDJ)", "runs", "stage", *FAULT_NAMES, "mean", "worst run",
+         "the paper's mean"),
+        rows,
+    )  # fmt: skip
+    yield f"\nThe paper's final mean is {paper / error.mean():.0f} times ours."
+
+
+def _bound_table(test: str, records: Sequence[Record]) -> Iterator[str]:
+    """Rms errors of each case against its Cramér–Rao bound."""
+    rows = []
+    for (faults,), part in grouped(records, "faults").items():
+        published = _paper_case(test, faults)
+        if published is not None:
+            bound = 100.0 * np.array(part[0]["bound"])
+            ratios = np.sqrt((percent_errors(part) ** 2).mean(axis=0)) / bound
+            pairs = zip(bound, ratios, strict=True)
+            cells = [cell for b, r in pairs for cell in (f"{b:.4f}", f"{r:.2f}")]
+            rows.append((f"{test} {published.number}", len(part), *cells))
+    headings = [cell for name in FAULT_NAMES for cell in (f"{name}: bound, %", "rms / bound")]
+    yield from markdown(("case", "runs", *headings), rows)
+
+
+def _label(faults: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in faults)
+
+
+def _cells(error: NDArray[np.float64]) -> list[str]:
+    """Mean of each constant, of all, and the largest mean of one run."""
+    case = error.mean(axis=1)
+    return [f"{value:.4f}" for value in (*error.mean(axis=0), case.mean(), case.max())]
+
+
+def _paper_case(test: str, faults: Sequence[float]) -> PaperCase | None:
+    return next((c for c in PAPER if c.test == test and c.faults == tuple(faults)), None)
+
+
+def _cube_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
+    add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
+
+
+def _cube_cases(options: Options) -> list[Case]:
+    return [
+        Case(test, faults, noise_seed=index, plant=options.plant)
+        for test in options.test or ("open", "closed")
+        for index, faults in enumerate(random_faults(options.cases, options.seed))
+    ]
+
+
+def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
+    yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
+    yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+    for (test,), part in grouped(records, "test").items():
+        yield f"\n{test}\n"
+        yield from markdown(("figure", "value"), _summary_rows(part))
+        yield f"\n{test}, largest errors\n"
+        yield from markdown(
+            ("noise seed", "truth", "errors", "stated deviations", "outliers, %"), _worst_rows(part)
+        )
+
+
+def _summary_rows(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
+    error = np.abs(percent_errors(records))
+    case, held = error.mean(axis=1), holds_truth(records)
+    truth = np.array([record["faults"] for record in records])
+    inside = held[(truth > 0.0) & (truth < 1.0)]
+    count = len(records)
+    rescued = sum(bool(record["rescued"]) for record in records)
+    unfinished = sum(not record["converged"] for record in records)
+    yield "mean of all constants", f"{case.mean():.4f}"
+    yield "95th percentile of the case mean", f"{np.percentile(case, 95.0):.4f}"
+    yield "worst case mean", f"{case.max():.4f}"
+    yield "maximum of any constant", f"{error.max():.4f}"
+    first = np.abs(percent_errors(records, "first")).mean()
+    yield "mean after the first approximation", f"{first:.3f}"
+    yield "coverage of 95 %, all", f"{100.0 * held.mean():.1f} %"
+    if inside.size:
+        yield "coverage of 95 %, truths inside the cube", f"{100.0 * inside.mean():.1f} %"
+    yield "sent back to the whole cube", f"{rescued} ({rescued / count:.1%})"
+    yield "not converged", f"{unfinished} ({unfinished / count:.1%})"
+    outliers = max(record["outliers"] for record in records)
+    yield "largest share of outliers", f"{outliers:.2%}"
+
+
+def _worst_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+    error = percent_errors(records)
+    for index in np.argsort(-np.abs(error).max(axis=1))[:5]:
+        record = records[index]
+        yield (
+            record["noise_seed"],
+            ", ".join(f"{x:.4f}" for x in record["faults"]),
+            ", ".join(f"{x:+.4f}" for x in error[index]),
+            ", ".join(f"{100.0 * x:.4f}" for x in record["std"]),
+            f"{100.0 * record['outliers']:.2f}",
+        )
+
+
+PAPER_CASES = Study(
+    "paper",
+    "The paper's Tables 1 and 2 beside this project's errors, and their Cramér–Rao bounds.",
+    _paper_cases, perform, _paper_report, _paper_options, count=5,
+    counted="noise seeds of each simulated case",
+)  # fmt: skip
+CUBE = Study(
+    "cube",
+    "Random severities of the unit cube, its corners, edges and faces among them.",
+    _cube_cases, perform, _cube_report, _cube_options,
+)  # fmt: skip
