@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from enum import Enum
-from types import TracebackType
 from typing import Protocol, Self
 
 from firmware_iface.errors import BusLostError, ConfigurationError, EhadiagError
@@ -158,12 +157,7 @@ class Transport(abc.ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @abc.abstractmethod
