@@ -10,7 +10,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 
 import msgspec
 
@@ -45,6 +45,19 @@ MAX_OVERTIME_S = 0.5
 """Seconds after its time in which a computation may end by itself, at its next report."""
 
 T = TypeVar("T")
+
+
+class RecordingOrigin(TypedDict, total=False):
+    """Where the recordings of a diagnosis are from."""
+
+    files: Sequence[str]
+    """That they were read from; empty where they were at hand."""
+    logs: Sequence[Log | None]
+    """Log of each recording."""
+    read_s: float
+    """Time of reading or acquiring them, s."""
+    ended_at: float | None
+    """When a live test ended, on `time.perf_counter`."""
 
 
 class Deadline:
@@ -317,23 +330,17 @@ class Setup:
         self,
         recordings: Sequence[Recording],
         *,
-        files: Sequence[str] = (),
-        logs: Sequence[Log | None] = (),
-        read_s: float = 0.0,
-        ended_at: float | None = None,
         progress: Progress | None = None,
         session: DiagnosisSession | None = None,
         deadline: Deadline | None = None,
+        **origin: Unpack[RecordingOrigin],
     ) -> Result:
         """Diagnose one actuator.
 
-        recordings: of the same actuator; files: that they were read from; empty where they were at
-        hand; logs: log of each recording; read_s: time of reading or acquiring them, s; ended_at:
-        when a live test ended, on `time.perf_counter`; progress: called with each stage and the
-        share of it that is done; where there is a deadline, in another thread; session: that was
-        fed while the test ran; deadline: that has begun already; None: the request's time limit
-        from now on. Returns NOT TESTED where the time limit was reached. KeyboardInterrupt: the
-        progress report raised it.
+        progress: called with each stage and the share of it that is done; where there is a
+        deadline, in another thread; session: that was fed while the test ran; deadline: that has
+        begun already; None: the request's time limit from now on. Returns NOT TESTED where the time
+        limit was reached. KeyboardInterrupt: the progress report raised it.
         """
         begin = time.perf_counter()
         limit = self.request.time_limit_s
@@ -346,32 +353,18 @@ class Setup:
             found = work(report) if deadline is None else deadline.run(work, report)
         except NotTestedError as error:
             found = self._not_tested(recordings, str(error), time.perf_counter() - begin)
-        return self.result(found, files=files, logs=logs, read_s=read_s, ended_at=ended_at)
+        return self.result(found, **origin)
 
     def not_tested(
-        self,
-        recordings: Sequence[Recording],
-        why: str,
-        *,
-        files: Sequence[str] = (),
-        logs: Sequence[Log | None] = (),
-        read_s: float = 0.0,
-        ended_at: float | None = None,
+        self, recordings: Sequence[Recording], why: str, **origin: Unpack[RecordingOrigin]
     ) -> Result:
         """Return the result NOT TESTED of recordings that were not judged; as `diagnose`."""
-        found = self._not_tested(recordings, why)
-        return self.result(found, files=files, logs=logs, read_s=read_s, ended_at=ended_at)
+        return self.result(self._not_tested(recordings, why), **origin)
 
-    def result(
-        self,
-        diagnosis: Diagnosis,
-        *,
-        files: Sequence[str] = (),
-        logs: Sequence[Log | None] = (),
-        read_s: float = 0.0,
-        ended_at: float | None = None,
-    ) -> Result:
+    def result(self, diagnosis: Diagnosis, **origin: Unpack[RecordingOrigin]) -> Result:
         """Put a diagnosis down with what it was asked for; as `diagnose`."""
+        files, logs = origin.get("files", ()), origin.get("logs", ())
+        ended_at = origin.get("ended_at")
         merge = self.request.merge
         joint = len(diagnosis.recordings) > 1 and not merge
         request = msgspec.structs.replace(
@@ -383,7 +376,7 @@ class Setup:
             request,
             sources=self._sources_at_hand if at_hand else self.sources,
             logs=logs,
-            read_s=read_s,
+            read_s=origin.get("read_s", 0.0),
             after_test_s=None if ended_at is None else time.perf_counter() - ended_at,
         )
 
