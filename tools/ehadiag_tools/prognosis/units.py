@@ -177,9 +177,8 @@ def perform(case: LifeCase) -> Record:
         own = learn_fleet([*lives, *earlier], fleet.scale, case.seed) if earlier else fleet
         found = forecast(unit.name, "hours", life, own, (LIMIT,), case.seed)
         (left,) = found.remaining
-        numbers = None
-        if left.median is not None:
-            numbers = [value / length for value in (left.low, left.median, left.high)]
+        ends = None if left.median is None else np.array([left.low, left.median, left.high])
+        numbers = None if ends is None else (ends / length).tolist()
         true = (unit.end - life.born - life.age[-1]) / length
         asked.append((share, true, bool(found.alarm), numbers))
     return {"asked": asked}
