@@ -27,6 +27,7 @@ from firmware_iface.files import read_toml
 
 if TYPE_CHECKING:
     from ehadiag_sim.control import SimulatorControl
+    from ehadiag_sim.foreign_plant import ForeignPlant
 
 DATA_ERROR_NAMES = tuple(item.name for item in fields(DataErrors))
 OTHER_KEYS = ("data_error", "broken")
@@ -57,6 +58,18 @@ def add_simulator_options(parser: argparse.ArgumentParser) -> None:
         help="changes of the simulated unit while it runs, with their times (TOML)",
     )
     group.add_argument(
+        "--plant",
+        metavar="FMU",
+        help="plant of another maker in place of the simulated actuator (FMI 2.0 or 3.0), a program"
+        " that runs with your rights",
+    )
+    group.add_argument(
+        "--plant-mapping",
+        metavar="FILE",
+        help="which variables of the plant are current, spool, pressure and position (TOML;"
+        " default: the FMU's name with .toml)",
+    )
+    group.add_argument(
         "--simulator-seed",
         type=seed_number,
         default=1,
@@ -81,8 +94,9 @@ def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the keyword arguments of `ehadiag_sim.emulator.emulated_computer`.
 
     arguments: the parsed command line. Returns severities, effects, errors of sensors, broken
-    hardware, seed, serial number and changes while it runs. ConfigurationError: a value out of its
-    range, a key that no scenario has. InputOutputError: scenario or script cannot be read.
+    hardware, seed, serial number, changes while it runs and another maker's plant.
+    ConfigurationError: a value out of its range, a key that no scenario has. InputOutputError:
+    scenario or script cannot be read.
     """
     scenario: Mapping[str, Any] = {}
     where = ""
@@ -103,7 +117,19 @@ def simulator_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "seed": arguments.simulator_seed,
         "serial": arguments.unit,
         "control": _control(arguments),
+        "foreign": _foreign_plant(arguments),
     }
+
+
+def _foreign_plant(arguments: argparse.Namespace) -> ForeignPlant | None:
+    mapping = arguments.plant_mapping
+    if arguments.plant is None:
+        if mapping is not None:
+            raise ConfigurationError("--plant-mapping: goes with --plant FMU")
+        return None
+    from ehadiag_sim.foreign_plant import ForeignPlant  # noqa: PLC0415 - loads msgspec
+
+    return ForeignPlant(Path(arguments.plant), Path(mapping) if mapping else None)
 
 
 def _control(arguments: argparse.Namespace) -> SimulatorControl | None:

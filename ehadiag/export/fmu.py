@@ -8,7 +8,7 @@ import platform
 import sys
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any, Final
@@ -37,6 +37,7 @@ from ehadiag.monitor.monitor_memory import MONITOR, MONITOR_UNIT_FIELDS, prepare
 from ehadiag.monitor.plan import design_cusum, monitor_plan
 from ehadiag.monitor.push_kernel import push_tick
 from ehadiag_sim.fmu_plant import (
+    FIXED_VALUES,
     PLANT_MEMORY,
     FmuInputs,
     FmuOutputs,
@@ -61,7 +62,25 @@ class FmuVariable:
     start: float
     """Before anything is set."""
     meaning: str
-    """With the unit of measure, for people."""
+    """For people."""
+    unit: str
+    """Unit of measure, one of `FMU_UNITS`."""
+    is_fixed: bool = False
+    """Whether a parameter cannot be set in a run."""
+
+
+FMU_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    "1": {},
+    "A": {"A": 1},
+    "m": {"m": 1},
+    "m/s": {"m": 1, "s": -1},
+    "s": {"s": 1},
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "N/m": {"kg": 1, "s": -2},
+    "Pa": {"kg": 1, "m": -1, "s": -2},
+    "degC": {"K": 1, "offset": 273.15},
+}
+"""Units of measure by their exponents of SI base units (FMI 2.0, 2.2.2)."""
 
 
 def model_description(
@@ -90,10 +109,16 @@ def model_description(
             "variableNamingConvention": "flat",
         },
     )
+    word = "State" if three else "state"
     co = {"modelIdentifier": model, "canHandleVariableCommunicationStepSize": "true"}
+    co |= {f"canGetAndSetFMU{word}": "true", f"canSerializeFMU{word}": "true"}
     if three:
         co["fixedInternalStepSize"] = repr(tick)
     ET.SubElement(root, "CoSimulation", co)
+    used = ET.SubElement(root, "UnitDefinitions")
+    for unit in sorted({item.unit for item in variables}):
+        exponents = {key: f"{value:g}" for key, value in FMU_UNITS[unit].items()}
+        ET.SubElement(ET.SubElement(used, "Unit", {"name": unit}), "BaseUnit", exponents)
     ET.SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(tick)})
     listed = ET.SubElement(root, "ModelVariables")
     if three:
@@ -112,10 +137,12 @@ def model_description(
             "name": item.name,
             "valueReference": str(place),
             "causality": item.causality,
-            "variability": "fixed" if item.causality == "parameter" else "discrete",
+            "variability": "discrete",
             "description": item.meaning,
         }
-        start = {"start": repr(float(item.start))}
+        if item.causality == "parameter":
+            attributes["variability"] = "fixed" if item.is_fixed else "tunable"
+        start = {"start": repr(float(item.start)), "unit": item.unit}
         if item.causality == "output":
             attributes["initial"] = "exact"
         if three:
@@ -172,9 +199,11 @@ def actuator_variables() -> tuple[FmuVariable, ...]:
     start = {"plays": 1.0, "oil_temperature": 40.0}
     start |= {"supply_pressure": 20.7e6, "return_pressure": 0.7e6}
     return (
-        *_variables("parameter", (*UnitCondition._fields, *FmuSettings._fields), start),
-        *_variables("input", FmuInputs._fields, {}),
-        *_variables("output", FmuOutputs._fields, {}),
+        *_variables(
+            "parameter", (*UnitCondition._fields, *FmuSettings._fields), start, FIXED_VALUES
+        ),
+        *_variables("input", FmuInputs._fields),
+        *_variables("output", FmuOutputs._fields),
     )
 
 
@@ -188,55 +217,62 @@ def monitor_variables(supply: float) -> tuple[FmuVariable, ...]:
     )  # fmt: skip
     start = {"viscosity": 1.0, "supply": supply}
     return (
-        *_variables("parameter", MONITOR_UNIT_FIELDS, start),
-        *_variables("input", inputs, {}),
-        *_variables("output", outputs, {}),
+        *_variables("parameter", MONITOR_UNIT_FIELDS, start, MONITOR_UNIT_FIELDS),
+        *_variables("input", inputs),
+        *_variables("output", outputs),
     )
 
 
 def _variables(
-    causality: str, names: Sequence[str], start: Mapping[str, float]
+    causality: str,
+    names: Sequence[str],
+    start: Mapping[str, float] | None = None,
+    fixed: Collection[str] = (),
 ) -> tuple[FmuVariable, ...]:
-    return tuple(
-        FmuVariable(
-            name,
-            causality,
-            start.get(name, 0.0),
-            VARIABLE_MEANINGS.get(name, name.replace("_", " ")),
+    made = []
+    for name in names:
+        unit, meaning = VARIABLE_MEANINGS.get(name, ("1", name.replace("_", " ")))
+        made.append(
+            FmuVariable(name, causality, (start or {}).get(name, 0.0), meaning, unit, name in fixed)
         )
-        for name in names
-    )
+    return tuple(made)
 
 
-VARIABLE_MEANINGS: Final = {
-    **{name: f"severity, 0 … 1: {law.meaning}" for name, law in FAULT_LAWS.items()},
-    "backlash": "half-width of the backlash at the feedback spring, m",
-    "oil_temperature": "degC",
-    "supply_pressure": "Pa",
-    "return_pressure": "Pa",
-    "spool_stribeck": "Stribeck velocity of the spool, m/s; 0: none",
-    "jack_stribeck": "Stribeck velocity of the jack, m/s; 0: none",
-    "load": "N",
-    "load_spring": "N/m",
-    "filter_time": "time constant before the converters of spool and pressure, s",
-    "hysteresis": "of the torque motor, over rated current",
-    "null_bias": "A",
-    "closed": "not 0: commands are positions, m; else currents, A",
-    "command": "A or m",
-    "current": "A, digitised",
-    "spool": "m, digitised",
-    "pressure": "Pa, digitised",
-    "position": "m, digitised",
-    "true_current": "A",
-    "true_spool": "m",
-    "true_pressure": "Pa",
-    "true_position": "m",
-    "viscosity": "of the oil, over that at 40 degC",
-    "supply": "supply minus return pressure, Pa",
-    "spool_offset": "constant error of the spool's sensor, m",
-    "pressure_offset": "constant error of the sensor of differential pressure, Pa",
-    "alarms": "sum of 1 (spool, upper), 2 (lower), 4 (pressure, upper), 8 (lower)",
+VARIABLE_MEANINGS: Final[Mapping[str, tuple[str, str]]] = {
+    **{name: ("1", f"severity, 0 … 1: {law.meaning}") for name, law in FAULT_LAWS.items()},
+    "backlash": ("m", "half-width of the backlash at the feedback spring"),
+    "oil_temperature": ("degC", "temperature of the oil"),
+    "supply_pressure": ("Pa", "supply pressure"),
+    "return_pressure": ("Pa", "return pressure"),
+    "spool_stribeck": ("m/s", "Stribeck velocity of the spool; 0: none"),
+    "jack_stribeck": ("m/s", "Stribeck velocity of the jack; 0: none"),
+    "load": ("N", "constant load on the jack"),
+    "load_force": ("N", "force of another model on the jack, added to the load"),
+    "load_spring": ("N/m", "stiffness of a load spring"),
+    "filter_time": ("s", "time constant before the converters of spool and pressure"),
+    "hysteresis": ("1", "of the torque motor, over rated current"),
+    "null_bias": ("A", "of the torque motor"),
+    "closed": ("1", "not 0: commands are positions, m; else currents, A"),
+    "command": ("1", "A or m"),
+    "current": ("A", "current, digitised"),
+    "spool": ("m", "spool position, digitised"),
+    "pressure": ("Pa", "differential pressure, digitised"),
+    "position": ("m", "jack position, digitised"),
+    "true_current": ("A", "current"),
+    "true_spool": ("m", "spool position"),
+    "true_pressure": ("Pa", "differential pressure"),
+    "true_position": ("m", "jack position"),
+    "true_velocity": ("m/s", "jack velocity"),
+    "predicted_spool": ("m", "spool position by the model"),
+    "predicted_pressure": ("Pa", "differential pressure by the model"),
+    "predicted_position": ("m", "jack position by the model"),
+    "viscosity": ("1", "of the oil, over that at 40 degC"),
+    "supply": ("Pa", "supply minus return pressure"),
+    "spool_offset": ("m", "constant error of the spool's sensor"),
+    "pressure_offset": ("Pa", "constant error of the sensor of differential pressure"),
+    "alarms": ("1", "sum of 1 (spool, upper), 2 (lower), 4 (pressure, upper), 8 (lower)"),
 }
+"""Unit of measure and meaning of a variable; those of no unit are named alone."""
 
 
 def export_fmus(
@@ -329,6 +365,9 @@ def _fmu_header(model: _FmuModel, name: str, token: str, tick: float) -> bytes:
     counts: dict[str, int] = {}
     for item in model.variables:
         counts[item.causality] = counts.get(item.causality, 0) + 1
+    fixed = "".join(
+        "01"[item.is_fixed] for item in model.variables if item.causality == "parameter"
+    )
     starts = ", ".join(repr(float(item.start)) for item in model.variables)
     lines: dict[str, Any] = {
         "MODEL": f'"{name}"',
@@ -338,6 +377,7 @@ def _fmu_header(model: _FmuModel, name: str, token: str, tick: float) -> bytes:
         "PARAMETERS": f"{counts['parameter']}u",
         "INPUTS": f"{counts['input']}u",
         "MEMORY": f"{model.memory}u",
+        "FIXED": f'"{fixed}"',
         "STARTS": f"{{{starts}}}",
     }
     defined = "".join(f"#define EHA_{key} {value}\n" for key, value in lines.items())

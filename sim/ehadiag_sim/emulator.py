@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from firmware_iface.recording import BitReason, BitState, CommandMode
 from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S, Transport, TransportState
 from firmware_iface.transport.frames import Frame
+
+if TYPE_CHECKING:
+    from ehadiag_sim.foreign_plant import ForeignPlant
 
 MAX_SERIAL_NUMBER = 0xFFFF
 
@@ -57,8 +61,9 @@ class FccCore:
     None: the defaults; idle_telemetry: whether telemetry is sent between tests too; start_ns: time
     of the first tick, ns; bus_map: messages to send and accept; None: the default bus;
     channel_faults: damage to the readings of the channels; None: none; control: changes while it
-    runs; None: none. ConfigurationError: two tests with one number, a test at another rate than the
-    controller; a serial number, a converter's range or the rated current that the bus cannot carry.
+    runs; None: none; foreign: plant of another maker; None: the detailed simulator.
+    ConfigurationError: two tests with one number, a test at another rate than the controller; a
+    serial number, a converter's range or the rated current that the bus cannot carry.
     """
 
     def __init__(
@@ -77,6 +82,7 @@ class FccCore:
         bus_map: BusMap | None = None,
         channel_faults: Sequence[ChannelFault] = (),
         control: SimulatorControl | None = None,
+        foreign: ForeignPlant | None = None,
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL_NUMBER:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL_NUMBER}")
@@ -84,6 +90,7 @@ class FccCore:
         self._tests = _by_number(tests, actuator)
         self._faults, self._sensors = faults, sensors
         self._channel_faults = tuple(channel_faults)
+        self._foreign = foreign
         self._effects = effects or Effects()
         self._control = control
         if control is not None:
@@ -268,6 +275,7 @@ class FccCore:
             seed,
             channel_faults=self._channel_faults,
             scales=self._scales,
+            foreign=self._foreign,
         )
 
 
@@ -303,6 +311,7 @@ def emulated_computer(
     seed: int = 0,
     serial: int = 1,
     control: SimulatorControl | None = None,
+    foreign: ForeignPlant | None = None,
 ) -> FccCore:
     """Return a computer with an actuator that may be broken, its kernels loaded.
 
@@ -310,7 +319,7 @@ def emulated_computer(
     own; bus_map: see `FccCore`, as for the parameters that follow; faults: severities of the
     faults; effects: effects beside the faults; sensors: errors of the converters; broken: kind of
     broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
-    noise; serial: serial number of the actuator; control: changes while it runs. Returns the
+    noise; serial: serial number of the actuator; control, foreign: see `FccCore`. Returns the
     emulated computer; its first tick has
     the present date, also in simulated time. ConfigurationError: see `FccCore`; an unknown kind of
     broken hardware.
@@ -329,6 +338,7 @@ def emulated_computer(
         bus_map=bus_map,
         channel_faults=item.channel_faults,
         control=control,
+        foreign=foreign,
         start_ns=time.time_ns(),
     )
     core.step()

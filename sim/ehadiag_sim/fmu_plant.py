@@ -21,7 +21,6 @@ from ehadiag_sim import plant_laws as laws
 from ehadiag_sim.conditions import DataErrors, Effects, Faults, Sensors
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S, STATE, advance_plant
 from ehadiag_sim.plant_laws import (
-    PlantCoefficients,
     PositionLaw,
     UnitCondition,
     UnitData,
@@ -63,6 +62,8 @@ class FmuInputs(NamedTuple):
 
     command: float
     """A or m."""
+    load_force: float
+    """Force of another model on the jack, N, against positive positions as the constant load."""
 
 
 class FmuOutputs(NamedTuple):
@@ -84,6 +85,8 @@ class FmuOutputs(NamedTuple):
     """Pa."""
     true_position: float
     """m."""
+    true_velocity: float
+    """Of the jack, m/s."""
 
 
 class FmuPlaces(NamedTuple):
@@ -99,7 +102,6 @@ class FmuPlaces(NamedTuple):
 class PlantPlaces(NamedTuple):
     """Places of the memory of a unit."""
 
-    coefficients: int
     state: int
     plays: int
     integral: int
@@ -120,13 +122,13 @@ class PlanPlaces(NamedTuple):
 
 
 FMU_VALUES = FmuPlaces(*places(UnitCondition, FmuSettings, FmuInputs, FmuOutputs))
-PLANT_MEMORY = PlantPlaces(*places(PlantCoefficients, STATE.end, MAX_FMU_PLAYS, 1, 1))
+PLANT_MEMORY = PlantPlaces(*places(STATE.end, MAX_FMU_PLAYS, 1, 1))
 PLANT_PLAN = PlanPlaces(*places(UnitData, PositionLaw, len(CHANNELS), len(CHANNELS)))
 
 _condition_of, _settings_of = unpacker(UnitCondition), unpacker(FmuSettings, FMU_VALUES.settings)
 _data_of, _law_of = unpacker(UnitData), unpacker(PositionLaw, PLANT_PLAN.law)
-_coefficients_of, _keep_coefficients = unpacker(PlantCoefficients), packer(PlantCoefficients)
 _keep_outputs = packer(FmuOutputs, FMU_VALUES.outputs)
+LOAD_PLACE = UnitCondition._fields.index("load")
 FMU_COMMAND_RESOLUTION = (DEFAULT_SCALES.current_step, DEFAULT_SCALES.position_step)
 """Of commands on the bus, A and m."""
 
@@ -177,6 +179,7 @@ def _show(values: Any, current: float, state: Any, plan: Any) -> None:
             state[STATE.spool],
             state[STATE.pressure],
             state[STATE.jack],
+            state[STATE.jack_velocity],
         ),
     )
 
@@ -191,10 +194,29 @@ _RANGES = {
     },
 }
 _RANGED = (*UnitCondition._fields, "hysteresis", "plays", "null_bias")
+FIXED_VALUES: Final = frozenset(
+    {*(f"E_{item.name}" for item in fields(DataErrors)), "plays", "filter_time"}
+)
+"""Parameters that cannot be set in a run: errors of the data, sizes of the memory."""
 RANGED_VALUES: Final = len(_RANGED)
 """Number of values, the first ones, that have the range of a condition of the simulator, 1."""
 LOWEST_VALUES: Final = tuple(float(_RANGES[name][0]) for name in _RANGED)
 HIGHEST_VALUES: Final = tuple(float(_RANGES[name][1]) for name in _RANGED)
+
+
+@bare_kernel
+def _are_sound(values: Any) -> bool:
+    """Whether condition, settings and inputs are finite and in their ranges."""
+    for i in range(FMU_VALUES.outputs):
+        if not math.isfinite(values[i]):
+            return False
+    for i in range(RANGED_VALUES):
+        if not LOWEST_VALUES[i] <= values[i] <= HIGHEST_VALUES[i]:
+            return False
+    c = _condition_of(values)
+    if c.supply_pressure <= c.return_pressure:
+        return False
+    return bool(_settings_of(values).plays <= MAX_FMU_PLAYS)
 
 
 @bare_kernel
@@ -206,20 +228,11 @@ def start_plant(address: int, plan_address: int, values_address: int) -> int:
         array_at(address, (PLANT_MEMORY.end,)),
         array_at(values_address, (FMU_VALUES.end,)),
     )
-    c, s = _condition_of(values), _settings_of(values)
-    for i in range(FMU_VALUES.inputs):
-        if not math.isfinite(values[i]):
-            return 1
-    for i in range(RANGED_VALUES):
-        if not LOWEST_VALUES[i] <= values[i] <= HIGHEST_VALUES[i]:
-            return 1
-    if s.plays > MAX_FMU_PLAYS or c.supply_pressure <= c.return_pressure:
+    if not _are_sound(values):
         return 1
     for i in range(PLANT_MEMORY.end):
         memory[i] = 0.0
     plan = array_at(plan_address, (PLANT_PLAN.end,))
-    data = _data_of(plan)
-    _keep_coefficients(memory, _scaled(data, c))
     memory[PLANT_MEMORY.error] = math.nan
     _show(
         values, 0.0, array_at(address + BYTES_PER_NUMBER * PLANT_MEMORY.state, (STATE.end,)), plan
@@ -229,10 +242,9 @@ def start_plant(address: int, plan_address: int, values_address: int) -> int:
 
 @bare_kernel
 def tick_plant(address: int, plan_address: int, values_address: int) -> int:
-    """Advance the unit by one control tick under the command among its values, and write the
-    outputs.
+    """Advance the unit by one control tick under its values, and write the outputs.
 
-    Returns 0, or 1 where the command is no number.
+    Returns 0, or 1 where a value is no number or out of range.
     """
     memory, values = (
         array_at(address, (PLANT_MEMORY.end,)),
@@ -241,10 +253,13 @@ def tick_plant(address: int, plan_address: int, values_address: int) -> int:
     plan = array_at(plan_address, (PLANT_PLAN.end,))
     law = _law_of(plan)
     state = array_at(address + BYTES_PER_NUMBER * PLANT_MEMORY.state, (STATE.end,))
-    s, p = _settings_of(values), _coefficients_of(memory)
-    command = values[FMU_VALUES.inputs]
-    if not math.isfinite(command):
+    if not _are_sound(values):
         return 1
+    s, command = _settings_of(values), values[FMU_VALUES.inputs]
+    constant_load = values[LOAD_PLACE]
+    values[LOAD_PLACE] = constant_load + values[FMU_VALUES.inputs + 1]
+    p = _scaled(_data_of(plan), _condition_of(values))
+    values[LOAD_PLACE] = constant_load
     resolution = FMU_COMMAND_RESOLUTION[0] if s.closed == 0.0 else FMU_COMMAND_RESOLUTION[1]
     command = np.rint(command / resolution) * resolution
     if s.closed == 0.0:

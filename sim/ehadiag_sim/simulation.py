@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,9 @@ from firmware_iface.recording import (
 )
 from firmware_iface.stored_test import StoredTest
 
+if TYPE_CHECKING:
+    from ehadiag_sim.foreign_plant import ForeignPlant, ForeignRun
+
 
 class Plant:
     """One actuator with its converters and control law, at rest in the middle to begin with.
@@ -46,7 +50,8 @@ class Plant:
     converters err; None: the specified noise, no offsets; seed: seed of the noise; the same seed
     gives the same samples; step: integration step, s; channel_faults: damage to the readings of the
     channels; None: none; scales: converters, and resolution of commands; None: the converters of
-    the actuator's file, the resolution of the default bus. ConfigurationError: a step that is not
+    the actuator's file, the resolution of the default bus; foreign: plant of another maker; None:
+    the detailed simulator. ConfigurationError: a step that is not
     finite or not within 1 ns … one tick; sensors sampled a tick early or more.
     """
 
@@ -61,12 +66,23 @@ class Plant:
         step: float = DEFAULT_STEP_S,
         channel_faults: Sequence[ChannelFault] = (),
         scales: Scales | None = None,
+        foreign: ForeignPlant | None = None,
     ) -> None:
         self._scales = scales or Scales(actuator_channels(actuator))
         sensors, effects = sensors or Sensors(), effects or Effects()
-        self._dynamics = PlantDynamics(
-            actuator, faults, effects, step, filter_time=sensors.filter_time, early=sensors.early
-        )
+        self._dynamics: PlantDynamics | ForeignRun
+        if foreign is None:
+            self._dynamics = PlantDynamics(
+                actuator,
+                faults,
+                effects,
+                step,
+                filter_time=sensors.filter_time,
+                early=sensors.early,
+            )
+        else:
+            tick = 1.0 / actuator.controller.rate
+            self._dynamics = foreign.begin(tick, faults or Faults(), effects, sensors)
         self._converters = SimulatedConverters(
             actuator, sensors, effects.unmodelled, seed, channel_faults, self._scales.channels
         )
@@ -201,6 +217,7 @@ def simulate(
     step: float = DEFAULT_STEP_S,
     channel_faults: Sequence[ChannelFault] = (),
     scales: Scales | None = None,
+    foreign: ForeignPlant | None = None,
 ) -> SimulatedRun:
     """Run a stored test from rest; the same seed gives the same run.
 
@@ -222,6 +239,7 @@ def simulate(
         step=step,
         channel_faults=channel_faults,
         scales=scales,
+        foreign=foreign,
     )
     command, mode = bus_command(test, plant.scales), _mode(test)
     truth = np.empty((4, test.ticks))

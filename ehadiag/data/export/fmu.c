@@ -37,6 +37,7 @@ typedef struct {
 } unit;
 
 static const double starts[EHA_VALUES] = EHA_STARTS;
+static const char fixed[EHA_PARAMETERS + 1] = EHA_FIXED; /* '1': not to be set in a run */
 
 static int refuse(unit *u, int status, const char *why)
 {
@@ -98,8 +99,8 @@ static int set(unit *u, const uint32_t *references, size_t count, const double *
         if (references[i] >= EHA_PARAMETERS + EHA_INPUTS) {
             return refuse(u, ERROR, "not a parameter and not an input");
         }
-        if (u->running != 0 && references[i] < EHA_PARAMETERS) {
-            return refuse(u, ERROR, "parameters are fixed once the unit is initialised");
+        if (u->running != 0 && references[i] < EHA_PARAMETERS && fixed[references[i]] == '1') {
+            return refuse(u, ERROR, "this parameter is fixed once the unit is initialised");
         }
         u->values[references[i]] = values[i];
     }
@@ -119,12 +120,108 @@ static int advance(unit *u, double now, double step)
     }
     for (double tick = 0.0; tick < whole; tick += 1.0) {
         if (eha_tick_once(u->memory, u->values) != 0) {
-            return refuse(u, ERROR, "an input is no number");
+            return refuse(u, ERROR, "an input is no number, or a parameter is out of its range");
         }
     }
     u->time = now + step;
     return OK;
 }
+
+/* State of a unit: all that changes in a run, as bytes. */
+typedef struct {
+    double values[EHA_VALUES];
+    double memory[EHA_MEMORY];
+    double time;
+    double running;
+} state;
+
+static int keep_state(const unit *u, void **kept)
+{
+    state *s = (state *)(*kept != NULL ? *kept : malloc(sizeof *s));
+
+    if (s == NULL) {
+        return ERROR;
+    }
+    (void)memcpy(s->values, u->values, sizeof s->values);
+    (void)memcpy(s->memory, u->memory, sizeof s->memory);
+    s->time = u->time;
+    s->running = (double)u->running;
+    *kept = s;
+    return OK;
+}
+
+static int take_state(unit *u, const void *kept)
+{
+    const state *s = (const state *)kept;
+
+    if (s == NULL) {
+        return refuse(u, ERROR, "no state");
+    }
+    (void)memcpy(u->values, s->values, sizeof u->values);
+    (void)memcpy(u->memory, s->memory, sizeof u->memory);
+    u->time = s->time;
+    u->running = s->running != 0.0;
+    return OK;
+}
+
+static int free_state(void **kept)
+{
+    free(*kept);
+    *kept = NULL;
+    return OK;
+}
+
+static int write_state(unit *u, const void *kept, void *bytes, size_t size)
+{
+    if (kept == NULL || size < sizeof(state)) {
+        return refuse(u, ERROR, "no state, or no room for it");
+    }
+    (void)memcpy(bytes, kept, sizeof(state));
+    return OK;
+}
+
+static int read_state(unit *u, const void *bytes, size_t size, void **kept)
+{
+    if (size != sizeof(state)) {
+        return refuse(u, ERROR, "these bytes are no state of this unit");
+    }
+    if (*kept == NULL) {
+        *kept = malloc(sizeof(state));
+    }
+    if (*kept == NULL) {
+        return ERROR;
+    }
+    (void)memcpy(*kept, bytes, sizeof(state));
+    return OK;
+}
+
+#define STATE_FUNCTIONS(get, set, drop, size_of, serialize, deserialize, byte)              \
+    int get(void *u, void **kept) { return keep_state((const unit *)u, kept); }             \
+    int set(void *u, void *kept) { return take_state((unit *)u, kept); }                    \
+    int drop(void *u, void **kept)                                                          \
+    {                                                                                       \
+        (void)u;                                                                            \
+        return free_state(kept);                                                            \
+    }                                                                                       \
+    int size_of(void *u, void *kept, size_t *size)                                          \
+    {                                                                                       \
+        (void)u, (void)kept;                                                                \
+        *size = sizeof(state);                                                              \
+        return OK;                                                                          \
+    }                                                                                       \
+    int serialize(void *u, void *kept, byte bytes[], size_t size)                           \
+    {                                                                                       \
+        return write_state((unit *)u, kept, bytes, size);                                   \
+    }                                                                                       \
+    int deserialize(void *u, const byte bytes[], size_t size, void **kept)                  \
+    {                                                                                       \
+        return read_state((unit *)u, bytes, size, kept);                                    \
+    }
+
+STATE_FUNCTIONS(fmi3GetFMUState, fmi3SetFMUState, fmi3FreeFMUState, fmi3SerializedFMUStateSize,
+                fmi3SerializeFMUState, fmi3DeserializeFMUState, uint8_t)
+STATE_FUNCTIONS(fmi2GetFMUstate, fmi2SetFMUstate, fmi2FreeFMUstate, fmi2SerializedFMUstateSize,
+                fmi2SerializeFMUstate, fmi2DeSerializeFMUstate, char)
 
 /* ---- FMI 3.0 ---- */
 
@@ -306,12 +403,6 @@ REFUSED(fmi3SetBinary)
 REFUSED(fmi3SetClock)
 REFUSED(fmi3GetNumberOfVariableDependencies)
 REFUSED(fmi3GetVariableDependencies)
-REFUSED(fmi3GetFMUState)
-REFUSED(fmi3SetFMUState)
-REFUSED(fmi3FreeFMUState)
-REFUSED(fmi3SerializedFMUStateSize)
-REFUSED(fmi3SerializeFMUState)
-REFUSED(fmi3DeserializeFMUState)
 REFUSED(fmi3GetDirectionalDerivative)
 REFUSED(fmi3GetAdjointDerivative)
 REFUSED(fmi3GetIntervalDecimal)
@@ -343,12 +434,6 @@ REFUSED(fmi2GetString)
 REFUSED(fmi2SetInteger)
 REFUSED(fmi2SetBoolean)
 REFUSED(fmi2SetString)
-REFUSED(fmi2GetFMUstate)
-REFUSED(fmi2SetFMUstate)
-REFUSED(fmi2FreeFMUstate)
-REFUSED(fmi2SerializedFMUstateSize)
-REFUSED(fmi2SerializeFMUstate)
-REFUSED(fmi2DeSerializeFMUstate)
 REFUSED(fmi2GetDirectionalDerivative)
 REFUSED(fmi2SetRealInputDerivatives)
 REFUSED(fmi2GetRealOutputDerivatives)

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from places import LOGS
 
-from ehadiag import CommandMode, ConfigurationError, Monitor, default_actuator
+from ehadiag import CommandMode, ConfigurationError, Monitor, bundled_tests, default_actuator
+from ehadiag.cli.main import main
 from ehadiag.export.fmu import export_fmus
 from ehadiag.monitor.monitor_memory import MONITOR_UNIT_FIELDS
 from ehadiag_sim.conditions import Effects, Faults, Sensors
-from ehadiag_sim.simulation import Plant
+from ehadiag_sim.foreign_plant import ForeignPlant
+from ehadiag_sim.simulation import Plant, simulate
 from ehadiag_tools.onboard.replay import ticks_of, unit_of
 from firmware_iface.files import RESULT_MODE, Folder
 from firmware_iface.logs.reader import read_recording
@@ -138,7 +140,102 @@ def test_what_cannot_be_is_refused(units, version, tmp_path):
     with pytest.raises(Exception, match="fmi"):
         unit.step(0.4 * TICK)
     with pytest.raises(Exception, match="fmi"):
-        unit.put({"Kintas": 0.5})
+        unit.put({"E_GM": 0.05})
+    unit.put({"Kintas": 1.5})
+    with pytest.raises(Exception, match="fmi"):
+        unit.step()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_faults_oil_and_load_change_in_a_run(units, version, tmp_path):
+    unit = Running(str(units / f"eha_actuator_fmi{version}.fmu"), tmp_path, {})
+    plant = Plant(default_actuator(), sensors=Sensors(noise_lsb=0.0))
+    names = ("true_current", "true_spool", "true_pressure", "true_position")
+    for k in range(200):
+        if k == 80:
+            values = {"FDJ": 0.5, "oil_temperature": 0.0, "supply_pressure": 18e6}
+            unit.put({**values, "load": 1000.0, "load_force": 500.0})
+            effects = Effects(oil_temperature=0.0, supply_pressure=18e6, load=1500.0)
+            plant.change(Faults(FDJ=0.5), effects, Sensors(noise_lsb=0.0))
+        command = 0.005 * math.sin(0.05 * k)
+        unit.put({"command": command})
+        unit.step()
+        plant.tick(command, CommandMode.CURRENT)
+        np.testing.assert_allclose(unit.read(*names), plant.truth, rtol=1e-9, atol=1e-15)
+    moved = np.diff(unit.read("true_position"), prepend=plant.truth[3])
+    assert moved == pytest.approx(0.0, abs=1e-12)
+    assert unit.read("true_velocity") != 0.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_goes_on_from_a_stored_state(units, name, tmp_path):
+    unit = Running(units / f"{name}.fmu", tmp_path, {})
+    three = name.endswith("3")
+    keep = unit.fmu.getFMUState if three else unit.fmu.getFMUstate
+    restore = unit.fmu.setFMUState if three else unit.fmu.setFMUstate
+    free = unit.fmu.freeFMUState if three else unit.fmu.freeFMUstate
+    pack = unit.fmu.serializeFMUState if three else unit.fmu.serializeFMUstate
+    unpack = unit.fmu.deserializeFMUState if three else unit.fmu.deSerializeFMUstate
+    shown = ("true_spool", "true_position") if "actuator" in name else ("predicted_spool", "alarms")
+
+    def run():
+        found = []
+        for k in range(40):
+            unit.put({"command": 0.004 * math.sin(0.1 * k)})
+            unit.step()
+            found.append(unit.read(*shown))
+        return np.array(found)
+
+    run()
+    kept = keep()
+    content = pack(kept)
+    first = run()
+    free(kept)
+    restore(unpack(content))
+    assert run().tobytes() == first.tobytes()
+    assert np.ptp(first[:, 0]) > 0.0
+
+
+def test_units_of_measure_are_stated(units):
+    for name in NAMES:
+        described = fmpy.read_model_description(units / f"{name}.fmu")
+        assert all(item.unit for item in described.modelVariables if item.name != "time")
+        pressure = next(item for item in described.unitDefinitions if item.name == "Pa").baseUnit
+        assert (pressure.kg, pressure.m, pressure.s) == (1, -1, -2)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_unit_of_another_maker_plays_the_actuator(units, version, tmp_path, capsys):
+    path = units / f"eha_actuator_fmi{version}.fmu"
+    mapping = tmp_path / "map.toml"
+    mapping.write_text(
+        'current = "command"\nspool = "true_spool"\nposition = "true_position"\n'
+        'pressure = { variable = "true_pressure", scale = 1.0 }\n'
+        'conditions = { Kintas = "Kintas", FSS = "FSS", FDJ = "FDJ", null_bias = "null_bias" }\n'
+        "start = { closed = 0.0 }\n"
+    )
+    foreign = ForeignPlant(path, mapping)
+    test = bundled_tests()["open"]
+    effects = Effects(null_bias=5e-5)
+    theirs, ours = (
+        simulate(default_actuator(), test, Faults(*SEVERITIES), effects, seed=3, foreign=plant)
+        for plant in (foreign, None)
+    )
+    for name in ("spool", "pressure", "position"):
+        np.testing.assert_allclose(
+            getattr(theirs, name), getattr(ours, name), rtol=1e-9, atol=1e-14
+        )
+    assert np.array_equal(theirs.codes, ours.codes)
+    command = ["bit", "--test", "closed", "--simulate", "--fast", "--Kintas", "0.3", "--FSS", "0.6"]
+    command += ["--FDJ", "0.3", "--plant", str(path), "--plant-mapping", str(mapping)]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 10
+    (tmp_path / "loaded.toml").write_text("load_N = 5.0\n")
+    command[command.index("--simulate") : command.index("--fast")] = [
+        "--simulate", str(tmp_path / "loaded.toml"),
+    ]  # fmt: skip
+    capsys.readouterr()
+    assert main([*command, "--out", str(tmp_path / "out")]) == 2
+    assert "no variable for load: name one under [conditions]" in capsys.readouterr().err
 
 
 def test_without_a_compiler_it_says_so(monkeypatch):
