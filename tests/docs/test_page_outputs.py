@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -70,3 +73,25 @@ def test_pages_with_two_terminals_show_the_same_result(page: str) -> None:
     (_, shown), (_, expected) = outputs(page)[0], outputs("README.md")[0]
     shown = settled(shown).replace("quickstart/", "ehadiag-out/")
     assert settled(expected).startswith(shown.rstrip("\n"))
+
+
+@pytest.mark.slow
+def test_a_day_at_the_rig_as_its_page_tells_it(tmp_path: Path) -> None:
+    """The commands of the tutorial in one shell folder; each line shown is printed, in order."""
+    for file in (ROOT / "docs" / "examples" / "rig").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    page = (ROOT / "docs/tutorials/rig.md").read_text(encoding="utf-8")
+    sessions = re.findall(r"^```console\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    assert sessions
+    for typed in "".join(sessions).split("$ ")[1:]:
+        command, *shown = typed.splitlines()
+        done = subprocess.run(
+            command, shell=True, cwd=tmp_path, env={**os.environ, "PATH": path, "COLUMNS": "200"},
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        lines = iter([line.rstrip() for line in (done.stdout + done.stderr).splitlines()])
+        for line in shown:
+            if line != "…":
+                same = (output_matches(line, row[: len(line)]) for row in lines)
+                assert any(same), f"{command}: {line}\n{done.stdout}{done.stderr}"
