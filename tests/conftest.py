@@ -1,8 +1,10 @@
-"""For all tests: settings of hypothesis, time limits, a small disk."""
+"""For all tests: settings of hypothesis, time limits, bytecode, a small disk."""
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +14,10 @@ from hypothesis import settings
 # An example's time says nothing on a machine that other work shares.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+# Tests start some two hundred processes: without bytecode each compiles the package anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 SLOW_LIMIT = 1800.0
 """Time limit of a test that is marked slow, s; that of others is in pyproject.toml."""
