@@ -140,7 +140,8 @@ def test_ctrl_c_after_the_test_abandons_what_runs_ahead(
     leave = EarlyIdentification.abandon
     monkeypatch.setattr(EarlyIdentification, "finish", interrupted)
     monkeypatch.setattr(EarlyIdentification, "abandon", abandon)
-    result = run("bit", "--simulate", "--fast", "--json", "--test", "open", "--record", "a.blf")
+    bit = ("bit", "--simulate", "--fast", "--json", "--no-picture", "--test", "open")
+    result = run(*bit, "--record", "a.blf")
     assert (result.code, told) == (30, ["finish", "abandon"])
     assert result.objects[0]["reasons"] == ["stopped by the user"]
 

@@ -262,9 +262,6 @@ def test_every_command_takes_verbose() -> None:
     assert all("-v" in command._option_string_actions for command in commands.values())
 
 
-FAST = ("bit", "--simulate", "--fast", "--json", "--record", "a.blf", "--test", "open")
-
-
 def parsed(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser(allow_abbrev=False)
     add_simulator_options(parser)

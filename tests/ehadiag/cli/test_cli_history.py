@@ -64,7 +64,7 @@ def test_the_users_own_history_is_kept_once_it_was_begun(run: Run) -> None:
 
 
 def test_a_simulated_unit_goes_into_a_named_history_only(run: Run) -> None:
-    bit = ("bit", "--simulate", "--fast", "--json", "--test", "open", "--unit", 9)
+    bit = ("bit", "--simulate", "--fast", "--json", "--no-picture", "--test", "open", "--unit", 9)
     run("history", "init")
     assert run(*bit, "--supply", 10).code == 30  # refused, which is kept as well
     assert run("history", "list", "--json").objects == []
@@ -86,17 +86,8 @@ def test_the_same_recording_counts_once_in_any_packing(run: Run, tmp_path: Path)
 def test_what_a_test_recorded_is_the_same_when_its_recording_is_diagnosed(
     run: Run, tmp_path: Path
 ) -> None:
-    run(
-        "bit",
-        "--simulate",
-        "--fast",
-        "--test",
-        "open",
-        "--history",
-        "h.sqlite",
-        "--record",
-        "a.blf",
-    )
+    bit = ("bit", "--simulate", "--fast", "--no-picture", "--test", "open")
+    run(*bit, "--history", "h.sqlite", "--record", "a.blf")
     run("diagnose", "--history", "h.sqlite", tmp_path / "a.blf")
     assert len(listed(run)) == 1
     assert len(listed(run, "--all")) == 2

@@ -48,18 +48,8 @@ def test_an_index_lists_the_results_worst_first_with_links(run: Run) -> None:
 
 
 def test_a_trend_where_there_is_a_history(run: Run) -> None:
-    run(
-        "diagnose",
-        "--report",
-        "--no-picture",
-        "--out",
-        "o",
-        "--history",
-        "h",
-        "--hours",
-        5,
-        HEALTHY,
-    )
+    options = ("--no-picture", "--out", "o", "--history", "h", "--hours", 5)
+    run("diagnose", "--report", *options, HEALTHY)
     page = Path("o/healthy-open.html").read_text()
     assert "Trend of this unit" in page
     assert "no number: 1 diagnosis of the unit, needs 3" in page
@@ -89,7 +79,8 @@ def test_another_recording_under_the_same_name_is_not_drawn(run: Run) -> None:
 
 
 def test_an_old_page_does_not_stay_beside_a_new_result(run: Run) -> None:
-    run("diagnose", "--report", "--out", "o", HEALTHY)
+    run("diagnose", "--report", "--no-picture", "--out", "o", HEALTHY)
+    assert Path("o/healthy-open.html").exists()
     run("diagnose", "--no-picture", "--out", "o", HEALTHY)
     assert not Path("o/healthy-open.html").exists()
 

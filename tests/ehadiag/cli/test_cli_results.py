@@ -62,7 +62,8 @@ def test_not_tested_keeps_the_keys(run: Run, tmp_path: Path) -> None:
 
 
 def test_json_goes_to_standard_output_and_nothing_else(run: Run) -> None:
-    result = run("diagnose", "--json", "--out", "reports", HEALTHY, "missing.blf", WORN)
+    out = ("--out", "reports", "--no-picture")
+    result = run("diagnose", "--json", *out, HEALTHY, "missing.blf", WORN)
     assert [item["verdict"] for item in result.objects] == ["HEALTHY", None, "DEGRADED"]
     assert "no such file" in result.err
 

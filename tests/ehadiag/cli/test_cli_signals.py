@@ -36,6 +36,7 @@ ONE = (
 )
 """What each of them does is in `test_what_signals_do`; a process with each takes its time."""
 ATTEMPTS = 5
+FAST = ("bit", "--json", "--no-picture", "--simulate", "--fast", "--test", "open", "--out", "o")
 BIT = (*COMMAND, "bit", "--test", "open", "--simulate", "--json", "--record", "cut.blf")
 
 
@@ -148,7 +149,7 @@ def test_the_second_one_does_not_wait_for_the_abort(
 
     monkeypatch.setattr(tester._BitSession, "_request", request)
     monkeypatch.setattr(EarlyIdentification, "watch", watch)
-    result = run("bit", "--json", "--simulate", "--fast", "--test", "open", "--out", "o")
+    result = run(*FAST)
     assert result.code == 30
     assert result.objects[0]["reasons"] == [STOPPED_TWICE_REASON]
     assert [action.value for action in requests] == ["start", "abort", "abort"]
@@ -167,10 +168,10 @@ def test_one_in_the_identification(
 
     monkeypatch.setattr(diagnosis.DiagnosisSession, "finish", lambda *_, **__: send(number))
     if command == "bit":
-        result = run("bit", "--simulate", "--fast", "--json", "--test", "open", "--out", "o")
+        result = run(*FAST)
     else:
         logs = [LOGS / "healthy-open.blf", LOGS / "paper-open-1.blf"]
-        result = run("diagnose", "--json", "--out", "o", *logs)
+        result = run("diagnose", "--json", "--no-picture", "--out", "o", *logs)
         assert "paper-open-1.blf is not diagnosed" in result.err
     (found,) = result.objects
     assert result.code == (30 if command == "bit" else 130)  # a log was left

@@ -18,9 +18,9 @@ from firmware_iface.transport.frames import Frame
 MIDDLE_OF_ALL = 0.5
 END = 5.5
 """s: length of the stored test."""
-KEPT = 100_000
+KEPT = 20_000
 """Frames that the assembler of the endless logs keeps."""
-NOISE = 200_000
+NOISE = 40_000
 """Foreign frames: twice what is kept. What does not grow with them does not with 10^8."""
 
 

@@ -57,24 +57,26 @@ def test_two_tests_at_once_on_a_bus_are_never_both_complete(make_core: MakeCore)
 def test_bus_off_ends_the_test_in_one_line(
     make_core: MakeCore, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
-    count = 0
-    receive = can.interfaces.virtual.VirtualBus._recv_internal
+    options = BusOptions("virtual", channel=str(uuid.uuid4()))
+    with (
+        PythonCanTransport(options, transmit=True) as bus,
+        PythonCanTransport(options, transmit=True) as ours,
+        computer_on(bus, make_core()),
+    ):
+        received, receive = [0], ours._bus._recv_internal
 
-    def off(self: can.BusABC, timeout: float | None) -> object:
-        nonlocal count
-        if not self.channel_id.startswith("off"):
-            return receive(self, timeout)
-        count += 1
-        if count > at:
-            raise can.CanOperationError("bus off", 5)
-        return receive(self, timeout)
+        def off(timeout: float | None) -> object:
+            received[0] += 1
+            if received[0] > at:
+                raise can.CanOperationError("bus off", 5)
+            return receive(timeout)
 
-    monkeypatch.setattr(can.interfaces.virtual.VirtualBus, "_recv_internal", off)
-    options = BusOptions("virtual", channel=f"off{uuid.uuid4()}")
-    with PythonCanTransport(options, transmit=True) as ours:
-        outcome = tester.run_test(ours, test_id=NUMBER, duration=DURATION, transmit=True)
+        monkeypatch.setattr(ours._bus, "_recv_internal", off)
+        outcome = tester.run_test(
+            ours, test_id=NUMBER, duration=DURATION, transmit=True, times=LOADED_MACHINE
+        )
     assert not outcome.complete
-    assert outcome.why
+    assert "bus off" in outcome.why
     assert "\n" not in outcome.why
 
 

@@ -193,25 +193,10 @@ def test_multicast_keeps_the_contract_in_a_namespace_of_its_own(chosen: str) -> 
         pytest.skip("no network namespace can be made here")
     inside = str(Path(__file__).with_name("inside_loopnet.py"))
     done = subprocess.run(
-        [
-            loopnet,
-            sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            "-n0",
-            "-m",
-            chosen,
-            "-p",
-            "no:cacheprovider",
-            inside,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-        cwd=ROOT,
-    )
+        [loopnet, sys.executable, "-m", "pytest", "-q", "-n0", "-m", chosen,
+         "-p", "no:cacheprovider", inside],
+        capture_output=True, text=True, timeout=300, check=False, cwd=ROOT,
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout[-3000:]
     assert " passed" in done.stdout
     assert "skipped" not in done.stdout
