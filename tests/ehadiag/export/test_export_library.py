@@ -233,7 +233,11 @@ FEWEST_KINDS = 250
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
-@pytest.mark.parametrize("host", EMULATED[:2], ids=lambda item: item.target)
+@pytest.mark.parametrize(
+    "host",
+    [EMULATED[0], pytest.param(EMULATED[1], marks=pytest.mark.slow)],
+    ids=lambda item: item.target,
+)
 @pytest.mark.parametrize("sane", [False, True])
 def test_bad_input_on_this_computer_and_without_floating_point_exceptions(
     sane, host, place, tmp_path
