@@ -96,7 +96,8 @@ TESTS = tuple(bundled_tests().values())
 @pytest.fixture(scope="module", params=["open", "closed"])
 def recording(request):
     test = resolve_test(request.param)
-    return simulate(default_actuator(), test, Faults(0.4, 0.5, 0.6), seed=3).recording("simulated")
+    done = simulate(default_actuator(), test, Faults(0.4, 0.5, 0.6), seed=3, step=1e-6)
+    return done.recording("simulated")
 
 
 def session_of(tests=TESTS, **options):

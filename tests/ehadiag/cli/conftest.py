@@ -1,4 +1,4 @@
-"""A fixture that runs the command line in this process; simulated units take a coarse step."""
+"""A fixture that runs the command line in this process."""
 
 from __future__ import annotations
 
@@ -7,22 +7,17 @@ from pathlib import Path
 
 import pytest
 from cli_result import Result, Run
+from coarse_simulation import coarse_step
 
 from ehadiag.cli.main import main
-from ehadiag_sim.simulation import Plant
-from ehadiag_tools.simulator.units import COARSE_STEP
+
+__all__ = ["coarse_step"]
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled() -> None:
     """No test shall see, or wait for, the compiler."""
     assert main(["warmup"]) == 0
-
-
-@pytest.fixture(autouse=True)
-def _coarse_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The simulator's accuracy has its own tests."""
-    monkeypatch.setitem(Plant.__init__.__kwdefaults__, "step", COARSE_STEP)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from places import LOGS
 
 from ehadiag import Diagnosis, Recording, Verdict, bundled_tests, default_actuator
 from ehadiag.assess.diagnosis import diagnose
+from ehadiag.identify.identification_session import NuisanceMode
 from firmware_iface.logs.reader import read_frames, read_recording
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.recording import BitOutcome, BitState, Environment
@@ -25,8 +26,8 @@ def recording() -> Recording:
     return read_recording(LOGS / "paper-open-1.blf")
 
 
-def diagnosis_of(recording: Recording) -> Diagnosis:
-    return diagnose([recording], default_actuator(), bundled_tests().values())
+def diagnosis_of(recording: Recording, **options: NuisanceMode) -> Diagnosis:
+    return diagnose([recording], default_actuator(), bundled_tests().values(), **options)
 
 
 def frames_of(table: FrameTable) -> list[Frame]:
@@ -157,10 +158,15 @@ def test_open_loop_needs_no_command_frames(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("every", "tested"), [pytest.param(100, True, marks=pytest.mark.slow), (9, False)]
+    ("every", "tested", "nuisances"),
+    [
+        pytest.param(100, True, NuisanceMode.AUTO, marks=pytest.mark.slow),
+        pytest.param(9, False, NuisanceMode.AUTO, marks=pytest.mark.slow),
+        (9, False, NuisanceMode.NONE),
+    ],
 )
 def test_closed_loop_with_lost_positions_is_judged_up_to_a_stated_share(
-    every: int, tested: bool
+    every: int, tested: bool, nuisances: NuisanceMode
 ) -> None:
     """Two ticks in a row lost: neither position nor current tells what the control law did."""
     whole = read_recording(LOGS / "paper-closed-1.blf")
@@ -171,7 +177,7 @@ def test_closed_loop_with_lost_positions_is_judged_up_to_a_stated_share(
         name: np.where(gone, np.nan, getattr(samples, name))
         for name in ("current", "spool", "pressure", "position")
     }
-    came = diagnosis_of(replace(whole, samples=replace(samples, **lost)))
+    came = diagnosis_of(replace(whole, samples=replace(samples, **lost)), nuisances=nuisances)
     if tested:
         assert came.verdict is Verdict.DEGRADED
     else:

@@ -43,7 +43,8 @@ STEPS = 1 + len(STAGE_SHARES) + 1
 @pytest.fixture(scope="module", params=["open", "closed"])
 def recording(request):
     test = resolve_test(request.param)
-    return test, simulate(default_actuator(), test, Faults(*FAULTS), seed=3).recording("simulated")
+    done = simulate(default_actuator(), test, Faults(*FAULTS), seed=3, step=1e-6)
+    return test, done.recording("simulated")
 
 
 def first_ticks_of(samples, ticks):
