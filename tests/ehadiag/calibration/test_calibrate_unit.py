@@ -8,14 +8,14 @@ sheet's: no severity from 0 up explains it.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
+from calibrated_unit import TESTS, UNIT, learned, of_calibrated_unit, recording
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ehadiag import Verdict, bundled_tests, default_actuator, load_actuator
+from ehadiag import Verdict, default_actuator, load_actuator
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.calibration.calibrate_unit import calibrate, update_calibration
 from ehadiag.calibration.model_choice import select_significant
@@ -24,21 +24,7 @@ from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.prior import faults_below_zero
 from ehadiag.model.registry import FAULTS, NUISANCE_PARAMETERS, unit_constants
 from ehadiag_sim.conditions import DataErrors, Effects, Faults, UnmodelledEffects
-from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
-
-TESTS = bundled_tests()
-UNIT = random_unit(np.random.default_rng([1, 3]), data=True, serial=41)
-
-
-@lru_cache(maxsize=8)
-def recording(test, faults=(0.0, 0.0, 0.0), seed=1):
-    return record(UNIT, TESTS[test], Faults(*faults), seed=seed, step=COARSE_STEP)
-
-
-@lru_cache(maxsize=1)
-def learned():
-    both = [recording("open"), recording("closed", seed=2)]
-    return calibrate(both, default_actuator(), TESTS.values())
+from ehadiag_tools.simulator.units import COARSE_STEP, Unit, record
 
 
 def refusal(recordings, start=None):
@@ -70,6 +56,7 @@ def test_only_a_calibrated_unit_can_be_updated():
 
 
 @pytest.mark.slow
+@of_calibrated_unit
 def test_it_learns_the_unit_and_keeps_it_in_a_file(tmp_path):
     found = learned()
     assert found.reasons == ()
@@ -85,6 +72,7 @@ def test_it_learns_the_unit_and_keeps_it_in_a_file(tmp_path):
 
 
 @pytest.mark.slow
+@of_calibrated_unit
 @pytest.mark.parametrize("test", ["open", "closed"])
 def test_a_worn_unit_is_then_diagnosed_to_hundredths_of_a_percent(test):
     truth = (0.3, 0.45, 0.2)
@@ -96,6 +84,7 @@ def test_a_worn_unit_is_then_diagnosed_to_hundredths_of_a_percent(test):
 
 
 @pytest.mark.slow
+@of_calibrated_unit
 def test_another_units_recording_is_refused_with_a_calibrated_file():
     other = replace(recording("open"), serial=42)
     found = diagnose([other], learned().actuator, TESTS.values())
@@ -111,6 +100,7 @@ def test_a_worn_unit_is_not_as_new():
 
 
 @pytest.mark.slow
+@of_calibrated_unit
 def test_a_later_recording_refines_it():
     before = learned().actuator
     found = update_calibration([recording("open", (0.05, 0.1, 0.02), 6)], before, TESTS.values())

@@ -22,8 +22,8 @@ NO_NAMESPACE = 125
 ATTEMPTS = 5
 TOO_LATE = re.compile("not complete 1 s after|no answer within 1 s")
 PAPER = ((0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
-"""First and last of the paper's cases: each takes the seconds of a test."""
-CASES = [(test, faults) for test in ("open", "closed") for faults in PAPER]
+"""First and last of the paper's cases, one in each test: it takes the seconds of a test."""
+CASES = list(zip(("open", "closed"), PAPER, strict=True))
 BOTH_ENDS = """
 "$PYTHON" -m ehadiag sim --interface udp_multicast "$@" 2> sim.err &
 sim=$!

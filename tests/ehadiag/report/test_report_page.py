@@ -10,21 +10,20 @@ import hashlib
 import json
 import re
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from calibrated_unit import TESTS, learned, of_calibrated_unit, recording
 from history_cases import an_entry, an_event
 from numpy.typing import NDArray
 from places import LOGS
 from report_html import Page
 
 import ehadiag
-from ehadiag import Calibrated, Diagnosis, Levels, bundled_tests, default_actuator
+from ehadiag import Calibrated, Levels, default_actuator
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag.calibration.unit_models import TriedModel
 from ehadiag.prognosis.units import prognosis_of
 from ehadiag.records import result_of
@@ -37,8 +36,6 @@ from ehadiag.report.report_pages import (
     diagnosis_page,
 )
 from ehadiag.report.response_signals import modelled_column, result_picture
-from ehadiag_sim.conditions import Faults
-from ehadiag_tools.simulator.units import COARSE_STEP, random_unit, record
 
 NOW = "2026-03-01T12:00:00.000Z"
 HOSTILE = (
@@ -195,27 +192,6 @@ def test_every_plot_has_words_and_every_table_a_head(with_trend: str) -> None:
     assert sum(tag == "h1" for tag, _ in page.elements) == 1
 
 
-TESTS = bundled_tests()
-UNIT = random_unit(np.random.default_rng([1, 3]), data=True, serial=41)
-
-
-@lru_cache(maxsize=1)
-def learned() -> Calibrated:
-    both = [
-        record(UNIT, TESTS[name], Faults(), seed=seed, step=COARSE_STEP)
-        for seed, name in enumerate(("open", "closed"))
-    ]
-    return calibrate(both, default_actuator(), TESTS.values())
-
-
-@lru_cache(maxsize=1)
-def worn_unit() -> Diagnosis:
-    recording = record(UNIT, TESTS["open"], Faults(0.3, 0.45, 0.2), seed=3, step=COARSE_STEP)
-    unit = learned().actuator
-    assert unit is not None
-    return diagnose([recording], unit, TESTS.values())
-
-
 def rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
@@ -226,8 +202,11 @@ def residual(panel: Panel) -> NDArray[np.float64]:
 
 
 @pytest.mark.slow
+@of_calibrated_unit
 def test_page_and_picture_of_a_calibrated_unit_draw_the_response_that_was_fitted() -> None:
-    diagnosis = worn_unit()
+    unit = learned().actuator
+    assert unit is not None
+    diagnosis = diagnose([recording("open", (0.3, 0.45, 0.2), 3)], unit, TESTS.values())
     found = diagnosis.identification
     assert found is not None
     (experiment,) = diagnosis.experiments
@@ -249,6 +228,7 @@ def test_page_and_picture_of_a_calibrated_unit_draw_the_response_that_was_fitted
 
 
 @pytest.mark.slow
+@of_calibrated_unit
 def test_the_page_of_a_calibration_says_what_was_learned_and_how_well() -> None:
     found = learned()
     text = Page(calibration_page(found, "1.2.3", NOW)).text

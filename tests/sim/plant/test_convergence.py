@@ -198,7 +198,9 @@ def test_random_units_are_near_at_the_coarse_step_of_studies(name, orifice):
         rng = np.random.default_rng(seed)
         unit = random_unit(rng, data=True, orifice=orifice)
         fault, test = Faults(*rng.random(3).tolist()), resolve_test(name)
-        run = simulate(unit.actuator, test, fault, unit.effects, unit.sensors, seed=seed)
+        run = simulate(
+            unit.actuator, test, fault, unit.effects, unit.sensors, seed=seed, step=COARSE_STEP
+        )
         fixed = unit.actuator, run.current, fault, unit.effects
         gap = (
             plant_response(*fixed, step=COARSE_STEP) - plant_response(*fixed, step=6.25e-8)
