@@ -12,7 +12,13 @@ from contextlib import contextmanager
 import pytest
 
 from ehadiag_sim.emulator import FccCore, run_emulator
+from firmware_iface.handshake import TimeLimits
 from firmware_iface.transport.base import Transport
+
+LOADED_MACHINE = TimeLimits(
+    wait=100.0, status=100.0, arming=100.0, telemetry=100.0, finish=100.0, abort=100.0
+)
+"""Time limits where the computer is a thread or process of a machine that other work shares."""
 
 
 @contextmanager

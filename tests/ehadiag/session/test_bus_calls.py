@@ -105,6 +105,10 @@ def test_a_test_is_run_recorded_and_diagnosed(tmp_path: Path) -> None:
     assert snapshots[-1].ending.verdict == "DEGRADED"
     again = ehadiag.diagnose(tmp_path / "run.blf")
     assert again.faults["FSS"].value == result.faults["FSS"].value
+    checked = ehadiag.check_bus(tmp_path / "run.blf")
+    assert (checked.usable, checked.test) == (True, "open")
+    assert checked.samples is not None
+    assert checked.to_dict()["schema"] == "ehadiag.bus/1"
 
 
 @pytest.mark.slow  # a whole test in real time
@@ -220,8 +224,16 @@ def test_watching_a_log_raises_alarms() -> None:
 
 def test_watching_a_bus_sends_nothing_and_ends_in_time(computer: None, channel: str) -> None:
     snapshots: list[Snapshot] = []
+    stop = threading.Event()
+
+    def take(snapshot: Snapshot) -> None:
+        snapshots.append(snapshot)
+        if snapshot.residuals is not None:
+            stop.set()
+
     with opened(channel) as bus, opened(channel) as witness:
-        found = ehadiag.watch(bus, duration_s=1.5, snapshots=snapshots.append)
+        found = ehadiag.watch(bus, stop=stop, snapshots=take)
+        ehadiag.watch(bus, duration_s=0.05)
         assert requests_on(witness) == 0
         bus.send(can.Message(arbitration_id=1))  # still open
     assert found.monitored > 0
@@ -260,12 +272,3 @@ def test_ctrl_c_leaves_a_complete_recording(computer: None, channel: str, tmp_pa
     with opened(channel) as bus, pytest.raises(KeyboardInterrupt):
         ehadiag.record(bus, tmp_path / "bus.blf", on_frame=on_frame)
     assert len(read_frames(str(tmp_path / "bus.blf"))) > 10
-
-
-def test_a_recorded_test_is_returned_as_it_is_read(tmp_path: Path) -> None:
-    with SimulatedBus(FSS=0.3) as bus:
-        ehadiag.run_test(bus, "open", transmit=True, record=tmp_path / "one.blf")
-    found = ehadiag.check_bus(tmp_path / "one.blf")
-    assert (found.usable, found.test) == (True, "open")
-    assert found.samples is not None
-    assert found.to_dict()["schema"] == "ehadiag.bus/1"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from fault_cases import DURATION, NUMBER, short_test
+from live_ends import LOADED_MACHINE
 from test_live_contract import FRAMES, TwoWay, collect, content
 
 from ehadiag import default_actuator
@@ -70,6 +71,7 @@ def test_a_test_between_two_processes_loses_no_sample(tmp_path: Path) -> None:
                 duration=DURATION,
                 transmit=True,
                 recorder=Recorder(tmp_path / "live.blf"),
+                times=LOADED_MACHINE,
             )
     finally:
         stop.set()

@@ -10,8 +10,7 @@ from dataclasses import replace
 import can
 import pytest
 from fault_cases import DURATION, NUMBER, TELEMETRY
-from live_ends import computer_on
-from test_live_session import LOADED_MACHINE
+from live_ends import LOADED_MACHINE, computer_on
 from test_live_session_limits import OURS, SharedBus
 
 from ehadiag_sim.emulator import FccCore

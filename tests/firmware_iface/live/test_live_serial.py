@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 
 import pytest
+from live_ends import LOADED_MACHINE
 from serial import rfc2217, serial_for_url
 
 from ehadiag import BusLostError
@@ -148,7 +149,7 @@ def test_a_computer_without_a_reader_serves_the_tester_that_comes_later(
                 time.sleep(0.01)
             ours = stack.enter_context(SerialTransport(os.ttyname(b_end), transmit=True))
             joint.start()
-            outcome = run_test(ours, test_id=9, duration=0.4, transmit=True)
+            outcome = run_test(ours, test_id=9, duration=0.4, transmit=True, times=LOADED_MACHINE)
         finally:
             stop.set()
             node.join()

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_ends import computer_on
+from live_ends import LOADED_MACHINE, computer_on
 
 from ehadiag import CommandMode, ConfigurationError, InputOutputError, StoredTest
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
@@ -248,12 +248,6 @@ def test_a_log_can_be_listened_to_like_a_bus(make_core: CoreFactory, tmp_path: P
 
 def virtual(channel: str, *, transmit: bool) -> Transport:
     return PythonCanTransport(BusOptions("virtual", channel=channel), transmit=transmit)
-
-
-LOADED_MACHINE = TimeLimits(
-    wait=100.0, status=100.0, arming=100.0, telemetry=100.0, finish=100.0, abort=100.0
-)
-"""Time limits where the computer is a thread of a machine that other work shares."""
 
 
 def recorded_test(ours: Transport, path: Path) -> tester.RequestOutcome:

@@ -15,7 +15,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from live_ends import cable
+from live_ends import LOADED_MACHINE, cable
 
 from ehadiag import Recording
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
@@ -36,6 +36,8 @@ pytestmark = pytest.mark.socketcan
 
 Until = Callable[[Callable[[], object]], None]
 BUS = default_map()
+LAST = Frame(0, 0x7FF, b"")
+"""Comes after all frames of a test."""
 CHANNELS = ("current", "spool", "pressure", "position", "command")
 
 
@@ -44,8 +46,9 @@ def request_and_listen(transport: Transport) -> tuple[tester.RequestOutcome, lis
         pass  # what came while the other program started
     frames: list[Frame] = []
     outcome = run_test(
-        transport, test_id=9, duration=0.4, transmit=True, on_frame=frames.append, bus_map=BUS
-    )
+        transport, test_id=9, duration=0.4, transmit=True, on_frame=frames.append, bus_map=BUS,
+        times=LOADED_MACHINE,
+    )  # fmt: skip
     return outcome, frames
 
 
@@ -78,7 +81,8 @@ def test_candump_sees_what_we_see(
     with log.open("wb") as file, peer("candump", "-L", "vcan0", stdout=file):
         until(lambda: log.stat().st_size > 0)
         outcome, frames = request_and_listen(ours)
-        time.sleep(0.1)
+        ours.send(LAST)
+        until(lambda: b"7FF#" in log.read_bytes())
     assert outcome.why == ""
     dumped = read_candump(log)
     requests = [item for item in dumped if item.can_id == 0x200]
@@ -168,7 +172,8 @@ def test_python_cans_logger_records_our_bus(
     with peer(*command, stdout=subprocess.DEVNULL):
         until(lambda: path.exists() and path.stat().st_size > 2000)
         outcome, frames = request_and_listen(ours)
-        time.sleep(0.2)
+        ours.send(LAST)
+        until(lambda: b" 7FF " in path.read_bytes())
     assert outcome.why == ""
     assert_same_samples(recording_of(frames), read_recording(path))
 
