@@ -218,7 +218,6 @@ def test_costs_are_those_of_the_scalar_model():
         assert cost == pytest.approx(np.minimum(residuals**2, 25.0)[~np.isnan(residuals)].sum())
 
 
-BOTH = pytest.mark.parametrize("kind", list(MODELS))
 LINEAR = default_actuator()
 ORIFICE = msgspec.structs.replace(
     LINEAR, second_stage=msgspec.structs.replace(LINEAR.second_stage, kind="orifice")
@@ -231,33 +230,33 @@ def test_fading_is_exponential(z):
     assert exp_minus(z) == pytest.approx(np.exp(-z), abs=1e-9)
 
 
-@BOTH
 @STAGES
 @pytest.mark.parametrize("velocity", [1e-3, 5e-3, 50e-3])
 @pytest.mark.parametrize("faults", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.7)])
-def test_the_jacks_friction_is_the_simulators(kind, actuator, velocity, faults):
+def test_the_jacks_friction_is_the_simulators(actuator, velocity, faults):
     measured = simulated(faults, Effects(jack_stribeck=velocity), actuator=actuator)
     values = {**severities(faults), "jack_stribeck": velocity}
-    here = residuals_of(kind, values, batch_of(measured), actuator)
-    without = residuals_of(kind, severities(faults), batch_of(measured), actuator)
-    # Where full current turns, a jack that turns within the tick makes one sample wrong.
-    assert (rms(np.clip(here, -3.0, 3.0)) < [0.05, 0.4, 0.05]).all()
-    assert np.quantile(np.abs(here[1]), 0.9) < 0.5
-    assert np.mean(np.abs(without[1])) > 4.0 * np.mean(np.abs(here[1]))
+    for kind in MODELS:
+        here = residuals_of(kind, values, batch_of(measured), actuator)
+        without = residuals_of(kind, severities(faults), batch_of(measured), actuator)
+        # Where full current turns, a jack that turns within the tick makes one sample wrong.
+        assert (rms(np.clip(here, -3.0, 3.0)) < [0.05, 0.4, 0.05]).all(), kind
+        assert np.quantile(np.abs(here[1]), 0.9) < 0.5, kind
+        assert np.mean(np.abs(without[1])) > 4.0 * np.mean(np.abs(here[1])), kind
 
 
-@BOTH
 @pytest.mark.parametrize("backlash", [0.0, 3e-6])
 @pytest.mark.parametrize("velocity", [5e-3, 20e-3, 50e-3])
 @pytest.mark.parametrize("faults", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.7)])
-def test_the_spools_friction_is_the_simulators(kind, velocity, faults, backlash):
+def test_the_spools_friction_is_the_simulators(velocity, faults, backlash):
     measured = simulated(faults, Effects(spool_stribeck=velocity, backlash=backlash))
     values = {**severities(faults), "spool_stribeck": velocity, "backlash": backlash}
-    here = residuals_of(kind, values, batch_of(measured))
-    without = residuals_of(kind, {**values, "spool_stribeck": 0.0}, batch_of(measured))
-    # At 5 mm/s the velocity of a worn spool runs away: what a step does lasts.
-    assert (rms(np.clip(here, -3.0, 3.0)) < [0.15, 0.3, 0.05]).all()
-    assert rms(without)[0] > 1.0
+    for kind in MODELS:
+        here = residuals_of(kind, values, batch_of(measured))
+        without = residuals_of(kind, {**values, "spool_stribeck": 0.0}, batch_of(measured))
+        # At 5 mm/s the velocity of a worn spool runs away: what a step does lasts.
+        assert (rms(np.clip(here, -3.0, 3.0)) < [0.15, 0.3, 0.05]).all(), kind
+        assert rms(without)[0] > 1.0, kind
 
 
 VALUES = st.fixed_dictionaries(

@@ -151,21 +151,13 @@ def test_residuals_on_a_virtual_bus_are_noise():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("diagnose", [False, True])
-def test_the_soak_accounts_for_every_frame(diagnose, tmp_path):
+def test_the_soak_accounts_for_every_frame(tmp_path):
     loopnet = str(ROOT / "tools" / "loopnet.sh")
     if subprocess.run([loopnet, "true"], capture_output=True, check=False).returncode == 125:
         pytest.skip("no network namespace can be made here")
     report = tmp_path / "soak.md"
-    command = [
-        loopnet,
-        sys.executable,
-        str(ROOT / "tools" / "study"),
-        "soak",
-        "-i",
-        "udp_multicast",
-    ]
-    options = ["--minutes", "0.05", "--output", str(report), *["--diagnose"] * diagnose]
+    command = [loopnet, sys.executable, str(ROOT / "tools" / "study"), "soak"]
+    options = ["-i", "udp_multicast", "--minutes", "0.05", "--output", str(report), "--diagnose"]
     done = subprocess.run(
         [*command, *options], capture_output=True, text=True, timeout=300, check=False, cwd=ROOT
     )
@@ -181,7 +173,7 @@ def test_the_soak_accounts_for_every_frame(diagnose, tmp_path):
     assert sent == received + own_lost + foreign_lost > 2000
     assert pushes + ticks_lost <= received / 2
     assert alarms == 0
-    assert (rows["diagnoses meanwhile"] == [0]) == (not diagnose)
+    assert rows["diagnoses meanwhile"] != [0]
     for name in ("push: p50, p99, p99.9, largest, µs", "all work on a tick: the same, µs"):
         assert rows[name][0] > 0.0
         assert rows[name] == sorted(rows[name])
@@ -238,6 +230,6 @@ def test_false_alarms_come_at_about_the_stated_rate():
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
 def test_false_alarms_come_at_the_stated_rate(shift):
     """About 1500 alarms, each sum its quarter: 2.6 % by chance, some per cent by Siegmund."""
-    alarms = count_alarms(2000, 3_000_000, seed=2, shift=shift)
+    alarms = count_alarms(1000, 1_500_000, seed=2, shift=shift)
     assert alarms.sum() == pytest.approx(1500, rel=0.15)
     np.testing.assert_allclose(alarms / alarms.sum(), 0.25, atol=0.05)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 import pandas
 import pytest
@@ -24,10 +28,12 @@ def case(test: str, rate: float, **changes: object) -> DaqCase:
     return DaqCase(**(usual | changes))
 
 
-def read(this: DaqCase, folder):
-    path = folder / "daq.csv"
-    pandas.DataFrame(recorded_columns(this)).to_csv(path, index=False, float_format="%.9g")
-    (found,) = recorded_tests([path], Interpretation(default_map(), None, SOUGHT))
+@cache
+def read(this: DaqCase):
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "daq.csv")
+        pandas.DataFrame(recorded_columns(this)).to_csv(path, index=False, float_format="%.9g")
+        (found,) = recorded_tests([path], Interpretation(default_map(), None, SOUGHT))
     return found
 
 
@@ -35,15 +41,15 @@ def read(this: DaqCase, folder):
     ("test", "rate", "most_us"),
     [
         ("closed", 5000.0, 15.0),
-        ("closed", 10_000.0, 8.0),
+        pytest.param("closed", 10_000.0, 8.0, marks=pytest.mark.slow),
         # The current changes from tick to tick in the sines alone: half a sampling interval.
-        ("open", 5000.0, 100.0),
+        pytest.param("open", 5000.0, 100.0, marks=pytest.mark.slow),
         ("open", 10_000.0, 50.0),
     ],
 )
-def test_the_ticks_are_found_between_samples(tmp_path, test, rate, most_us):
+def test_the_ticks_are_found_between_samples(test, rate, most_us):
     this = case(test, rate)
-    found = read(this, tmp_path)
+    found = read(this)
     assert found.test_id == bundled_tests()[test].id
     at = found.samples.host_ns * 1e-9
     true = SETTLING_S + this.lead_in_s + np.arange(len(at)) * 1e-3
@@ -53,18 +59,18 @@ def test_the_ticks_are_found_between_samples(tmp_path, test, rate, most_us):
     assert found.samples.acquired.rate == pytest.approx(rate)
 
 
-def test_the_codes_of_a_closed_loop_follow_from_the_current(tmp_path):
+def test_the_codes_of_a_closed_loop_follow_from_the_current():
     """The law on the acquisition's own positions would be 7 LSB off."""
-    found = read(case("closed", 5000.0), tmp_path)
+    found = read(case("closed", 5000.0))
     test, actuator = bundled_tests()["closed"], default_actuator()
     trace = build_experiment(found.samples, found.environment, test, actuator).trace
     assert trace.residual_lsb < 1.0
 
 
-def test_a_command_of_its_own_is_found_at_the_same_place(tmp_path):
+def test_a_command_of_its_own_is_found_at_the_same_place():
     """The clock of the held command began with its first change, 0.2 s into the test."""
     this = case("open", 5000.0, with_command=True)
-    found = read(this, tmp_path)
+    found = read(this)
     assert np.isfinite(found.samples.spool[:200]).all()
     assert found.out_of_order == 0.0
 
