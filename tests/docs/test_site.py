@@ -19,18 +19,9 @@ def test_the_site_is_built_without_a_warning_and_has_every_public_name(tmp_path:
         pytest.importorskip(name)
     options = ["-q", "-W", "--keep-going", "-b", "html", "-d", str(tmp_path / "trees")]
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sphinx",
-            *options,
-            str(REPOSITORY / "docs"),
-            str(tmp_path / "site"),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        [sys.executable, "-m", "sphinx", *options, REPOSITORY / "docs", tmp_path / "site"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site" / "reference" / "api.html").read_text()
     names = set(ehadiag.__all__) - {"__version__"}

@@ -17,13 +17,7 @@ from firmware_iface.stored_test import bundled_tests
 
 ACTUATOR = default_actuator()
 TESTS = bundled_tests()
-EVERYTHING = {
-    "data": True,
-    "sensing": True,
-    "friction": True,
-    "orifice": True,
-    "strangers": True,
-}
+EVERYTHING = {"data": True, "sensing": True, "friction": True, "orifice": True, "strangers": True}
 
 
 def unit(seed, **groups):

@@ -197,16 +197,8 @@ def test_the_largest_serial(run: Run) -> None:
         (("bit", "--test", "open", "--simulate", "--fast", "--history", "h.blf"), 3, "not an SQL"),
         (("history", "list", "--history", "none"), 2, "begin one by ehadiag history init"),
         (("history", "show", "5", *GOOD), 2, "has no diagnosis 5"),
-        (
-            ("history", "plot", "--unit", "5", "--out", "x.png", *GOOD),
-            2,
-            "serial 5",
-        ),
-        (
-            ("history", "event", "--unit", "5", "a", "--resets", "x", *GOOD),
-            2,
-            "FSS",
-        ),
+        (("history", "plot", "--unit", "5", "--out", "x.png", *GOOD), 2, "serial 5"),
+        (("history", "event", "--unit", "5", "a", "--resets", "x", *GOOD), 2, "FSS"),
         (("history", "event", "--unit", "5", "a", "--when", "x", *GOOD), 2, "8601"),
         (("history", "export", "--out", "no/x.csv", *GOOD), 3, "No such file"),
         (("history", "list", "--unit", "9" * 20, *GOOD), 2, "serial number is a whole number"),

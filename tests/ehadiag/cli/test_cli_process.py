@@ -44,10 +44,7 @@ exit $code
 @pytest.mark.slow
 @pytest.mark.parametrize(("test", "faults"), CASES)
 def test_two_processes_on_multicast(
-    test: str,
-    faults: tuple[float, float, float],
-    tmp_path: Path,
-    environment: dict[str, str],
+    test: str, faults: tuple[float, float, float], tmp_path: Path, environment: dict[str, str]
 ) -> None:
     names = ("Kintas", "FSS", "FDJ")
     options = [f"--{name}={value}" for name, value in zip(names, faults, strict=True)]
@@ -82,12 +79,8 @@ def test_two_processes_on_multicast(
 def test_reader_that_goes_away_ends_it_without_a_traceback(environment: dict[str, str]) -> None:
     done = subprocess.run(
         ["sh", "-c", '"$@" | head -1', "pipe", *COMMAND, "tests", "--csv", "open"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+        env=environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
     assert done.stdout == "time_s,command_mA\n"
     assert done.stderr == ""
 
@@ -123,13 +116,8 @@ def without_home(
     """)
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
-        cwd=temporary,
-        env=kept,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
+        cwd=temporary, env=kept, capture_output=True, text=True, timeout=900, check=False,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("warm", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -166,13 +154,8 @@ def in_shell(
     """Run ehadiag with arguments and redirections as a shell reads them."""
     return subprocess.run(
         ["sh", "-c", f'"$0" -m ehadiag {command}', sys.executable],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+        cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
 
 
 @pytest.mark.skipif(os.name != "posix", reason="streams are closed by a POSIX shell")

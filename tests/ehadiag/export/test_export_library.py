@@ -277,10 +277,7 @@ def test_the_host_library_needs_no_more_than_x86_64(place):
 def test_reset_begins_anew(loaded):
     unit = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 20e6, 0.0]
     one, two = np.zeros(MONITOR.end), np.zeros(MONITOR.end)
-    push, reset = (
-        loaded.function("eha_monitor_push", 2),
-        loaded.function("eha_monitor_reset", 2),
-    )
+    push, reset = (loaded.function("eha_monitor_push", 2), loaded.function("eha_monitor_reset", 2))
     tick, spool = np.array([5e-3, 5e-3, 1e-5, 1e5, 0.0]), np.array([2e-5])
     for numbers in (one, two):
         assert started(loaded, unit, numbers) == 0
@@ -298,10 +295,7 @@ def test_the_manifest_tells_what_was_written(place):
     assert told["target"] == "host"
     for name, facts in told["files"].items():
         content = (out / name).read_bytes()
-        assert facts == {
-            "bytes": len(content),
-            "sha256": hashlib.sha256(content).hexdigest(),
-        }
+        assert facts == {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def test_an_unknown_target_is_named():

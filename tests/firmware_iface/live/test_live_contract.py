@@ -442,10 +442,7 @@ def test_playing_onto_a_bus_keeps_order_skips_errors_and_stops() -> None:
     options = BusOptions("virtual", channel=str(uuid.uuid4()))
     log = [*FRAMES[:20], Frame(FRAMES[20].time_ns, 8, b"", error=True), *FRAMES[20:40]]
     table = FrameTable.from_frames(log)
-    with (
-        PythonCanTransport(options) as listener,
-        PythonCanTransport(options, transmit=True) as bus,
-    ):
+    with PythonCanTransport(options) as listener, PythonCanTransport(options, transmit=True) as bus:
         assert play_log(table, bus, speed=None) == 40
         assert content(collect(listener, 40)) == content(FRAMES[:40])
         stop = threading.Event()
@@ -522,10 +519,7 @@ def test_adapters_are_silenced_unless_asked_to_transmit() -> None:
 
 def test_bus_off_ends_the_bus() -> None:
     options = BusOptions("virtual", channel=str(uuid.uuid4()))
-    with (
-        PythonCanTransport(options) as listener,
-        PythonCanTransport(options, transmit=True) as bus,
-    ):
+    with PythonCanTransport(options) as listener, PythonCanTransport(options, transmit=True) as bus:
         bus.send(Frame(0, 0x004, bytes(8), error=True))
         item = collect(listener, 1)[0]
         assert item.error
