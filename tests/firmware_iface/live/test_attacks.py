@@ -30,11 +30,8 @@ def test_two_tests_at_once_on_a_bus_are_never_both_complete(make_core: MakeCore)
     outcomes: list[tester.RequestOutcome] = []
 
     def request(bus: PythonCanTransport) -> None:
-        outcomes.append(
-            tester.run_test(
-                bus, test_id=NUMBER, duration=DURATION, transmit=True, times=LOADED_MACHINE
-            )
-        )
+        # With the usual time limits: an answer that does not come is one of the right outcomes.
+        outcomes.append(tester.run_test(bus, test_id=NUMBER, duration=DURATION, transmit=True))
 
     with (
         PythonCanTransport(options, transmit=True) as bus,
