@@ -8,15 +8,7 @@ from itertools import count
 from typing import Any
 
 from ehadiag.estimate import Severity
-from ehadiag.live import (
-    Alarm,
-    BusState,
-    Ending,
-    Residuals,
-    RunningTest,
-    Signals,
-    Snapshot,
-)
+from ehadiag.live import Alarm, BusState, Ending, Residuals, RunningTest, Signals, Snapshot
 from firmware_iface.errors import InputOutputError
 
 __all__ = ["fail", "show_everything", "talk"]

@@ -110,9 +110,7 @@ def test_exit_codes_tell_failure_error_and_interruption(
     assert "Is a directory" in error
 
 
-def test_the_list_has_every_study_of_the_documentation(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_list_has_every_study_of_the_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--list"]) == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     assert listed == [study.name for study in STUDIES]

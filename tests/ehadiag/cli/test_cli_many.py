@@ -23,12 +23,7 @@ from places import LOGS, ROOT
 from stored_results import LINES, former_result
 from two_actuators import write_log, write_mappings
 
-from ehadiag.batch.result_files import (
-    BatchSummary,
-    junit_report,
-    result_columns,
-    summary_lines,
-)
+from ehadiag.batch.result_files import BatchSummary, junit_report, result_columns, summary_lines
 from ehadiag.result import Result
 from ehadiag.terminal.output import worst_exit_code
 

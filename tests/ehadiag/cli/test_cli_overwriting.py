@@ -69,10 +69,7 @@ def contents(folder: Path) -> dict[str, bytes]:
             ("v.blf", "--history", "new.sqlite", "--summary", "new.sqlite-wal"),
             "--summary new.sqlite-wal: is the health history new.sqlite-wal as well",
         ),
-        (
-            ("v.blf", "--history", "v.blf"),
-            "the health history v.blf: is the log v.blf as well",
-        ),
+        (("v.blf", "--history", "v.blf"), "the health history v.blf: is the log v.blf as well"),
     ],
 )
 def test_diagnose_writes_over_nothing_it_uses(

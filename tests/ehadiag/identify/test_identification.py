@@ -37,10 +37,7 @@ from firmware_iface.recording import (
 )
 from firmware_iface.stored_test import resolve_test
 
-PAPER_FIRST = {
-    "open": (0.7147, 7.7791, 9.6052, 9.5992),
-    "closed": (0.3005, 4.5653, 5.1306, 2.2902),
-}
+PAPER_FIRST = {"open": (0.7147, 7.7791, 9.6052, 9.5992), "closed": (0.3005, 4.5653, 5.1306, 2.2902)}
 """The paper's mean error after the first approximation, percent (PHY-40)."""
 ALL = [(test, number) for test in ("open", "closed") for number in range(1, 5)]
 

@@ -75,10 +75,7 @@ def linear(seed=1):
     return slopes, lambda p: np.einsum("i,isn->sn", p, slopes) - 3.0
 
 
-@given(
-    seed=st.integers(0, 99),
-    widths=st.lists(st.floats(1e-6, 1.0), min_size=3, max_size=3),
-)
+@given(seed=st.integers(0, 99), widths=st.lists(st.floats(1e-6, 1.0), min_size=3, max_size=3))
 @settings(max_examples=20, deadline=None)
 def test_a_linear_model_is_found_exactly_whatever_the_spread(seed, widths):
     slopes, function = linear(seed)
@@ -159,13 +156,7 @@ def test_what_nothing_explains_ends_with_the_budget():
     told = []
     first = ParameterDensity(np.array([0.5, 0.5, 0.5, 0.0]), 0.4 * np.eye(3))
     found = multistart_search(
-        problem,
-        first,
-        np.zeros((4, 4)),
-        [first],
-        is_noise,
-        budget=600,
-        progress=told.append,
+        problem, first, np.zeros((4, 4)), [first], is_noise, budget=600, progress=told.append
     )
     assert not found.explained
     assert problem.evaluations < 600 + 600  # a start goes on to its end
@@ -190,13 +181,7 @@ def test_a_place_that_only_misses_the_pressure_is_left_once_it_is_found_again(
     problem = Problem(lambda p: curved((0.8, 0.5, 0.7))(p) + wave)
     first = ParameterDensity(np.array([0.5, 0.5, 0.5, 0.0]), 0.4 * np.eye(3))
     found = multistart_search(
-        problem,
-        first,
-        np.zeros((4, 4)),
-        [first],
-        is_noise,
-        confirms=confirms,
-        excess_before=before,
+        problem, first, np.zeros((4, 4)), [first], is_noise, confirms=confirms, excess_before=before
     )
     assert not found.explained
     assert found.confirmed == (starts is not None)

@@ -55,9 +55,7 @@ def loaded(load, test="open"):
 def with_all_effects(experiment):
     free = (*FAULTS, *SENSOR_OFFSETS, *basic_nuisances_of(0.0))
     return estimate_nuisances(
-        [experiment],
-        NuisanceSearchSettings(free, give_up=True, budget=300),
-        CONSIDERED_PARAMETERS,
+        [experiment], NuisanceSearchSettings(free, give_up=True, budget=300), CONSIDERED_PARAMETERS
     )
 
 

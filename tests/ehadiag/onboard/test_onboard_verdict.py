@@ -25,10 +25,7 @@ from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.model.plant import relative_viscosity
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard import onboard_verdict
-from ehadiag.onboard.onboard_identification import (
-    begin_identification,
-    continue_identification,
-)
+from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
 from ehadiag.onboard.onboard_memory import (
     ONBOARD,
     ONBOARD_GENES,

@@ -184,9 +184,7 @@ def commands(roles: dict[str, list[float]], fixed: CommandMode | None = None) ->
 
     meanings = {1: CommandMode.CURRENT, 2: CommandMode.POSITION, 5: CommandMode.POSITION}
     return SimpleNamespace(
-        fill=fill,
-        episode=span(0, 3),
-        bus_map=SimpleNamespace(fixed_mode=fixed, modes=meanings),
+        fill=fill, episode=span(0, 3), bus_map=SimpleNamespace(fixed_mode=fixed, modes=meanings)
     )
 
 

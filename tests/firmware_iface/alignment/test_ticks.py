@@ -321,8 +321,7 @@ def test_an_anchor_out_of_line_leaves_the_axis_and_the_others_find_their_place()
 
 
 @pytest.mark.parametrize(
-    ("ahead_ms", "first"),
-    [(0.0, 0), (0.3, 0), (0.85, 0), (-0.05, 0), (-0.3, 1)],
+    ("ahead_ms", "first"), [(0.0, 0), (0.3, 0), (0.85, 0), (-0.05, 0), (-0.3, 1)]
 )
 def test_a_command_belongs_to_the_telemetry_that_follows(ahead_ms: float, first: int) -> None:
     """At the same time (less than a tenth of a tick after) it still is the same tick's."""

@@ -271,10 +271,7 @@ def test_on_a_bus_as_fast_as_possible_it_stops_when_told(make_core: CoreFactory)
     options = BusOptions("virtual", channel=str(uuid.uuid4()), extra={"preserve_timestamps": True})
     stop = threading.Event()
     ticks: list[int] = []
-    with (
-        PythonCanTransport(options) as listener,
-        PythonCanTransport(options, transmit=True) as bus,
-    ):
+    with PythonCanTransport(options) as listener, PythonCanTransport(options, transmit=True) as bus:
 
         def node() -> None:
             ticks.append(run_emulator(make_core(), bus, stop, real_time=False))

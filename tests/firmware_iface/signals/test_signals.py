@@ -36,12 +36,7 @@ from firmware_iface.signals.held import (
 )
 from firmware_iface.signals.recordings import Interpretation, recorded_tests
 from firmware_iface.signals.resample import TickClock, is_held, on_ticks
-from firmware_iface.signals.tables import (
-    RecordedSignal,
-    even_times,
-    join_tables,
-    read_signals,
-)
+from firmware_iface.signals.tables import RecordedSignal, even_times, join_tables, read_signals
 
 SOUGHT = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
 KEYS = ("current", "spool", "pressure", "position")
