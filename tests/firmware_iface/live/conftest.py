@@ -7,14 +7,12 @@ from collections.abc import Callable, Iterator
 
 import fault_cases
 import pytest
-from coarse_simulation import coarse_step
 from live_ends import cable
 
 from ehadiag import StoredTest, default_actuator
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.emulator import FccCore
 
-__all__ = ["coarse_step"]
 CoreFactory = Callable[..., FccCore]
 
 
