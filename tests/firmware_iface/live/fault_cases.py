@@ -294,24 +294,12 @@ CASES = (
 )
 
 
-def stated(case: Case) -> str:
-    """The outcome of a case in words."""
+def concluded(case: Case) -> str:
+    """What comes of a case, in words."""
     if case.why:
         reason = case.why.replace(".*", " … ").rstrip("$").strip()
         return f"NOT TESTED: {reason}"
-    parts = [f"complete; {'all' if case.least == 1.0 else f'{case.least:.0%} of the'} samples"]
-    if case.counts:
-        parts.append("counted as " + ", ".join(item.replace("_", " ") for item in case.counts))
-    if case.wrong:
-        parts.append(f"up to {case.wrong:.1%} wrong, unseen")
-    return "; ".join(parts)
-
-
-def concluded(case: Case) -> str:
-    """The outcome of a whole stored test in words."""
-    if case.why:
-        return "NOT TESTED"
-    return f"NOT TESTED: {case.unfit}" if case.unfit else "same"
+    return f"NOT TESTED: {case.unfit}" if case.unfit else "the same verdict"
 
 
 CLOSED_LOSSES = """\
@@ -348,19 +336,18 @@ def table() -> str:
     """The tables of the docs."""
     from fault_logs import LOG_CASES  # builds upon this module
 
-    rows = by_outcome([(item.name, stated(item), concluded(item)) for item in CASES])
+    rows = by_outcome([(item.name, concluded(item)) for item in CASES])
     logs = by_outcome([(item.name, item.stated) for item in LOG_CASES])
     return f"""# What a damaged harness does to a test
 
-Each fault is injected between the emulated computer and the tester. The tables are printed by
-`python tests/firmware_iface/live/fault_cases.py`, and `test_live_faults.py` checks each line.
+Each fault is injected between the emulated computer and the tester, in a short test (samples that
+arrive are those of the sound bus to the last bit, their least share is asserted) and in the stored
+test `open`. The tables are printed by `python tests/firmware_iface/live/fault_cases.py`, and
+`test_live_faults.py` checks each line. *The same verdict*: each estimate is within its 95 %
+interval, too.
 
-- *Handshake and samples*: a test of 0.4 s, and the least share of samples that arrive.
-- *Diagnosis*: the complete stored test `open`. “Same”: the verdict of the sound bus, and each
-  estimate within its 95 % interval.
-
-| fault | handshake and samples | diagnosis |
-| --- | --- | --- |
+| fault | what comes of it |
+| --- | --- |
 {rows}
 ## Closed loop
 
