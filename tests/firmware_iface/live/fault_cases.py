@@ -341,8 +341,8 @@ def table() -> str:
     return f"""# What a damaged harness does to a test
 
 Each fault is injected between the emulated computer and the tester, in a short test (samples that
-arrive are those of the sound bus to the last bit, their least share is asserted) and in the stored
-test `open`. The tables are printed by `python tests/firmware_iface/live/fault_cases.py`, and
+arrive are those of the sound bus to the last bit, unless damage passes the check sum) and in the
+stored test `open`. The tables are printed by `python tests/firmware_iface/live/fault_cases.py`, and
 `test_live_faults.py` checks each line. *The same verdict*: each estimate is within its 95 %
 interval, too.
 
