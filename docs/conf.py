@@ -98,16 +98,16 @@ def parameter_table() -> str:
     """Return the rows of the registry of parameters, as Markdown."""
     from ehadiag.model.registry import REGISTRY  # noqa: PLC0415 - loads kernels
 
-    lines = ["| name | symbol | unit | range | kind | meaning |", "| --- " * 6 + "|"]
+    lines = ["| name | symbol | unit | range | meaning |", "| --- " * 5 + "|"]
     data = [item for item in REGISTRY if item.name == f"datum_{item.symbol.removeprefix('d')}"]
     error = "relative error of the actuator file's "
     meanings = "; ".join(item.meaning.removeprefix(error) for item in data)
     for item in [data[0], *(item for item in REGISTRY if item not in data)]:
         bounded = math.isfinite(item.lower)
         span = f"{item.lower:g} … {item.upper:g}" if bounded else "any"
-        cells = [f"`{item.name}`", item.symbol, item.unit, span, item.kind.value, item.meaning]
+        cells = [f"`{item.name}`", item.symbol, item.unit, span, item.meaning]
         if item in data:  # one row for all, since they have the same bounds
-            cells[:2], cells[5] = ["`datum_NAME`", "dNAME"], f"{error}NAME: {meanings}"
+            cells[:2], cells[4] = ["`datum_NAME`", "dNAME"], f"{error}NAME: {meanings}"
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Undo the fix of each break in a copy of the sources and run its tests: they must fail.
 
-`python tools/undone_fixes.py [BREAK...]` prints the rows of docs/explanation/attacks.md.
+`python tools/undone_fixes.py [BREAK...]` prints a row for each (docs/explanation/attacks.md).
 """
 
 from __future__ import annotations

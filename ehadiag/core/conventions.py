@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -93,6 +94,14 @@ def with_unit(value: float, unit: str) -> str:
     """
     factor, name = display_unit(unit, value)
     return f"{factor * value:.4g} {name}"
+
+
+def to_precision(std: float, *values: float) -> list[str]:
+    """Write values to the second digit of their standard deviation, without powers of ten."""
+    if not std > 0.0 or math.isinf(std):
+        return [f"{value:.4g}" for value in values]
+    digits = max(1 - math.floor(math.log10(std)), 0)
+    return [f"{value:.{digits}f}" for value in values]
 
 
 def fingerprint(content: Any) -> str:

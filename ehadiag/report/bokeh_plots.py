@@ -107,7 +107,7 @@ def _plot_panel(plot: figure, panel: Panel, scale: float) -> None:
         legend = plot.legend[0]
         legend.update(
             location="left", orientation="horizontal", click_policy="hide", border_line_color=None,
-            label_text_font_size="11px", background_fill_alpha=0.0, margin=0, padding=2,
+            label_text_font_size="11px", background_fill_alpha=0.0, margin=0, padding=2, ncols=3,
         )  # fmt: skip
         plot.center = [item for item in plot.center if item is not legend]
         plot.add_layout(legend, "above")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
+from ehadiag.assess.verdict import Verdict
 from ehadiag.report.head import plain_name
 from firmware_iface.errors import printable
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from ehadiag.estimate import Severity
     from ehadiag.prognosis.units import Prognosis
 
-FLEET_HEAD = ("unit", "verdict", "worst", "trend", "time left", "last test", "actuator", "")
+FLEET_HEAD = ("unit", "verdict", "worst", "time left", "trend", "last test", "actuator", "")
 WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
 
 
@@ -71,8 +72,8 @@ def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
         Cell(serial, unit.link),
         Cell(unit.word, kind=unit.verdict),
         Cell(worst),
-        Cell(_sparkline(unit.past, levels)),
         Cell(_left(unit.prognosis)),
+        Cell(_sparkline(unit.past, levels)),
         Cell(unit.tested[:16].replace("T", " ")),
         Cell(printable(unit.actuator)),
         Cell("report", unit.report) if unit.report else Cell(""),
@@ -80,8 +81,9 @@ def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
 
 
 def _worst(unit: FleetUnit) -> tuple[str, float]:
-    """Name and value of the worst severity; below 0 where none is known."""
-    known = [(item.name, item.estimate) for item in unit.severities if item.estimate is not None]
+    """Name and value of the worst severity; below 0 where none has a verdict."""
+    judged = unit.severities if unit.verdict != Verdict.NOT_TESTED.name else ()
+    known = [(item.name, item.estimate) for item in judged if item.estimate is not None]
     return max(known, key=lambda pair: pair[1], default=("", -1.0))
 
 

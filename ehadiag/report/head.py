@@ -69,13 +69,18 @@ class Head:
     reasons: tuple[Reason, ...]
     """Why there is no verdict, the plain cause first; none where there is one."""
     bars: tuple[Bar, ...]
-    """Severities, worst first."""
+    """Severities, worst first; to be drawn only beside a verdict."""
     advisory: float
     """Level from which a severity is DEGRADED, 0 … 1."""
     limit: float
     """Level from which it is FAULT."""
     facts: tuple[tuple[str, str], ...]
     """Date of the test, unit, test, actuator: label and text."""
+
+    @property
+    def drawn(self) -> tuple[Bar, ...]:
+        """Severities that have a verdict: small bars of a test that failed would look sound."""
+        return self.bars if self.verdict != Verdict.NOT_TESTED.name else ()
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -97,6 +102,8 @@ class _Explanation(NamedTuple):
 CONSEQUENCES = frozenset({"Samples are missing."})
 """Causes that a recording that begins late or ends early explains."""
 CUT_OFF = ("The recording ends early", "The recording begins late")
+LEAST_WEAR = 0.005
+"""Least severity that is worth a word, 1: it is rounded to a percent."""
 CUT_NOTE = re.compile(r"the (last|first) .* are missing")
 
 
@@ -120,19 +127,20 @@ def verdict_word(result: Result) -> str:
 
 def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) -> Head:
     """Return the content of a result's head."""
+    untested = result.verdict is Verdict.NOT_TESTED
     bars = sorted(
-        (_bar(item, levels) for item in result.severities.values()),
+        (_bar(item, levels, untested) for item in result.severities.values()),
         key=lambda bar: -1.0 if bar.value is None else bar.value,
         reverse=True,
     )
-    untested = result.verdict is Verdict.NOT_TESTED
     reasons = _explained(result) if untested else ()
     sentences = tuple(item.cause for item in reasons) if untested else _found(result, bars, levels)
     if prognosis is not None and not untested:
         sentences += tuple(remaining_sentences(prognosis)[:1])
     serial = "unknown" if result.serial is None else str(result.serial)
+    date = "date unknown" if result.date is None else _shown_date(result.date)
     facts = (
-        ("tested", "date unknown" if result.date is None else _shown_date(result.date)),
+        *([] if untested and result.date is None else [("tested", date)]),
         ("unit", serial),
         ("test", result.test or "unknown"),
         ("actuator", result.actuator),
@@ -187,9 +195,11 @@ def _shown_date(date: str) -> str:
     return f"{date[:10]} {date[11:16]} UTC"
 
 
-def _bar(item: Severity, levels: Levels) -> Bar:
+def _bar(item: Severity, levels: Levels, untested: bool) -> Bar:
     value, state, standing = item.estimate, "", "not known"
-    if value is not None:
+    if value is not None and untested:
+        standing = "no verdict"
+    elif value is not None:
         state, standing = "HEALTHY", "below both levels"
         if value >= levels.limit:
             state, standing = "FAULT", "at or above the limit"
@@ -231,12 +241,15 @@ def _found(result: Result, bars: Sequence[Bar], levels: Levels) -> tuple[str, ..
             text = f"{item.meaning} is {factor * item.value:.3g} {unit}"
             text += f", its limit is {factor * item.limit:.3g} {unit}."
             out.append(text[0].upper() + text[1:])
-    if not out and bars and bars[0].value is not None:
-        worst = bars[0]
-        out.append(
-            f"Nothing is worn beyond its advisory level of {percent(levels.advisory)};"
-            f" {worst.name} is highest, at {percent(bars[0].value, *both)}."
-        )
+    worst = bars[0] if bars else None
+    if not out and worst and worst.value is not None:
+        text = "No wear was found."
+        if worst.value >= LEAST_WEAR:
+            text = (
+                f"All wear is below its advisory level of {percent(levels.advisory)};"
+                f" most worn: {worst.name}, {percent(worst.value, *both)}."
+            )
+        out.append("Nothing to do. " * (result.verdict is Verdict.HEALTHY) + text)
     return tuple(out)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from ehadiag.core.conventions import display_unit
+from ehadiag.core.conventions import display_unit, to_precision
 from ehadiag.core.criteria import FIT
 from ehadiag.history.records import hash_of_file
 from ehadiag.model.registry import parameter
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
     from ehadiag.calibration.unit_models import Calibrated
     from ehadiag.core.actuator import Calibration
-    from ehadiag.estimate import Severity
     from ehadiag.history.records import Entry, MaintenanceEvent
     from ehadiag.prognosis.units import Prognosis
     from ehadiag.report.head import Bar
@@ -67,7 +66,7 @@ def diagnosis_page(
     verdict = result.verdict.name
     future = trend.prognosis if trend else None
     head = head_of(result, levels, future)
-    faults = [_fault(bar, result.severities[bar.symbol]) for bar in head.bars]
+    faults = [_fault(bar) for bar in head.bars]
     date = (result.date or "date unknown")[:16].replace("T", " ")
     return render_template(
         "report.html.j2",
@@ -124,16 +123,13 @@ def _draw_responses(
     return out
 
 
-def _fault(bar: Bar, item: Severity) -> dict[str, Any]:
-    hidden = ["nothing was identified"] * (bar.value is None)
-    hidden += ["the test does not show it"] * (not item.shown)
+def _fault(bar: Bar) -> dict[str, Any]:
     return {
         "name": bar.symbol,
         "meaning": bar.name,
         "estimate": bar.value,
         "interval": None if bar.value is None else bar.interval,
         "standing": bar.standing,
-        "hidden": hidden,
     }
 
 
@@ -143,8 +139,8 @@ def _effects(result: Result) -> list[dict[str, str]]:
         if item.value is None or item.std is None:
             continue
         factor, unit = display_unit(item.unit, item.value)
-        bound = " (at its bound)" if item.at_bound else ""
-        value, std = f"{factor * item.value:.4g}{bound}", f"{factor * item.std:.2g}"
+        value, std = to_precision(factor * item.std, factor * item.value, factor * item.std)
+        value += " (at its bound)" * item.at_bound
         out.append({"name": item.meaning or item.name, "value": value, "std": std, "unit": unit})
     return out
 

@@ -199,9 +199,10 @@ def _test_parts(test: StoredTest) -> tuple[Band, ...]:
     for name, spans in used.items():
         for span in spans:
             names.setdefault(span, []).append(name)
+    labels = {span: ", ".join(names[span]) for span in sorted(names)}
+    order = list(dict.fromkeys(labels.values()))  # parts of one label have one colour
     return tuple(
-        Band(*span, f"part {number % 3}", ", ".join(names[span]))
-        for number, span in enumerate(sorted(names))
+        Band(*span, f"part {order.index(label) % 3}", label) for span, label in labels.items()
     )
 
 

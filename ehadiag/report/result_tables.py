@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.core.conventions import display_unit
+from ehadiag.core.conventions import display_unit, to_precision
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
 from ehadiag.report.head import head_of, percent
@@ -117,8 +117,8 @@ def _print_head(head: Head, result: Result, console: Console) -> None:
     facts = ", ".join(f"{label} {printable(value)}" for label, value in head.facts)
     _line(console, facts)
     _line(console, f"recording {printable(result.source)}")
-    if result.identified:
-        for bar in head.bars:
+    if result.identified and head.drawn:
+        for bar in head.drawn:
             console.print(_bar(bar, head, console), soft_wrap=True)
         levels = f"marks at | advisory {percent(head.advisory)}, | limit {percent(head.limit)}"
         start = max(min(27, console.width - len(levels)), 0)
@@ -190,12 +190,14 @@ def _limited(result: Result) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     for item in result.other:
-        low, high = item.interval95 or (math.nan, math.nan)
+        std = item.shown(_known(item.std))
+        numbers = (_known(item.value), *(item.interval95 or (math.nan, math.nan)))
+        value, low, high = to_precision(std, *map(item.shown, numbers))
         table.add_row(
             item.meaning,
-            f"{item.shown(_known(item.value)):.4g} {item.shown_unit}",
-            f"{item.shown(_known(item.std)):.2g}",
-            f"{item.shown(low):.4g} … {item.shown(high):.4g}",
+            f"{value} {item.shown_unit}",
+            *to_precision(std, std),
+            f"{low} … {high}",
             f"{item.shown(_known(item.limit)):.3g} {item.shown_unit}",
             "beyond its limit" if item.beyond else "",
         )
@@ -214,7 +216,7 @@ def _is_shown(item: Effect) -> bool:
 
 def _size(item: Effect) -> str:
     value, std = item.shown(_known(item.value)), item.shown(_known(item.std))
-    return f"{item.meaning} {value:.4g} ± {std:.2g} {item.shown_unit}"
+    return f"{item.meaning} {' ± '.join(to_precision(std, value, std))} {item.shown_unit}"
 
 
 def _on_board(found: Onboard, result: Result) -> str:

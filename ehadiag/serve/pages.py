@@ -12,7 +12,8 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from ehadiag.core.conventions import MAX_RESULT_BYTES, utc_text
+from ehadiag.assess.verdict import Verdict
+from ehadiag.core.conventions import MAX_RESULT_BYTES
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
@@ -174,7 +175,7 @@ class Pages:
             [
                 Cell(printable(path.name), "/reports/" + quote(os.fsencode(path.name))),
                 *_reported(path),
-                Cell(utc_text(datetime.fromtimestamp(path.stat().st_mtime, UTC))[:16]),
+                Cell(f"{datetime.fromtimestamp(path.stat().st_mtime, UTC):%Y-%m-%d %H:%M}"),
             ]
             for path in self._reports()[:MAX_PAGE_ROWS]
         ]  # fmt: skip
@@ -260,7 +261,8 @@ def _reported(path: Path) -> list[Cell]:
         result = Result.from_json(line)
     except (EhadiagError, ValueError):
         return [Cell(""), Cell(""), Cell("")]
-    known = [item for item in result.severities.values() if item.estimate is not None]
+    judged = result.severities.values() if result.verdict is not Verdict.NOT_TESTED else ()
+    known = [item for item in judged if item.estimate is not None]
     worst = max(known, key=lambda item: item.value, default=None)
     return [
         Cell("unknown" if result.serial is None else str(result.serial)),

@@ -95,7 +95,7 @@ def _head(snapshot: Snapshot) -> RenderableType:
     head.add_column(justify="right", no_wrap=True)
     left = Text.assemble(
         (f"ehadiag {snapshot.command}", "bold"),
-        f"  serial {serial}  actuator ",
+        f"  unit {serial}  actuator ",
         printable(snapshot.actuator),
     )
     head.add_row(left, Text(f"{snapshot.time[11:19]} UTC"))
@@ -162,7 +162,7 @@ def _signals(signals: Signals, width: int, *, unicode: bool) -> RenderableType:
         ("jack", _latest(signals.position_mm), signals.position_mm, "mm"),
     )
     for name, value, history, unit in rows:
-        shown = "-" if value is None else f"{value:+.4f}"
+        shown = "-" if value is None else f"{value:+8.4f}"
         table.add_row(name, shown, unit, sparkline(history, width - 26, unicode=unicode))
     return table
 
@@ -181,12 +181,12 @@ def _residuals(found: Residuals | None, width: int, *, unicode: bool) -> Rendera
         (found.spool, "spool", found.spool_above, found.spool_below),
         (found.pressure, "pressure", found.pressure_above, found.pressure_below),
     ):
-        value = "   rests" if residual is None else f"{residual:+8.1f}"
+        value = "   at rest" if residual is None else f"{residual:+8.1f} σ"
         high = max(above, below)
         side = "above" if above >= below else "below"
         style = "bold red" if high >= FULL_BAR else ""
         table.add_row(
-            Text(f"residual {name:8s}{value} σ"),
+            Text(f"residual {name:8s}{value}"),
             Text(_bar(high, unicode=unicode, length=length), style=style),
             Text(f"{high:4.0%} of the alarm, {side}", style=style),
         )

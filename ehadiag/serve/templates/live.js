@@ -30,6 +30,7 @@ const number = (value, digits) => ({ number: text(value, digits) });
 function show(snapshot) {
   at("result").hidden = snapshot === null || !snapshot.ending;
   if (snapshot === null) return;
+  at("seen").hidden = at("share").hidden = false;
   const { bus, test, residuals, ending, signals } = snapshot;
   at("unit").textContent = snapshot.actuator + ", unit " + text(snapshot.serial);
   at("verdict").textContent = ending ? ending.verdict.replace("_", " ") : "";
@@ -105,6 +106,8 @@ stream.addEventListener("state", (event) => {
   if (state.running !== null && state.starting) {
     at("unit").textContent = "Starting test " + state.running + " …";
     at("phase").textContent = "Loading the model and opening the bus";
+    at("result").hidden = at("seen").hidden = true; // of the test before
+    at("share").hidden = false;
     at("share").removeAttribute("value");
   }
   if (at("start")) { at("start").disabled = state.running !== null; at("abort").disabled = state.running === null; }

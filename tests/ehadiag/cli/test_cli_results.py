@@ -199,10 +199,12 @@ def test_csv_is_the_command_of_the_test(run: Run) -> None:
     assert {time: values[time] for time in expected} == pytest.approx(expected)
 
 
-def test_help_names_every_command_and_code(run: Run) -> None:
-    result = run("--help")
-    assert result.code == 0
+@pytest.mark.parametrize(("arguments", "code"), [(("--help",), 0), ((), 2)])
+def test_help_names_every_command_and_code(arguments: tuple[str, ...], code: int, run: Run) -> None:
+    """And so does the command alone, which is wrong usage to a script."""
+    result = run(*arguments)
+    assert (result.code, result.err) == (code, "")
     for word in ("bit", "diagnose", "sim", "tests", "check-bus", "replay", "warmup"):
         assert f"\n    {word}" in result.out
-    for code in ("0 healthy", "10 degraded", "20 fault", "30 not tested", "2 wrong", "3 input"):
-        assert code in result.out
+    for words in ("0 healthy", "10 degraded", "20 fault", "30 not tested", "2 wrong", "3 input"):
+        assert words in result.out

@@ -103,8 +103,9 @@ def test_it_fits_and_shows_what_others_wrote_as_text(width: int, text: str) -> N
 
 def test_all_that_is_known_is_there() -> None:
     whole = "\n".join(printed(snapshot(), 80))
-    for item in ("open", "2070 frames/s", "load 23%", "lost 1", "3.5 s left", "current mode",
-                 "0.3000 ± 0.0100", "rests", "100% of the alarm, above", "no alarm"):  # fmt: skip
+    for item in ("open", "2070 frames/s", "load 23%", "lost 1", "3.5 s left",
+                 "current mode", "0.3000 ± 0.0100", "at rest", "100% of the alarm, above",
+                 "no alarm"):  # fmt: skip
         assert item in whole
 
 

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ehadiag import bundled_tests, default_actuator, load_actuator
-from ehadiag.core.conventions import date_text, fingerprint, start_text, with_unit
+from ehadiag.core.conventions import date_text, fingerprint, start_text, to_precision, with_unit
 from ehadiag.model.registry import REGISTRY
 from firmware_iface.bus_map import default_map
 from firmware_iface.errors import plain_name, printable, printable_lines, valid_text
@@ -133,3 +133,9 @@ def test_each_content_has_its_own() -> None:
     hashes = {fingerprint(item) for item in things}
     assert len(hashes) == len(things)
     assert all(len(item) == 64 for item in hashes)
+
+
+def test_values_stand_to_the_second_digit_of_their_deviation() -> None:
+    assert to_precision(0.00028, 3.972e-05, -0.0005054) == ["0.00004", "-0.00051"]
+    assert to_precision(12.3, 456.7, 12.3) == ["457", "12"]
+    assert to_precision(0.0, 1.23456) == ["1.235"]

@@ -47,6 +47,21 @@ def test_a_terminal_breaks_no_word_and_loses_no_digit(worn: ehadiag.Result, widt
     assert words - bars <= set(re.findall(r"\S+", text))
 
 
+def test_a_dumb_terminal_gets_every_digit(
+    worn: ehadiag.Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, highlight=False, markup=False, emoji=False)
+    assert console.is_dumb_terminal
+    print_result(worn, console)
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in out.getvalue().replace(" … ", "")
+    for item in worn.severities.values():
+        assert all(f"{number:.5f}" in out.getvalue() for number in (item.value, *item.interval))
+
+
 def test_the_worst_comes_first_with_what_to_do(worn: ehadiag.Result) -> None:
     levels = Levels(0.25, 0.5)
     head = head_of(worn, levels)
@@ -105,8 +120,26 @@ def test_an_unexplained_test_is_inconclusive_and_has_the_exit_code_of_not_tested
 ) -> None:
     reason = "the model does not explain the recording: 9.0% of the residuals beyond three times"
     result = untested(worn, reason, fit=worn.fit)
-    assert head_of(result, Levels()).word == "INCONCLUSIVE"
+    head = head_of(result, Levels())
+    assert head.word == "INCONCLUSIVE"
+    assert head.sentences == ("Wear alone does not explain how this unit moved.",)
     assert result.exit_code == 30
+    assert {bar.standing for bar in head.bars} == {"no verdict"}
+    assert not any("█" in line for line in printed(result, 80))
+
+
+def test_a_sound_unit_needs_nothing(worn: ehadiag.Result) -> None:
+    def sized(value: float) -> ehadiag.Result:
+        faults = {
+            name: msgspec.structs.replace(item, estimate=value, interval95=(value, value))
+            for name, item in worn.severities.items()
+        }
+        return msgspec.structs.replace(worn, severities=faults, state="HEALTHY", reasons=())
+
+    (said,) = head_of(sized(0.123), Levels()).sentences
+    assert said.startswith("Nothing to do. All wear is below its advisory level of 25 %; most worn")
+    assert said.endswith("12 %.")
+    assert head_of(sized(0.001), Levels()).sentences == ("Nothing to do. No wear was found.",)
 
 
 def test_an_unknown_reason_stands_for_itself(worn: ehadiag.Result) -> None:

@@ -20,6 +20,10 @@ from ehadiag.serve.sessions import Session, SessionRunner
 
 __all__ = ["browser"]
 pytestmark = pytest.mark.slow
+CUT = """[...document.querySelectorAll('#verdict, #severities .number')]
+  .filter((item) => item.getBoundingClientRect().right > innerWidth)
+  .map((item) => item.innerText)"""
+"""Cells of the verdict and the severities that a narrow window cuts."""
 HOSTILE = "</td></script><script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
@@ -67,12 +71,14 @@ def test_pages_show_hostile_texts_as_texts_and_nothing_is_objected_to(
             assert "onerror=alert(" in page.inner_text("main")
             assert page.evaluate("document.querySelectorAll('img').length") == 0
             if path == "/session":
+                page.set_viewport_size({"width": 400, "height": 900})
+                assert page.evaluate(CUT) == []
                 for item, words in (
                     ("#unit", HOSTILE), ("#verdict", "DEGRADED"), ("#residuals", "-3.25"),
                     ("#against", HOSTILE), ("#alarms", "below"), ("#alarm-count", "1"),
                     ("#phase", "3.5 s left"), ("#bus", "2000"), ("#severities", "0.3000"),
                     ("#said", HOSTILE), ("#notes", HOSTILE), ("#test", HOSTILE),
                 ):  # fmt: skip
-                    assert words in page.inner_text(item), item
+                    assert words in page.text_content(item), item
         assert wrong == []
         assert [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []

@@ -103,6 +103,9 @@ def test_a_test_is_run_recorded_and_diagnosed(tmp_path: Path) -> None:
     assert (stages[0], len(set(stages)) > 1) == ("test open", True)
     assert snapshots[-1].ending is not None
     assert snapshots[-1].ending.verdict == "DEGRADED"
+    running = snapshots[-1].test
+    assert running is not None
+    assert (running.left_s, running.elapsed_s, snapshots[-1].working) == (None, 5.5, "")
     again = ehadiag.diagnose(tmp_path / "run.blf")
     assert again.faults["FSS"].value == result.faults["FSS"].value
     checked = ehadiag.check_bus(tmp_path / "run.blf")
