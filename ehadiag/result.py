@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -14,6 +16,7 @@ from ehadiag.assess.verdict import Verdict
 from ehadiag.estimate import Culprit, Effect, Severity
 from ehadiag.request import MOST_SEED, Request
 from firmware_iface.errors import ConfigurationError, NotTestedError
+from firmware_iface.files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -441,6 +444,30 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         from ehadiag.report.response_signals import result_picture  # noqa: PLC0415
 
         return draw_picture(result_picture(self))
+
+    def write_signals(self, path: str | os.PathLike[str]) -> None:
+        """Write recorded and modelled signals, residuals and events to a file.
+
+        With verdict and severities as metadata; the JSON object and the DBC are attached.
+
+        Parameters
+        ----------
+        path : str | os.PathLike[str]
+            File to write, `.mf4` or `.mcap`; one that exists is replaced.
+
+        Raises
+        ------
+        ConfigurationError
+            Another suffix, or the library of the format is not installed.
+        NotTestedError
+            There are no samples.
+        InputOutputError
+            The file cannot be written.
+        """
+        from ehadiag.report.signal_files import signal_file  # noqa: PLC0415 - slow
+
+        place = Path(path)
+        write_file(place, signal_file(self, place.suffix.lower().removeprefix(".")), "signals")
 
     def __str__(self) -> str:
         """Return the command line's table."""

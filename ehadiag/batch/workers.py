@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ehadiag.batch.result_files import is_result_table
+from ehadiag.core.conventions import SIGNAL_FILE_SUFFIXES
 from ehadiag.core.interruption import children_with_safe_path
 from firmware_iface.errors import ConfigurationError, InputOutputError, install_command, reason_of
 
@@ -38,9 +39,9 @@ def expand_logs(names: Iterable[str], report: Callable[[str], None]) -> list[Log
     """Return the recordings that arguments stand for, in their order and as often as named.
 
     A folder stands for all recordings in it and below, in the order of their names, but not for
-    hidden ones, what lies in hidden folders or behind links, and tables of results; a pattern
-    (`*`, `?`, `[…]`, `**`), where there is no file of that name, for what it matches; `-` for the
-    names on standard input, one a line, or ended by null characters.
+    hidden ones, what lies in hidden folders or behind links, and tables and signals of results; a
+    pattern (`*`, `?`, `[…]`, `**`), where there is no file of that name, for what it matches; `-`
+    for the names on standard input, one a line, or ended by null characters.
 
     names: arguments of the command; report: takes a sentence on what of a folder is left out. A
     name that stands for no recording is in the list too, with the reason. ConfigurationError: the
@@ -86,14 +87,16 @@ def _expand_folder(folder: str, report: Callable[[str], None]) -> Iterator[LogIn
             if not name.startswith(".") and kind_of(Path(name)) in known
         ]
     ours = [name for name in inside if is_result_table(Path(name))]
+    signals = [name for name in inside if name.endswith(SIGNAL_FILE_SUFFIXES)]
     for left_out, why in (
         (links, "a link to a folder is not followed, name the folder to read it"),
         (ours, "a table of results is no recording"),
+        (signals, "signals of a result are no recording"),
     ):
         if left_out:
             more = f" and {len(left_out) - 1} more" if len(left_out) > 1 else ""
             report(f"folder {folder}: {why}: {min(left_out)}{more}")
-    recordings = sorted(set(inside).difference(ours))
+    recordings = sorted(set(inside).difference(ours, signals))
     for error in closed:
         yield LogInput(error.filename, f"folder {error.filename}: {reason_of(error)}")
     if not recordings and not closed:

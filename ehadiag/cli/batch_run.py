@@ -226,8 +226,9 @@ class _BatchRun:
 
     def _workers(self) -> int:
         """Return how many processes; 1: only this one."""
-        # A report draws samples, which no worker sends back.
-        if len(self._inputs) < 2 or self._arguments.cluster or self._arguments.report:
+        # Reports and signals need samples, which no worker sends back.
+        needs_samples = self._arguments.report or self._arguments.signals
+        if len(self._inputs) < 2 or self._arguments.cluster or needs_samples:
             return 1
         jobs = self._arguments.jobs
         return min(jobs, len(self._inputs)) if jobs else worker_count(len(self._inputs))

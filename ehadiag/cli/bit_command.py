@@ -102,6 +102,7 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
         help="how long to wait after the test for what the flight-control computer finds itself,"
         " where it says that it is at it (default 60)",
     )
+    options.add_xcp_option(parser, "measure command and channels by XCP, not by telemetry")
     options.add_screen_options(parser)
     add_actuators_options(parser)
     options.add_request_options(parser, *options.SEARCH)
@@ -109,6 +110,7 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
     add_history_options(parser)
     options.add_result_options(parser)
     options.add_report_option(parser)
+    options.add_signals_option(parser)
     option_values.add_bus_options(parser)
     add_simulator_options(parser)
     show_usual(
@@ -241,12 +243,10 @@ def _connection(
     from firmware_iface.logs.recorder import Recorder  # noqa: PLC0415 - loads python-can
 
     with ExitStack() as stack:
-        record = partial(Recorder, path, channel=setup.bus_map.channel)
         if not arguments.simulate:
             bus = stack.enter_context(
                 option_values.open_transport(arguments, transmit=not arguments.listen)
             )
-            recorder = record()
         else:
             from ehadiag_sim.emulator import (  # noqa: PLC0415 - loads kernels
                 EmulatorTransport,
@@ -255,10 +255,10 @@ def _connection(
             )
 
             settings = simulator_settings(arguments)
-            core = emulated_computer(setup.actuator, [test], setup.bus_map, **settings)
+            xcp = options.xcp_ids(arguments)
+            core = emulated_computer(setup.actuator, [test], setup.bus_map, xcp=xcp, **settings)
             if arguments.fast:
                 bus = stack.enter_context(EmulatorTransport(core))
-                recorder = record()
             else:
                 if not option_values.has_bus(arguments):
                     arguments.interface, arguments.channel = "virtual", f"ehadiag-{id(arguments):x}"
@@ -266,10 +266,27 @@ def _connection(
                     stack.enter_context(option_values.open_transport(arguments, transmit=True))
                     for _ in range(2)
                 )
-                recorder = record()
                 simulation.pace = stack.enter_context(emulator_in_thread(core, computer))
+        bus = stack.enter_context(_measured_by_xcp(arguments, setup, test, bus))
+        recorder = Recorder(path, channel=setup.bus_map.channel)
         print_status(f"test {test.name!r} on {bus.name}, recording to {path}")
         yield bus, recorder
+
+
+def _measured_by_xcp(
+    arguments: argparse.Namespace, setup: Setup, test: StoredTest, bus: Transport
+) -> Transport:
+    """Return the bus with command and channels as XCP measures them, where that is wanted."""
+    ids = options.xcp_ids(arguments)
+    if ids is None:
+        return bus
+    from ehadiag_sim.scales import scales_of  # noqa: PLC0415 - loads numpy
+    from firmware_iface.recording import CommandMode  # noqa: PLC0415
+    from firmware_iface.xcp_master import XcpTransport  # noqa: PLC0415 - loads cantools
+
+    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+    channels = scales_of(setup.bus_map, setup.actuator).channels
+    return XcpTransport(bus, setup.bus_map, channels, mode, ids)
 
 
 def _bit_monitor(
@@ -292,6 +309,8 @@ def _bit_monitor(
 
 
 def _refuse_contradictions(arguments: argparse.Namespace) -> None:
+    if options.xcp_ids(arguments) is not None and arguments.listen:
+        raise ConfigurationError("--xcp: measures on command, and --listen sends nothing")
     if arguments.simulate and arguments.listen:
         raise ConfigurationError("--simulate and --listen exclude each other")
     if arguments.fast and not arguments.simulate:

@@ -398,6 +398,7 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         help="take changes of the simulated unit as lines of JSON on this port of the loopback"
         " address; 0: any free one",
     )
+    options.add_xcp_option(parser, "serve XCP on CAN, for measurement only")
     options.add_request_options(parser, "actuator", *options.BUS)
     option_values.add_bus_options(parser)
     add_simulator_options(parser)
@@ -435,7 +436,8 @@ def run_sim(arguments: argparse.Namespace) -> int:
     from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads kernels
 
     settings = simulator_settings(arguments)
-    core = emulated_computer(actuator, tests, bus_map, **settings)
+    xcp = options.xcp_ids(arguments)
+    core = emulated_computer(actuator, tests, bus_map, xcp=xcp, **settings)
     with (
         _control_port(settings["control"], arguments.control),
         option_values.open_transport(arguments, transmit=True) as transport,

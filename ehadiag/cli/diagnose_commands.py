@@ -54,7 +54,8 @@ if TYPE_CHECKING:
     from firmware_iface.recording import Recording
 
 OPTIONS_UNUSED_BY_LIST = (
-    "joint", "out", "report", "history", "hours", "cycles", "results", "resume", "junit", "summary",
+    "joint", "out", "report", "signals", "history", "hours", "cycles", "results", "resume",
+    "junit", "summary",
 )  # fmt: skip
 """Options that say what becomes of a diagnosis."""
 UNSET_VALUES: tuple[object, ...] = (None, False, [])
@@ -84,6 +85,7 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
     add_history_options(parser)
     options.add_result_options(parser)
     options.add_report_option(parser)
+    options.add_signals_option(parser)
     add_batch_options(parser)
     show_usual(
         parser,
@@ -148,8 +150,9 @@ def _refuse_diagnose_contradictions(arguments: argparse.Namespace) -> None:
         if alone and value:
             raise ConfigurationError(f"{name}: {alone} gives one result, and has no use for it")
     for name in ("--jobs", "--cluster"):
-        if arguments.report and several[name]:
-            raise ConfigurationError(f"{name}: --report draws samples, which workers do not send")
+        if (arguments.report or arguments.signals) and several[name]:
+            option = "--report" if arguments.report else "--signals"
+            raise ConfigurationError(f"{name}: {option} needs samples, which workers do not send")
     if arguments.cluster and arguments.jobs:
         raise ConfigurationError("--jobs: a cluster has its own number of workers")
 

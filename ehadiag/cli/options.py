@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ehadiag.core.conventions import SIGNAL_FILE_KINDS
 from ehadiag.request import Option, Request, request_options
 from ehadiag.setup import Setup
+
+if TYPE_CHECKING:
+    from firmware_iface.xcp import XcpIds
 
 MAX_HISTORY_SERIAL = (1 << 63) - 1
 """Largest serial number that a history can hold, 1."""
@@ -146,6 +150,39 @@ def add_screen_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write what the live view shows to standard output, four JSON lines a second; all else"
         " goes to standard error. The session ends as by Ctrl-C when nobody reads any more",
+    )
+
+
+def add_xcp_option(parser: argparse.ArgumentParser, help: str) -> None:
+    """Add `--xcp`."""
+    parser.add_argument(
+        "--xcp",
+        nargs="?",
+        const="6F0:6F1",
+        metavar="REQ:RES",
+        help=f"{help}; identifiers in hexadecimal (default 6F0:6F1)",
+    )
+
+
+def xcp_ids(arguments: argparse.Namespace) -> XcpIds | None:
+    """Return the identifiers of `--xcp`; None without it."""
+    if arguments.xcp is None:
+        return None
+    from firmware_iface.xcp import parse_xcp_ids  # noqa: PLC0415 - loads numpy
+
+    return parse_xcp_ids(arguments.xcp)
+
+
+def add_signals_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--signals`."""
+    parser.add_argument(
+        "--signals",
+        action="append",
+        choices=SIGNAL_FILE_KINDS,
+        default=[],
+        metavar="KIND",
+        help="also write recorded and modelled signals, residuals and events to the output folder:"
+        " mf4 (ASAM MDF4) or mcap (Foxglove, PlotJuggler); repeatable",
     )
 
 

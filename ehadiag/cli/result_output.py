@@ -17,7 +17,7 @@ from pathlib import Path
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli.defaults import DEFAULTS_FILE_NAME, user_defaults_file
 from ehadiag.cli.history_options import HistoryWriter, history_path
-from ehadiag.core.conventions import MAX_RESULT_BYTES
+from ehadiag.core.conventions import MAX_RESULT_BYTES, SIGNAL_FILE_SUFFIXES
 from ehadiag.core.interruption import defer_signals
 from ehadiag.report.rendering import diagnosis_html_page
 from ehadiag.result import Origin, Result
@@ -139,8 +139,8 @@ def _file_identity(name: str) -> object:
     return (info.st_dev, info.st_ino)
 
 
-ATTACHMENT_SUFFIXES = (".png", ".html")
-"""Suffixes of what stands beside a result: picture and report."""
+ATTACHMENT_SUFFIXES = (".png", ".html", *SIGNAL_FILE_SUFFIXES)
+"""Suffixes of what stands beside a result: picture, report and signals."""
 
 
 def open_output_folder(name: str) -> Folder:
@@ -179,6 +179,14 @@ class ResultWriter:
         self._keeper = HistoryWriter(arguments)
         if arguments.report and folder is None:
             raise ConfigurationError("--report: name by --out the folder where the page goes")
+        self._signals = tuple(dict.fromkeys(arguments.signals))
+        if self._signals and folder is None:
+            raise ConfigurationError("--signals: name by --out the folder where the files go")
+        if self._signals:
+            from ehadiag.report.signal_files import signal_library  # noqa: PLC0415 - slow
+
+            for kind in self._signals:
+                signal_library(kind)
         self.stopped = False
         """Whether a signal came while a result was brought out."""
 
@@ -227,6 +235,10 @@ class ResultWriter:
                 with report_failure(codes):
                     self._report(result, f"{stem}.html")
                     written.append(f"{stem}.html")
+            for kind in self._signals if result.can_be_drawn and not came.is_set() else ():
+                with report_failure(codes):
+                    self._write_signals(result, kind, f"{stem}.signals.{kind}")
+                    written.append(f"{stem}.signals.{kind}")
             if self._folder is not None and written:
                 print_status(
                     "wrote " + ", ".join(str(self._folder.path / item) for item in written)
@@ -263,6 +275,8 @@ class ResultWriter:
             return True
         content = result.to_json().encode() + b"\n"
         suffixes = [".png"] * self.pictures + [".html"] * bool(self._arguments.report)
+        if any(item.samples_sha256 for item in result.origins):
+            suffixes += [f".signals.{kind}" for kind in self._signals]
         for stem in _numbered_stems(wanted):
             try:
                 there = folder.read(f"{stem}.json", MAX_RESULT_BYTES)
@@ -330,6 +344,14 @@ class ResultWriter:
         page = diagnosis_html_page(result, levels, self._keeper.place)
         with write_errors(f"report {self._folder.path / name}"):
             self._folder.write(name, page)
+
+    def _write_signals(self, result: Result, kind: str, name: str) -> None:
+        from ehadiag.report.signal_files import signal_file  # noqa: PLC0415 - slow
+
+        assert self._folder is not None
+        content = signal_file(result, kind)
+        with write_errors(f"signals {self._folder.path / name}"):
+            self._folder.write(name, content)
 
 
 def _numbered_stems(name: str) -> Iterator[str]:

@@ -28,7 +28,7 @@ from firmware_iface.errors import (
     printable,
     reason_of,
 )
-from firmware_iface.files import RESULT_MODE, Folder
+from firmware_iface.files import RESULT_MODE, Folder, write_errors
 from firmware_iface.stored_test import COMMAND_UNITS, bundled_tests, resolve_test
 
 FILE_TEMPLATES = {
@@ -129,7 +129,7 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     """Add description and options of the command."""
     parser.description = (
         "Write monitor and identification as a static library with C headers for"
-        " another computer. No cross compiler is needed."
+        " another computer (no cross compiler is needed), simulation units, or an A2L file."
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--target", metavar="NAME", help="computer, see --list")
@@ -137,6 +137,11 @@ def define_export(parser: argparse.ArgumentParser) -> None:
         "--fmu",
         action="store_true",
         help="co-simulation units (FMI 2.0 and 3.0) of simulator and monitor, for this computer",
+    )
+    what.add_argument(
+        "--a2l",
+        action="store_true",
+        help="A2L file (ASAM MCD-2 MC) of what the emulated computer measures by XCP",
     )
     what.add_argument("--list", action="store_true", help="list the targets and exit")
     parser.add_argument("--out", metavar="DIR", help="folder to write into")
@@ -147,7 +152,8 @@ def define_export(parser: argparse.ArgumentParser) -> None:
         metavar="H",
         help="mean time between false alarms of the monitor (default %(default)g)",
     )
-    options.add_request_options(parser, "actuator")
+    options.add_request_options(parser, "actuator", "mapping", "dbc")
+    options.add_xcp_option(parser, "with --a2l: how the computer is reached")
     parser.set_defaults(run=run_export)
 
 
@@ -162,6 +168,9 @@ def run_export(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.out is None:
         raise ConfigurationError("export: need --out DIR")
+    if arguments.a2l:
+        print_text(printable(str(Path(arguments.out) / _write_a2l(arguments))))
+        return 0
     actuator = options.setup_of(arguments).actuator
     names = (
         _write_fmus(arguments, actuator) if arguments.fmu else _write_library(arguments, actuator)
@@ -175,6 +184,17 @@ def run_export(arguments: argparse.Namespace) -> int:
             f" learned ({', '.join(sorted(effects))})"
         )
     return 0
+
+
+def _write_a2l(arguments: argparse.Namespace) -> str:
+    from ehadiag.export.a2l import A2L_FILE, a2l_text  # noqa: PLC0415 - loads the simulator
+    from firmware_iface.xcp import XcpIds  # noqa: PLC0415 - loads numpy
+
+    setup = options.setup_of(arguments)
+    text = a2l_text(setup.actuator, setup.bus_map, options.xcp_ids(arguments) or XcpIds())
+    with open_output_folder(arguments.out) as folder, write_errors(f"A2L file {A2L_FILE}"):
+        folder.write(A2L_FILE, text.encode("ascii"))
+    return A2L_FILE
 
 
 def _write_fmus(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:

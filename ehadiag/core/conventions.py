@@ -14,6 +14,10 @@ FRICTION_NAME = "FSS"
 """Effect and severity that a recording shows by their ratio alone."""
 MAX_RESULT_BYTES = 1 << 20
 """Size of the largest JSON result that is read, bytes."""
+SIGNAL_FILE_KINDS = ("mf4", "mcap")
+"""Formats of files with recorded and modelled signals."""
+SIGNAL_FILE_SUFFIXES = tuple(f".signals.{kind}" for kind in SIGNAL_FILE_KINDS)
+"""What follows the name of a result in those of its signals."""
 
 
 def date_text(time_ns: int | None) -> str | None:

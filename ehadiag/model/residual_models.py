@@ -93,8 +93,8 @@ class ModelResponse:
     """Pa."""
     position: Array
     """m."""
-    anchored: int
-    """How many times the model was re-anchored."""
+    anchored: NDArray[np.intp]
+    """Ascending ticks at whose end the model was put back on the measured spool, shape (m,)."""
 
 
 def model_response(
@@ -121,7 +121,7 @@ def model_response(
     node_end = np.empty(n, dtype=np.int64)
     plant = PlantConstants(*(float(value) for value in constants))
     reference = np.full(n, np.nan) if measured is None else measured
-    anchored = spool_response(
+    spool_response(
         plant,
         PATH_BENDS.monitor,
         spool_scratch(),
@@ -137,7 +137,7 @@ def model_response(
     )
     unseen = np.full(n, np.nan)
     jack_response(plant, tick, origin, place, 0.0, unseen, nodes, node_end, pressure, position)
-    return ModelResponse(spool, pressure, position, anchored)
+    return ModelResponse(spool, pressure, position, np.flatnonzero(nodes[node_end - 1, 4]))
 
 
 class _Workspace(NamedTuple):

@@ -41,6 +41,7 @@ STYLES = {
     "break-away": CurveStyle("#00664d", marker="triangle", hollow=True),
     "reversal": CurveStyle("#005a91", marker="circle", hollow=True),
     "end stop": CurveStyle("#8a004f", marker="square", hollow=True),
+    "re-anchoring": CurveStyle("#333333", marker="x"),
     "forecast 0": CurveStyle("#0072b2", "dotted", 1.4),
     "forecast 1": CurveStyle("#b34e00", "dotted", 1.4),
     "forecast 2": CurveStyle("#007a5a", "dotted", 1.4),
@@ -128,6 +129,10 @@ class Panel:
     """Half the converter's range, in the unit, for a second axis in percent."""
     y_range: tuple[float, float] | None = None
     """Ends of the vertical axis; None: as the curves need."""
+    offset: float = 0.0
+    """Taken off the recorded values, in the unit."""
+    noise: float | None = None
+    """Standard deviation of the recorded values, in the unit; None: not judged."""
 
     @property
     def y_label(self) -> str:

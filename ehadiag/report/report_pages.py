@@ -60,7 +60,8 @@ def diagnosis_page(
     Returns HTML.
     """
     plots: dict[str, LayoutDOM] = {}
-    responses = _draw_responses(response_columns(result.diagnosis) if result.at_hand else (), plots)
+    columns = response_columns(result.diagnosis) if result.at_hand else ()
+    responses = _draw_responses((column for _, column in columns), plots)
     if trend is not None and any(entry.severities for entry in trend.entries):
         plots["trend"] = plot_column(trend_column(trend.entries, trend.events, trend.prognosis))
     verdict = result.verdict.name

@@ -10,6 +10,7 @@ import contextlib
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from ehadiag.assess.diagnosis import Diagnosis
 from ehadiag.calibration.unit_models import Calibrated
 from ehadiag.core.actuator import Actuator
-from ehadiag.identify.experiment import Experiment, build_experiment
+from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, build_experiment
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.residual_models import model_response
 from ehadiag.model.sensors import SensorLaw, sensor_law
@@ -38,8 +39,13 @@ from firmware_iface.errors import printable
 from firmware_iface.recording import CommandMode, Recording, Samples
 from firmware_iface.stored_test import RATE_TOLERANCE, StoredTest
 
+QUIET_TIME_S = 0.02
+"""Time, s, without a re-anchoring that parts two runs of them: a model that is off is put back
+at almost every tick."""
+
 MotionEvents = dict[str, NDArray[np.intp]]
-"""Ascending ticks of a body's break-aways, reversals without a rest, and arrivals at a stop."""
+"""Ascending ticks of a body's break-aways, reversals without a rest, and arrivals at a stop; and
+those from which on the model would be put back on the measured spool."""
 
 
 def motion_events(place: CurveValues, stop: float) -> MotionEvents:
@@ -84,7 +90,7 @@ def _sensor_law(constants: PlantConstants) -> SensorLaw:
     return law
 
 
-class _Signal(NamedTuple):
+class ResponseSignal(NamedTuple):
     """A signal of a response, as people read it."""
 
     key: str
@@ -96,10 +102,10 @@ class _Signal(NamedTuple):
 
 
 RESPONSE_SIGNALS = (
-    _Signal("current", "servovalve current", "mA", "µA", 1e3),
-    _Signal("spool", "spool position", "mm", "µm", 1e3),
-    _Signal("pressure", "differential pressure", "MPa", "kPa", 1e-6),
-    _Signal("position", "jack position", "mm", "µm", 1e3),
+    ResponseSignal("current", "servovalve current", "mA", "µA", 1e3),
+    ResponseSignal("spool", "spool position", "mm", "µm", 1e3),
+    ResponseSignal("pressure", "differential pressure", "MPa", "kPa", 1e-6),
+    ResponseSignal("position", "jack position", "mm", "µm", 1e3),
 )
 
 
@@ -122,8 +128,31 @@ def modelled_column(
         for signal, values in zip(RESPONSE_SIGNALS, modelled, strict=True)
     }
     events = {key: motion_events(*motion) for key, motion in moving.items()}
+    events["spool"]["re-anchoring"] = _reanchorings(experiment, constants)
     tick, test = experiment.tick, experiment.test
-    return _column("Measured and modelled", recording, measured, curves, tick, test, events)
+    column = _column("Measured and modelled", recording, measured, curves, tick, test, events)
+    offsets = (
+        trace.offset, experiment.spool_offset, experiment.pressure_offset,
+        experiment.position_offset,
+    )  # fmt: skip
+    rows = zip(RESPONSE_SIGNALS, column.panels, offsets, (None, *experiment.noise), strict=True)
+    panels = (
+        replace(
+            panel, offset=offset * signal.factor, noise=None if std is None else std * signal.factor
+        )
+        for signal, panel, offset, std in rows
+    )
+    return replace(column, panels=tuple(panels))
+
+
+def _reanchorings(experiment: Experiment, constants: PlantConstants) -> NDArray[np.intp]:
+    """Find the ticks at which re-anchorings begin, each more than `QUIET_TIME_S` after the last."""
+    ticks = model_response(
+        constants, experiment.trace.current, experiment.tick, origin=experiment.origin,
+        measured=experiment.spool, anchor=experiment.anchor(ANCHOR_THRESHOLDS_LSB),
+    ).anchored  # fmt: skip
+    quiet = round(QUIET_TIME_S / experiment.tick)
+    return ticks[np.diff(ticks, prepend=-quiet - 1) > quiet]
 
 
 def _expected_column(
@@ -242,22 +271,24 @@ def _deviates(measured: CurveValues, model: CurveValues) -> NDArray[np.bool_]:
     return present & (np.abs(gap - np.median(gap[present])) > 0.05 * largest)
 
 
-def response_columns(diagnosis: Diagnosis) -> Iterator[PictureColumn]:
+def response_columns(diagnosis: Diagnosis) -> Iterator[tuple[Recording, PictureColumn]]:
     """Describe the response of each recording: modelled if there are estimates, else expected."""
     found = diagnosis.identification
     if found is not None and all(math.isfinite(item.value) for item in found.estimates):
         pairs = zip(diagnosis.experiments, diagnosis.recordings, strict=False)
         for experiment, recording in pairs:
-            yield modelled_column(experiment, found.constants(experiment.constants), recording)
+            constants = found.constants(experiment.constants)
+            yield recording, modelled_column(experiment, constants, recording)
     else:
         for recording, test in zip(diagnosis.recordings, diagnosis.tests, strict=True):
             if recording.samples is not None and recording.samples.ticks:
-                yield _expected_column(recording, recording.samples, test, diagnosis.actuator)
+                column = _expected_column(recording, recording.samples, test, diagnosis.actuator)
+                yield recording, column
 
 
 def result_picture(result: Result) -> Picture:
     """Describe the picture of a result that can be drawn; its title says what was diagnosed."""
-    columns = tuple(response_columns(result.diagnosis))
+    columns = tuple(column for _, column in response_columns(result.diagnosis))
     return Picture("\n".join(_title(result, len(columns))), columns)
 
 

@@ -19,14 +19,16 @@ from ehadiag_sim.control import Conditions, SimulatorControl
 from ehadiag_sim.scales import scales_of
 from ehadiag_sim.sensing import ChannelFault
 from ehadiag_sim.simulation import Plant
+from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.errors import ConfigurationError, EhadiagError
 from firmware_iface.live_decode import BitRequest, LiveDecoder
-from firmware_iface.recording import BitReason, BitState, CommandMode
+from firmware_iface.recording import CHANNEL_NAMES, BitReason, BitState, CommandMode
 from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S, Transport, TransportState
 from firmware_iface.transport.frames import Frame
+from firmware_iface.xcp import XcpIds, is_extended, measurements_of
 
 if TYPE_CHECKING:
     from ehadiag_sim.foreign_plant import ForeignPlant
@@ -61,9 +63,10 @@ class FccCore:
     None: the defaults; idle_telemetry: whether telemetry is sent between tests too; start_ns: time
     of the first tick, ns; bus_map: messages to send and accept; None: the default bus;
     channel_faults: damage to the readings of the channels; None: none; control: changes while it
-    runs; None: none; foreign: plant of another maker; None: the detailed simulator.
-    ConfigurationError: two tests with one number, a test at another rate than the controller; a
-    serial number, a converter's range or the rated current that the bus cannot carry.
+    runs; None: none; foreign: plant of another maker; None: the detailed simulator; xcp:
+    identifiers of its XCP slave; None: it has none. ConfigurationError: two tests with one number,
+    a test at another rate than the controller; a serial number, a converter's range or the rated
+    current that the bus cannot carry; an XCP identifier that a message has.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class FccCore:
         channel_faults: Sequence[ChannelFault] = (),
         control: SimulatorControl | None = None,
         foreign: ForeignPlant | None = None,
+        xcp: XcpIds | None = None,
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL_NUMBER:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL_NUMBER}")
@@ -105,6 +109,10 @@ class FccCore:
         self._decoder = LiveDecoder(bus_map)
         self._rate = actuator.controller.rate
         self.period_ns = round(1e9 / self._rate)
+        self._slave = None
+        if xcp is not None:
+            _refuse_taken_identifiers(xcp, bus_map)
+            self._slave = XcpSlave(measurements_of(self._scales.channels), xcp, self.period_ns)
         self._start_ns = start_ns
         self._tick = 0
         self._count = 0
@@ -141,6 +149,8 @@ class FccCore:
 
     def take(self, frame: Frame) -> None:
         """Take a frame off the bus; anything but a valid request is ignored."""
+        if self._slave is not None:
+            self._slave.take(frame)
         request = self._decoder.decode(frame)
         if isinstance(request, BitRequest):
             self._pending.append(request)
@@ -178,11 +188,33 @@ class FccCore:
             frames += self._encoder.environment(supply, drain, degc, 0)
         if self._control is not None:
             frames = self._control.frames(frames)
+        if self._slave is not None:
+            values = self._raw_values(command, mode, test_id, codes.tolist())
+            frames += self._slave.tick(values, self.now_ns)
         return [
             # An 8-byte frame at 1 Mbit/s with stuff bits: frames of a tick follow so.
             _stamped(frame, self.now_ns + i * 130_000)
             for i, frame in enumerate(frames)
         ]
+
+    def _raw_values(
+        self, command: float, mode: CommandMode, test_id: int, codes: Sequence[int]
+    ) -> dict[str, int]:
+        """What XCP measures in this tick, by the names of `MEASUREMENTS`."""
+        supply, drain, degc = self._plant.probed
+        commanded = round(command * 1e9)
+        return {
+            "tick": self._tick & 0xFFFFFFFF,
+            "bit_state": int(self._state),
+            "test_id": test_id,
+            "command_mode": int(mode),
+            "command_current": commanded if mode is CommandMode.CURRENT else 0,
+            "command_position": commanded if mode is CommandMode.POSITION else 0,
+            "supply_pressure": round(supply),
+            "return_pressure": round(drain),
+            "oil_temperature": round(degc * 100.0),
+            **dict(zip(CHANNEL_NAMES, codes, strict=True)),
+        }
 
     def _start(self, test_id: int) -> None:
         reason = self._objection(test_id)
@@ -279,6 +311,14 @@ class FccCore:
         )
 
 
+def _refuse_taken_identifiers(xcp: XcpIds, bus_map: BusMap) -> None:
+    taken = {(item.can_id, item.extended): item.name for item in bus_map.messages.values()}
+    for can_id in xcp:
+        name = taken.get((can_id, is_extended(can_id)))
+        if name is not None:
+            raise ConfigurationError(f"XCP identifier {can_id:#x}: message {name} has it")
+
+
 def _by_number(tests: Iterable[StoredTest], actuator: Actuator) -> dict[int, StoredTest]:
     numbered: dict[int, StoredTest] = {}
     for test in tests:
@@ -312,6 +352,7 @@ def emulated_computer(
     serial: int = 1,
     control: SimulatorControl | None = None,
     foreign: ForeignPlant | None = None,
+    xcp: XcpIds | None = None,
 ) -> FccCore:
     """Return a computer with an actuator that may be broken, its kernels loaded.
 
@@ -319,10 +360,9 @@ def emulated_computer(
     own; bus_map: see `FccCore`, as for the parameters that follow; faults: severities of the
     faults; effects: effects beside the faults; sensors: errors of the converters; broken: kind of
     broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
-    noise; serial: serial number of the actuator; control, foreign: see `FccCore`. Returns the
-    emulated computer; its first tick has
-    the present date, also in simulated time. ConfigurationError: see `FccCore`; an unknown kind of
-    broken hardware.
+    noise; serial: serial number of the actuator; control, foreign, xcp: see `FccCore`. Returns the
+    emulated computer; its first tick has the present date, also in simulated time.
+    ConfigurationError: see `FccCore`; an unknown kind of broken hardware.
     """
     item = Hardware(actuator, effects or Effects(), sensors or Sensors())
     if broken:
@@ -339,6 +379,7 @@ def emulated_computer(
         channel_faults=item.channel_faults,
         control=control,
         foreign=foreign,
+        xcp=xcp,
         start_ns=time.time_ns(),
     )
     core.step()

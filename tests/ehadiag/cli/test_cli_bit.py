@@ -328,3 +328,27 @@ def test_a_computer_too_busy_to_simulate_is_not_the_actuators_fault(
     (reason,) = found["reasons"]
     assert reason.startswith("this computer is too busy to simulate in real time")
     assert "--fast" in reason
+
+
+def test_a_test_measured_by_xcp_has_the_same_result(run: Run) -> None:
+    command = ("bit", "--test", "closed", "--simulate", "--fast", "--FSS", "0.4", "--json")
+    command = (*command, "--no-picture")
+    by_telemetry, by_xcp = run(*command), run(*command, "--xcp")
+    assert by_xcp.code == by_telemetry.code == 10
+    (expected,), (found,) = by_telemetry.objects, by_xcp.objects
+    for name, severity in expected["faults"].items():
+        assert found["faults"][name]["estimate"] == pytest.approx(severity["estimate"], abs=1e-6)
+    assert "by XCP" in by_xcp.err
+    refused = run(*command[:3], "--listen", "-i", "virtual", "--xcp")
+    assert refused.code == 2
+    assert "--xcp: measures on command" in refused.message
+
+
+def test_without_an_xcp_slave_nothing_is_recorded(run: Run, tmp_path: Path) -> None:
+    found = run("bit", "--test", "open", "-i", "virtual", "-c", "no slave", "--xcp", "--out", "o")
+    assert found.code == 3
+    assert "no XCP slave answers CONNECT on 6F0:6F1" in found.err
+    assert list((tmp_path / "o").iterdir()) == []
+    wrong = run("bit", "--test", "open", "-i", "virtual", "-c", "no slave", "--xcp", "6F0")
+    assert wrong.code == 2
+    assert "need two different ones in hexadecimal" in wrong.message

@@ -336,3 +336,33 @@ def test_matplotlib_reads_nothing_that_lies_about(
     )  # fmt: skip
     assert lines(done.stderr) == ["wrote o/healthy-open.json, o/healthy-open.png"]
     assert (tmp_path / "o/healthy-open.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_signals_are_written_beside_a_result_once(run: Run, tmp_path: Path) -> None:
+    command = ("diagnose", "--json", "--no-picture", "--signals", "mf4", "--signals", "mcap", WORN)
+    assert "--signals: name by --out the folder" in run(*command).message
+    names = ["paper-open-1.json", "paper-open-1.signals.mcap", "paper-open-1.signals.mf4"]
+    for _ in range(2):
+        assert run(*command, "--out", "o").code == 10
+        assert sorted(item.name for item in (tmp_path / "o").iterdir()) == names
+    refused = run(*command, HEALTHY, "--out", "o", "--jobs", "2")
+    assert refused.code == 2
+    assert "--jobs: --signals needs samples" in refused.message
+
+
+def test_no_signals_of_others_are_replaced(run: Run, tmp_path: Path) -> None:
+    other = tmp_path / "o" / "paper-open-1.signals.mf4"
+    other.parent.mkdir()
+    other.write_bytes(b"of somebody else")
+    run("diagnose", "--json", "--no-picture", "--signals", "mf4", WORN, "--out", "o")
+    assert other.read_bytes() == b"of somebody else"
+    assert (tmp_path / "o" / "paper-open-1-2.signals.mf4").exists()
+
+
+def test_signals_in_a_folder_of_recordings_are_no_recordings(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "o").mkdir()
+    shutil.copy(WORN, tmp_path / "o")
+    run("diagnose", "--json", "--no-picture", "--signals", "mf4", "o", "--out", "o")
+    found = run("diagnose", "--json", "o")
+    assert len(found.objects) == 1
+    assert "signals of a result are no recording: o/paper-open-1.signals.mf4" in found.err

@@ -225,7 +225,7 @@ def test_the_past_does_not_feel_the_future(faults, current):
 def test_anchoring_leaves_a_true_model_alone(faults, current):
     free = run(faults, current)
     held = run(faults, current, measured=free.spool, anchor=ANCHOR)
-    assert held.anchored == 0
+    assert held.anchored.size == 0
     np.testing.assert_array_equal(held.spool, free.spool)
     np.testing.assert_array_equal(held.pressure, free.pressure)
 
@@ -252,7 +252,7 @@ def test_anchoring_takes_a_wrong_start_back():
     free = run((0.3, 1.0, 0.3), current, origin=off)
     held = run((0.3, 1.0, 0.3), current, origin=off, measured=truth.spool, anchor=ANCHOR)
     assert np.abs(free.spool - truth.spool)[:30].min() > 10 * SPOOL_CHANNEL.lsb
-    assert held.anchored >= 1
+    assert held.anchored.size >= 1
     assert np.abs(held.spool - truth.spool)[1:].max() < SPOOL_CHANNEL.lsb
 
 

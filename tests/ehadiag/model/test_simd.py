@@ -318,7 +318,7 @@ current, measured = np.loadtxt(sys.stdin)
 constants = PlantConstants(*map(float, sys.argv[1:]))
 anchor = Anchor(0.3, 3e-7, 1.5e-6)
 answer = model_response(constants, current, 1e-3, measured=measured, anchor=anchor)
-for row in (answer.spool, answer.pressure, answer.position, [answer.anchored]):
+for row in (answer.spool, answer.pressure, answer.position, [len(answer.anchored)]):
     print(*[float(x).hex() for x in row])
 """
 
@@ -342,7 +342,7 @@ def test_plain_python_gives_the_compiled_answer():
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
     )
     rows = [[float.fromhex(x) for x in line.split()] for line in done.stdout.splitlines()]
-    assert compiled.anchored == rows[3][0] >= 1
+    assert len(compiled.anchored) == rows[3][0] >= 1
     # The compiler may join a product and a sum into one rounding.
     np.testing.assert_allclose(rows[0], compiled.spool, atol=1e-14)
     np.testing.assert_allclose(rows[1], compiled.pressure, atol=1e-2)
