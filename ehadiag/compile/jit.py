@@ -94,7 +94,7 @@ class Kernel:
 
     @cached_property
     def _called(self) -> Callable[..., Any]:
-        if not self.is_entry or _is_plain():
+        if not self.is_entry or is_plain():
             return self.py_func
         code, layout, read = self._compiled
         kinds = self.kinds[0]
@@ -118,7 +118,7 @@ class Kernel:
 
         Its arguments stand at one place in each call, so that it is for one thread at a time.
         """
-        if _is_plain():
+        if is_plain():
             return lambda address, *numbers: self.py_func(address, numbers)
         code, layout, read = self._compiled
         block = ctypes.create_string_buffer(layout.size)
@@ -143,7 +143,7 @@ class Kernel:
         return code, layout, struct.Struct(f"={result}") if result else None
 
 
-def _is_plain() -> bool:
+def is_plain() -> bool:
     """Whether kernels run as they are written, by numba's setting for that."""
     return os.environ.get("NUMBA_DISABLE_JIT") == "1"
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined
 from ehadiag.compile.vector import (
+    LANES,
     VECTOR_WIDTH,
     Mask,
     Vector,
@@ -31,23 +32,21 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.laws import SpoolLaw, flapper_rest, play_output, spool_rest_position
-from ehadiag.model.scalar_spool import TICK_UNITS
 from ehadiag.model.simd_jack_pieces import PIECE_NUMBERS, jack_over_pieces
 from ehadiag.model.simd_layout import (
     LANE_NODES,
     LANE_PATH,
     LANE_PATH_SLOPE,
-    LANES,
+    MAX_TICK_EVENTS,
     QUARTER_HALVINGS,
     ROWS,
+    TICK_UNITS,
     spool_laws,
 )
 from ehadiag.model.spool_events import WIRE_TOLERANCE
 
 QUARTER_UNITS = float(TICK_UNITS // LANE_NODES)
 """Finest steps of a quarter of a tick, 1."""
-MAX_TICK_EVENTS = 6
-"""Of a lane in a tick. Each cuts a piece of the path for all lanes of a vector; so do the nodes."""
 
 
 class _Motion(NamedTuple):
