@@ -48,14 +48,10 @@ LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "ehadiag.model.simd_residuals": ("run_blocks",),
         "ehadiag.model.simd_jack": ("fill_driven_jack_costs",),
     },
-    "single": {
+    "model": {
         "ehadiag.model.simd_residuals": ("run_single", "respond"),
-    },
-    "monitor": {
         "ehadiag.monitor.monitor_memory": ("prepare_monitor", "reset_monitor"),
         "ehadiag.monitor.push_kernel": ("push_tick", "push_ticks"),
-    },
-    "model": {
         "ehadiag.model.laws": ("fill_control_currents",),
         "ehadiag.identify.compact_ga": ("draw_generation", "update_state"),
     },

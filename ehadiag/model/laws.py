@@ -1,4 +1,4 @@
-"""Physical equations of the actuator and its controller, for scalar and vector kernels.
+"""Physical equations of the actuator and its controller, of one candidate or of many.
 
 Named tuples hold what a law needs of a candidate, precombined; the functions take numbers or
 vectors of lanes. Symbols and requirement numbers are those of docs/reference/physics.md.

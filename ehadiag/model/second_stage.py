@@ -330,4 +330,4 @@ def jack_piece(
     """
     if senses or j.oil > 0.0 or j.extra > 0.0:
         return _other_piece(j, probe, senses, p, begin, stop, state)
-    return linear_piece(j, p, begin, stop, state)
+    return linear_piece(j, probe, p, begin, stop, state)

@@ -88,6 +88,8 @@ def _slid(
     for level in range(longest, shortest - 1, -1):
         units, k = float(1 << level), level * 16 * LANES + o
         takes = rest >= units
+        if VECTOR_WIDTH == 1 and not any_lane(takes):
+            continue
         rest = where(takes, rest - units, rest)
         ka = load(m, k) * na + load(m, k + LANES) * nw
         ka = ka + load(m, k + 2 * LANES) * nb + load(m, k + 3 * LANES) * nv
@@ -125,6 +127,8 @@ def _slid_loose(
     for level in range(longest, shortest - 1, -1):
         units, k = float(1 << level), level * 16 * LANES + o
         takes = rest >= units
+        if VECTOR_WIDTH == 1 and not any_lane(takes):
+            continue
         rest = where(takes, rest - units, rest)
         ka = load(m, k) * na + load(m, k + LANES) * nw
         kw = load(m, k + 4 * LANES) * na + load(m, k + 5 * LANES) * nw
@@ -156,6 +160,8 @@ def _rung(
     for level in range(longest, shortest - 1, -1):
         units, k = float(1 << level), level * 4 * LANES + o
         takes = rest >= units
+        if VECTOR_WIDTH == 1 and not any_lane(takes):
+            continue
         rest = where(takes, rest - units, rest)
         ka = load(m, k) * a + load(m, k + LANES) * w
         kw = load(m, k + 2 * LANES) * a + load(m, k + 3 * LANES) * w

@@ -1,6 +1,6 @@
 """The jack's one algorithm against scipy's stiff solver, piece by piece.
 
-Jacks of many candidates along a measured path of the spool: against the scalar model. Friction that
+Jacks of many candidates along a measured path of the spool: against one alone. Friction that
 falls with the velocity: against the simulator, and one kernel against another.
 """
 
@@ -283,7 +283,7 @@ SLOW_CURRENT = 3e-3 * np.sin(np.arange(300) * 0.045)
 @STAGES
 @settings(max_examples=25, deadline=None)
 @given(values=VALUES, neighbour=VALUES)
-def test_vector_and_scalar_kernels_agree(actuator, values, neighbour):
+def test_blocks_and_one_alone_agree(actuator, values, neighbour):
     batch = batch_of(np.zeros((3, len(SLOW_CURRENT))), SLOW_CURRENT)
     points = np.array([[one[name] for name in values] for one in (values, neighbour)])
     one, other = (
