@@ -12,6 +12,7 @@ from ehadiag.compile.vector import (
     Vector,
     absolute,
     any_lane,
+    large_packed,
     load,
     maximum,
     minimum,
@@ -109,7 +110,7 @@ SINGLE_LANE_FLAGS = max_lane_pieces(VECTOR_WIDTH) * PIECE_NUMBERS
 """Behind them: not 0 in lanes that go alone."""
 
 
-@packed
+@large_packed
 def jack_over_pieces(
     o: int,
     these: Vector,
