@@ -222,7 +222,7 @@ def _make_constants(row: Array, severities: Array, u: MonitorUnit) -> None:
 def prepare_monitor(address: int, plan_address: int, unit_address: int) -> int:
     """Write laws, settings and tables of a monitor, with the spool at rest in the middle.
 
-    Addresses are those of the monitor's MONITOR.end numbers, of a plan, and of a unit's
+    Addresses are those of the monitor's MONITOR_SIZE numbers, of a plan, and of a unit's
     MONITOR_UNIT_FIELDS.
     Returns 0, or 1 where a number of the unit is out of its range and nothing was written.
     """

@@ -27,13 +27,13 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
+from ehadiag.compile.vector import LANES
 from ehadiag.core.actuator import default_actuator
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, unknowns_of
 from ehadiag.identify.identification_session import identify
 from ehadiag.identify.solvers import SEARCH_CAP
 from ehadiag.model.registry import FAULTS, ResidualModel
 from ehadiag.model.residual_models import ScalarModel, SimdModel
-from ehadiag.model.simd_layout import LANES
 from ehadiag.monitor.streaming import Monitor, Tick
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.alignment.align import assemble

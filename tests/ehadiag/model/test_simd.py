@@ -17,12 +17,12 @@ from other_actuator import with_data
 from places import LOGS
 
 from ehadiag import default_actuator
+from ehadiag.compile.vector import LANES
 from ehadiag.identify.experiment import build_experiment, lay_out_spans, unknowns_of
 from ehadiag.model.batch import NO_ANCHOR, Anchor, Batch
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, parameter
 from ehadiag.model.residual_models import ScalarModel, SimdModel, model_response
-from ehadiag.model.simd_layout import LANES
 from ehadiag_tools.damaged import damaged_unit
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
