@@ -204,7 +204,8 @@ def brief_kernel(function: F) -> F:
 
 def bare_kernel(function: F) -> F:
     """Compile as a function of its own that kernels call, without a copy in each."""
-    return cast("F", Kernel(function, False, error_model="numpy", _nrt=False))
+    # Else numba lets it take over from its caller that it is to be inlined.
+    return _part(function, forceinline=False)
 
 
 def inlined(function: F) -> F:
@@ -217,7 +218,7 @@ def inlined(function: F) -> F:
 
 def large_part(function: F) -> F:
     """Compile like `inlined`, but as a function of its own, without a copy in each kernel."""
-    return _part(function, fastmath={"contract"})
+    return _part(function, forceinline=False, fastmath={"contract"})
 
 
 def inlined_exact(function: F) -> F:

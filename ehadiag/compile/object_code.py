@@ -252,8 +252,6 @@ def _module(
     for item in module.functions:
         if not item.is_declaration:
             item.linkage = "external" if item.name in names else "internal"
-            if not processor.fast and "ehadiag" in item.name and not _is_inlined(item):
-                item.add_function_attribute("noinline")  # a copy in each caller: twice the code
     if single:
         _tidy(module)  # so that constants stand where they are used
     text = EXCEPTION.sub("store ptr null, ptr", str(module))
@@ -277,11 +275,6 @@ def _module(
         r'^(source_filename|target datalayout|target triple) = ".*"\n', "", text, flags=re.M
     )
     return _parsed(_head(machine) + text, machine)
-
-
-def _is_inlined(function: Any) -> bool:
-    """Whether a function is to be a part of what calls it."""
-    return any(b"alwaysinline" in item for item in function.attributes)
 
 
 def _tidy(module: Any) -> None:

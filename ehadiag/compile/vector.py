@@ -45,7 +45,7 @@ def packed(function: F) -> F:
 
 def large_packed(function: F) -> F:
     """Compile like `packed`, but as a function of its own, without a copy in each kernel."""
-    options = {"error_model": "numpy", "fastmath": set(VECTOR_MATH_FLAGS)}
+    options = {"error_model": "numpy", "forceinline": False, "fastmath": set(VECTOR_MATH_FLAGS)}
     return cast("F", Kernel(function, False, _nrt=False, **options))
 
 
