@@ -94,7 +94,7 @@ class Kernel:
 
     @cached_property
     def _called(self) -> Callable[..., Any]:
-        if not self.is_entry or _is_plain():
+        if not self.is_entry or is_plain():
             return self.py_func
         code, layout, read = self._compiled
         kinds = self.kinds[0]
@@ -118,7 +118,7 @@ class Kernel:
 
         Its arguments stand at one place in each call, so that it is for one thread at a time.
         """
-        if _is_plain():
+        if is_plain():
             return lambda address, *numbers: self.py_func(address, numbers)
         code, layout, read = self._compiled
         block = ctypes.create_string_buffer(layout.size)
@@ -143,7 +143,7 @@ class Kernel:
         return code, layout, struct.Struct(f"={result}") if result else None
 
 
-def _is_plain() -> bool:
+def is_plain() -> bool:
     """Whether kernels run as they are written, by numba's setting for that."""
     return os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
@@ -204,7 +204,8 @@ def brief_kernel(function: F) -> F:
 
 def bare_kernel(function: F) -> F:
     """Compile as a function of its own that kernels call, without a copy in each."""
-    return cast("F", Kernel(function, False, error_model="numpy", _nrt=False))
+    # Else numba lets it take over from its caller that it is to be inlined.
+    return _part(function, forceinline=False)
 
 
 def inlined(function: F) -> F:
@@ -213,6 +214,11 @@ def inlined(function: F) -> F:
     A product and a sum may become one instruction with one rounding, nothing else is loosened.
     """
     return _part(function, forceinline=True, fastmath={"contract"})
+
+
+def large_part(function: F) -> F:
+    """Compile like `inlined`, but as a function of its own, without a copy in each kernel."""
+    return _part(function, forceinline=False, fastmath={"contract"})
 
 
 def inlined_exact(function: F) -> F:

@@ -33,6 +33,7 @@ from ehadiag.compile.sources import (
     sources_of,
 )
 from ehadiag.compile.worker import (
+    GROUND_LANES,
     CFunction,
     ObjectFile,
     Processor,
@@ -44,16 +45,15 @@ from firmware_iface.files import warn_once
 
 LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "search": {
-        "ehadiag.model.simd_residuals": ("_run_blocks",),
+        "ehadiag.model.simd_residuals": ("run_blocks",),
         "ehadiag.model.simd_jack": ("fill_driven_jack_costs",),
     },
     "model": {
-        "ehadiag.model.residual_models": ("jack_response", "_residuals"),
-        "ehadiag.model.scalar_spool": ("spool_response",),
+        "ehadiag.model.simd_residuals": ("run_single", "respond"),
+        "ehadiag.monitor.monitor_memory": ("prepare_monitor", "reset_monitor"),
+        "ehadiag.monitor.push_kernel": ("push_tick", "push_ticks"),
         "ehadiag.model.laws": ("fill_control_currents",),
         "ehadiag.identify.compact_ga": ("draw_generation", "update_state"),
-        "ehadiag.monitor.monitor_memory": ("prepare_monitor", "reset_monitor"),
-        "ehadiag.monitor.push_kernel": ("push_tick",),
     },
     "simulator": {"ehadiag_sim.plant_dynamics": ("advance_plant",)},
     "onboard": {
@@ -66,6 +66,8 @@ LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 }
 """Kernels of each library by their modules, the one that takes longest to compile first. A kernel
 in none of them is a library of its own."""
+LANES_OF = {"search": GROUND_LANES}
+"""Candidates side by side in a library's kernels, where they are more than one."""
 SHIPPED = ("search", "model", "simulator")
 """Libraries that come with the package; `onboard` runs elsewhere, and here only in studies."""
 IDENTIFICATION, SIMULATION = ("search", "model"), ("simulator",)
@@ -170,8 +172,8 @@ def _modules(library: str) -> tuple[str, ...]:
 @cache
 def _sources(library: str) -> str:
     """Hash of all that a library is made of."""
-    hashes = [source_hash(item) for item in _modules(library)]
-    return KERNEL_DIGEST(repr(hashes).encode()).hexdigest()[:16]
+    made_of = [source_hash(item) for item in _modules(library)], LANES_OF.get(library, 1)
+    return KERNEL_DIGEST(repr(made_of).encode()).hexdigest()[:16]
 
 
 def compiler_versions() -> dict[str, str]:
@@ -242,7 +244,8 @@ def _made(library: str, level: tuple[str, str]) -> bytes:
     ]
     processor = LEVELS.get(level, HOST)
     replaced = C_FUNCTIONS if processor.rounds else C_FUNCTIONS | ROUNDING_FUNCTIONS
-    code = object_code(ObjectFile(functions, processor, replaced=replaced))
+    lanes = LANES_OF.get(library, 1)
+    code = object_code(ObjectFile(functions, processor, replaced=replaced, lanes=lanes))
     names = [item.name for item in functions]
     return code if level == NO_LEVEL else shared_library(code, names)
 

@@ -1,8 +1,9 @@
 """Data types of kernels: SIMD vectors, arrays at an address, named tuples in flat arrays.
 
 A vector is a numba type that holds a number for each of VECTOR_WIDTH candidates; arithmetic on it
-is vector instructions (`ehadiag.compile.vector_types`). Without the compiler all of it works on
-numpy's arrays.
+is vector instructions (`ehadiag.compile.vector_types`). How many candidates a kernel takes is fixed
+when it is compiled: the same source makes kernels of blocks and of a single candidate. Without the
+compiler there is one candidate, and all of it works on numpy's arrays.
 """
 
 from __future__ import annotations
@@ -15,11 +16,14 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.jit import Array, Kernel, inlined
+from ehadiag.compile import worker
+from ehadiag.compile.jit import Array, Kernel, inlined, is_plain
 
 BYTES_PER_NUMBER = 8
 """Size of a number in memory, bytes."""
-VECTOR_WIDTH = 8
+LANES = 1 if is_plain() else worker.process_lanes
+"""Candidates of a block, 1."""
+VECTOR_WIDTH = min(LANES, 8)
 """Numbers of a vector, 1."""
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,6 +40,12 @@ def packed(function: F) -> F:
     Nothing is allocated in it, so that no references to arrays need be counted.
     """
     options = {"error_model": "numpy", "forceinline": True, "fastmath": set(VECTOR_MATH_FLAGS)}
+    return cast("F", Kernel(function, False, _nrt=False, **options))
+
+
+def large_packed(function: F) -> F:
+    """Compile like `packed`, but as a function of its own, without a copy in each kernel."""
+    options = {"error_model": "numpy", "forceinline": False, "fastmath": set(VECTOR_MATH_FLAGS)}
     return cast("F", Kernel(function, False, _nrt=False, **options))
 
 
@@ -92,6 +102,11 @@ def first_lane(mask: Mask) -> int:
 def shifted_lanes(first: float, vector: Vector) -> Vector:
     """Put every number one lane further on, `first` into the first lane; the last is lost."""
     return np.concatenate([[first], vector[:-1]])
+
+
+def last_lane(vector: Vector) -> float:
+    """Number in the last lane."""
+    return float(vector[-1])
 
 
 @packed

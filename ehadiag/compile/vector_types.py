@@ -27,6 +27,7 @@ from ehadiag.compile.vector import (
     copy_sign,
     first_lane,
     lane_sqrt,
+    last_lane,
     load,
     maximum,
     minimum,
@@ -47,7 +48,8 @@ class _MaskType(types.Type):
 
 
 _VECTOR, _MASK = _VectorType(), _MaskType()
-_DOUBLES = ir.VectorType(ir.DoubleType(), VECTOR_WIDTH)
+_IS_WIDE = VECTOR_WIDTH > 1
+_DOUBLES = ir.VectorType(ir.DoubleType(), VECTOR_WIDTH) if _IS_WIDE else ir.DoubleType()
 
 
 @register_model(_VectorType)
@@ -59,7 +61,8 @@ class _VectorModel(models.PrimitiveModel):
 @register_model(_MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), VECTOR_WIDTH))
+        bit = ir.IntType(1)
+        super().__init__(manager, kind, ir.VectorType(bit, VECTOR_WIDTH) if _IS_WIDE else bit)
 
 
 def _wide(builder: Any, value: Any) -> Any:
@@ -169,6 +172,10 @@ def _neg(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
     return builder.fneg(arguments[0], flags=VECTOR_MATH_FLAGS)
 
 
+_KIND = f"v{VECTOR_WIDTH}f64" if _IS_WIDE else "f64"
+"""LLVM's name of a vector."""
+
+
 def _of_each(function: Any, name: str) -> None:
     """Let kernels apply a function of the processor to a vector or a number."""
 
@@ -178,7 +185,7 @@ def _of_each(function: Any, name: str) -> None:
 
     @lower_builtin(function, _VECTOR)
     def _lowered_of_each(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return _intrinsic(builder, f"llvm.{name}.v{VECTOR_WIDTH}f64", arguments[0])
+        return _intrinsic(builder, f"llvm.{name}.{_KIND}", arguments[0])
 
     _of_numbers(function, lambda b, x: _intrinsic(b, f"llvm.{name}.f64", x), 1)
 
@@ -190,9 +197,7 @@ def _intrinsic(builder: Any, name: str, *values: Any) -> Any:
 
 _of_each(absolute, "fabs")
 _of_each(lane_sqrt, "sqrt")
-_binary(
-    copy_sign, _VECTOR, lambda b, x, y: _intrinsic(b, f"llvm.copysign.v{VECTOR_WIDTH}f64", x, y)
-)
+_binary(copy_sign, _VECTOR, lambda b, x, y: _intrinsic(b, f"llvm.copysign.{_KIND}", x, y))
 _of_numbers(copy_sign, lambda b, x, y: _intrinsic(b, "llvm.copysign.f64", x, y), 2)
 
 
@@ -246,10 +251,24 @@ def _typed_behind(_context: Any) -> Any:
 
 @lower_builtin(shifted_lanes, types.Float, _VECTOR)
 def _behind(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+    if not _IS_WIDE:
+        return arguments[0]
     places = ir.Constant(
         ir.VectorType(ir.IntType(32), VECTOR_WIDTH), [0, *range(VECTOR_WIDTH, 2 * VECTOR_WIDTH - 1)]
     )
     return builder.shuffle_vector(_wide(builder, arguments[0]), arguments[1], places)
+
+
+@type_callable(last_lane)
+def _typed_last(_context: Any) -> Any:
+    return lambda vector: types.float64 if vector is _VECTOR else None
+
+
+@lower_builtin(last_lane, _VECTOR)
+def _last(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+    if not _IS_WIDE:
+        return arguments[0]
+    return builder.extract_element(arguments[0], ir.Constant(ir.IntType(32), VECTOR_WIDTH - 1))
 
 
 def _pointer(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

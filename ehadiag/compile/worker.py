@@ -95,13 +95,22 @@ class ObjectFile:
     """What else of the C library the code may call."""
     exact: frozenset[Any] = frozenset()
     """Kernels of which no result is rounded to single precision."""
+    lanes: int = 1
+    """Candidates that kernels of the model take side by side."""
+
+
+GROUND_LANES = 16
+"""Candidates of a block in a search, 1."""
+process_lanes = GROUND_LANES
+"""Lanes of the kernels that this process compiles; Python lays out the memory of blocks by it."""
 
 
 BEGIN = (
     "import pickle, sys;"
     "sys.path[:] = pickle.load(sys.stdin.buffer);"
-    "from ehadiag.compile.worker import main;"
-    "main()"
+    "from ehadiag.compile import worker;"
+    "worker.process_lanes = pickle.load(sys.stdin.buffer);"
+    "worker.main()"
 )
 
 
@@ -122,7 +131,7 @@ def object_code(wanted: ObjectFile) -> bytes:
     environment["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"  # of errors that it expects
     done = subprocess.run(
         [sys.executable, "-P", "-c", BEGIN],
-        input=pickle.dumps(sys.path) + pickle.dumps(wanted),
+        input=b"".join(map(pickle.dumps, (sys.path, wanted.lanes, wanted))),
         capture_output=True,
         env=environment,
         check=False,

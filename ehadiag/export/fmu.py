@@ -33,7 +33,12 @@ from ehadiag.export.library import (
 from ehadiag.export.targets import HOST, c_compiler, link_shared
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.severities import FAULT_LAWS
-from ehadiag.monitor.monitor_memory import MONITOR, MONITOR_UNIT_FIELDS, prepare_monitor
+from ehadiag.monitor.monitor_memory import (
+    MONITOR,
+    MONITOR_SIZE,
+    MONITOR_UNIT_FIELDS,
+    prepare_monitor,
+)
 from ehadiag.monitor.plan import design_cusum, monitor_plan
 from ehadiag.monitor.push_kernel import push_tick
 from ehadiag_sim.fmu_plant import (
@@ -356,7 +361,7 @@ def _monitor(actuator: Actuator, hours: float) -> _FmuModel:
             CFunction("eha_monitor_push", push_tick, (PointerArgument(), DoublesArgument(5))),
         ),
         {"eha_plan": plan.tolist()},
-        MONITOR.end,
+        MONITOR_SIZE,
         fill_template("fmu_monitor.h.in", predicted=str(MONITOR.predicted)).decode(),
     )
 

@@ -188,7 +188,7 @@ def export_library(
         options={"actuator": actuator.name, "hours": hours, "shift": shift},
         plan=_digest(plan),
         functions=[item.name for item in EXPORTED_FUNCTIONS],
-        monitor_bytes=monitor_memory.MONITOR.end * BYTES_PER_NUMBER,
+        monitor_bytes=monitor_memory.MONITOR_SIZE * BYTES_PER_NUMBER,
         identification_bytes=identification.ONBOARD.end * BYTES_PER_NUMBER,
         object_bytes=len(code),
         measured=UNMEASURED_FIGURES
@@ -232,9 +232,9 @@ def _library_header(
         library=f"{version:.1f}",
         plan=f"{digest:.1f}",
         serial=f"{serial:.1f}",
-        bytes=str(monitor_memory.MONITOR.end * BYTES_PER_NUMBER),
+        bytes=str(monitor_memory.MONITOR_SIZE * BYTES_PER_NUMBER),
         before=str(monitor_memory.MONITOR.predicted),
-        behind=str(monitor_memory.MONITOR.end - monitor_memory.MONITOR.predicted - held),
+        behind=str(monitor_memory.MONITOR_SIZE - monitor_memory.MONITOR.predicted - held),
         **names,
     )
 

@@ -5,14 +5,13 @@ A candidate is one set of physical constants that may be those of the unit.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.jit import Array, Array2, inlined
+from ehadiag.compile.jit import Array, Array2
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,25 +41,6 @@ class Anchor:
 
 
 NO_ANCHOR = Anchor(0.0, np.inf, np.inf)
-
-
-@inlined
-def anchored_spool(
-    error: float, gain: float, small: float, large: float, xs: float, filtered: float, bound: float
-) -> tuple[float, float, bool]:
-    """Spool position and filtered innovation after a tick, m, and whether the spool was moved.
-
-    error: innovation, measured less modelled position, m, NaN where the sample is missing; gain,
-    small, large: see `Anchor`; xs, filtered: before, m; bound: the spool's stroke either way, m.
-    """
-    if not math.isfinite(error):
-        return xs, filtered, False
-    filtered += gain * (error - filtered)
-    if abs(error) > large:
-        return min(max(xs + error, -bound), bound), 0.0, True
-    if abs(filtered) > small:
-        return min(max(xs + filtered, -bound), bound), 0.0, True
-    return xs, filtered, False
 
 
 SPOOL_ROW, PRESSURE_ROW, POSITION_ROW = 0, 1, 2
@@ -102,8 +82,3 @@ class Batch(NamedTuple):
     shape (signals, N)."""
     anchor: Array2
     """Re-anchoring in each span, see `ehadiag.model.batch.Anchor`; shape (m, 4)."""
-
-
-def longest_span(batch: Batch) -> int:
-    """Ticks of the longest span."""
-    return int(np.diff(batch.start).max())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from ehadiag.compile.jit import bare_kernel, inlined
+from ehadiag.compile.jit import bare_kernel, large_part
 from ehadiag.compile.vector import packed
 from ehadiag.model.laws import JackLaw, excess_force, stage_pressure, stage_resistance
 from ehadiag.model.sensors import (
@@ -227,7 +227,7 @@ def _sensed(
 def _pieces(senses: bool) -> Any:
     """Compiled jack over a piece; senses: with the sensor of pressure and Stribeck's friction."""
 
-    @(bare_kernel if senses else inlined)
+    @(bare_kernel if senses else large_part)
     def piece(
         j: JackLaw, probe: PressureProbe, p: PathPiece, begin: float, stop: float, state: JackState
     ) -> JackState:
@@ -298,15 +298,6 @@ def _pieces(senses: bool) -> Any:
     return piece
 
 
-sensed_linear_piece = _pieces(True)
-"""Compiled: jack over the shares begin … stop of a piece, with what the plain one leaves out."""
-_bare_piece = _pieces(False)
-NO_PROBE = PressureProbe(0.0, 0.0)
-
-
-@inlined
-def linear_piece(
-    j: JackLaw, p: PathPiece, begin: float, stop: float, state: JackState
-) -> JackState:
-    """Jack over the shares begin … stop of a piece, its pressure as it is at the end."""
-    return _bare_piece(j, NO_PROBE, p, begin, stop, state)
+linear_piece, sensed_linear_piece = _pieces(False), _pieces(True)
+"""Compiled: jack over the shares begin … stop of a piece; the second one with what the plain one
+leaves out."""

@@ -1,4 +1,4 @@
-"""Physical equations of the actuator and its controller, for scalar and vector kernels.
+"""Physical equations of the actuator and its controller, of one candidate or of many.
 
 Named tuples hold what a law needs of a candidate, precombined; the functions take numbers or
 vectors of lanes. Symbols and requirement numbers are those of docs/reference/physics.md.
@@ -28,21 +28,6 @@ MIN_STRIBECK_VELOCITY = 1e-5
 MAX_DECAY_EXPONENT = 40.0
 BRIDGE_ROUNDS = 12
 """Rounds of the iteration for the first stage's pressures, 1: to 1e-4 of a severity."""
-
-
-class PathBends(NamedTuple):
-    """Bends of the spool's path that the jack does not feel."""
-
-    monitor: float = 5e-08
-    """Bend in the monitor, whose second stage follows the spool at once, m."""
-    orifice: float = 5e-10
-    """Bend with orifices, which store the flow, m."""
-    estimation: float = 0.02e-6
-    """Bend where severities are estimated, m: with the monitor's jack friction would be up to 0.2
-    deviations off."""
-
-
-PATH_BENDS = PathBends()
 
 plant_of = unpacker(PlantConstants)
 """Compiled: the constants that a row of `PLANT_FIELDS` numbers holds."""
@@ -192,8 +177,6 @@ class SpoolLaw(NamedTuple):
     """Of flapper and spool, m."""
     backlash: float
     """Half-width of the play between spool and feedback wire, m."""
-    bend: float
-    """Of the spool's path that the second stage does not feel, m."""
     ring_damping: float
     ring_rate: float
     """Decay and angular frequency (1/s) of the flapper at a resting spool; rate 0 where it does
@@ -201,12 +184,12 @@ class SpoolLaw(NamedTuple):
 
 
 @inlined
-def spool_law(c: PlantConstants, bend: float = PATH_BENDS.monitor) -> SpoolLaw:
+def spool_law(c: PlantConstants) -> SpoolLaw:
     """Precombine what the flapper and spool laws need (PHY-4, PHY-5, PHY-14, PHY-43).
 
-    bend: of the spool's path that a linear second stage does not feel, m. The speed by a bridge's
-    deflection bends little: while the flapper is free a line takes its place, through the
-    deflection that balances the friction and by least squares up to the flapper's stop.
+    The speed by a bridge's deflection bends little: while the flapper is free a line takes its
+    place, through the deflection that balances the friction and by least squares up to the
+    flapper's stop.
     """
     force = c.AS * c.GPF
     ring_damping = 0.5 * c.CF / c.JF
@@ -246,7 +229,6 @@ def spool_law(c: PlantConstants, bend: float = PATH_BENDS.monitor) -> SpoolLaw:
         c.XFM,
         c.XSM,
         c.BKL,
-        PATH_BENDS.orifice if c.OIL > 0.0 else bend,
         ring_damping,
         math.sqrt(square) if square > 0.0 else 0.0,
     )
@@ -274,13 +256,6 @@ def steady_spool_velocity(t: SpoolLaw, xf: float, direction: float) -> float:
 def clamped_spool_velocity(t: SpoolLaw, xf: float, direction: float) -> float:
     """Velocity that the spool approaches with the flapper on its stop, m/s (PHY-43)."""
     return (t.force * (xf - t.null) - t.eased * direction) / t.damping
-
-
-@inlined
-def held_flapper(t: SpoolLaw, deflection: float, wire: float) -> float:
-    """Deflection of a flapper in equilibrium while friction holds the spool, m."""
-    xf = flapper_rest(t.ratio, deflection, wire)
-    return min(max(xf, -t.breakaway), t.breakaway)
 
 
 class JackLaw(NamedTuple):

@@ -1,86 +1,34 @@
-"""Models of recordings: scalar kernels for one candidate at a time, vector kernels for many.
+"""Models of recordings, by one source: one candidate at a time, or a block of them side by side.
 
-`ScalarModel` is what the target computer runs and the reference for `SimdModel`, which uses all
-processors. `model_response` runs the scalar model alone: current in; spool, pressure and jack
-position out.
+`SimdModel` uses all processors. `model_response` runs one candidate alone: current in; spool,
+pressure and jack position out.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.compile.jit import Array, Array2, inlined, kernel
-from ehadiag.compile.vector import VECTOR_WIDTH
-from ehadiag.model.batch import (
-    NO_ANCHOR,
-    POSITION_ROW,
-    PRESSURE_ROW,
-    SPOOL_ROW,
-    Anchor,
-    Batch,
-    longest_span,
-)
-from ehadiag.model.laws import PATH_BENDS, jack_law, plant_of
+from ehadiag.compile.jit import Array
+from ehadiag.compile.vector import LANES, VECTOR_WIDTH
+from ehadiag.model.batch import NO_ANCHOR, SIGNAL_ROWS, Anchor, Batch
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.registry import Unknowns
-from ehadiag.model.scalar_spool import SPOOL_GRID, SpoolScratch, spool_response, spool_scratch
-from ehadiag.model.second_stage import jack_rest, jack_tick
-from ehadiag.model.sensors import JackState, read_pressure, read_spool, sensor_law
-from ehadiag.model.simd_layout import LANES
 from ehadiag.model.simd_residuals import (
-    LaneScratch,
+    BlockScratch,
     block_costs,
     block_residuals,
+    block_scratch,
     jack_levels,
-    lane_scratch,
+    respond,
+    run_single,
     thread_scratch,
 )
-
-
-@kernel
-def jack_response(
-    constants: PlantConstants,
-    tick: float,
-    origin: float,
-    place: float,
-    follow: float,
-    measured: Array,
-    nodes: Array2,
-    node_end: NDArray[np.int64],
-    pressure: Array,
-    position: Array,
-) -> None:
-    """Differential pressure and jack position of every tick, as they are sampled, from rest.
-
-    tick: s; origin, place: spool and jack position before the first tick, m; follow: see `Anchor`;
-    measured: jack position to re-anchor on, m, NaN where missing; nodes, node_end: the spool's
-    path, see `spool_response`. Writes pressure, Pa, and position, m, before any re-anchoring of the
-    tick.
-    """
-    law, sensor = jack_law(constants), sensor_law(constants)
-    jack = jack_rest(law, place, origin)
-    spool, first = origin, 0
-    for k in range(node_end.shape[0]):
-        end = node_end[k]
-        pressure[k], jack, spool = jack_tick(law, sensor, tick, nodes, first, end, jack, spool)
-        position[k] = jack.place - sensor.lead * jack.velocity
-        move = follow * (measured[k] - sensor.position_offset - sensor.position_gain * position[k])
-        if math.isfinite(move):
-            jack = JackState(
-                min(max(jack.place + move, -law.stroke), law.stroke),
-                jack.velocity, jack.direction, jack.fresh,
-                jack.pressure, jack.lagged, jack.seen,
-            )  # fmt: skip
-        spool += nodes[end - 1, 4]
-        first = end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,128 +63,45 @@ def model_response(
     tick, m; history: current before the first tick, A, None: the hysteresis is unloaded; measured:
     spool position to re-anchor on, m, NaN where missing.
     """
-    n = len(current)
-    spool, pressure, position = np.empty(n), np.empty(n), np.empty(n)
-    nodes = np.empty((n * SPOOL_GRID.nodes, SPOOL_GRID.columns))
-    node_end = np.empty(n, dtype=np.int64)
-    plant = PlantConstants(*(float(value) for value in constants))
-    reference = np.full(n, np.nan) if measured is None else measured
-    spool_response(
-        plant,
-        PATH_BENDS.monitor,
-        spool_scratch(),
+    response = np.empty((SIGNAL_ROWS + 1, len(current)))
+    work = block_scratch(np.zeros(0, dtype=np.int64), 1)
+    respond(
+        PlantConstants(*(float(value) for value in constants)),
+        work.memory.ctypes.data,
+        work.rows,
         current,
         tick,
         origin,
+        place,
         np.zeros(0) if history is None else history,
-        reference,
+        np.full(len(current), np.nan) if measured is None else measured,
         anchor.as_array(),
-        spool,
-        nodes,
-        node_end,
+        response,
     )
-    unseen = np.full(n, np.nan)
-    jack_response(plant, tick, origin, place, 0.0, unseen, nodes, node_end, pressure, position)
-    return ModelResponse(spool, pressure, position, np.flatnonzero(nodes[node_end - 1, 4]))
-
-
-class _Workspace(NamedTuple):
-    """Scratch arrays, so that no evaluation allocates; one for each thread."""
-
-    spool: Array
-    pressure: Array
-    position: Array
-    nodes: Array2
-    node_end: NDArray[np.int64]
-    tables: SpoolScratch
-
-
-def _workspace(batch: Batch) -> _Workspace:
-    longest = longest_span(batch)
-    return _Workspace(
-        spool=np.empty(longest),
-        pressure=np.empty(longest),
-        position=np.empty(longest),
-        nodes=np.empty((longest * SPOOL_GRID.nodes, SPOOL_GRID.columns)),
-        node_end=np.empty(longest, dtype=np.int64),
-        tables=spool_scratch(),
-    )
-
-
-@inlined
-def _weighted(error: float, weight: float) -> float:
-    """Residual of a sample, 0 where it is missing."""
-    residual = error * weight
-    return residual if math.isfinite(residual) else 0.0
-
-
-@kernel
-def _residuals(batch: Batch, candidate: Array2, bend: float, work: _Workspace, out: Array2) -> int:
-    """Weighted residuals of one candidate, rows of constants of shape (tests, PLANT_FIELDS)."""
-    anchored, signals = 0, batch.weight.shape[0]
-    for index in range(batch.tick.shape[0]):
-        a, b = batch.start[index], batch.start[index + 1]
-        n = b - a
-        constants, tick = plant_of(candidate[batch.test[index]]), batch.tick[index]
-        anchored += spool_response(
-            constants,
-            bend,
-            work.tables,
-            batch.current[batch.since[index] : batch.since[index] + n],
-            tick,
-            batch.origin[index],
-            batch.current[batch.since[index] - batch.history[index] : batch.since[index]],
-            batch.spool[a:b],
-            batch.anchor[index],
-            work.spool[:n],
-            work.nodes,
-            work.node_end[:n],
-        )
-        follow = batch.anchor[index, 3] if signals > POSITION_ROW else 0.0
-        jack_response(
-            constants,
-            tick,
-            batch.origin[index],
-            batch.place[index],
-            follow,
-            batch.position[a:b],
-            work.nodes,
-            work.node_end[:n],
-            work.pressure[:n],
-            work.position[:n],
-        )
-        law = sensor_law(constants)
-        for k in range(n):
-            spool = batch.spool[a + k] - read_spool(law, work.spool[k])
-            out[SPOOL_ROW, a + k] = _weighted(spool, batch.weight[SPOOL_ROW, a + k])
-            pressure = batch.pressure[a + k] - read_pressure(law, work.pressure[k])
-            out[PRESSURE_ROW, a + k] = _weighted(pressure, batch.weight[PRESSURE_ROW, a + k])
-            if signals > POSITION_ROW:
-                position = batch.position[a + k] - law.position_offset
-                position -= law.position_gain * work.position[k]
-                out[POSITION_ROW, a + k] = _weighted(position, batch.weight[POSITION_ROW, a + k])
-    return anchored
+    counts = response[SIGNAL_ROWS]
+    return ModelResponse(*response[:SIGNAL_ROWS], np.flatnonzero(np.diff(counts, prepend=0.0)))
 
 
 class ScalarModel:
-    """A `ehadiag.model.registry.ResidualModel` of scalar kernels.
+    """A `ehadiag.model.registry.ResidualModel` of one candidate at a time.
 
-    bend: of the spool's path that a linear second stage does not feel, m.
+    Its jack's steps are those that its own path asks for.
     """
 
-    def __init__(self, batch: Batch, unknowns: Unknowns, bend: float = PATH_BENDS.monitor) -> None:
+    def __init__(self, batch: Batch, unknowns: Unknowns) -> None:
         self.batch = batch
         self.unknowns = unknowns
-        self._bend = bend
         self.evaluations = 0
-        self._work = _workspace(batch)
+        self._work = block_scratch(np.empty(batch.weight.shape[1], dtype=np.int64), 1)
 
     def residuals(self, points: Array) -> tuple[Array, NDArray[np.int64]]:
         """See the protocol."""
-        out = np.empty((len(points), *self.batch.weight.shape))
+        out = np.zeros((len(points), *self.batch.weight.shape))
         anchored = np.empty(len(points), dtype=np.int64)
-        for i, candidate in enumerate(self.unknowns.candidates(points)):
-            anchored[i] = _residuals(self.batch, candidate, self._bend, self._work, out[i])
+        candidates, address = self.unknowns.candidates(points), self._work.memory.ctypes.data
+        for i in range(len(points)):
+            one = slice(i, i + 1)
+            anchored[i] = run_single(self.batch, candidates[one], self._work, address, out[one])
         self.evaluations += len(points)
         return out, anchored
 
@@ -283,7 +148,7 @@ class SimdModel:
             levels = jack_levels(batch, unknowns.candidates(_lattice_points(unknowns)))
         self.levels: NDArray[np.int64] = levels
         """How the jack's ticks are cut; to find that takes half as long as to run a block."""
-        self._work = lane_scratch(levels)
+        self._work = block_scratch(levels)
 
     def residuals(self, points: Array) -> tuple[Array, NDArray[np.int64]]:
         """See the protocol."""
@@ -296,7 +161,7 @@ class SimdModel:
         edges = [min(count, blocks * i // threads * LANES) for i in range(threads)] + [count]
         first, *others = [slice(a, b) for a, b in pairwise(edges)]
 
-        def evaluate(part: slice, scratch: LaneScratch) -> None:
+        def evaluate(part: slice, scratch: BlockScratch) -> None:
             block_residuals(self.batch, candidates[part], scratch, out[part], anchored[part])
 
         if others:

@@ -9,17 +9,15 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from ehadiag.compile.jit import Array, bare_kernel, inlined
+from ehadiag.compile.jit import bare_kernel, inlined
 from ehadiag.compile.vector import absolute, copy_sign, lane_sqrt, maximum, minimum, packed
-from ehadiag.model.jack import limited_pressure, linear_piece, pressure_at_rest, sensed_linear_piece
-from ehadiag.model.laws import JackLaw, stage_pressure, stribeck_friction
+from ehadiag.model.jack import linear_piece, sensed_linear_piece
+from ehadiag.model.laws import JackLaw, stribeck_friction
 from ehadiag.model.sensors import (
     JackState,
     PathPiece,
     PressureProbe,
-    SensorLaw,
     cubic_through_ends,
-    has_sensor_dynamics,
     position_on_piece,
     sample_pressure,
 )
@@ -332,44 +330,4 @@ def jack_piece(
     """
     if senses or j.oil > 0.0 or j.extra > 0.0:
         return _other_piece(j, probe, senses, p, begin, stop, state)
-    return linear_piece(j, p, begin, stop, state)
-
-
-@inlined
-def jack_rest(j: JackLaw, place: float, spool: float) -> JackState:
-    """Jack at rest, jack and spool at these positions, m."""
-    p12 = pressure_at_rest(j, land_opening(j, spool))
-    return JackState(place, 0.0, 0.0, 0.0, p12, p12, p12)
-
-
-@inlined
-def jack_tick(
-    j: JackLaw,
-    sensor: SensorLaw,
-    tick: float,
-    nodes: Array,
-    first: int,
-    end: int,
-    state: JackState,
-    spool: float,
-) -> tuple[float, JackState, float]:
-    """Second stage and jack over the spool's path of one tick.
-
-    tick: s; nodes, first, end: the path, rows first … end - 1, see `ehadiag.model.scalar_spool`;
-    spool: position before the tick, m. Returns differential pressure when it is sampled (Pa), jack
-    and spool at the end of the tick. The caller adds jumps of the path.
-    """
-    due, senses = tick - min(sensor.lead, tick), has_sensor_dynamics(sensor)
-    for node in range(first, end):
-        span, x1 = nodes[node, 0], nodes[node, 1]
-        piece = PathPiece(span, spool, x1, span * nodes[node, 2], span * nodes[node, 3])
-        piece = land_opening_piece(j, piece)
-        state = jack_piece(j, PressureProbe(sensor.lag, due), senses, piece, 0.0, 1.0, state)
-        due -= span
-        spool = x1
-    if senses:
-        return state.seen, state, spool
-    if j.oil > 0.0:
-        return state.pressure, state, spool
-    opening = land_opening(j, spool) if j.shaped != 0.0 else spool
-    return limited_pressure(j, stage_pressure(j, opening, state.velocity)), state, spool
+    return linear_piece(j, probe, p, begin, stop, state)

@@ -14,6 +14,7 @@ import numpy as np
 from ehadiag.compile.elementary import LN2
 from ehadiag.compile.jit import Array, Array2, bare_kernel, inlined, kernel
 from ehadiag.compile.vector import (
+    LANES,
     VECTOR_WIDTH,
     Mask,
     Vector,
@@ -54,18 +55,18 @@ from ehadiag.model.sensors import (
     read_pressure,
     sensor_law,
 )
-from ehadiag.model.simd_jack_pieces import LANE_PIECES_SIZE, jack_events, jack_over_pieces
+from ehadiag.model.simd_jack_pieces import jack_events, jack_over_pieces
 from ehadiag.model.simd_layout import (
+    BLOCK,
     COEFFICIENTS,
     LANE_FILTER_ROWS,
     LANE_NODES,
     LANE_PATH,
-    LANE_PATH_ROWS,
     LANE_PATH_SLOPE,
-    LANE_STATE_ROWS,
-    LANES,
     MAX_JACK_HALVINGS,
     ROWS,
+    aligned_numbers,
+    block_part,
     full_filter_steps,
     jack_law_of_lane,
     jack_laws,
@@ -452,28 +453,33 @@ def driven_jack_costs(
     (s), position at its end (m), velocities at start and end (m/s), shape (ticks, 4 or more);
     before: position before, m; pressure: measured, Pa, NaN where missing; noise: of it, Pa.
     """
-    out = np.zeros(len(candidates))
-    scratch = DrivenScratch(
-        sums=np.zeros(LANES),
-        state=np.zeros(LANE_STATE_ROWS * LANES),
-        path=np.zeros(LANE_PATH_ROWS * LANES),
-        coefficients=np.zeros(COEFFICIENTS.end * LANES),
-        pieces=np.zeros(LANE_PIECES_SIZE),
-    )
+    out, memory = np.zeros(len(candidates)), aligned_numbers(BLOCK.end)
     contiguous = (np.ascontiguousarray(item) for item in (candidates, nodes, pressure))
     candidates, nodes, pressure = contiguous
-    fill_driven_jack_costs(candidates, nodes, before, pressure, noise, cap, scratch, out)
+    fill_driven_jack_costs(candidates, nodes, before, pressure, noise, cap, memory.ctypes.data, out)
     return out
 
 
-class DrivenScratch(NamedTuple):
-    """Memory of `fill_driven_jack_costs`."""
-
-    sums: Array
-    state: Array
-    path: Array
-    coefficients: Array
-    pieces: Array
+@packed
+def drive_jacks(
+    address: int, end: int, tick: float, from_xs: float, to_xs: float, rate0: float, rate1: float
+) -> None:
+    """Jacks of a block over a tick (s) of a spool that is given: its places (m), its velocities."""
+    state = block_part(address, BLOCK.state, BLOCK.path)
+    path = block_part(address, BLOCK.path, BLOCK.coefficients)
+    coefficients = block_part(address, BLOCK.coefficients, BLOCK.moving)
+    pieces = block_part(address, BLOCK.pieces, BLOCK.scratch)
+    store(pieces, 0, tick)
+    store(pieces, VECTOR_WIDTH, to_xs)
+    store(pieces, 2 * VECTOR_WIDTH, rate0)
+    store(pieces, 3 * VECTOR_WIDTH, rate1)
+    for o in range(0, end, VECTOR_WIDTH):
+        j = jack_laws(coefficients, o)
+        every = j.load * 0.0 + 1.0
+        store(path, LANE_PATH * LANES + o, every * from_xs)
+        jack_over_pieces(o, every, 1, tick, state, path, coefficients, pieces)
+        store(path, (LANE_PATH + LANE_NODES) * LANES + o, land_opening(j, every * to_xs))
+    sampled_pressures(end, True, state, path, coefficients)
 
 
 @kernel
@@ -484,12 +490,13 @@ def fill_driven_jack_costs(
     pressure: Array,
     noise: float,
     cap: float,
-    scratch: DrivenScratch,
+    address: int,
     out: Array,
 ) -> None:
-    """Write what `driven_jack_costs` returns."""
-    sums, state, path = scratch.sums, scratch.state, scratch.path
-    coefficients, pieces = scratch.coefficients, scratch.pieces
+    """Write what `driven_jack_costs` returns; address: of a block's memory."""
+    state = block_part(address, BLOCK.state, BLOCK.path)
+    coefficients = block_part(address, BLOCK.coefficients, BLOCK.moving)
+    sums = block_part(address, BLOCK.scratch, BLOCK.scratch + LANES)
     for first in range(0, candidates.shape[0], LANES):
         here = min(LANES, candidates.shape[0] - first)
         end = VECTOR_WIDTH if here <= VECTOR_WIDTH else LANES
@@ -503,19 +510,9 @@ def fill_driven_jack_costs(
         from_xs = before
         for k in range(nodes.shape[0]):
             tick, to_xs = nodes[k, 0], nodes[k, 1]
-            for lane in range(VECTOR_WIDTH):
-                pieces[lane], pieces[VECTOR_WIDTH + lane] = tick, to_xs
-                pieces[2 * VECTOR_WIDTH + lane] = nodes[k, 2]
-                pieces[3 * VECTOR_WIDTH + lane] = nodes[k, 3]
-            for o in range(0, end, VECTOR_WIDTH):
-                j = jack_laws(coefficients, o)
-                every = j.load * 0.0 + 1.0
-                store(path, LANE_PATH * LANES + o, every * from_xs)
-                jack_over_pieces(o, every, 1, tick, state, path, coefficients, pieces)
-                store(path, (LANE_PATH + LANE_NODES) * LANES + o, land_opening(j, every * to_xs))
+            drive_jacks(address, end, tick, from_xs, to_xs, nodes[k, 2], nodes[k, 3])
             from_xs = to_xs
             if math.isfinite(pressure[k]):
-                sampled_pressures(end, True, state, path, coefficients)
                 for o in range(0, end, VECTOR_WIDTH):
                     seen = load(state, ROWS.pressure_sampled * LANES + o)
                     shown = read_pressure(sensor_laws(coefficients, o), seen)

@@ -6,11 +6,13 @@ import math
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined
 from ehadiag.compile.vector import (
+    LANES,
     VECTOR_WIDTH,
     Mask,
     Vector,
     absolute,
     any_lane,
+    large_packed,
     load,
     maximum,
     minimum,
@@ -35,10 +37,10 @@ from ehadiag.model.simd_layout import (
     LANE_NODES,
     LANE_PATH,
     LANE_PATH_SLOPE,
-    LANES,
     ROWS,
     jack_law_of_lane,
     jack_laws,
+    max_lane_pieces,
     sensor_law_of_lane,
     sensor_laws,
 )
@@ -104,13 +106,11 @@ def jack_events(
 PIECE_NUMBERS = 4 * VECTOR_WIDTH
 """Numbers of a piece, VECTOR_WIDTH lanes each: duration (s; 0 in a lane that has no such piece),
 place at the end, velocities at start and end."""
-MAX_LANE_PIECES = 56
-SINGLE_LANE_FLAGS = MAX_LANE_PIECES * PIECE_NUMBERS
+SINGLE_LANE_FLAGS = max_lane_pieces(VECTOR_WIDTH) * PIECE_NUMBERS
 """Behind them: not 0 in lanes that go alone."""
-LANE_PIECES_SIZE = SINGLE_LANE_FLAGS + VECTOR_WIDTH
 
 
-@packed
+@large_packed
 def jack_over_pieces(
     o: int,
     these: Vector,

@@ -9,9 +9,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from ehadiag.compile.jit import Array, bare_kernel, inlined, merged
 from ehadiag.compile.vector import (
+    BYTES_PER_NUMBER,
+    LANES,
     VECTOR_WIDTH,
+    array_at,
     lane_of,
     lane_packer,
     lanes_of,
@@ -22,7 +27,6 @@ from ehadiag.compile.vector import (
 )
 from ehadiag.model.laws import DriveLaw, JackLaw, SpoolLaw, drive_law, jack_law, plant_of, spool_law
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.scalar_spool import MAX_PLAYS, SPOOL_GRID
 from ehadiag.model.sensors import (
     FilterStep,
     SensorLaw,
@@ -31,7 +35,12 @@ from ehadiag.model.sensors import (
     sensor_law,
 )
 
-LANES = 2 * VECTOR_WIDTH
+FINEST_LEVEL = 10
+"""Halvings of a tick to which events are located, 1: 1 µs at 1 kHz."""
+TICK_UNITS = 1 << FINEST_LEVEL
+"""Finest steps of a tick, 1."""
+MAX_PLAYS = 16
+"""Largest number of plays of the hysteresis, 1."""
 LANE_NODES = 4
 """Pieces of the spool's path in a tick, 1."""
 
@@ -155,21 +164,85 @@ keep_sampled_filter_step = lane_packer(
 """Compiled, of an array, a lane and a law: write that lane's."""
 
 
-STEP_SHIFTS = (SPOOL_GRID.finest_level - 3, SPOOL_GRID.finest_level - 6, 0)
+MAX_TICK_EVENTS = 6
+"""Of a lane in a tick. Each cuts a piece of the path for all lanes of a vector; so do the nodes."""
+MAX_EVENT_PIECES = 32
+"""Pieces of the path of a lane alone in a tick, 1."""
+
+
+def max_lane_pieces(width: int) -> int:
+    """Pieces of the path that events of a vector of lanes may cut in a tick."""
+    return LANE_NODES + (MAX_TICK_EVENTS + 1) * width
+
+
+STEP_SHIFTS = (FINEST_LEVEL - 3, FINEST_LEVEL - 6, 0)
 """Lengths of the steps of a tick with events, as powers of two of the finest: an eighth of the
-tick, an eighth of that, and the finest; VECTOR_WIDTH of each, one behind the other."""
-VECTOR_WIDTH_EXPONENT = VECTOR_WIDTH.bit_length() - 1
-"""Exponent of VECTOR_WIDTH as a power of two, 1."""
+tick, an eighth of that, and the finest; STEPS of each, one behind the other."""
+STEPS_EXPONENT = 3
+STEPS = 1 << STEPS_EXPONENT
+"""Steps of one length, 1: a lane alone looks for an event after each of them."""
 MOVING_ROWS, STUCK_ROWS = 18, 4
 """Vectors for steps of one length: 4 x 4 transitions, time in s, decay of the spool's velocity with
 the flapper on its stop; 2 x 2 transitions."""
-MOVING_SIZE = LANES * len(STEP_SHIFTS) * MOVING_ROWS * VECTOR_WIDTH
-STUCK_SIZE = LANES * len(STEP_SHIFTS) * STUCK_ROWS * VECTOR_WIDTH
-QUARTER_HALVINGS = SPOOL_GRID.finest_level - 2
+QUARTER_HALVINGS = FINEST_LEVEL - 2
 """Of a quarter of the tick, down to the finest step."""
-SLIDES_SIZE, RINGS_SIZE = (QUARTER_HALVINGS + 1) * 16 * LANES, (QUARTER_HALVINGS + 1) * 4 * LANES
-LANE_TAYLOR_ORDER = 8
-"""Order of the series of a transition, 1."""
+
+
+class BlockPlaces(NamedTuple):
+    """Places of the parts of a block's memory."""
+
+    state: int
+    path: int
+    """Behind the rows of the path what `ehadiag.model.simd_spool_events` works on."""
+    coefficients: int
+    moving: int
+    loose: int
+    stuck: int
+    """Transitions over the steps of `STEP_SHIFTS`, see `tabulate_coefficients`."""
+    slides: int
+    free_slides: int
+    rings: int
+    """Transitions over 2^0 … 2^QUARTER_HALVINGS finest steps."""
+    pieces: int
+    """See `ehadiag.model.simd_jack_pieces`."""
+    scratch: int
+    """Nine matrices of all lanes, while the others are made."""
+    end: int
+
+
+def block_places(lanes: int, start: int = 0) -> BlockPlaces:
+    """Places of the memory of a block of so many candidates, from a start on."""
+    width, halvings = min(lanes, 8), QUARTER_HALVINGS + 1
+    moving = lanes * len(STEP_SHIFTS) * MOVING_ROWS * STEPS
+    sizes = (
+        LANE_STATE_ROWS * lanes, LANE_PATH_ROWS * lanes + 4 * (MAX_EVENT_PIECES + STEPS),
+        COEFFICIENTS.end * lanes, moving, moving, lanes * len(STEP_SHIFTS) * STUCK_ROWS * STEPS,
+        halvings * 16 * lanes, halvings * 16 * lanes, halvings * 4 * lanes,
+        (4 * max_lane_pieces(width) + 1) * width, 9 * 16 * lanes,
+    )  # fmt: skip
+    return BlockPlaces(*(start + item for item in places(*sizes)))
+
+
+BLOCK = block_places(LANES)
+CACHE_LINE_BYTES = 64
+"""Size of a line of the cache, bytes: that of a vector of lanes."""
+
+
+def aligned_numbers(size: int) -> Array:
+    """Zeros that begin where a line of the cache does: a vector that straddles two takes longer."""
+    raw = np.zeros(size + CACHE_LINE_BYTES // BYTES_PER_NUMBER)
+    first = -raw.ctypes.data % CACHE_LINE_BYTES // raw.itemsize
+    return raw[first : first + size]
+
+
+@merged
+def block_part(address: int, start: int, end: int) -> Array:
+    """Numbers of a block's memory; to cut them out of an array calls the runtime."""
+    return array_at(address + BYTES_PER_NUMBER * start, (end - start,))
+
+
+TAYLOR_ORDER, TAYLOR_HALVINGS = 8, 3
+"""Order of the series of a transition, and halvings of the finest step for it, 1."""
 NO_RING_TIME = 1e30
 """Ring time of a flapper that does not ring, s."""
 
@@ -186,10 +259,6 @@ def _add(source: Array, target: Array) -> None:
     """Add `source` to `target`."""
     for o in range(0, source.shape[0], VECTOR_WIDTH):
         store(target, o, load(target, o) + load(source, o))
-
-
-MATRIX_SCRATCH_SIZE = 9 * 16 * LANES
-"""Numbers that `tabulate_coefficients` takes as scratch: nine matrices of all lanes."""
 
 
 @merged
@@ -216,7 +285,7 @@ def _smallest(rates: Array, n: int, tick: float, scratch: Array, out: Array) -> 
     """exp(rates h) for the finest step: Taylor at a still smaller one, then squaring."""
     scaled, term = _part(scratch, 0, n), _part(scratch, 1, n)
     power, spare = _part(scratch, 2, n), _part(scratch, 3, n)
-    short = tick / 2.0 ** (SPOOL_GRID.finest_level + SPOOL_GRID.taylor_halvings)
+    short = tick / 2.0 ** (FINEST_LEVEL + TAYLOR_HALVINGS)
     for i in range(rates.shape[0]):
         scaled[i] = rates[i] * short
         term[i] = power[i] = 0.0
@@ -224,11 +293,11 @@ def _smallest(rates: Array, n: int, tick: float, scratch: Array, out: Array) -> 
         start = (r * n + r) * LANES
         term[start : start + LANES] = 1.0
         power[start : start + LANES] = 1.0
-    for order in range(1, LANE_TAYLOR_ORDER + 1):
+    for order in range(1, TAYLOR_ORDER + 1):
         _product(term, scaled, spare, n, 1.0 / order)
         term, spare = spare, term
         _add(term, power)
-    for _ in range(SPOOL_GRID.taylor_halvings):
+    for _ in range(TAYLOR_HALVINGS):
         _product(power, power, spare, n, 1.0)
         power, spare = spare, power
     _copy(power, out, 0)
@@ -254,25 +323,25 @@ def _powers(
     """Transitions over the steps of `STEP_SHIFTS`.
 
     smallest: over the finest step, overwritten.
-    table: out, shape (LANES, 3, rows, VECTOR_WIDTH), flat; the first n² rows are written.
+    table: out, shape (LANES, 3, rows, STEPS), flat; the first n² rows are written.
     quarter, whole: out, transitions of all lanes over a quarter of a tick and over a whole one.
     """
     size = n * n
     one, power, spare = smallest, _part(scratch, 0, n), _part(scratch, 1, n)
     for level in range(len(STEP_SHIFTS) - 1, -1, -1):
         _copy(one, power, 0)
-        for step in range(VECTOR_WIDTH):
+        for step in range(STEPS):
             for i in range(LANES):
                 for e in range(size):
-                    place = ((i * len(STEP_SHIFTS) + level) * rows + e) * VECTOR_WIDTH + step
+                    place = ((i * len(STEP_SHIFTS) + level) * rows + e) * STEPS + step
                     table[place] = power[e * LANES + i]
             if level == 0 and step == 1:
                 _copy(power, quarter, 0)
-            if step < VECTOR_WIDTH - 1:
+            if step < STEPS - 1:
                 _product(power, one, spare, n, 1.0)
                 power, spare = spare, power
         if level > 0:
-            for _ in range(STEP_SHIFTS[level - 1] - STEP_SHIFTS[level] - VECTOR_WIDTH_EXPONENT):
+            for _ in range(STEP_SHIFTS[level - 1] - STEP_SHIFTS[level] - STEPS_EXPONENT):
                 _product(power, power, spare, n, 1.0)
                 power, spare = spare, power
             one, power = power, one
@@ -308,40 +377,69 @@ def _filter(law: SensorLaw, tick: float, i: int, out: Array) -> None:
         out[(COEFFICIENTS.filter + LANE_FILTER_ROWS - 1) * LANES + place] = step
 
 
+class BlockTraits(NamedTuple):
+    """What any lane of a block has."""
+
+    backlash: bool
+    creeps: bool
+    """Friction that falls with the velocity."""
+    shaped: bool
+    """Lands of a shape."""
+    senses: bool
+    """A sensor with dynamics."""
+    orifice: bool
+    """Orifices in its second stage."""
+    plays: int
+    """Number of plays of the hysteresis."""
+
+
+@inlined
+def lane_traits(coefficients: Array, i: int, plays: int) -> BlockTraits:
+    """What lane `i` has."""
+    spool, jack = spool_law_of_lane(coefficients, i), jack_law_of_lane(coefficients, i)
+    return BlockTraits(
+        spool.backlash > 0.0,
+        spool.extra > 0.0,
+        jack.shaped != 0.0,
+        has_sensor_dynamics(sensor_law_of_lane(coefficients, i)) or jack.by_stribeck > 0.0,
+        jack.oil > 0.0,
+        plays,
+    )
+
+
 @bare_kernel
-def tabulate_coefficients(
-    candidates: Array,
-    tick: float,
-    coefficients: Array,
-    moving: Array,
-    loose: Array,
-    stuck: Array,
-    slides: Array,
-    free_slides: Array,
-    rings: Array,
-    scratch: Array,
-) -> tuple[bool, bool, bool, bool]:
+def tabulate_coefficients(address: int, candidates: Array, tick: float) -> BlockTraits:
     """Write coefficients and transition tables of a block of candidates for ticks of one length, s.
 
-    candidates: rows of constants, shape (LANES, PLANT_FIELDS). Written are the coefficients,
-    transitions over the steps of `STEP_SHIFTS` of a moving spool (with and without the feedback
-    wire) and of one at rest, and over 2^0 … 2^QUARTER_HALVINGS finest steps. Returns whether any
-    lane has backlash, friction that falls with the velocity, lands of a shape, and a sensor with
-    dynamics.
+    address: of the block; candidates: rows of constants, shape (LANES, PLANT_FIELDS). Written are
+    the coefficients, transitions over the steps of `STEP_SHIFTS` of a moving spool (with and
+    without the feedback wire) and of one at rest, and over 2^0 … 2^QUARTER_HALVINGS finest steps.
     """
+    coefficients = block_part(address, BLOCK.coefficients, BLOCK.moving)
+    moving = block_part(address, BLOCK.moving, BLOCK.loose)
+    loose = block_part(address, BLOCK.loose, BLOCK.stuck)
+    stuck = block_part(address, BLOCK.stuck, BLOCK.slides)
+    slides = block_part(address, BLOCK.slides, BLOCK.free_slides)
+    free_slides = block_part(address, BLOCK.free_slides, BLOCK.rings)
+    rings = block_part(address, BLOCK.rings, BLOCK.pieces)
+    scratch = block_part(address, BLOCK.scratch, BLOCK.end)
     rates, ring = _part(scratch, 4, 4), _part(scratch, 5, 2)
     smallest, quarter, whole = _part(scratch, 6, 4), _part(scratch, 7, 4), _part(scratch, 8, 4)
     smallest_ring = _part(scratch, 6, 2)
     rates[:] = 0.0
     ring[:] = 0.0
-    any_backlash = any_creep = any_shape = any_other = False
+    plays = int(plant_of(candidates[0]).NPL)
+    any_of = BlockTraits(False, False, False, False, False, plays)
     for i in range(LANES):
         c = plant_of(candidates[i])
         t = _laws(c, tick, i, coefficients)
-        any_backlash = any_backlash or t.backlash > 0.0
-        any_creep = any_creep or t.extra > 0.0
-        any_shape = any_shape or jack_law_of_lane(coefficients, i).shaped != 0.0
-        any_other = any_other or has_sensor_dynamics(sensor_law(c)) or c.VSJ > 0.0
+        has = lane_traits(coefficients, i, plays)
+        coefficients[COEFFICIENTS.idle * LANES + i] = 0.0
+        any_of = BlockTraits(
+            any_of.backlash or has.backlash, any_of.creeps or has.creeps,
+            any_of.shaped or has.shaped, any_of.senses or has.senses,
+            any_of.orifice or has.orifice, plays,
+        )  # fmt: skip
         stiffness, friction = -c.KF / c.JF, -c.CF / c.JF
         rates[1 * LANES + i], rates[11 * LANES + i] = 1.0, 1.0
         rates[4 * LANES + i], rates[5 * LANES + i] = stiffness, friction
@@ -357,19 +455,19 @@ def tabulate_coefficients(
         t = spool_law_of_lane(coefficients, i)
         rate = t.damping / t.mass
         for level, shift in enumerate(STEP_SHIFTS):
-            for step in range(VECTOR_WIDTH):
-                time = tick / (1 << SPOOL_GRID.finest_level) * ((step + 1) << shift)
-                place = ((i * len(STEP_SHIFTS) + level) * MOVING_ROWS + 16) * VECTOR_WIDTH + step
+            for step in range(STEPS):
+                time = tick / (1 << FINEST_LEVEL) * ((step + 1) << shift)
+                place = ((i * len(STEP_SHIFTS) + level) * MOVING_ROWS + 16) * STEPS + step
                 moving[place] = time
-                moving[place + VECTOR_WIDTH] = math.exp(-time * rate)
+                moving[place + STEPS] = math.exp(-time * rate)
     _smallest(ring, 2, tick, scratch, smallest_ring)
     _doubled(smallest_ring, 2, rings, scratch)
     _powers(smallest_ring, 2, STUCK_ROWS, stuck, scratch, quarter, whole)
     _copy(whole[: 4 * LANES], coefficients, COEFFICIENTS.rest * LANES)
-    if any_other:
+    if any_of.senses:
         for i in range(LANES):
             _filter(sensor_law(plant_of(candidates[i])), tick, i, coefficients)
-    if any_backlash:
+    if any_of.backlash:
         rates[6 * LANES : 7 * LANES] = 0.0
         _smallest(rates, 4, tick, scratch, smallest)
         _doubled(smallest, 4, free_slides, scratch)
@@ -377,6 +475,7 @@ def tabulate_coefficients(
         _copy(quarter, coefficients, COEFFICIENTS.loose * LANES)
         for i in range(LANES):
             for level in range(len(STEP_SHIFTS)):
-                place = ((i * len(STEP_SHIFTS) + level) * MOVING_ROWS + 16) * VECTOR_WIDTH
-                store(loose, place, load(moving, place))
-    return any_backlash, any_creep, any_shape, any_other
+                place = ((i * len(STEP_SHIFTS) + level) * MOVING_ROWS + 16) * STEPS
+                for step in range(STEPS):
+                    loose[place + step] = moving[place + step]
+    return any_of

@@ -1,8 +1,9 @@
 """First stage and spool of a block of candidates over a tick without events.
 
-The same equations as `ehadiag.model.scalar_spool`, by exact quarters of a tick, with constant
-friction or with one that falls with the velocity. A lane in which an event may hide is left to
-`ehadiag.model.simd_spool_halving` and `ehadiag.model.simd_spool_events`.
+Between events flapper and spool obey linear equations with constant coefficients (PHY-4, PHY-5):
+they go by exact quarters of a tick, with constant friction or with one that falls with the
+velocity. A lane in which an event may hide is left to `ehadiag.model.simd_spool_halving` and
+`ehadiag.model.simd_spool_events`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import NamedTuple
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined
 from ehadiag.compile.vector import (
+    LANES,
     VECTOR_WIDTH,
     Mask,
     Vector,
@@ -40,9 +42,9 @@ from ehadiag.model.simd_layout import (
     LANE_NODES,
     LANE_PATH,
     LANE_PATH_SLOPE,
-    LANES,
     MOVING_ROWS,
     ROWS,
+    STEPS,
     drive_laws,
     full_filter_steps,
     sampled_filter_steps,
@@ -491,38 +493,36 @@ def held_friction(
     """Law of a moving spool with the mean friction of some steps of one length.
 
     moving, loose: transitions, see `ehadiag.model.simd_layout`; place: of the lane and the length
-    of the steps in them; steps: 1 … VECTOR_WIDTH; h: length of a step, s; s: state before. Returns
+    of the steps in them; steps: 1 … STEPS; h: length of a step, s; s: state before. Returns
     the law, the velocity (m/s) by which the end is slower along the motion, and whether the
     friction may be held for so long.
     """
     d, swing = float(s.direction), 0.0
-    k = place * MOVING_ROWS * VECTOR_WIDTH + steps - 1
+    k = place * MOVING_ROWS * STEPS + steps - 1
     if steps * h > SPOOL_LIMITS.held_s:
         return t, 0.0, False
     if s.clamped:
-        rest, fade = clamped_spool_velocity(t, s.xf, d), moving[k + 17 * VECTOR_WIDTH]
+        rest, fade = clamped_spool_velocity(t, s.xf, d), moving[k + 17 * STEPS]
         free, pull = rest + (s.vs - rest) * fade, t.force / t.damping * (1.0 - fade)
     elif is_wire_carried(t, s.direction, s.xs, s.wire):
         a, b = s.xf - t.dry * d, s.xs - spool_rest_position(t, deflection, d)
-        free = moving[k + 12 * VECTOR_WIDTH] * a + moving[k + 13 * VECTOR_WIDTH] * s.wf
-        free += moving[k + 14 * VECTOR_WIDTH] * b + moving[k + 15 * VECTOR_WIDTH] * s.vs
-        swing = moving[k + 4 * VECTOR_WIDTH] * a + moving[k + 5 * VECTOR_WIDTH] * s.wf - s.wf
-        swing += moving[k + 6 * VECTOR_WIDTH] * b + moving[k + 7 * VECTOR_WIDTH] * s.vs
-        pull = moving[k + 12 * VECTOR_WIDTH] - moving[k + 14 * VECTOR_WIDTH] * t.reach
+        free = moving[k + 12 * STEPS] * a + moving[k + 13 * STEPS] * s.wf
+        free += moving[k + 14 * STEPS] * b + moving[k + 15 * STEPS] * s.vs
+        swing = moving[k + 4 * STEPS] * a + moving[k + 5 * STEPS] * s.wf - s.wf
+        swing += moving[k + 6 * STEPS] * b + moving[k + 7 * STEPS] * s.vs
+        pull = moving[k + 12 * STEPS] - moving[k + 14 * STEPS] * t.reach
     else:
         still = flapper_rest(t.ratio, deflection, s.wire)
-        rest, fade = steady_spool_velocity(t, still, d), loose[k + 15 * VECTOR_WIDTH]
+        rest, fade = steady_spool_velocity(t, still, d), loose[k + 15 * STEPS]
         free = rest + (s.vs - rest) * fade
-        free += loose[k + 12 * VECTOR_WIDTH] * (s.xf - still) + loose[k + 13 * VECTOR_WIDTH] * s.wf
-        swing = (
-            loose[k + 4 * VECTOR_WIDTH] * (s.xf - still) + loose[k + 5 * VECTOR_WIDTH] * s.wf - s.wf
-        )
+        free += loose[k + 12 * STEPS] * (s.xf - still) + loose[k + 13 * STEPS] * s.wf
+        swing = loose[k + 4 * STEPS] * (s.xf - still) + loose[k + 5 * STEPS] * s.wf - s.wf
         pull = t.force / t.damping * (1.0 - fade)
     mean, _, less, doubt = creep_friction(t, steps * h, s.vs * d, free * d, pull, swing * d)
     law = SpoolLaw(
         t.ratio, t.reach, t.force, t.mass, t.damping, t.dynamic + t.force * mean,
         t.eased + t.force * mean, t.null, t.dry + mean,
-        t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash, t.bend,
+        t.breakaway, t.extra, t.by_stribeck, t.flapper_stop, t.stroke, t.backlash,
         t.ring_damping, t.ring_rate,
     )  # fmt: skip
     return law, less, doubt <= MAX_CREEP_ERROR

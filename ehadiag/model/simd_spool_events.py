@@ -9,12 +9,16 @@ event is looked into with shorter steps, down to the finest.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from ehadiag.compile.jit import Array, bare_kernel, inlined, merged
 from ehadiag.compile.vector import (
+    LANES,
     VECTOR_WIDTH,
     Mask,
     absolute,
     first_lane,
+    last_lane,
     load,
     maximum,
     minimum,
@@ -29,7 +33,6 @@ from ehadiag.model.laws import (
     play_output,
     spool_rest_position,
 )
-from ehadiag.model.scalar_spool import TICK_UNITS
 from ehadiag.model.second_stage import jack_piece, land_opening_piece
 from ehadiag.model.sensors import PathPiece, PressureProbe, has_sensor_dynamics
 from ehadiag.model.simd_jack_pieces import keep_lane_jack, lane_jack
@@ -38,11 +41,13 @@ from ehadiag.model.simd_layout import (
     LANE_PATH,
     LANE_PATH_ROWS,
     LANE_PATH_SLOPE,
-    LANES,
+    MAX_EVENT_PIECES,
     MOVING_ROWS,
     ROWS,
     STEP_SHIFTS,
+    STEPS,
     STUCK_ROWS,
+    TICK_UNITS,
     jack_law_of_lane,
     sensor_law_of_lane,
     spool_law_of_lane,
@@ -59,12 +64,10 @@ from ehadiag.model.spool_events import (
 )
 
 LANE_QUARTER_UNITS = TICK_UNITS // LANE_NODES
-MAX_EVENT_PIECES = 32
 EVENT_PIECES_START = LANE_PATH_ROWS * LANES
 """Behind the rows of the path: pieces (duration in s, place at the end, velocities) …"""
 EVENT_INSTANTS_START = EVENT_PIECES_START + 4 * MAX_EVENT_PIECES
 """… and flapper, its rate, spool and its rate at the instants of a vector."""
-EVENT_SCRATCH_SIZE = 4 * MAX_EVENT_PIECES + 4 * VECTOR_WIDTH
 
 
 @bare_kernel
@@ -88,83 +91,95 @@ def event_ticks(
             _event_tick(i, tick, with_jack, state, path, coefficients, moving, loose, stuck)
 
 
+class _Instant(NamedTuple):
+    """What the next step looks back to."""
+
+    xf: float
+    wf: float
+    size: float
+    """Distance of the flapper from the middle."""
+
+
 @packed
 def _moving_instants(
-    t: SpoolLaw, table: Array, place: int, h: float, fine: bool, base: float,
-    s: SpoolState, path: Array,
-) -> Mask:  # fmt: skip
-    """Moving spool and flapper after 1 … VECTOR_WIDTH steps of `h` seconds, into the path's
+    t: SpoolLaw, table: Array, place: int, n: int, last: _Instant, h: float, fine: bool,
+    base: float, s: SpoolState, path: Array,
+) -> tuple[Mask, _Instant]:  # fmt: skip
+    """Moving spool and flapper after n + 1 … n + VECTOR_WIDTH steps of `h` seconds, into the path's
     scratch.
 
-    All is positive along the motion d, about the point (dry, base d) where both would rest.
-    Returns where an event has come or, steps not being the finest, may hide.
+    All is positive along the motion d, about the point (dry, base d) where both would rest. last:
+    after n steps, of no meaning for 0 of them. Returns where an event has come or, steps not being
+    the finest, may hide, and the last instant.
     """
     d, dry = float(s.direction), t.dry
     a, w, b, v = s.xf * d - dry, s.wf * d, (s.xs - base) * d, s.vs * d
-    k = place * MOVING_ROWS * VECTOR_WIDTH
-    na = load(table, k) * a + load(table, k + VECTOR_WIDTH) * w
-    na = na + load(table, k + 2 * VECTOR_WIDTH) * b + load(table, k + 3 * VECTOR_WIDTH) * v
-    nw = load(table, k + 4 * VECTOR_WIDTH) * a + load(table, k + 5 * VECTOR_WIDTH) * w
-    nw = nw + load(table, k + 6 * VECTOR_WIDTH) * b + load(table, k + 7 * VECTOR_WIDTH) * v
-    nb = load(table, k + 8 * VECTOR_WIDTH) * a + load(table, k + 9 * VECTOR_WIDTH) * w
-    nb = nb + load(table, k + 10 * VECTOR_WIDTH) * b + load(table, k + 11 * VECTOR_WIDTH) * v
-    nv = load(table, k + 12 * VECTOR_WIDTH) * a + load(table, k + 13 * VECTOR_WIDTH) * w
-    nv = nv + load(table, k + 14 * VECTOR_WIDTH) * b + load(table, k + 15 * VECTOR_WIDTH) * v
-    store(path, EVENT_INSTANTS_START, (na + dry) * d)
-    store(path, EVENT_INSTANTS_START + VECTOR_WIDTH, nw * d)
-    store(path, EVENT_INSTANTS_START + 2 * VECTOR_WIDTH, nb * d + base)
-    store(path, EVENT_INSTANTS_START + 3 * VECTOR_WIDTH, nv * d)
+    k = place * MOVING_ROWS * STEPS + n
+    na = load(table, k) * a + load(table, k + STEPS) * w
+    na = na + load(table, k + 2 * STEPS) * b + load(table, k + 3 * STEPS) * v
+    nw = load(table, k + 4 * STEPS) * a + load(table, k + 5 * STEPS) * w
+    nw = nw + load(table, k + 6 * STEPS) * b + load(table, k + 7 * STEPS) * v
+    nb = load(table, k + 8 * STEPS) * a + load(table, k + 9 * STEPS) * w
+    nb = nb + load(table, k + 10 * STEPS) * b + load(table, k + 11 * STEPS) * v
+    nv = load(table, k + 12 * STEPS) * a + load(table, k + 13 * STEPS) * w
+    nv = nv + load(table, k + 14 * STEPS) * b + load(table, k + 15 * STEPS) * v
+    store(path, EVENT_INSTANTS_START + n, (na + dry) * d)
+    store(path, EVENT_INSTANTS_START + n + STEPS, nw * d)
+    store(path, EVENT_INSTANTS_START + n + 2 * STEPS, nb * d + base)
+    store(path, EVENT_INSTANTS_START + n + 3 * STEPS, nv * d)
     size = absolute(na + dry)
+    first = _Instant(a, w, abs(a + dry)) if n == 0 else last
     found = (nv <= 0.0) | (nb >= t.stroke - base * d) | (size >= t.flapper_stop)
     if not fine:
         # Where an extreme of the flapper lies inside a step the spool may stop, the flapper touch.
-        before_a, before_w = shifted_lanes(a, na), shifted_lanes(w, nw)
+        before_a, before_w = shifted_lanes(first.xf, na), shifted_lanes(first.wf, nw)
         swing = 0.25 * h * maximum(absolute(before_w), absolute(nw))
         low = minimum(before_a, na) - swing <= 0.0
-        far = maximum(shifted_lanes(abs(a + dry), size), size) + swing >= t.flapper_stop
+        far = maximum(shifted_lanes(first.size, size), size) + swing >= t.flapper_stop
         found = found | ((before_w * nw < 0.0) & (low | far))
-    return found
+    return found, _Instant(last_lane(na), last_lane(nw), last_lane(size))
 
 
 @packed
 def _loose_instants(
-    t: SpoolLaw, table: Array, place: int, h: float, fine: bool, still: float,
-    s: SpoolState, path: Array,
-) -> Mask:  # fmt: skip
+    t: SpoolLaw, table: Array, place: int, n: int, last: _Instant, h: float, fine: bool,
+    still: float, s: SpoolState, path: Array,
+) -> tuple[Mask, _Instant]:  # fmt: skip
     """As `_moving_instants` within the backlash, without the feedback wire."""
     d = float(s.direction)
     lift = still * d
     steady = (t.force * lift - t.dynamic) / t.damping
     a, w, v = s.xf * d - lift, s.wf * d, s.vs * d - steady
-    k = place * MOVING_ROWS * VECTOR_WIDTH
-    na = load(table, k) * a + load(table, k + VECTOR_WIDTH) * w
-    nw = load(table, k + 4 * VECTOR_WIDTH) * a + load(table, k + 5 * VECTOR_WIDTH) * w
-    nb = load(table, k + 8 * VECTOR_WIDTH) * a + load(table, k + 9 * VECTOR_WIDTH) * w
-    nb = nb + load(table, k + 11 * VECTOR_WIDTH) * v + load(table, k + 16 * VECTOR_WIDTH) * steady
-    nv = load(table, k + 12 * VECTOR_WIDTH) * a + load(table, k + 13 * VECTOR_WIDTH) * w
-    nv = nv + load(table, k + 15 * VECTOR_WIDTH) * v + steady
-    store(path, EVENT_INSTANTS_START, (na + lift) * d)
-    store(path, EVENT_INSTANTS_START + VECTOR_WIDTH, nw * d)
-    store(path, EVENT_INSTANTS_START + 2 * VECTOR_WIDTH, nb * d + s.xs)
-    store(path, EVENT_INSTANTS_START + 3 * VECTOR_WIDTH, nv * d)
+    k = place * MOVING_ROWS * STEPS + n
+    na = load(table, k) * a + load(table, k + STEPS) * w
+    nw = load(table, k + 4 * STEPS) * a + load(table, k + 5 * STEPS) * w
+    nb = load(table, k + 8 * STEPS) * a + load(table, k + 9 * STEPS) * w
+    nb = nb + load(table, k + 11 * STEPS) * v + load(table, k + 16 * STEPS) * steady
+    nv = load(table, k + 12 * STEPS) * a + load(table, k + 13 * STEPS) * w
+    nv = nv + load(table, k + 15 * STEPS) * v + steady
+    store(path, EVENT_INSTANTS_START + n, (na + lift) * d)
+    store(path, EVENT_INSTANTS_START + n + STEPS, nw * d)
+    store(path, EVENT_INSTANTS_START + n + 2 * STEPS, nb * d + s.xs)
+    store(path, EVENT_INSTANTS_START + n + 3 * STEPS, nv * d)
     size = absolute(na + lift)
+    first = _Instant(a, w, abs(a + lift)) if n == 0 else last
     travel = s.xs * d
     found = (nv <= 0.0) | (nb >= t.stroke - travel) | (size >= t.flapper_stop)
     found = found | (nb >= t.backlash - WIRE_TOLERANCE - (s.xs - s.wire) * d)
     if not fine:
-        before_a, before_w = shifted_lanes(a, na), shifted_lanes(w, nw)
+        before_a, before_w = shifted_lanes(first.xf, na), shifted_lanes(first.wf, nw)
         swing = 0.25 * h * maximum(absolute(before_w), absolute(nw))
         low = minimum(before_a, na) - swing <= t.dry - lift
-        far = maximum(shifted_lanes(abs(a + lift), size), size) + swing >= t.flapper_stop
+        far = maximum(shifted_lanes(first.size, size), size) + swing >= t.flapper_stop
         found = found | ((before_w * nw < 0.0) & (low | far))
-    return found
+    return found, _Instant(last_lane(na), last_lane(nw), last_lane(size))
 
 
 @packed
 def _stuck_instants(
-    t: SpoolLaw, table: Array, place: int, h: float, fine: bool, still: float,
-    s: SpoolState, path: Array,
-) -> Mask:  # fmt: skip
+    t: SpoolLaw, table: Array, place: int, n: int, last: _Instant, h: float, fine: bool,
+    still: float, s: SpoolState, path: Array,
+) -> tuple[Mask, _Instant]:  # fmt: skip
     """As `_moving_instants` for a spool at rest, whose flapper rings about `still`, m.
 
     The spool breaks away beyond the static friction, but not to the side on which its stop holds
@@ -173,40 +188,41 @@ def _stuck_instants(
     xf, wf, side = s.xf, s.wf, s.xs if abs(s.xs) >= t.stroke else 0.0
     room = min(t.breakaway, t.flapper_stop)
     a = xf - still
-    k = place * STUCK_ROWS * VECTOR_WIDTH
-    new_xf = load(table, k) * a + load(table, k + VECTOR_WIDTH) * wf + still
-    new_wf = load(table, k + 2 * VECTOR_WIDTH) * a + load(table, k + 3 * VECTOR_WIDTH) * wf
-    store(path, EVENT_INSTANTS_START, new_xf)
-    store(path, EVENT_INSTANTS_START + VECTOR_WIDTH, new_wf)
+    k = place * STUCK_ROWS * STEPS + n
+    new_xf = load(table, k) * a + load(table, k + STEPS) * wf + still
+    new_wf = load(table, k + 2 * STEPS) * a + load(table, k + 3 * STEPS) * wf
+    store(path, EVENT_INSTANTS_START + n, new_xf)
+    store(path, EVENT_INSTANTS_START + n + STEPS, new_wf)
     size = absolute(new_xf)
+    first = _Instant(xf, wf, abs(xf)) if n == 0 else last
     found = ((size > t.breakaway) & (side * new_xf <= 0.0)) | (size >= t.flapper_stop)
     if not fine:
-        before = shifted_lanes(wf, new_wf)
+        before = shifted_lanes(first.wf, new_wf)
         swing = 0.25 * h * maximum(absolute(before), absolute(new_wf))
-        far = maximum(shifted_lanes(abs(xf), size), size) + swing > room
+        far = maximum(shifted_lanes(first.size, size), size) + swing > room
         found = found | ((before * new_wf < 0.0) & far)
-    store(path, EVENT_INSTANTS_START + 2 * VECTOR_WIDTH, s.xs)
-    store(path, EVENT_INSTANTS_START + 3 * VECTOR_WIDTH, 0.0)
-    return found
+    store(path, EVENT_INSTANTS_START + n + 2 * STEPS, s.xs)
+    store(path, EVENT_INSTANTS_START + n + 3 * STEPS, 0.0)
+    return found, _Instant(last_lane(new_xf), last_lane(new_wf), last_lane(size))
 
 
 @packed
 def _clamped_instants(
-    t: SpoolLaw, table: Array, place: int, deflection: float, s: SpoolState,
+    t: SpoolLaw, table: Array, place: int, n: int, deflection: float, s: SpoolState,
     path: Array,
 ) -> Mask:  # fmt: skip
     """As `_moving_instants` with the flapper on its stop; the spool may be at rest."""
     d, xf = float(s.direction), s.xf
-    k = (place * MOVING_ROWS + 16) * VECTOR_WIDTH
-    time, fade = load(table, k), load(table, k + VECTOR_WIDTH)
+    k = (place * MOVING_ROWS + 16) * STEPS + n
+    time, fade = load(table, k), load(table, k + STEPS)
     steady = clamped_spool_velocity(t, xf, d) if d != 0.0 else 0.0
     excess = s.vs - steady
     new_xs = time * steady + (1.0 - fade) * (excess * t.mass / t.damping) + s.xs
     new_vs = fade * excess + steady
-    store(path, EVENT_INSTANTS_START, xf)
-    store(path, EVENT_INSTANTS_START + VECTOR_WIDTH, 0.0)
-    store(path, EVENT_INSTANTS_START + 2 * VECTOR_WIDTH, new_xs)
-    store(path, EVENT_INSTANTS_START + 3 * VECTOR_WIDTH, new_vs)
+    store(path, EVENT_INSTANTS_START + n, xf)
+    store(path, EVENT_INSTANTS_START + n + STEPS, 0.0)
+    store(path, EVENT_INSTANTS_START + n + 2 * STEPS, new_xs)
+    store(path, EVENT_INSTANTS_START + n + 3 * STEPS, new_vs)
     wire = play_output(s.wire, new_xs, t.backlash)
     leaves = (flapper_rest(t.ratio, deflection, wire) - xf) * xf < 0.0
     if d == 0.0:
@@ -249,7 +265,7 @@ def _event_tick(
         while done & ((1 << STEP_SHIFTS[level]) - 1) != 0:
             level += 1
         shift, fine = STEP_SHIFTS[level], level == finest
-        whole = VECTOR_WIDTH - ((done >> shift) & (VECTOR_WIDTH - 1))
+        whole = STEPS - ((done >> shift) & (STEPS - 1))
         h, place = unit * (1 << shift), i * len(STEP_SHIFTS) + level
         law, less, short = t, 0.0, True
         if s.direction != 0 and t.extra > 0.0:
@@ -257,23 +273,26 @@ def _event_tick(
             if fine and not short:
                 whole = 1
                 law, less, short = held_friction(t, moving, loose, place, whole, h, deflection, s)
-        if s.clamped:
-            found = _clamped_instants(law, moving, place, deflection, s, path)
-        elif s.direction != 0:
-            if is_wire_carried(t, s.direction, s.xs, s.wire):
-                base = spool_rest_position(law, deflection, float(s.direction))
-                found = _moving_instants(law, moving, place, h, fine, base, s, path)
+        first, last = whole if short or fine else 0, _Instant(0.0, 0.0, 0.0)
+        carries = s.direction != 0 and is_wire_carried(t, s.direction, s.xs, s.wire)
+        base = spool_rest_position(law, deflection, float(s.direction))
+        still = flapper_rest(t.ratio, deflection, s.wire)
+        for n in range(0, first, VECTOR_WIDTH):
+            if s.clamped:
+                found = _clamped_instants(law, moving, place, n, deflection, s, path)
+            elif carries:
+                found, last = _moving_instants(law, moving, place, n, last, h, fine, base, s, path)
+            elif s.direction != 0:
+                found, last = _loose_instants(law, loose, place, n, last, h, fine, still, s, path)
             else:
-                still = flapper_rest(t.ratio, deflection, s.wire)
-                found = _loose_instants(law, loose, place, h, fine, still, s, path)
-        else:
-            still = flapper_rest(t.ratio, deflection, s.wire)
-            found = _stuck_instants(t, stuck, place, h, fine, still, s, path)
-        first = first_lane(found) if short or fine else 0
+                found, last = _stuck_instants(t, stuck, place, n, last, h, fine, still, s, path)
+            first = min(n + first_lane(found), whole)
+            if first < n + VECTOR_WIDTH:
+                break
         event = EVENTS.none
         if first < whole and fine:
             o = EVENT_INSTANTS_START + first
-            new_xf, new_xs, new_vs = path[o], path[o + 2 * VECTOR_WIDTH], path[o + 3 * VECTOR_WIDTH]
+            new_xf, new_xs, new_vs = path[o], path[o + 2 * STEPS], path[o + 3 * STEPS]
             if s.clamped:
                 wire = play_output(s.wire, new_xs, t.backlash)
                 event = clamped_event(t, deflection, new_xf, new_xs, new_vs, wire, s.direction)
@@ -290,10 +309,10 @@ def _event_tick(
             o = EVENT_INSTANTS_START + n - 1
             s = SpoolState(
                 path[o],
-                path[o + VECTOR_WIDTH],
-                path[o + 2 * VECTOR_WIDTH],
-                path[o + 3 * VECTOR_WIDTH],
-                play_output(s.wire, path[o + 2 * VECTOR_WIDTH], t.backlash),
+                path[o + STEPS],
+                path[o + 2 * STEPS],
+                path[o + 3 * STEPS],
+                play_output(s.wire, path[o + 2 * STEPS], t.backlash),
                 s.direction,
                 s.clamped,
             )

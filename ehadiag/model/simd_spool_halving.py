@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined
 from ehadiag.compile.vector import (
+    LANES,
     VECTOR_WIDTH,
     Mask,
     Vector,
@@ -31,23 +32,21 @@ from ehadiag.compile.vector import (
     where,
 )
 from ehadiag.model.laws import SpoolLaw, flapper_rest, play_output, spool_rest_position
-from ehadiag.model.scalar_spool import TICK_UNITS
 from ehadiag.model.simd_jack_pieces import PIECE_NUMBERS, jack_over_pieces
 from ehadiag.model.simd_layout import (
     LANE_NODES,
     LANE_PATH,
     LANE_PATH_SLOPE,
-    LANES,
+    MAX_TICK_EVENTS,
     QUARTER_HALVINGS,
     ROWS,
+    TICK_UNITS,
     spool_laws,
 )
 from ehadiag.model.spool_events import WIRE_TOLERANCE
 
 QUARTER_UNITS = float(TICK_UNITS // LANE_NODES)
 """Finest steps of a quarter of a tick, 1."""
-MAX_TICK_EVENTS = 6
-"""Of a lane in a tick. Each cuts a piece of the path for all lanes of a vector; so do the nodes."""
 
 
 class _Motion(NamedTuple):
@@ -89,6 +88,8 @@ def _slid(
     for level in range(longest, shortest - 1, -1):
         units, k = float(1 << level), level * 16 * LANES + o
         takes = rest >= units
+        if VECTOR_WIDTH == 1 and not any_lane(takes):
+            continue
         rest = where(takes, rest - units, rest)
         ka = load(m, k) * na + load(m, k + LANES) * nw
         ka = ka + load(m, k + 2 * LANES) * nb + load(m, k + 3 * LANES) * nv
@@ -126,6 +127,8 @@ def _slid_loose(
     for level in range(longest, shortest - 1, -1):
         units, k = float(1 << level), level * 16 * LANES + o
         takes = rest >= units
+        if VECTOR_WIDTH == 1 and not any_lane(takes):
+            continue
         rest = where(takes, rest - units, rest)
         ka = load(m, k) * na + load(m, k + LANES) * nw
         kw = load(m, k + 4 * LANES) * na + load(m, k + 5 * LANES) * nw
@@ -157,6 +160,8 @@ def _rung(
     for level in range(longest, shortest - 1, -1):
         units, k = float(1 << level), level * 4 * LANES + o
         takes = rest >= units
+        if VECTOR_WIDTH == 1 and not any_lane(takes):
+            continue
         rest = where(takes, rest - units, rest)
         ka = load(m, k) * a + load(m, k + LANES) * w
         kw = load(m, k + 2 * LANES) * a + load(m, k + 3 * LANES) * w

@@ -1,6 +1,6 @@
-"""Events of flapper and spool, and steps of a spool whose friction falls with its velocity.
+"""Events of flapper and spool, and friction that falls with the spool's velocity.
 
-Shared by the scalar and the vector kernels. With Stribeck's friction the part that fades with the
+With Stribeck's friction the part that fades with the
 velocity is held over a step at the mean of its start and end; steps that are too long for that are
 halved.
 """
@@ -14,21 +14,15 @@ from ehadiag.compile.jit import inlined
 from ehadiag.compile.vector import absolute, maximum, minimum, packed
 from ehadiag.model.laws import (
     SpoolLaw,
-    clamped_spool_velocity,
     exp_minus,
     flapper_rest,
     play_output,
-    spool_rest_position,
-    steady_spool_velocity,
 )
 
 
 class SpoolEvents(NamedTuple):
     """Codes of what may end a step of flapper and spool."""
 
-    possible: int = -1
-    """An event may hide inside the step: halve it; none if it is still uncertain at the finest
-    step."""
     none: int = 0
     """The step has no event."""
     reversal: int = 1
@@ -96,54 +90,6 @@ def clamped_event(
 
 
 @inlined
-def moving_event(
-    t: SpoolLaw,
-    h: float,
-    before_xf: float,
-    before_wf: float,
-    xf: float,
-    wf: float,
-    xs: float,
-    vs: float,
-    wire: float,
-    loose: bool,
-    direction: int,
-) -> int:
-    """What ends a step with flapper free and spool moving; loose: without the feedback wire."""
-    if vs * direction <= 0.0:
-        return EVENTS.reversal
-    if loose and is_wire_carried(t, direction, xs, wire):
-        return EVENTS.wire_engagement
-    if abs(xs) >= t.stroke and xs * direction > 0.0:
-        return EVENTS.stop
-    if abs(xf) >= t.flapper_stop:
-        return EVENTS.flapper_stop
-    if before_wf * wf < 0.0:
-        # An extreme of the flapper lies inside: the spool may stop there, or the flapper touch.
-        swing = 0.25 * h * max(abs(before_wf), abs(wf))
-        lowest = min(before_xf * direction, xf * direction) - t.dry - swing
-        if lowest <= 0.0 or max(abs(before_xf), abs(xf)) + swing >= t.flapper_stop:
-            return EVENTS.possible
-    return EVENTS.none
-
-
-@inlined
-def stuck_event(
-    t: SpoolLaw, h: float, before_xf: float, before_wf: float, xf: float, wf: float, xs: float
-) -> int:
-    """What ends a step with flapper free and spool at rest."""
-    if not is_spool_held(t, xf, xs):
-        return EVENTS.breakaway
-    if abs(xf) >= t.flapper_stop:
-        return EVENTS.flapper_stop
-    if before_wf * wf < 0.0:
-        swing = 0.25 * h * max(abs(before_wf), abs(wf))
-        if max(abs(before_xf), abs(xf)) + swing > min(t.breakaway, t.flapper_stop):
-            return EVENTS.possible
-    return EVENTS.none
-
-
-@inlined
 def state_after_event(t: SpoolLaw, event: int, s: SpoolState) -> SpoolState:
     """State after a step that an event ends, or none."""
     xf, wf, xs, vs, wire, direction, clamped = s
@@ -168,27 +114,6 @@ CREEP_NEWTON_ROUNDS = 3
 """Rounds of Newton's method, 1."""
 MIN_FRICTION_SLOPE = 0.2
 """Least slope of the equation of the end's friction, 1; below, the velocity diverges."""
-
-
-class StepTransition(NamedTuple):
-    """What a step without friction makes of flapper and spool, by rows XF, DXF, XS, DXS."""
-
-    m00: Any
-    m01: Any
-    m02: Any
-    m03: Any
-    m10: Any
-    m11: Any
-    m12: Any
-    m13: Any
-    m20: Any
-    m21: Any
-    m22: Any
-    m23: Any
-    m30: Any
-    m31: Any
-    m32: Any
-    m33: Any
 
 
 @packed
@@ -230,63 +155,3 @@ def creep_friction(t: SpoolLaw, span: float, before: Any, free: Any, pull: Any, 
     doubt = span * t.force / t.damping * miss + unsure
     mean = maximum(minimum(0.5 * (first + last) + ringing, t.extra), 0.0)
     return mean, largest, pull * (weight - 0.5) * (last - first), doubt
-
-
-@inlined
-def creep_step(
-    t: SpoolLaw, m: StepTransition, h: float, fade: float, deflection: float, loose: bool,
-    s: SpoolState,
-) -> tuple[SpoolState, bool]:  # fmt: skip
-    """Flapper and moving spool after a step of `h` seconds, and whether it was short enough.
-
-    m: with the feedback wire, or without it where `loose`; fade: of the spool's velocity with the
-    flapper on its stop, over the step.
-    """
-    d = float(s.direction)
-    if s.clamped:
-        rest = clamped_spool_velocity(t, s.xf, d)
-        pull = t.force / t.damping * (1.0 - fade)
-        free = rest + (s.vs - rest) * fade
-        mean, _, less, doubt = creep_friction(t, h, s.vs * d, free * d, pull, 0.0)
-        steady = clamped_spool_velocity(t, s.xf - mean * d, d)
-        xs = s.xs + steady * h + (s.vs - steady) * (1.0 - fade) * t.mass / t.damping
-        vs = steady + (s.vs - steady) * fade - less * d
-        after = SpoolState(s.xf, s.wf, xs, vs, s.wire, s.direction, s.clamped)
-    elif loose:
-        still = flapper_rest(t.ratio, deflection, s.wire)
-        rest = steady_spool_velocity(t, still, d)
-        a, w = s.xf - still, s.wf
-        pull = t.force / t.damping * (1.0 - m.m33)
-        free = rest + m.m30 * a + m.m31 * w + m.m33 * (s.vs - rest)
-        swing = (m.m10 * a + m.m11 * w - w) * d
-        mean, _, less, doubt = creep_friction(t, h, s.vs * d, free * d, pull, swing)
-        steady = steady_spool_velocity(t, still - mean * d, d)
-        v = s.vs - steady
-        after = SpoolState(
-            still + m.m00 * a + m.m01 * w,
-            m.m10 * a + m.m11 * w,
-            s.xs + steady * h + m.m20 * a + m.m21 * w + m.m23 * v,
-            steady + m.m30 * a + m.m31 * w + m.m33 * v - less * d,
-            s.wire,
-            s.direction,
-            s.clamped,
-        )
-    else:
-        base = spool_rest_position(t, deflection, d)
-        a, w, b, v = s.xf - t.dry * d, s.wf, s.xs - base, s.vs
-        free = m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v
-        pull = m.m30 - m.m32 * t.reach
-        swing = (m.m10 * a + m.m11 * w + m.m12 * b + m.m13 * v - w) * d
-        mean, _, less, doubt = creep_friction(t, h, s.vs * d, free * d, pull, swing)
-        rest_xf, rest_xs = (t.dry + mean) * d, base - mean * t.reach * d
-        a, b = s.xf - rest_xf, s.xs - rest_xs
-        after = SpoolState(
-            rest_xf + m.m00 * a + m.m01 * w + m.m02 * b + m.m03 * v,
-            m.m10 * a + m.m11 * w + m.m12 * b + m.m13 * v,
-            rest_xs + m.m20 * a + m.m21 * w + m.m22 * b + m.m23 * v,
-            m.m30 * a + m.m31 * w + m.m32 * b + m.m33 * v - less * d,
-            s.wire,
-            s.direction,
-            s.clamped,
-        )
-    return after, doubt <= MAX_CREEP_ERROR

@@ -11,17 +11,8 @@ from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at, packer, places, u
 from ehadiag.model.laws import (
     ControlLaw,
     ControlState,
-    DriveLaw,
-    JackLaw,
-    SpoolLaw,
-    drive_law,
-    jack_law,
-    plant_of,
-    spool_law,
 )
 from ehadiag.model.plant import PLANT_FIELDS, PlantConstants
-from ehadiag.model.scalar_spool import MAX_PLAYS, SPOOL_GRID, fill_tables
-from ehadiag.model.sensors import JackState, SensorLaw, sensor_law
 from ehadiag.model.severities import (
     EXPONENT_PLACES,
     FAULT_CHANGES,
@@ -31,6 +22,8 @@ from ehadiag.model.severities import (
     PRESSURE_PLACES,
     damaged_constant,
 )
+from ehadiag.model.simd_layout import block_places, tabulate_coefficients
+from ehadiag.model.simd_tick import rest_block
 
 
 class MonitorSettings(NamedTuple):
@@ -59,33 +52,6 @@ class MonitorSettings(NamedTuple):
     limit: float
     deviation: float
     """A lost command did not go on where the current is off by more, A."""
-
-
-class ValveMemory(NamedTuple):
-    """Flapper and spool between two ticks: `ehadiag.model.spool_events.SpoolState` as numbers."""
-
-    xf: float
-    """Flapper deflection, m."""
-    wf: float
-    """Its rate, m/s."""
-    xs: float
-    """Spool position, m."""
-    vs: float
-    """Its velocity, m/s."""
-    wire: float
-    """End of the feedback wire, m."""
-    direction: float
-    """Of the spool's motion, +1 or -1; 0 at rest."""
-    clamped: float
-    """Not 0: the flapper is on its stop."""
-    filtered: float
-    """Innovation of the re-anchoring, m."""
-    jack_spool: float
-    """Where the jack has the spool, m."""
-    lagged: float
-    """The spool behind the filter before its converter, m."""
-    anchored: float
-    """How often the model was put back on the measured spool."""
 
 
 class CommandMemory(NamedTuple):
@@ -130,18 +96,12 @@ class LibraryIdentity(NamedTuple):
 class MonitorPlaces(NamedTuple):
     """Places of the parts of a monitor's memory."""
 
-    drive_law: int
-    spool_law: int
-    jack_law: int
-    sensor_law: int
     control_law: int
     settings: int
     identity: int
     """`LibraryIdentity` of an exported monitor."""
-    valve: int
-    """First of the state: a restart sets all up to `slide` to 0."""
-    jack: int
     control: int
+    """First of the state, which ends with that of the model: a restart sets all of it to 0."""
     command: int
     health: int
     """`HealthMemory` of an exported monitor."""
@@ -151,41 +111,21 @@ class MonitorPlaces(NamedTuple):
     """Residuals of spool and pressure, in deviations."""
     cusum: int
     """Upper and lower sum of the spool, then of the pressure."""
-    plays: int
-    """Plays of the hysteresis, A, as many as the settings have, and last the current behind its
-    driver's lag."""
-    slide: int
-    """Tables of `ehadiag.model.scalar_spool.SpoolTables`: spool moving with the feedback wire,"""
-    loose: int
-    """without it,"""
-    ring: int
-    """spool at rest,"""
-    decay: int
-    """and flapper on its stop."""
-    nodes: int
-    """Path of a tick."""
-    end: int
+    model: int
+    """Block of one lane, see `ehadiag.model.simd_layout`; its state comes first."""
 
 
 MONITOR = MonitorPlaces(
-    *places(DriveLaw, SpoolLaw, JackLaw, SensorLaw, ControlLaw, MonitorSettings,
-            LibraryIdentity, ValveMemory, JackState, ControlState, CommandMemory, HealthMemory,
-            3, 2, 4, MAX_PLAYS + 1,
-            16 * (SPOOL_GRID.finest_level + 1), 16 * (SPOOL_GRID.finest_level + 1),
-            4 * (SPOOL_GRID.finest_level + 1), SPOOL_GRID.finest_level + 1,
-            SPOOL_GRID.nodes * SPOOL_GRID.columns)
+    *places(ControlLaw, MonitorSettings, LibraryIdentity, ControlState, CommandMemory,
+            HealthMemory, 3, 2, 4)
 )  # fmt: skip
+MODEL = block_places(1, MONITOR.model)
+"""Places of the parts of a monitor's model in its memory."""
+MONITOR_SIZE: Final = MODEL.end
+"""Numbers of a monitor, 1."""
 
-drive_law_of = unpacker(DriveLaw, MONITOR.drive_law)
-spool_law_of, jack_law_of = (
-    unpacker(SpoolLaw, MONITOR.spool_law),
-    unpacker(JackLaw, MONITOR.jack_law),
-)
-sensor_law_of = unpacker(SensorLaw, MONITOR.sensor_law)
 control_law_of = unpacker(ControlLaw, MONITOR.control_law)
 settings_of = unpacker(MonitorSettings, MONITOR.settings)
-valve_of, keep_valve = unpacker(ValveMemory, MONITOR.valve), packer(ValveMemory, MONITOR.valve)
-jack_of, keep_jack = unpacker(JackState, MONITOR.jack), packer(JackState, MONITOR.jack)
 control_of, keep_control = (
     unpacker(ControlState, MONITOR.control),
     packer(ControlState, MONITOR.control),
@@ -198,6 +138,12 @@ health_of, keep_health = (
     unpacker(HealthMemory, MONITOR.health),
     packer(HealthMemory, MONITOR.health),
 )
+
+
+@inlined_exact
+def model_at(address: int) -> int:
+    """Address of a monitor's model."""
+    return address + BYTES_PER_NUMBER * MONITOR.model
 
 
 MONITOR_PLAN_CONTROL: Final = PLANT_FIELDS
@@ -229,14 +175,6 @@ SEVERITY_COUNT: Final = len(FAULT_LAWS)
 _unit_of = unpacker(MonitorUnit, SEVERITY_COUNT)
 _plan_control_of = unpacker(ControlLaw, MONITOR_PLAN_CONTROL)
 _plan_settings_of = unpacker(MonitorSettings, MONITOR_PLAN_SETTINGS)
-_keep_drive_law, _keep_spool_law = (
-    packer(DriveLaw, MONITOR.drive_law),
-    packer(SpoolLaw, MONITOR.spool_law),
-)
-_keep_jack_law, _keep_sensor_law = (
-    packer(JackLaw, MONITOR.jack_law),
-    packer(SensorLaw, MONITOR.sensor_law),
-)
 _keep_control_law, _keep_settings = (
     packer(ControlLaw, MONITOR.control_law),
     packer(MonitorSettings, MONITOR.settings),
@@ -284,7 +222,7 @@ def _make_constants(row: Array, severities: Array, u: MonitorUnit) -> None:
 def prepare_monitor(address: int, plan_address: int, unit_address: int) -> int:
     """Write laws, settings and tables of a monitor, with the spool at rest in the middle.
 
-    Addresses are those of the monitor's MONITOR.end numbers, of a plan, and of a unit's
+    Addresses are those of the monitor's MONITOR_SIZE numbers, of a plan, and of a unit's
     MONITOR_UNIT_FIELDS.
     Returns 0, or 1 where a number of the unit is out of its range and nothing was written.
     """
@@ -296,39 +234,23 @@ def prepare_monitor_by(
     address: int, constants_address: int, plan_address: int, unit_address: int
 ) -> int:
     """Prepare a monitor as `prepare_monitor`, by other constants than the plan's."""
-    p, plan = array_at(address, (MONITOR.end,)), array_at(plan_address, (MONITOR_PLAN_SIZE,))
+    p, plan = array_at(address, (MONITOR.model,)), array_at(plan_address, (MONITOR_PLAN_SIZE,))
     given = array_at(constants_address, (PLANT_FIELDS,))
     numbers = array_at(unit_address, (MONITOR_UNIT_SIZE,))
     unit = _unit_of(numbers)
     if not _is_valid(numbers, unit):
         return 1
     # Until the first tick there is room where its path will be.
-    row = array_at(address + BYTES_PER_NUMBER * MONITOR.nodes, (PLANT_FIELDS,))
+    row = array_at(address + BYTES_PER_NUMBER * MODEL.path, (1, PLANT_FIELDS))
     for i in range(PLANT_FIELDS):
-        row[i] = given[i]
-    _make_constants(row, numbers, unit)
-    constants, control = plant_of(row), _plan_control_of(plan)
-    law = spool_law(constants)
-    _keep_drive_law(p, drive_law(constants, control.tick))
-    _keep_spool_law(p, law)
-    _keep_jack_law(p, jack_law(constants))
-    _keep_sensor_law(p, sensor_law(constants))
+        row[0, i] = given[i]
+    _make_constants(row[0], numbers, unit)
+    control = _plan_control_of(plan)
+    tabulate_coefficients(model_at(address), row, control.tick)
     _keep_control_law(p, control)
     _keep_settings(p, _plan_settings_of(plan))
     p[MONITOR_CLOSED] = 1.0 if unit.closed != 0.0 else 0.0
-    fill_tables(
-        constants,
-        law,
-        control.tick,
-        array_at(
-            address + BYTES_PER_NUMBER * (MONITOR.nodes + PLANT_FIELDS), (SPOOL_GRID.scratch, 4, 4)
-        ),
-        array_at(address + BYTES_PER_NUMBER * MONITOR.slide, (SPOOL_GRID.finest_level + 1, 4, 4)),
-        array_at(address + BYTES_PER_NUMBER * MONITOR.loose, (SPOOL_GRID.finest_level + 1, 4, 4)),
-        array_at(address + BYTES_PER_NUMBER * MONITOR.ring, (SPOOL_GRID.finest_level + 1, 2, 2)),
-        array_at(address + BYTES_PER_NUMBER * MONITOR.decay, (SPOOL_GRID.finest_level + 1,)),
-    )
-    _rest(p, 0.0)
+    _rest(address, 0.0)
     return 0
 
 
@@ -337,16 +259,15 @@ def reset_monitor(address: int, spool: float) -> int:
     """Restart a prepared monitor from rest with the spool there (m), limited by its stroke; returns
     0.
     """
-    _rest(array_at(address, (MONITOR.end,)), spool)
+    _rest(address, spool)
     return 0
 
 
-@inlined_exact
-def _rest(p: Array, spool: float) -> None:
-    for i in range(MONITOR.valve, MONITOR.slide):
+@bare_kernel
+def _rest(address: int, spool: float) -> None:
+    p = array_at(address, (MODEL.path,))
+    for i in range(MONITOR.control, MODEL.path):
         p[i] = 0.0
-    law = spool_law_of(p)
-    xs = min(max(spool, -law.stroke), law.stroke)
-    xf = min(max(-law.ratio * xs, -law.breakaway), law.breakaway)
-    keep_valve(p, ValveMemory(xf, 0.0, xs, 0.0, xs, 0.0, 0.0, 0.0, xs, xs, 0.0))
+    plays = int(settings_of(p).plays)
+    rest_block(model_at(address), 1, plays, spool, 0.0)
     keep_command(p, CommandMemory(math.nan, 0.0, 0.0, 0.0))

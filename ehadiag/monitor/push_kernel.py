@@ -1,4 +1,4 @@
-"""One tick of the streaming monitor: the scalar model from a state carried between calls.
+"""One tick of the streaming monitor: the model from a state carried between calls.
 
 Spool, jack and control law are those of `ehadiag.model`; here stand what a lost sample does, and
 the sums.
@@ -10,39 +10,26 @@ import math
 
 import numpy as np
 
-from ehadiag.compile.jit import Array, Array2, brief_kernel, inlined, inlined_exact, kernel, merged
-from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
-from ehadiag.model.batch import anchored_spool
+from ehadiag.compile.jit import Array, Array2, brief_kernel, inlined, inlined_exact, kernel
+from ehadiag.compile.vector import array_at
 from ehadiag.model.laws import ControlLaw, ControlState, control_current
-from ehadiag.model.scalar_spool import (
-    SPOOL_GRID,
-    SpoolTables,
-    motor_tick,
-    sampled_spool,
-    spool_tick,
-)
-from ehadiag.model.second_stage import jack_tick
 from ehadiag.model.sensors import read_pressure, read_spool
-from ehadiag.model.spool_events import SpoolState
+from ehadiag.model.simd_jack import sampled_positions
+from ehadiag.model.simd_layout import BLOCK, ROWS, block_part, lane_traits, sensor_law_of_lane
+from ehadiag.model.simd_spool import anchor_spool_lanes
+from ehadiag.model.simd_tick import advance_block
 from ehadiag.monitor.monitor_memory import (
+    MODEL,
     MONITOR,
     CommandMemory,
     MonitorSettings,
-    ValveMemory,
     command_of,
     control_law_of,
     control_of,
-    drive_law_of,
-    jack_law_of,
-    jack_of,
     keep_command,
     keep_control,
-    keep_jack,
-    keep_valve,
-    sensor_law_of,
+    model_at,
     settings_of,
-    spool_law_of,
-    valve_of,
 )
 
 MAX_EXTRAPOLATED_TICKS = 5.0
@@ -104,12 +91,6 @@ def _commanded(
     return float(out)
 
 
-@merged
-def _array_at_place(address: int, place: int, shape: tuple[int, ...]) -> Array:
-    """What begins at a place of the layout; to cut it out of an array calls the runtime."""
-    return array_at(address + BYTES_PER_NUMBER * place, shape)
-
-
 @inlined
 def _accumulate(p: Array, s: MonitorSettings, channel: int) -> int:
     """Advance both sums of a channel; one that gave alarm restarts, one of a lost sample stays.
@@ -139,52 +120,24 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
     8 its lower sum.
     """
     command, current, spool, pressure, position = sample
-    p = _array_at_place(address, 0, (MONITOR.end,))
-    nodes = _array_at_place(address, MONITOR.nodes, (SPOOL_GRID.nodes, SPOOL_GRID.columns))
-    s, law, m = settings_of(p), spool_law_of(p), valve_of(p)
-    tables = SpoolTables(
-        _array_at_place(address, MONITOR.slide, (SPOOL_GRID.finest_level + 1, 4, 4)),
-        _array_at_place(address, MONITOR.loose, (SPOOL_GRID.finest_level + 1, 4, 4)),
-        _array_at_place(address, MONITOR.ring, (SPOOL_GRID.finest_level + 1, 2, 2)),
-        _array_at_place(address, MONITOR.decay, (SPOOL_GRID.finest_level + 1,)),
-        law,
-    )
-    held = _array_at_place(address, MONITOR.plays, (int(s.plays) + 1,))
-    deflection = motor_tick(drive_law_of(p), held, _commanded(p, s, command, current, position))
-    before = SpoolState(m.xf, m.wf, m.xs, m.vs, m.wire, int(m.direction), m.clamped != 0.0)
-    after, count = spool_tick(tables, deflection, control_law_of(p).tick, before, nodes, 0)
-    sensor, tick = sensor_law_of(p), control_law_of(p).tick
-    seen, lagged = sampled_spool(sensor, tick, nodes, 0, count, m.xs, m.lagged)
-    innovation = spool - read_spool(sensor, seen)
-    p12, jack, jack_spool = jack_tick(
-        jack_law_of(p), sensor, tick, nodes, 0, count, jack_of(p), m.jack_spool
-    )
-    keep_jack(p, jack)
-    p[MONITOR.predicted], p[MONITOR.predicted + 1] = seen, p12
-    p[MONITOR.predicted + 2] = jack.place - sensor.lead * jack.velocity
-    p[MONITOR.residual] = innovation * s.spool_weight
-    missed = pressure - read_pressure(sensor, p12)
+    p, model = array_at(address, (MONITOR.model,)), model_at(address)
+    state = block_part(model, BLOCK.state, BLOCK.path)
+    coefficients = block_part(model, BLOCK.coefficients, BLOCK.moving)
+    s, tick = settings_of(p), control_law_of(p).tick
+    sensor, has = sensor_law_of_lane(coefficients, 0), lane_traits(coefficients, 0, int(s.plays))
+    driven = _commanded(p, s, command, current, position)
+    advance_block(model, 1, 1, driven, tick, has, True, -1)
+    sampled_positions(1, state, coefficients)
+    read = ROWS.spool_sampled if has.senses else ROWS.spool
+    p[MONITOR.predicted], p[MONITOR.predicted + 1] = state[read], state[ROWS.pressure_sampled]
+    p[MONITOR.predicted + 2] = state[ROWS.position_sampled]
+    p[MONITOR.residual] = (spool - read_spool(sensor, state[read])) * s.spool_weight
+    missed = pressure - read_pressure(sensor, state[ROWS.pressure_sampled])
     p[MONITOR.residual + 1] = missed * s.pressure_weight
-    xs, filtered, moved = anchored_spool(
-        innovation, s.anchor_gain, s.anchor_small, s.anchor_large, after.xs, m.filtered, law.stroke
-    )
-    clamped = 1.0 if after.clamped else 0.0
-    keep_valve(
-        p,
-        ValveMemory(
-            after.xf,
-            after.wf,
-            xs,
-            after.vs,
-            after.wire + (xs - after.xs),
-            float(after.direction),
-            clamped,
-            filtered,
-            jack_spool + (xs - after.xs),
-            lagged + (xs - after.xs),
-            m.anchored + (1.0 if moved else 0.0),
-        ),
-    )
+    if math.isfinite(spool):
+        anchor_spool_lanes(
+            1, read, spool, s.anchor_gain, s.anchor_small, s.anchor_large, state, coefficients
+        )
     return _accumulate(p, s, 0) + 4 * _accumulate(p, s, 1)
 
 
@@ -195,13 +148,12 @@ def push_ticks(address: int, samples: Array2, modelled: Array2) -> None:
     samples: of each tick, shape (n, 5); modelled: gets spool (m), position (m) and current (A) of
     the model, and residuals of spool and pressure in deviations, shape (n, 5).
     """
-    p = _array_at_place(address, 0, (MONITOR.end,))
-    flowing = MONITOR.plays + int(settings_of(p).plays)
+    p = array_at(address, (MODEL.path,))
     for k in range(samples.shape[0]):
         row = samples[k]
         push_tick(address, (row[0], row[1], row[2], row[3], row[4]))
         modelled[k, 0] = p[MONITOR.predicted]
         modelled[k, 1] = p[MONITOR.predicted + 2]
-        modelled[k, 2] = p[flowing]
+        modelled[k, 2] = p[MODEL.state + ROWS.current]
         modelled[k, 3] = p[MONITOR.residual]
         modelled[k, 4] = p[MONITOR.residual + 1]

@@ -23,6 +23,7 @@ from ehadiag.model.batch import Anchor
 from ehadiag.model.laws import JACK_STATIC_FRICTION_RATIO
 from ehadiag.model.plant import PlantConstants, relative_viscosity
 from ehadiag.model.registry import FAULTS, REGISTRY, Unknowns, parameter, unit_constants
+from ehadiag.model.simd_layout import ROWS, aligned_numbers
 from ehadiag.monitor import monitor_memory
 from ehadiag.monitor.monitor_memory import MonitorUnit, prepare_monitor, reset_monitor
 from ehadiag.monitor.plan import CusumDesign, default_noise, design_cusum, monitor_plan
@@ -36,14 +37,13 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 TICK_RANGE_S = (1e-5, 0.1)
 """Range of the control tick, s."""
 SPOOL_POSITION_PLACES = [
-    monitor_memory.MONITOR.valve + monitor_memory.ValveMemory._fields.index(name)
-    for name in ("xs", "wire", "jack_spool", "lagged")
+    monitor_memory.MODEL.state + row for row in (ROWS.spool, ROWS.wire, ROWS.spool_lagged)
 ]
 """All that has the spool's position (`ehadiag.monitor.push_kernel.push_tick`)."""
 LOST_TICKS_PLACE = monitor_memory.MONITOR.command + monitor_memory.CommandMemory._fields.index(
     "lost"
 )
-STATE_PLACES = slice(monitor_memory.MONITOR.valve, monitor_memory.MONITOR.slide)
+STATE_PLACES = slice(monitor_memory.MONITOR.control, monitor_memory.MODEL.path)
 """All that goes on from tick to tick."""
 VISCOSITY_PLACE, SUPPLY_PLACE, CLOSED_PLACE = (
     monitor_memory.SEVERITY_COUNT + MonitorUnit._fields.index(name)
@@ -160,7 +160,7 @@ class Monitor:
         closed = float(mode is CommandMode.POSITION)
         start = MonitorUnit(*offsets, 1.0, float(constants.PSR), closed)
         self._unit = np.array([*values, *start], dtype=np.float64)
-        p = np.zeros(monitor_memory.MONITOR.end)
+        p = aligned_numbers(monitor_memory.MONITOR_SIZE)
         self._memory, self._address = p, p.ctypes.data
         self.tune(environment or Environment())
         self._push = cast("Kernel", push_tick).of_one_thread()
@@ -169,7 +169,7 @@ class Monitor:
         self.reading: Reading = Reading(
             _view(p[monitor_memory.MONITOR.predicted : monitor_memory.MONITOR.residual]),
             _view(p[monitor_memory.MONITOR.residual : monitor_memory.MONITOR.cusum]),
-            _view(p[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.plays].reshape(2, 2)),
+            _view(p[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.model].reshape(2, 2)),
             _view(self._alarmed),
         )
         """What the last push left."""
@@ -265,7 +265,7 @@ class Monitor:
     def nudge(self, spool: float) -> None:
         """Move the modelled spool by some m, as re-anchoring does, and restart the sums."""
         self._memory[SPOOL_POSITION_PLACES] += spool
-        self._memory[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.plays] = 0.0
+        self._memory[monitor_memory.MONITOR.cusum : monitor_memory.MONITOR.model] = 0.0
 
     def reset(self, spool: float = 0.0) -> None:
         """Restart from rest with the spool there (m), as a stored test begins."""

@@ -15,7 +15,9 @@ from ehadiag.compile.jit import Array, brief_kernel, inlined_exact
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at, unpacker
 from ehadiag.model.laws import ControlLaw, JackLaw
 from ehadiag.model.plant import PlantConstants
+from ehadiag.model.simd_layout import COEFFICIENTS
 from ehadiag.monitor.monitor_memory import (
+    MODEL,
     MONITOR,
     MONITOR_PLAN_CONTROL,
     MONITOR_UNIT_SIZE,
@@ -111,7 +113,9 @@ class ObjectPlaces(NamedTuple):
 
 
 A_MONITOR: Final = ObjectPlaces(
-    MONITOR.identity, 0, MONITOR.jack_law + JackLaw._fields.index("supply")
+    MONITOR.identity,
+    0,
+    MODEL.coefficients + COEFFICIENTS.jack_law + JackLaw._fields.index("supply"),
 )
 AN_IDENTIFICATION: Final = ObjectPlaces(ONBOARD.identity, 1, ONBOARD.unit + UNIT_SUPPLY)
 plan_identity_of = unpacker(LibraryIdentity, PLAN_IDENTITY)
@@ -251,7 +255,7 @@ def c_monitor_push(address: int, plan_address: int, tick_address: int) -> int:
     error = object_error(address, tick_address, plan, A_MONITOR)
     if error != 0:
         return error
-    p, r, most = array_at(address, (MONITOR.end,)), verdict_rules_of(plan), plan_control_of(plan).IM
+    p, r, most = array_at(address, (MODEL.path,)), verdict_rules_of(plan), plan_control_of(plan).IM
     most_current, before = COMMAND_RANGE * most, health_of(p)
     most_command = most_current
     if settings_of(p).closed != 0.0:
@@ -296,7 +300,7 @@ def c_monitor_health(address: int, plan_address: int) -> int:
     error = object_error(address, address, plan, A_MONITOR)
     if error != 0:
         return HEALTH.arithmetic if error == ERRORS.arithmetic else HEALTH.object
-    p, longest = array_at(address, (MONITOR.end,)), verdict_rules_of(plan).longest_gap
+    p, longest = array_at(address, (MODEL.path,)), verdict_rules_of(plan).longest_gap
     health, bits = health_of(p), 0
     if health.spool > longest:
         bits += HEALTH.spool
@@ -306,7 +310,7 @@ def c_monitor_health(address: int, plan_address: int) -> int:
         bits += HEALTH.command
     if health.beyond != 0.0:
         bits += HEALTH.beyond
-    for i in range(MONITOR.valve, MONITOR.command):
+    for i in range(MODEL.state, MODEL.path):
         if not math.isfinite(p[i]):
             return bits + HEALTH.model
     return bits

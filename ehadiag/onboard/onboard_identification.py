@@ -68,7 +68,7 @@ from ehadiag.onboard.onboard_search import (
     add_costs,
     begin_window,
     count_residual,
-    drive_jacks,
+    drive_models,
     end_generation,
     end_grid,
     end_noise,
@@ -209,7 +209,7 @@ def pass_tick(address: int, plan: Array, ticks_address: int, ticks: Array, k: in
     if phase == PHASES.grids and _pass_search(p) == 0:
         offset = p[ONBOARD.point + ONBOARD_GENES] / plan[PLAN_SPOOL_WEIGHT]
         spool = next_spool(ticks, k, _window_end(address, plan, 1), p[PROGRESS.spool])
-        drive_jacks(address, plan, spool - offset, p[PROGRESS.spool] - offset, ticks[k, 3])
+        drive_models(address, plan, spool - offset, p[PROGRESS.spool] - offset, ticks[k, 3])
         p[PROGRESS.spool] = spool
         return 1.0
     push_models(address, ticks, k)

@@ -12,8 +12,8 @@ from ehadiag.core.actuator import MAX_CALIBRATED_PARAMETERS
 from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.model.plant import WALTHER_POINTS
 from ehadiag.monitor.monitor_memory import (
-    MONITOR,
     MONITOR_PLAN_SIZE,
+    MONITOR_SIZE,
     MONITOR_UNIT_FIELDS,
     MONITOR_UNIT_SIZE,
     LibraryIdentity,
@@ -242,7 +242,7 @@ ONBOARD: Final = OnboardPlaces(
             ONBOARD_PARAMETERS, 3 * ONBOARD_GENES,
             (ESTIMATION.correlation_lags + 1) * ONBOARD_PARAMETERS, CHANNELS * CHANNEL_SUMS, SUMS,
             4 * HISTOGRAM_BINS, 4 * MATRIX_SIZE + 8 * ONBOARD_PARAMETERS,
-            ONBOARD_MODELS * MONITOR.end)
+            ONBOARD_MODELS * MONITOR_SIZE)
 )  # fmt: skip
 ONBOARD_VERDICT: Final = OnboardOutcome._fields.index("verdict")
 ONBOARD_RUNS: Final = OnboardOutcome._fields.index("runs")

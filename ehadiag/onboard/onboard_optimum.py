@@ -10,9 +10,11 @@ from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.identify.linearisation import DIFFERENCES
 from ehadiag.model.plant import PLANT_FIELDS
+from ehadiag.model.simd_layout import ROWS
 from ehadiag.monitor.monitor_memory import (
+    MODEL,
     MONITOR,
-    ValveMemory,
+    MONITOR_SIZE,
 )
 from ehadiag.onboard.onboard_memory import (
     MATRIX_SIZE,
@@ -61,7 +63,7 @@ from ehadiag.onboard.onboard_verdict import (
     write_verdict,
 )
 
-SPOOL_VELOCITY_PLACE = ONBOARD.monitors + MONITOR.valve + ValveMemory._fields.index("vs")
+SPOOL_VELOCITY_PLACE = ONBOARD.monitors + MODEL.state + ROWS.spool_rate
 
 
 @inlined_exact
@@ -90,7 +92,7 @@ times what a considered parameter of the package may have, since a calibration's
 larger than those."""
 ATTEMPTS = 1.0 + len(SEARCH.stds)
 """Searches that there are, 1: the first approximation, then the genetic ones."""
-ANCHORED_PLACE = ONBOARD.monitors + MONITOR.valve + ValveMemory._fields.index("anchored")
+ANCHORED_PLACE = ONBOARD.monitors + MODEL.state + ROWS.anchor_count
 USED_SQUARES, USED = ONBOARD.sums, ONBOARD.sums + 1
 """Sums of the last pass: squares of residuals that the deviations go by, and how many they are."""
 
@@ -285,7 +287,7 @@ def add_directions(address: int, plan: Array, done: int) -> None:
         middle = p[at] / noise
         smooth = math.isfinite(middle) and middle * middle < ESTIMATION.residual_cap
         for i in range(ONBOARD_GENES):
-            change = p[at + (1 + i) * MONITOR.end] / noise - middle
+            change = p[at + (1 + i) * MONITOR_SIZE] / noise - middle
             smooth = smooth and abs(change) < DIFFERENCES.max_considered
             slope[i] = change / p[ONBOARD.along + i]
         slope[ONBOARD_GENES] = slope[ONBOARD_GENES + 1] = 0.0
@@ -293,7 +295,7 @@ def add_directions(address: int, plan: Array, done: int) -> None:
         if not smooth:
             continue
         for k in range(min(DIRECTIONS_OF_PASS, direction_count(plan) - first)):
-            change = p[at + (1 + ONBOARD_GENES + k) * MONITOR.end] / noise - middle
+            change = p[at + (1 + ONBOARD_GENES + k) * MONITOR_SIZE] / noise - middle
             if not abs(change) < MAX_DIRECTION_CHANGE:
                 continue
             for i in range(ONBOARD_PARAMETERS):

@@ -17,22 +17,19 @@ from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
 from ehadiag.identify.compact_ga import CompactGaState, draw_generation, update_state
 from ehadiag.identify.staged_search import SEARCH_STAGES
-from ehadiag.model.laws import PATH_BENDS, SpoolLaw
-from ehadiag.model.scalar_spool import SPOOL_GRID
-from ehadiag.model.second_stage import jack_rest, jack_tick
 from ehadiag.model.sensors import read_pressure
+from ehadiag.model.simd_jack import drive_jacks
+from ehadiag.model.simd_layout import BLOCK, ROWS, block_part, sensor_law_of_lane
 from ehadiag.monitor.monitor_memory import (
     MONITOR,
     MONITOR_PLAN_SETTINGS,
+    MONITOR_SIZE,
     MONITOR_UNIT_SIZE,
     MonitorSettings,
     control_law_of,
-    jack_law_of,
-    jack_of,
-    keep_jack,
+    model_at,
     prepare_monitor_by,
     reset_monitor,
-    sensor_law_of,
 )
 from ehadiag.monitor.push_kernel import push_tick
 from ehadiag.onboard.onboard_memory import (
@@ -50,7 +47,6 @@ PLAN_PRESSURE_WEIGHT = MONITOR_PLAN_SETTINGS + MonitorSettings._fields.index("pr
 """Where the plan has the reciprocal noise."""
 ANCHOR_SMALL_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_small")
 ANCHOR_LARGE_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_large")
-PATH_BEND_PLACE = MONITOR.spool_law + SpoolLaw._fields.index("bend")
 KINTAS, FSS, FDJ = 0, 1, 2
 """Places of the severities."""
 
@@ -121,7 +117,7 @@ def parameters_at(address: int, place: int) -> Array:
 @inlined_exact
 def monitor_at(address: int, lane: int) -> int:
     """Address of a model."""
-    return address + BYTES_PER_NUMBER * (ONBOARD.monitors + lane * MONITOR.end)
+    return address + BYTES_PER_NUMBER * (ONBOARD.monitors + lane * MONITOR_SIZE)
 
 
 @inlined_exact
@@ -140,21 +136,15 @@ def start_model_by(
         unit[i] = min(max(point[i], 0.0), 1.0)
     unit[UNIT_SPOOL_OFFSET] = point[ONBOARD_GENES] / plan[PLAN_SPOOL_WEIGHT]
     unit[UNIT_PRESSURE_OFFSET] = point[ONBOARD_GENES + 1] / plan[PLAN_PRESSURE_WEIGHT]
-    place = monitor_at(address, lane)
-    wrong = int(
-        prepare_monitor_by(
-            place, constants_address, plan_address, address + BYTES_PER_NUMBER * ONBOARD.unit
-        )
-    )
-    numbers = array_at(place, (MONITOR.end,))
-    numbers[PATH_BEND_PLACE] = min(numbers[PATH_BEND_PLACE], PATH_BENDS.estimation)
-    return wrong
+    state = address + BYTES_PER_NUMBER * ONBOARD.unit
+    model = monitor_at(address, lane)
+    return int(prepare_monitor_by(model, constants_address, plan_address, state))
 
 
 @inlined_exact
 def loosen_anchor(address: int, lane: int, factor: float) -> None:
     """Widen what a model may be off before it is put back on the spool."""
-    numbers = array_at(monitor_at(address, lane), (MONITOR.end,))
+    numbers = array_at(monitor_at(address, lane), (MONITOR_SIZE,))
     numbers[ANCHOR_SMALL_PLACE] *= factor
     numbers[ANCHOR_LARGE_PLACE] *= factor
 
@@ -222,8 +212,8 @@ def fitted_lines(p: Array, channel: int, along: Array, slope: Array) -> tuple[fl
     middle = p[at] / noise
     total, scatter = middle, 0.0
     for i in range(ONBOARD_GENES):
-        up = p[at + (1 + 2 * i) * MONITOR.end] / noise
-        down = p[at + (2 + 2 * i) * MONITOR.end] / noise
+        up = p[at + (1 + 2 * i) * MONITOR_SIZE] / noise
+        down = p[at + (2 + 2 * i) * MONITOR_SIZE] / noise
         total += up + down
         a, b, c = along[i, 0], along[i, 1], along[i, 2]
         slope[i] = (a * middle + b * up + c * down) / (a * a + b * b + c * c)
@@ -337,10 +327,7 @@ def start_grid(address: int, plan_address: int, plan: Array, grid: int, done: in
 def begin_window(address: int, spool: float) -> None:
     """Let all models begin with the spool there, m."""
     for lane in range(ONBOARD_MODELS):
-        place = monitor_at(address, lane)
-        reset_monitor(place, spool)
-        p = array_at(place, (MONITOR.end,))
-        keep_jack(p, jack_rest(jack_law_of(p), 0.0, spool))
+        reset_monitor(monitor_at(address, lane), spool)
 
 
 @inlined_exact
@@ -355,22 +342,19 @@ def next_spool(ticks: Array, k: int, end: int, before: float) -> float:
 
 
 @bare_kernel
-def drive_jacks(address: int, plan: Array, spool: float, before: float, pressure: float) -> None:
+def drive_models(address: int, plan: Array, spool: float, before: float, pressure: float) -> None:
     """Advance the jacks of all models by a tick of the measured spool, and add to their costs."""
     costs = array_at(address + BYTES_PER_NUMBER * COSTS, (ONBOARD_MODELS,))
     for lane in range(ONBOARD_MODELS):
         place = monitor_at(address, lane)
-        p = array_at(place, (MONITOR.end,))
-        nodes = array_at(
-            place + BYTES_PER_NUMBER * MONITOR.nodes, (SPOOL_GRID.nodes, SPOOL_GRID.columns)
+        tick, model = control_law_of(array_at(place, (MONITOR.model,))).tick, model_at(place)
+        rate = (spool - before) / tick
+        drive_jacks(model, 1, tick, before, spool, rate, rate)
+        shown = read_pressure(
+            sensor_law_of_lane(block_part(model, BLOCK.coefficients, BLOCK.moving), 0),
+            block_part(model, BLOCK.state, BLOCK.path)[ROWS.pressure_sampled],
         )
-        tick = control_law_of(p).tick
-        nodes[0, 0], nodes[0, 1], nodes[0, 4] = tick, spool, 0.0
-        nodes[0, 2] = nodes[0, 3] = (spool - before) / tick
-        sensor = sensor_law_of(p)
-        shown, jack, _ = jack_tick(jack_law_of(p), sensor, tick, nodes, 0, 1, jack_of(p), before)
-        keep_jack(p, jack)
-        residual = (pressure - read_pressure(sensor, shown)) * plan[PLAN_PRESSURE_WEIGHT]
+        residual = (pressure - shown) * plan[PLAN_PRESSURE_WEIGHT]
         if math.isfinite(residual):
             costs[lane] += min(residual * residual, SEARCH_STAGES.pressure_cap)
 
@@ -380,7 +364,7 @@ def add_costs(address: int, spool_cap: float, pressure_cap: float) -> None:
     """Add the squares of the models' residuals, capped, to their costs; a cap of 0 leaves out."""
     p = array_at(address, (ONBOARD.end,))
     for lane in range(ONBOARD_MODELS):
-        at = ONBOARD.monitors + lane * MONITOR.end + MONITOR.residual
+        at = ONBOARD.monitors + lane * MONITOR_SIZE + MONITOR.residual
         if math.isfinite(p[at]):
             p[COSTS + lane] += min(p[at] * p[at], spool_cap)
         if pressure_cap > 0.0 and math.isfinite(p[at + 1]):

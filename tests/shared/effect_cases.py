@@ -18,7 +18,7 @@ from firmware_iface.stored_test import resolve_test
 
 TICK = 1e-3
 LSB = np.array([SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb, POSITION_CHANNEL.lsb])
-MODELS = {"scalar": ScalarModel, "simd": SimdModel}
+MODELS = {"alone": ScalarModel, "block": SimdModel}
 CURRENT = resolve_test("open").command()[1900:3000]
 """A, one a tick: from creeping through both stops of the valve to rest."""
 

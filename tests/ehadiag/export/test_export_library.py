@@ -18,7 +18,8 @@ from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.export.library import FIRMWARE_C_FILES, export_library
 from ehadiag.export.plan import exported_unit, library_plan
 from ehadiag.export.targets import TARGETS, find_target
-from ehadiag.monitor.monitor_memory import MONITOR
+from ehadiag.model.simd_layout import ROWS
+from ehadiag.monitor.monitor_memory import MODEL, MONITOR, MONITOR_SIZE
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.c_interface import ERRORS, HEALTH
 from ehadiag.onboard.onboard_memory import ONBOARD
@@ -59,7 +60,7 @@ def test_the_host_is_the_monitor_of_the_package(loaded, log):
     monitor = Monitor(
         default_actuator(), SEVERITIES, recording.environment, mode=recording.samples.mode
     )
-    numbers = np.zeros(MONITOR.end)
+    numbers = np.zeros(MONITOR_SIZE)
     assert started(loaded, unit_of(recording, SEVERITIES), numbers) == 0
     push = loaded.function("eha_monitor_push", 2)
     seen = numbers[MONITOR.predicted : MONITOR.cusum + 4]
@@ -76,7 +77,7 @@ def test_the_host_is_the_monitor_of_the_package(loaded, log):
 def test_a_number_that_cannot_be_is_refused_and_nothing_written(loaded, index, wrong):
     unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
     unit[index] = wrong
-    numbers = np.full(MONITOR.end, 3.0)
+    numbers = np.full(MONITOR_SIZE, 3.0)
     assert started(loaded, unit, numbers) == ERRORS.range
     assert (numbers == 3.0).all()
     job, start = np.full(ONBOARD.end, 3.0), exported_unit(unit, PLAN)
@@ -94,7 +95,7 @@ def test_a_number_out_of_its_range_is_refused(loaded, index, wrong):
     """A viscosity of no oil, an offset beyond the converter, a supply in MPa, bar or psi."""
     unit = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
     unit[index] = wrong
-    numbers = np.full(MONITOR.end, 3.0)
+    numbers = np.full(MONITOR_SIZE, 3.0)
     assert started(loaded, unit, numbers) == ERRORS.range
     assert (numbers == 3.0).all()
 
@@ -104,7 +105,7 @@ GOOD_UNIT = [0.1, 0.1, 0.1, 0.0, 0.0, 1.0, 20e6, 0.0]
 
 def ready(loaded):
     """Memory of a monitor that has begun."""
-    numbers = np.zeros(MONITOR.end)
+    numbers = np.zeros(MONITOR_SIZE)
     assert started(loaded, GOOD_UNIT, numbers) == 0
     return numbers
 
@@ -168,7 +169,7 @@ def test_an_object_that_was_never_begun_is_refused_and_as_it_was(loaded, content
 
 @pytest.mark.parametrize(("member", "wrong"), [(8, 1.0), (9, 12345.0), (8, np.nan), (9, np.nan)])
 def test_another_library_s_header_is_noticed(loaded, member, wrong):
-    unit, numbers = exported_unit(GOOD_UNIT, PLAN), np.full(MONITOR.end, 3.0)
+    unit, numbers = exported_unit(GOOD_UNIT, PLAN), np.full(MONITOR_SIZE, 3.0)
     unit[member] = wrong
     init = loaded.function("eha_monitor_init", 2)
     assert init(numbers.ctypes.data, unit.ctypes.data) == ERRORS.library
@@ -176,7 +177,7 @@ def test_another_library_s_header_is_noticed(loaded, member, wrong):
 
 
 def test_every_serial_number_runs_with_the_data_of_a_type(loaded):
-    unit, numbers = exported_unit(GOOD_UNIT, PLAN), np.zeros(MONITOR.end)
+    unit, numbers = exported_unit(GOOD_UNIT, PLAN), np.zeros(MONITOR_SIZE)
     unit[10] = 4711.0
     assert loaded.function("eha_monitor_init", 2)(numbers.ctypes.data, unit.ctypes.data) == 0
 
@@ -203,8 +204,8 @@ def test_a_number_in_the_wrong_unit_counts_as_lost_and_shows_in_the_health(loade
     pushed(loaded, numbers, bad)
     pushed(loaded, other, lost)
     assert health(loaded, numbers) == HEALTH.beyond
-    assert numbers[MONITOR.predicted : MONITOR.plays].tobytes() == (
-        other[MONITOR.predicted : MONITOR.plays].tobytes()
+    assert numbers[MONITOR.predicted : MONITOR.model].tobytes() == (
+        other[MONITOR.predicted : MONITOR.model].tobytes()
     )
     pushed(loaded, numbers, tick)
     assert health(loaded, numbers) == 0
@@ -222,7 +223,7 @@ def test_a_monitor_without_samples_is_not_able_to_judge(loaded):
 
 def test_a_model_without_numbers_is_not_able_to_judge(loaded):
     numbers = ready(loaded)
-    numbers[MONITOR.valve + 2] = np.nan
+    numbers[MODEL.state + ROWS.spool] = np.nan
     pushed(loaded, numbers, [0.0] * 5)
     assert health(loaded, numbers) & HEALTH.model
 
@@ -276,7 +277,7 @@ def test_the_host_library_needs_no_more_than_x86_64(place):
 
 def test_reset_begins_anew(loaded):
     unit = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 20e6, 0.0]
-    one, two = np.zeros(MONITOR.end), np.zeros(MONITOR.end)
+    one, two = np.zeros(MONITOR_SIZE), np.zeros(MONITOR_SIZE)
     push, reset = (loaded.function("eha_monitor_push", 2), loaded.function("eha_monitor_reset", 2))
     tick, spool = np.array([5e-3, 5e-3, 1e-5, 1e5, 0.0]), np.array([2e-5])
     for numbers in (one, two):
@@ -377,7 +378,7 @@ def test_the_shared_library_is_found_by_pkg_config(place, tmp_path):
 
 def test_the_page_says_what_memory_they_take():
     page = (ROOT / "docs" / "how-to" / "export.md").read_text()
-    assert f"one `eha_monitor`\nof {8 * MONITOR.end} bytes" in page
+    assert f"one `eha_monitor`\nof {8 * MONITOR_SIZE} bytes" in page
     thousands, rest = divmod(8 * ONBOARD.end, 1000)
     assert f"`eha_identification` of {thousands} {rest:03} bytes" in page
 

@@ -1,6 +1,6 @@
 """The jack's one algorithm against scipy's stiff solver, piece by piece.
 
-Jacks of many candidates along a measured path of the spool: against the scalar model. Friction that
+Jacks of many candidates along a measured path of the spool: against one alone. Friction that
 falls with the velocity: against the simulator, and one kernel against another.
 """
 
@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from ehadiag import default_actuator
-from ehadiag.model.jack import JACK_STEPS
-from ehadiag.model.laws import exp_minus, jack_law, plant_of, stage_resistance
+from ehadiag.model.jack import JACK_STEPS, limited_pressure
+from ehadiag.model.laws import exp_minus, jack_law, plant_of, stage_pressure, stage_resistance
 from ehadiag.model.registry import FAULTS, Unknowns
-from ehadiag.model.residual_models import jack_response
 from ehadiag.model.second_stage import jack_piece
 from ehadiag.model.sensors import JackState, PathPiece, PressureProbe
 from ehadiag.model.simd_jack import driven_jack_costs
@@ -85,9 +84,9 @@ def jack(place, velocity, direction, fresh):
     return JackState(place, velocity, direction, fresh, 0.0, 0.0, 0.0)
 
 
-def over(piece, begin, stop, state):
+def over(piece, begin, stop, state, law=LAW):
     """The jack there, its pressure not looked at."""
-    return JackState(*jack_piece(LAW, PressureProbe(0.0, -1.0), False, piece, begin, stop, state))
+    return JackState(*jack_piece(law, PressureProbe(0.0, -1.0), False, piece, begin, stop, state))
 
 
 def piece_through(x0, x1, bend=0.0):
@@ -196,7 +195,18 @@ def test_friction_holds_a_resting_jack():
 TICKS, TICK, BEFORE, NOISE = 400, 1e-3, 2e-7, 3e4
 
 
-def test_costs_are_those_of_the_scalar_model():
+def driven_pressures(law, places, rates):
+    """Of a jack on the path, tick by tick."""
+    state, before, out = jack(0.0, 0.0, 0.0, 0.0), BEFORE, []
+    for place, rate in zip(places, rates, strict=True):
+        piece = PathPiece(TICK, before, place, rate * TICK, rate * TICK)
+        state = over(piece, 0.0, 1.0, state, law)
+        out.append(limited_pressure(law, stage_pressure(law, place, state.velocity)))
+        before = place
+    return np.array(out)
+
+
+def test_costs_are_those_of_a_jack_alone():
     rng = np.random.default_rng(3)
     base = damaged_unit((0.0, 0.0, 0.0), environment=Environment())
     points = rng.uniform(0.0, 1.0, (19, len(FAULTS)))
@@ -209,11 +219,7 @@ def test_costs_are_those_of_the_scalar_model():
     measured[::17] = np.nan
     found = driven_jack_costs(candidates, nodes, BEFORE, measured, NOISE, 25.0)
     for row, cost in zip(candidates, found, strict=True):
-        pressure, position = np.empty(TICKS), np.empty(TICKS)
-        jack_response(
-            plant_of(row), TICK, BEFORE, 0.0, 0.0, position, nodes, np.arange(1, TICKS + 1),
-            pressure, position,
-        )  # fmt: skip
+        pressure = driven_pressures(jack_law(plant_of(row)), place, rate)
         residuals = (measured - pressure) / NOISE
         assert cost == pytest.approx(np.minimum(residuals**2, 25.0)[~np.isnan(residuals)].sum())
 
@@ -276,7 +282,7 @@ SLOW_CURRENT = 3e-3 * np.sin(np.arange(300) * 0.045)
 @STAGES
 @settings(max_examples=25, deadline=None)
 @given(values=VALUES, neighbour=VALUES)
-def test_vector_and_scalar_kernels_agree(actuator, values, neighbour):
+def test_blocks_and_one_alone_agree(actuator, values, neighbour):
     batch = batch_of(np.zeros((3, len(SLOW_CURRENT))), SLOW_CURRENT)
     points = np.array([[one[name] for name in values] for one in (values, neighbour)])
     one, other = (

@@ -134,7 +134,7 @@ SLOW_CURRENT = 3e-3 * np.sin(np.arange(300) * 0.045)
 
 @settings(max_examples=30, deadline=None)
 @given(values=VALUES)
-def test_vector_and_scalar_kernels_agree(values):
+def test_blocks_and_one_alone_agree(values):
     batch = batch_of(np.zeros((3, len(SLOW_CURRENT))), SLOW_CURRENT)
     one, other = (residuals_of(kind, values, batch, ORIFICE) for kind in MODELS)
     gaps = np.abs(one - other)
@@ -146,7 +146,7 @@ def test_vector_and_scalar_kernels_agree(values):
 @given(rows=st.lists(st.tuples(*[st.floats(0.0, 1.0)] * 3), min_size=2, max_size=20))
 def test_no_lane_depends_on_its_neighbours(rows):
     batch = batch_of(np.zeros((3, len(SLOW_CURRENT))), SLOW_CURRENT)
-    model = MODELS["simd"](batch, unknowns_of(severities(), ORIFICE))
+    model = MODELS["block"](batch, unknowns_of(severities(), ORIFICE))
     together = model.residuals(np.array(rows))[0]
     alone = model.residuals(np.array(rows[-1:]))[0]
     np.testing.assert_array_equal(together[-1], alone[0])

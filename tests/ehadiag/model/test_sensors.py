@@ -99,7 +99,7 @@ def test_gains_and_offsets_are_what_the_converters_do(kind):
     plain = residuals_of(kind, severities(), batch_of(measured))
     here = residuals_of(kind, {**severities(), **values}, batch_of(shown))
     # With more unknowns the lanes take the jack's steps by other candidates.
-    np.testing.assert_allclose(here, plain, atol=1e-2 if kind == "scalar" else 5e-2)
+    np.testing.assert_allclose(here, plain, atol=1e-2 if kind == "alone" else 5e-2)
     assert (rms(here - plain) < 1e-2).all()
 
 
@@ -182,13 +182,13 @@ SLOW_CURRENT = 3e-3 * np.sin(np.arange(300) * 0.045)
 
 @settings(max_examples=40, deadline=None)
 @given(values=EFFECTS, neighbour=EFFECTS)
-def test_vector_and_scalar_kernels_agree(values, neighbour):
+def test_blocks_and_one_alone_agree(values, neighbour):
     """Spool to rounding; pressure and jack within what both differ by without these effects."""
     batch = batch_of(np.zeros((3, len(SLOW_CURRENT))), SLOW_CURRENT)
     unknowns = unknowns_of(values)
     points = np.array([[one[name] for name in values] for one in (values, neighbour)])
-    one_by_one = MODELS["scalar"](batch, unknowns).residuals(points)[0]
-    model = MODELS["simd"](batch, unknowns)
+    one_by_one = MODELS["alone"](batch, unknowns).residuals(points)[0]
+    model = MODELS["block"](batch, unknowns)
     together = model.residuals(points)[0]
     gaps = np.abs(together - one_by_one)
     assert np.quantile(gaps[:, 0], 0.99) < 0.1

@@ -1,4 +1,4 @@
-"""The vector kernels against the scalar ones, lane by lane.
+"""Blocks of candidates against one alone, which chooses steps of its own for the jack.
 
 The kernels as plain Python give what the compiled ones give.
 """
@@ -17,12 +17,12 @@ from other_actuator import with_data
 from places import LOGS
 
 from ehadiag import default_actuator
+from ehadiag.compile.vector import LANES
 from ehadiag.identify.experiment import build_experiment, lay_out_spans, unknowns_of
 from ehadiag.model.batch import NO_ANCHOR, Anchor, Batch
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, parameter
 from ehadiag.model.residual_models import ScalarModel, SimdModel, model_response
-from ehadiag.model.simd_layout import LANES
 from ehadiag_tools.damaged import damaged_unit
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
@@ -91,19 +91,16 @@ def population():
     return np.vstack([CORNERS, rng.random((23, 3)), [[0.3, 0.6, 0.3]]])
 
 
-def test_the_spool_is_the_scalar_kernels(recorded_model, population):
-    """Each candidate's own scalar answer is the measurement: 0.05 LSB rms are the most it may err.
-
-    A marginal event may fall the other way by rounding; none does here.
-    """
+def test_the_spool_is_that_of_one_alone(recorded_model, population):
+    """Each candidate's own answer is the measurement: rounding is all that it may err."""
     current = recorded_model.batch.current
     for index in (0, 3, 6, 7, 12, 20, 31):
         batch = own_batch(population[index], current, channels=(True, False))
         off = np.sqrt(in_lanes(batch, population[index : index + 1])[0] / len(current))
-        assert off < 0.05
+        assert off < 1e-8
 
 
-def test_the_pressure_is_the_scalar_kernels_but_for_a_few_samples(recorded_model, population):
+def test_the_pressure_is_that_of_one_alone_but_for_a_few_samples(recorded_model, population):
     """With each residual capped at 1 LSB the mean square is that of 0.1 LSB rms or less."""
     current = recorded_model.batch.current
     for index in (0, 3, 6, 7, 12, 20, 31):
@@ -112,7 +109,7 @@ def test_the_pressure_is_the_scalar_kernels_but_for_a_few_samples(recorded_model
         assert off < 0.1
 
 
-def test_costs_are_those_of_the_scalar_kernel(recorded_model, population):
+def test_costs_are_those_of_one_alone(recorded_model, population):
     """A handful of samples beside an event err by LSBs: at the truth that shows most, below 1 %."""
     model = recorded_model
     np.testing.assert_allclose(
@@ -173,7 +170,7 @@ def test_the_jack_feels_a_spool_that_meets_its_stop(faults):
     assert np.abs(residuals[0, 1]).max() < 0.5
 
 
-def test_offsets_and_missing_samples_count_as_in_the_scalar_kernel():
+def test_offsets_and_missing_samples_count_as_for_one_alone():
     current = 4e-3 * np.sin(np.arange(400) * 0.05)
     batch = own_batch((0.4, 0.2, 0.5), current, offsets=(3e-7, 2e4))
     batch.spool[50:60] = np.nan
@@ -185,7 +182,7 @@ def test_offsets_and_missing_samples_count_as_in_the_scalar_kernel():
     assert here[0] < 10.0  # an offset or dropout taken wrongly makes hundreds
     np.testing.assert_allclose(here[1], there[1], rtol=1e-3)
     rows[:, 3] = 0.0
-    # The scalar jack is up to 0.1 LSB off: 1 in 600 of 2 x 400 squares.
+    # The jack alone is up to 0.1 LSB off: 1 in 600 of 2 x 400 squares.
     np.testing.assert_allclose(
         in_lanes(batch, rows, 25.0, unknowns), one_by_one(batch, rows, 25.0, unknowns), rtol=2e-2
     )
@@ -193,7 +190,7 @@ def test_offsets_and_missing_samples_count_as_in_the_scalar_kernel():
 
 @pytest.mark.parametrize("lead", [0.0, 5e-5, 1e-4, 1.5e-4, 2e-4])
 def test_the_sampling_instant_is_that_of_finer_ticks(lead):
-    """A spool read before the end of the tick: both kernels look back along their own path."""
+    """A spool read before the end of the tick: all look back along their own path."""
     current, finer = 3e-3 * np.sin(np.arange(400) * 0.05), 20
     faults = (0.3, 0.6, 0.3)
     fine = model_response(damaged_unit(faults), np.repeat(current, finer), 1e-3 / finer).spool
@@ -239,7 +236,7 @@ def test_a_flapper_that_does_not_ring():
     )
 
 
-def test_residuals_and_anchors_are_the_scalar_kernels(recorded_model, population):
+def test_residuals_and_anchors_are_those_of_one_alone(recorded_model, population):
     batch = recorded_model.batch
     noise = 1.0 / batch.weight[0].max()
     anchored = batch._replace(anchor=np.array([[0.1, 3.0 * noise, 12.0 * noise, 0.0]]))
