@@ -101,6 +101,11 @@ class Identification:
     attempts: int
     """Searches that it took; more than one where the first did not explain the recording."""
     timing: IdentificationTiming
+    slip_speed: float = 0.0
+    """Speed of the jack, m/s, below which the pressure was left out; 0: none was."""
+    friction_range: tuple[float, float] | None = None
+    """Least and largest `FSS` by the exponents of clogging that the actuator file allows; None
+    where it states one."""
 
     def named(self, name: str) -> Estimate:
         """Return the estimate of that name; KeyError if there is none."""

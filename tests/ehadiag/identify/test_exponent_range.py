@@ -142,4 +142,4 @@ def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_p
 
 
 def test_judging_needs_no_effects():
-    assert judge(SimpleNamespace(estimates=(), nuisances={}), Levels())[0] is Verdict.HEALTHY
+    assert judge(SimpleNamespace(estimates=(), friction_range=None), Levels())[0] is Verdict.HEALTHY

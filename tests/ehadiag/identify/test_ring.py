@@ -94,9 +94,8 @@ def missing(actuator, name, begin, end):
     test = resolve_test(name)
     recording = simulate(actuator, test, step=1e-6).recording("simulated")
     experiment = build_experiment(recording.samples, recording.environment, test, actuator)
-    return float(
-        np.isnan(experiment.sliding.pressure)[round(1e3 * begin) : round(1e3 * end)].mean()
-    )
+    left = np.isnan(experiment.sliding(experiment.slip_speed()).pressure)
+    return float(left[round(1e3 * begin) : round(1e3 * end)].mean())
 
 
 @pytest.mark.parametrize(
