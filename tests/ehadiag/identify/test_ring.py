@@ -9,7 +9,7 @@ import pytest
 from ehadiag import default_actuator
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.prior import ParameterPrior
-from ehadiag.identify.ring import Ring, find_ring, ring_prior
+from ehadiag.identify.ring import Ring, find_ring, is_same_ring, ring_prior
 from ehadiag_sim.conditions import Effects
 from ehadiag_sim.simulation import simulate
 from firmware_iface.stored_test import resolve_test
@@ -104,6 +104,30 @@ def missing(actuator, name, begin, end):
 def test_pressure_on_a_standing_jack_is_left_out(begin, end, share):
     """Ramps at 10 mm/s and fast sines are learned from, holds are not."""
     assert missing(with_volume(0.9e-4), "closed", begin, end) == share
+
+
+def test_a_worn_jack_slips_at_more():
+    test = resolve_test("closed")
+    recording = simulate(with_volume(0.9e-4), test, step=1e-5).recording("simulated")
+    experiment = build_experiment(
+        recording.samples, recording.environment, test, with_volume(0.9e-4)
+    )
+    c = experiment.constants
+    ratio = experiment.slip_speed(0.5) / experiment.slip_speed()
+    assert ratio == pytest.approx((c.FDJ + 0.5 * (c.FDJ1 - c.FDJ)) / c.FDJ)
+
+
+@pytest.mark.parametrize(
+    ("ring", "other", "same"),
+    [
+        (Ring(0.1, 80.0), Ring(0.102, 80.1), True),
+        (Ring(0.1, 80.0), Ring(0.11, 80.4), False),
+        (Ring(0.1, 80.0), None, False),
+        (None, None, True),
+    ],
+)
+def test_two_scans_say_the_same(ring, other, same):
+    assert is_same_ring(ring, other) is same
 
 
 def test_a_second_stage_without_oil_leaves_nothing_out():
