@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
 
-from ehadiag import default_actuator
+from ehadiag import Verdict, default_actuator
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.prior import ParameterPrior
 from ehadiag.identify.ring import Ring, find_ring, is_same_ring, ring_prior
-from ehadiag_sim.conditions import Effects
+from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
-from firmware_iface.stored_test import resolve_test
+from firmware_iface.stored_test import bundled_tests, resolve_test
 
 
 def with_volume(volume):
@@ -132,3 +136,37 @@ def test_two_scans_say_the_same(ring, other, same):
 
 def test_a_second_stage_without_oil_leaves_nothing_out():
     assert missing(default_actuator(), "closed", 0.0, 5.5) == 0.0
+
+
+@pytest.mark.slow
+def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
+    """The pressure of a slow jack rings at phases that no model foresees."""
+    test, actuator, worn = resolve_test("closed"), with_volume(0.9e-4), Faults(0.2, 0.1, 0.6)
+    calibration = Calibration(
+        date="2026-01-02T03:04:05Z",
+        start=actuator.name,
+        effects={"hysteresis": 0.02},
+        parameters=("hysteresis",),
+        std=(1e-4,),
+        root=((1.0,),),
+        fit=FitQuality(excess=1.5, outliers=0.01, spool_rms=1.0, pressure_rms=1.2),
+        recordings=(CalibrationSource(name="a.blf", test="open"),),
+    )
+    unit = msgspec.structs.replace(actuator, calibration=calibration)
+    done = simulate(actuator, test, worn, effects=Effects(hysteresis=0.02), seed=3, step=1e-6)
+    recording = done.recording("simulated")
+    assert recording.samples is not None
+    experiment = build_experiment(recording.samples, recording.environment, test, unit)
+    slow = np.isnan(experiment.sliding(experiment.slip_speed(worn.FDJ)).pressure)
+    assert 0.3 < slow.mean() < 0.95
+    ticks = np.arange(len(slow))
+    ring = 4e5 * np.sin(2.0 * np.pi * 0.083 * ticks + np.cumsum(ticks % 50 == 0))
+    pressure = recording.samples.pressure + np.where(slow, ring, 0.0)
+    samples = replace(recording.samples, pressure=pressure)
+    found = diagnose([replace(recording, samples=samples)], unit, bundled_tests().values())
+    assert found.identification is not None
+    slips = experiment.slip_speed(worn.FDJ)
+    assert found.identification.slip_speed == pytest.approx(slips, rel=0.3)
+    assert found.identification.named("FDJ").value == pytest.approx(0.6, abs=0.01)
+    assert found.verdict is Verdict.DEGRADED
+    assert any("slips in steps below" in note for note in found.notes)
