@@ -436,4 +436,5 @@ def over_exponents(
         nuisances={**found.nuisances, EXPONENT_NAME: nuisance},
         covariance=covariance,
         friction_range=(ends[0], ends[1]),
+        response={FRICTION_NAME: friction.value, EXPONENT_NAME: (high - low) / 2.0},
     )

@@ -398,7 +398,9 @@ def _calibrated_prior(calibration: Calibration, channels: Channels) -> UnitPrior
     free += [parameter(name) for name in DAILY_PRIORS]
     left = UNEXPLAINED_SEVERITY_STD * math.sqrt(calibration.fit.left)
     beside_noise = 0.0
-    if has_further_effects(calibration):
+    # What a real valve leaves is of effects that no model has, whichever of them were learned.
+    of_orifices = "bulk_modulus" in calibration.parameters and left > 0.0
+    if has_further_effects(calibration) or of_orifices:
         beside_noise = math.sqrt(max(calibration.fit.excess - 1.0, 0.0))
     std = {
         name: math.hypot(CALIBRATED_SEVERITY_STD, left, law.further_std * beside_noise)

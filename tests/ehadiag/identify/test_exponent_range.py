@@ -88,10 +88,11 @@ def test_the_interval_holds_the_friction_of_every_exponent(kintas, friction, exp
 
 @given(kintas=st.floats(0.1, 0.9), friction=st.floats(0.0, 0.5))
 def test_estimate_and_exponent_are_what_was_identified(kintas, friction):
-    """The ratio of friction and pressure gain, which is all that a recording shows, is kept."""
+    """The response is that with the largest exponent, which was searched with."""
     constants = plant_constants(ANY)
     found = over_exponents(identified(kintas, friction, 0.3), constants, (0.0, 2.0))
     seen = found.constants(constants)
+    assert seen.CLE == 2.0
     free = tuple(parameter(name) for name in ("Kintas", "FSS"))
     assert {item.name for item in free} < set(found.values)
     largest = plant_constants(with_exponent(2.0))
