@@ -103,6 +103,8 @@ class Identification:
     timing: IdentificationTiming
     slip_speed: float = 0.0
     """Speed of the jack, m/s, below which the pressure was left out; 0: none was."""
+    better_exponent: float | None = None
+    """Exponent of clogging, 1, that explains far more than the actuator file's; None: none does."""
     friction_range: tuple[float, float] | None = None
     """Least and largest `FSS` by the exponents of clogging that the actuator file allows; None
     where it states one."""

@@ -266,7 +266,9 @@ class IdentificationSession:
             attempts=freed.starts + (1 if best else 0),
             timing=_timing(begin, searched_at, search_s),
         )
-        return replace(concluded, slip_speed=freed.slip_speed)
+        return replace(
+            concluded, slip_speed=freed.slip_speed, better_exponent=freed.better_exponent
+        )
 
     def _discrepancy(self, refined: Refinement) -> Array:
         """Covariance by wrong laws of the faults."""

@@ -9,12 +9,15 @@ from functools import partial
 import numpy as np
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import GIVE_UP
+from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
+from ehadiag.core.conventions import FRICTION_NAME
+from ehadiag.core.criteria import FIT, GIVE_UP
 from ehadiag.identify.estimates import (
     excess_cost,
     independent_covariance,
     is_pressure_misfit,
     is_unexplainable,
+    signal_excess_costs,
 )
 from ehadiag.identify.experiment import (
     Experiment,
@@ -49,6 +52,7 @@ from ehadiag.identify.posterior import (
     search_posterior,
 )
 from ehadiag.identify.prior import UnitPrior, density_about, prior_density, prior_information
+from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
@@ -83,6 +87,8 @@ class NuisanceEstimate:
     """Runs of the model in all."""
     slip_speed: float = 0.0
     """Speed of the jack, m/s, below which the pressure was left out; 0: none was."""
+    better_exponent: float | None = None
+    """Exponent of clogging, 1, that explains far more than the actuator file's; None: none does."""
 
 
 def estimate_nuisances(
@@ -290,13 +296,43 @@ class NuisanceEstimator:
         slow = max(item.slip_speed(max(values["FDJ"], 0.0)) for item in experiments)
         sliding = [item.sliding(slow) for item in experiments]
         found = self._with(sliding, self.prior, values, before)
-        found = self._loosened(sliding, found, values, budget=1)
+        better = None if found.explained else self._better_exponent(sliding, found)
+        if better is None:
+            found = self._loosened(sliding, found, values, budget=1)
         return replace(
             found,
             slip_speed=slow,
+            better_exponent=better,
             evaluations=staged.evaluations + found.evaluations,
             starts=staged.found.starts + found.starts,
         )
+
+    def _better_exponent(
+        self, experiments: Sequence[Experiment], found: NuisanceEstimate
+    ) -> float | None:
+        """Return the other end of the exponents where one start explains far more of the spool.
+
+        A recording shows `FSS / k^m`, which any m explains: but not how a friction slows the spool,
+        by which a bridge behind a filter differs from the linear first stage (PHY-43).
+        """
+        low, stated = self.prior.exponents
+        before = signal_excess_costs(found.refined.residuals)[SPOOL_ROW]
+        if low < stated or before <= FIT.max_explained_excess:
+            return None
+        other = 0.0 if stated > MAX_CLOGGING_EXPONENT / 2.0 else MAX_CLOGGING_EXPONENT
+        c, values = experiments[0].constants, found.refined.values
+        bridge = c.GPF * c.XFM / c.PSR if other > 0.0 else 0.0
+        others = [
+            replace(item, constants=item.constants._replace(CLE=other, BRG=bridge))
+            for item in experiments
+        ]
+        share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
+        new = c.FSS / (c.FSS1 - c.FSS)
+        friction = (values[FRICTION_NAME] + new) * share ** (other - stated) - new
+        hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
+        settings, _ = self._search(others, self.prior, hint, budget=1)
+        left = signal_excess_costs(search_in_stages(others, settings).found.residuals)[SPOOL_ROW]
+        return other if left - 1.0 < GIVE_UP.max_changed_share * (before - 1.0) else None
 
     def _with_load(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate
