@@ -138,10 +138,8 @@ def test_a_second_stage_without_oil_leaves_nothing_out():
     assert missing(default_actuator(), "closed", 0.0, 5.5) == 0.0
 
 
-@pytest.mark.slow
-def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
-    """The pressure of a slow jack rings at phases that no model foresees."""
-    test, actuator, worn = resolve_test("closed"), with_volume(0.9e-4), Faults(0.2, 0.1, 0.6)
+def calibrated(actuator):
+    """A unit of which hysteresis was learned, and something left."""
     calibration = Calibration(
         date="2026-01-02T03:04:05Z",
         start=actuator.name,
@@ -152,7 +150,14 @@ def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
         fit=FitQuality(excess=1.5, outliers=0.01, spool_rms=1.0, pressure_rms=1.2),
         recordings=(CalibrationSource(name="a.blf", test="open"),),
     )
-    unit = msgspec.structs.replace(actuator, calibration=calibration)
+    return msgspec.structs.replace(actuator, calibration=calibration)
+
+
+@pytest.mark.slow
+def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
+    """The pressure of a slow jack rings at phases that no model foresees."""
+    test, actuator, worn = resolve_test("closed"), with_volume(0.9e-4), Faults(0.2, 0.1, 0.6)
+    unit = calibrated(actuator)
     done = simulate(actuator, test, worn, effects=Effects(hysteresis=0.02), seed=3, step=1e-6)
     recording = done.recording("simulated")
     assert recording.samples is not None
@@ -170,3 +175,19 @@ def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
     assert found.identification.named("FDJ").value == pytest.approx(0.6, abs=0.01)
     assert found.verdict is Verdict.DEGRADED
     assert any("slips in steps below" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_a_wrong_exponent_of_clogging_is_contradicted_by_the_recording():
+    test, actuator, worn = resolve_test("open"), with_volume(0.9e-4), Faults(0.3, 0.6, 0.2)
+    series = msgspec.structs.replace(actuator.servovalve, clogging_exponent=2.0)
+    true = msgspec.structs.replace(actuator, servovalve=series)
+    effects = Effects(hysteresis=0.02)
+    recording = simulate(true, test, worn, effects=effects, seed=3, step=1e-6).recording("unit")
+    stated = {
+        exponent: diagnose([recording], calibrated(unit), bundled_tests().values())
+        for exponent, unit in ((0.0, actuator), (2.0, true))
+    }
+    assert stated[2.0].verdict is Verdict.DEGRADED
+    assert stated[0.0].verdict is Verdict.NOT_TESTED
+    assert any("contradicts servovalve.clogging_exponent: with 2" in r for r in stated[0.0].reasons)
