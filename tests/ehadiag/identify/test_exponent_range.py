@@ -139,6 +139,8 @@ def test_discrepancy_grows_with_wear_and_with_what_is_left():
     assert size[2] == pytest.approx(2.0 * size[1])
     assert size[3] == pytest.approx(2.0 * size[2])
     assert not any(unit_prior(default_actuator()).discrepancy.values()), "the reference's laws hold"
+    stiff = prior.discrepancy_covariance(FAULTS, {"Kintas": 0.0, "FSS": 0.8, "FDJ": 0.0}, 1.0)
+    assert np.sqrt(np.diag(stiff)) == pytest.approx([0.008, 0.024, 0.0])
 
 
 def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_pressure():
