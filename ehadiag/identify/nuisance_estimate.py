@@ -254,7 +254,7 @@ class NuisanceEstimator:
         alone.
         """
         calibrated = self.prior.joint is not None
-        if calibrated and experiments[0].slip_speed() > 0.0:
+        if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
         if found.explained:
