@@ -274,6 +274,11 @@ def objections_to_estimate(
             f"{rms:.2f} (limit {most_rms:.3g}): other actuator data, or an effect that the three "
             "faults leave out"
         )
+    if identification.better_exponent is not None:
+        out.append(
+            "the recording contradicts servovalve.clogging_exponent: with"
+            f" {identification.better_exponent:g} far more of it is explained"
+        )
     hidden = [item.name for item in identification.estimates if not item.shown]
     if hidden:
         out.append(f"the test does not show {', '.join(hidden)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -219,7 +220,8 @@ class DiagnosisSession:
                 recordings, experiments, progress, ordered=not orders
             )
             modelled = [identified_response(item, identification) for item in experiments]
-            positions = tuple(map(fit_position, experiments, modelled))
+            slow = identification.slip_speed
+            positions = tuple(map(partial(fit_position, slip_speed=slow), experiments, modelled))
             if why and orders:
                 identification, words = restrict_to_observable(identification, closed=closed)
                 why = tuple(f"{reason}: {words}" for reason in orders)
@@ -487,9 +489,19 @@ def _notes_on_discrepancy(
     if identification is None or verdict is Verdict.NOT_TESTED:
         return ()
     fit = identification.fit
+    slow = identification.slip_speed
+    out = (
+        (
+            f"the jack slips in steps below {slow * 1e3:.1f} mm/s, by the friction found: the"
+            " pressure is left out where it is slower",
+        )
+        if slow
+        else ()
+    )
     if not is_explained_by_discrepancy_alone(fit, actuator.calibration):
-        return ()
+        return out
     return (
+        *out,
         f"{fit.outliers:.1%} of the residuals are beyond three times the noise, as the discrepancy"
         " of the faults' laws in the actuator file allows; limits of other effects are not judged",
     )

@@ -20,7 +20,7 @@ from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.criteria import RESPONSE
 from ehadiag.core.estimation_rules import ESTIMATION
-from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment
+from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
 from ehadiag.model.batch import NO_ANCHOR
@@ -221,8 +221,14 @@ class PositionFit:
     """Drift of a sound sensor at most, m/s."""
 
 
-def fit_position(experiment: Experiment, modelled: ModelResponse) -> PositionFit | None:
-    """Fit the sensor's gain and drift; None where there are too few samples of the position."""
+def fit_position(
+    experiment: Experiment, modelled: ModelResponse, slip_speed: float = 0.0
+) -> PositionFit | None:
+    """Fit the sensor's gain and drift; None where there are too few samples of the position.
+
+    slip_speed: m/s, below which the jack slips in steps that no model foresees: of travels with
+    such a part none counts in what is left.
+    """
     span = round(TRAVEL_SPAN_S / experiment.tick)
     measured = experiment.position[span:] - experiment.position[:-span]
     seen = np.isfinite(measured)
@@ -239,8 +245,12 @@ def fit_position(experiment: Experiment, modelled: ModelResponse) -> PositionFit
     columns = [travel, np.ones_like(travel)] if moves else [np.ones_like(travel)]
     values = measured[seen] / unit - (0.0 if moves else travel)
     solution, left = _robust_fit(np.column_stack(columns), values)
-    smoothed = np.abs(median_of_three(left))
-    most = np.minimum(left**2, RESPONSE.min_travel_outlier**2)
+    if slip_speed > 0.0:
+        slow = slow_ticks(model, channels.position, slip_speed * experiment.tick)
+        so_far = np.concatenate([[0], np.cumsum(slow)])
+        left = left[(so_far[span:-1] == so_far[: -span - 1])[seen]]
+    smoothed = np.abs(median_of_three(left)) if len(left) > 2 else np.zeros(1)
+    most = np.minimum(left**2, RESPONSE.min_travel_outlier**2) if len(left) else np.zeros(1)
     return PositionFit(
         gain=float(solution[0]) if moves else float("nan"),
         drift=float(solution[-1]) * unit / TRAVEL_SPAN_S,

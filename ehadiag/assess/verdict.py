@@ -8,7 +8,7 @@ from enum import IntEnum, StrEnum
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
-from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
+from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import VERDICT
 from firmware_iface.errors import ConfigurationError
 
@@ -74,7 +74,8 @@ def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tupl
         return _by_estimate(identification.estimates, levels)
     open_ends = _limits_within_exponents(identification, levels)
     verdict, reasons = _by_estimate(identification.estimates, levels, faults_only=True)
-    if open_ends and all(reason.startswith(f"{FRICTION_NAME} ") for reason in reasons):
+    faults = {item.name for item in identification.estimates if _at_limit(item, levels)}
+    if open_ends and faults <= {FRICTION_NAME}:
         return Verdict.NOT_TESTED, open_ends
     if reasons:
         return verdict, reasons
@@ -90,13 +91,13 @@ def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tupl
 
 def _limits_within_exponents(identification: Identification, levels: Levels) -> tuple[str, ...]:
     """Severities that are a fault with one exponent of clogging, and none with another."""
-    if EXPONENT_NAME not in identification.nuisances:
+    ends = identification.friction_range
+    if ends is None or not ends[0] < levels.limit <= ends[1]:
         return ()
-    return tuple(
-        f"{item.name} may be anything from {item.interval95[0]:.3f} to {item.interval95[1]:.3f},"
-        " by the valve's exponent of clogging: state servovalve.clogging_exponent"
-        for item in identification.estimates
-        if item.name == FRICTION_NAME and item.interval95[0] < levels.limit <= item.interval95[1]
+    low, high = identification.named(FRICTION_NAME).interval95
+    return (
+        f"{FRICTION_NAME} may be anything from {low:.3f} to {high:.3f},"
+        " by the valve's exponent of clogging: state servovalve.clogging_exponent",
     )
 
 

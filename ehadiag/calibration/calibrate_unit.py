@@ -107,13 +107,16 @@ def _learn_chambers_as_new(session: CalibrationSession, best: LearnedModel) -> L
     stiffness = (1.0 + values["bulk_modulus"]) / (1.0 + values["datum_volume_of_one_chamber"])
     ring = Ring(stiffness / (1.0 + values["datum_MJ"]) - 1.0, 0.0)
     joint = ring_prior(ring, OIL_EFFECTS["bulk_modulus"], DATUM_PRIOR)
-    found = [
-        session.learn(
-            best.model, new=True, hint=hint, hint_of_open=True, joint=joint,
-            budget=SEARCHES.max_runs_one_start, turn=turn,
-        )
-        for turn in range(SEARCHES.searches_of_chambers)
-    ]  # fmt: skip
+    found: list[LearnedModel] = []
+    for turn in range(SEARCHES.searches_of_chambers):
+        found.append(
+            session.learn(
+                best.model, new=True, hint=hint, hint_of_open=True, joint=joint,
+                budget=SEARCHES.max_runs_one_start, turn=turn,
+            )
+        )  # fmt: skip
+        if _is_good_enough(found[-1], best):
+            break
     return min(found, key=lambda item: item.criterion)
 
 

@@ -279,7 +279,7 @@ class CalibrationSession:
 
     def _sliding(self, actuator: Actuator, part: RecordingSelection) -> list[Experiment]:
         """Experiments to learn from."""
-        return [item.sliding for item in self.build(actuator, part)]
+        return [item.sliding(item.slip_speed()) for item in self.build(actuator, part)]
 
     def _indices(self, part: RecordingSelection) -> list[int]:
         known = [(index, test) for index, test in enumerate(self._tests) if test is not None]
@@ -294,7 +294,10 @@ class CalibrationSession:
     ) -> Experiment:
         assert recording.samples is not None
         assert test is not None
-        return build_experiment(recording.samples, recording.environment, test, actuator)
+        built = build_experiment(recording.samples, recording.environment, test, actuator)
+        # With the largest exponent of clogging, as a diagnosis identifies (`over_exponents`).
+        largest = actuator.servovalve.clogging_range[1]
+        return replace(built, constants=built.constants._replace(CLE=largest))
 
     def learn(
         self,

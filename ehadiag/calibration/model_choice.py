@@ -34,7 +34,7 @@ from ehadiag.core.criteria import FIT
 from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.identify.estimates import estimate_covariance, is_pressure_misfit, signal_excess_costs
 from ehadiag.identify.experiment import lay_out_spans, share_offsets, unknowns_of
-from ehadiag.identify.ring import SPOOL_PARAMETERS, find_ring, ring_prior
+from ehadiag.identify.ring import SPOOL_PARAMETERS, find_ring, is_same_ring, ring_prior
 from ehadiag.model.batch import PRESSURE_ROW, SPOOL_ROW
 from ehadiag.model.registry import parameter
 from ehadiag.model.residual_models import SimdModel
@@ -294,13 +294,19 @@ def _learn_chambers(session: CalibrationSession, first: UnitModel) -> list[Learn
     if plain.estimated.explained:
         return [plain]
     out = [plain]
-    moved = replace(first, by_position=True)
-    # The plain search may have bent what moves the spool: the scan is repeated. Chambers that do
-    # not move have had no scan yet.
-    for turn, model in enumerate((moved, moved, moved, first)):
+    moved, better = replace(first, by_position=True), False
+    # The plain search may have bent what moves the spool: the scan is repeated, and the search
+    # where it says another stiffness. Chambers that do not move have had no scan yet.
+    models = [moved, moved, moved, first]
+    while models:
+        model, *models = models
         values = out[-1].estimated.refined.values
         experiments = share_offsets(session.build(model.of(session.start), open_loop))
         ring = find_ring(experiments, values)
+        if len(out) == 2 and is_same_ring(ring, session.ring):
+            if better:
+                break
+            model, models = first, []
         session.ring = ring or session.ring
         hint = {name: values[name] for name in SPOOL_PARAMETERS if name in values}
         joint = None
@@ -314,11 +320,11 @@ def _learn_chambers(session: CalibrationSession, first: UnitModel) -> list[Learn
             joint=joint,
             budget=SEARCHES.max_runs_one_start,
             part=open_loop,
-            turn=turn,
+            turn=len(out) - 1,
         )
         out.append(found)
         better = found.estimated.excess < SEARCHES.max_excess_share_moved * plain.estimated.excess
-        if found.estimated.explained or (turn > 0 and better):
+        if found.estimated.explained or (len(out) > 2 and better):
             break
     return sorted(out, key=lambda item: item.criterion, reverse=True)
 

@@ -223,12 +223,16 @@ def identification_result(
     timing: IdentificationTiming,
     about: Mapping[str, float],
     discrepancy: Mapping[str, float],
+    doubt: Array,
 ) -> Identification:
     """Put together what an identification says.
 
-    spread: covariance of all that was refined, SI; about: effects that the constants already have;
-    discrepancy: of the faults' laws, by name, over the severity, 1.
+    spread: covariance of all that was refined, SI, if the faults' laws hold; about: effects that
+    the constants already have; discrepancy: of the faults' laws, by name, over the severity, 1;
+    doubt: covariance by that discrepancy, SI.
     """
+    shown = _shown_severities(refined, spread)
+    spread = spread + doubt
     deviations = np.sqrt(np.diag(spread)).tolist()
     nuisances = {
         item.name: Nuisance(
@@ -240,7 +244,7 @@ def identification_result(
         if item.kind is not ParameterKind.FAULT
     }
     return Identification(
-        estimates=severity_estimates(first, found, refined, spread),
+        estimates=severity_estimates(first, found, refined, spread, shown),
         nuisances=nuisances,
         about=about,
         covariance=fault_covariance(refined, spread),
@@ -263,17 +267,27 @@ def fault_covariance(refined: Refinement, spread: Array) -> Array:
     return spread[np.ix_(places, places)]
 
 
+def _shown_severities(refined: Refinement, spread: Array) -> list[bool]:
+    """Whether the test shows each severity: doubt about a law of wear is none about the test."""
+    std = np.sqrt(np.diag(fault_covariance(refined, spread)))
+    return (std < FIT.max_shown_std).tolist()
+
+
 def severity_estimates(
-    first: FirstApproximation, found: SearchResult, refined: Refinement, spread: Array
+    first: FirstApproximation,
+    found: SearchResult,
+    refined: Refinement,
+    spread: Array,
+    shown: Sequence[bool],
 ) -> tuple[Estimate, ...]:
     """Severities as each stage left them.
 
-    spread: covariance of all that was refined, SI.
+    spread: covariance of all that was refined, SI; shown: whether the test shows each.
     """
     values = refined.values
-    deviations = np.sqrt(np.diag(fault_covariance(refined, spread)))
+    deviations = np.sqrt(np.diag(fault_covariance(refined, spread))).tolist()
     out = []
-    for item, searched, std in zip(FAULTS, found.best, deviations.tolist(), strict=True):
+    for item, searched, std, seen in zip(FAULTS, found.best, deviations, shown, strict=True):
         value = _bounded_severity(item, values[item.name])
         out.append(
             Estimate(
@@ -285,7 +299,7 @@ def severity_estimates(
                 interval95=interval95(value, std),
                 at_bound=value <= item.lower + FIT.bound_tolerance
                 or value >= item.upper - FIT.bound_tolerance,
-                shown=std < FIT.max_shown_std,
+                shown=seen,
             )
         )
     return tuple(out)
@@ -408,7 +422,6 @@ def over_exponents(
         std=std,
         interval95=interval95(value, std),
         at_bound=not 0.0 < value < 1.0,
-        shown=std < FIT.max_shown_std,
     )
     place = [item.name for item in found.estimates].index(FRICTION_NAME)
     covariance = found.covariance.copy()
@@ -422,4 +435,6 @@ def over_exponents(
         estimates=tuple(estimate if item is friction else item for item in found.estimates),
         nuisances={**found.nuisances, EXPONENT_NAME: nuisance},
         covariance=covariance,
+        friction_range=(ends[0], ends[1]),
+        response={FRICTION_NAME: friction.value, EXPONENT_NAME: (high - low) / 2.0},
     )

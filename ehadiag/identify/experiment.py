@@ -137,19 +137,26 @@ class Experiment:
         small, large = (value * self.spool_noise / ESTIMATION.noise_lsb for value in thresholds_lsb)
         return Anchor(ANCHORING.gain, small, large, JACK_ANCHOR_SHARE)
 
-    @property
-    def sliding(self) -> Experiment:
-        """The same without the pressure on a jack that stands or slides too slowly.
+    def slip_speed(self, severity: float = 0.0) -> float:
+        """Speed, m/s, below which a jack of a severity of `FDJ` slips in steps and rings on.
 
-        Friction holds any pressure of its band on a standing jack: which one is decided by 0.1 µm
-        of the spool. A slow one slips in steps, and rings on: the phase is decided by as little.
-        Without oil in the second stage nothing rings, and nothing is left out.
+        Without oil in the second stage nothing rings: 0.
         """
         c = self.constants
         if c.OIL == 0.0:
+            return 0.0
+        friction = c.FDJ + severity * (c.FDJ1 - c.FDJ)
+        return float(REST.slow_ratio * friction / (c.AJ * math.sqrt(c.OIL * c.MJ)))
+
+    def sliding(self, slip_speed: float) -> Experiment:
+        """Return the same without the pressure on a jack that stands or slides more slowly.
+
+        Friction holds any pressure of its band on a standing jack: which one is decided by 0.1 µm
+        of the spool. A slow one slips in steps, and rings on: the phase is decided by as little.
+        """
+        if slip_speed == 0.0:
             return self
-        slips = REST.slow_ratio * c.FDJ / (c.AJ * math.sqrt(c.OIL * c.MJ))
-        slow = _slow(self.position, self.channels.position, slips * self.tick)
+        slow = slow_ticks(self.position, self.channels.position, slip_speed * self.tick)
         return replace(self, pressure=np.where(slow, np.nan, self.pressure))
 
     def with_noise(self, noise: tuple[float, ...]) -> Experiment:
@@ -244,7 +251,7 @@ def build_experiment(
     )
 
 
-def _slow(position: Array, channel: Channel, least: float) -> NDArray[np.bool_]:
+def slow_ticks(position: Array, channel: Channel, least: float) -> NDArray[np.bool_]:
     """Ticks, shape (n,), around which the jack moves by less than `least`, m, a tick."""
     count = REST.slow_ticks
     seen = np.isfinite(position)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -101,6 +101,15 @@ class Identification:
     attempts: int
     """Searches that it took; more than one where the first did not explain the recording."""
     timing: IdentificationTiming
+    slip_speed: float = 0.0
+    """Speed of the jack, m/s, below which the pressure was left out; 0: none was."""
+    better_exponent: float | None = None
+    """Exponent of clogging, 1, that explains far more than the actuator file's; None: none does."""
+    friction_range: tuple[float, float] | None = None
+    """Least and largest `FSS` by the exponents of clogging that the actuator file allows; None
+    where it states one."""
+    response: Mapping[str, float] = field(default_factory=dict)
+    """What the identified response has in place of estimates that are of a range, by name, SI."""
 
     def named(self, name: str) -> Estimate:
         """Return the estimate of that name; KeyError if there is none."""
@@ -118,7 +127,8 @@ class Identification:
     def constants(self, base: PlantConstants) -> PlantConstants:
         """Constants of the unit as it was found; `base`: of its experiments, so as new."""
         about = self.about
-        values = {name: value - about.get(name, 0.0) for name, value in self.values.items()}
+        found = {**self.values, **self.response}
+        values = {name: value - about.get(name, 0.0) for name, value in found.items()}
         free = tuple(parameter(name) for name in values)
         return Unknowns(free, (base,), {}).constants(np.array(list(values.values())))
 

@@ -240,10 +240,9 @@ class IdentificationSession:
                 first,
                 best.found,
                 best.refined,
-                estimate_covariance(best.refined)
-                + _guessed_covariance(best.refined)
-                + self._discrepancy(best.refined),
+                estimate_covariance(best.refined) + _guessed_covariance(best.refined),
                 best.experiments,
+                doubt=self._discrepancy(best.refined),
                 evaluations=first.evaluations
                 + best.evaluations
                 + (freed.evaluations if freed else 0),
@@ -254,18 +253,21 @@ class IdentificationSession:
         values = freed.refined.values
         severities = np.array([values[item.name] for item in FAULTS])
         before = best.evaluations if best else found.evaluations
-        return conclude(
+        concluded = conclude(
             first,
             replace(found, best=severities, cost=freed.refined.cost),
             freed.refined,
             estimate_covariance(freed.refined)
             + freed.covariance
-            + self.prior.spread(freed.refined.parameters, values, experiments[0].constants)
-            + self._discrepancy(freed.refined),
+            + self.prior.spread(freed.refined.parameters, values, experiments[0].constants),
             freed.experiments,
+            doubt=self._discrepancy(freed.refined),
             evaluations=first.evaluations + before + freed.evaluations,
             attempts=freed.starts + (1 if best else 0),
             timing=_timing(begin, searched_at, search_s),
+        )
+        return replace(
+            concluded, slip_speed=freed.slip_speed, better_exponent=freed.better_exponent
         )
 
     def _discrepancy(self, refined: Refinement) -> Array:

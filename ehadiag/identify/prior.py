@@ -11,6 +11,7 @@ import numpy as np
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator, Calibration
+from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.identify.estimates import (
     ExplanationTest,
@@ -287,11 +288,13 @@ class UnitPrior:
     ) -> Array:
         """Covariance by wrong laws of the faults, SI, shape (k, k).
 
+        A spool's friction takes of the speed by which clogging is known: its law counts there, too.
         excess: of the residuals over noise: a law that the residuals show to be wrong is off by
         more.
         """
         more = 1.0 + math.sqrt(max(excess - 1.0, 0.0))
-        std = {name: size * more * values[name] for name, size in self.discrepancy.items()}
+        worn = {**values, "Kintas": math.hypot(values["Kintas"], values[FRICTION_NAME])}
+        std = {name: size * more * worn[name] for name, size in self.discrepancy.items()}
         return independent_covariance(parameters, std)
 
 
@@ -398,7 +401,9 @@ def _calibrated_prior(calibration: Calibration, channels: Channels) -> UnitPrior
     free += [parameter(name) for name in DAILY_PRIORS]
     left = UNEXPLAINED_SEVERITY_STD * math.sqrt(calibration.fit.left)
     beside_noise = 0.0
-    if has_further_effects(calibration):
+    # What a real valve leaves is of effects that no model has, whichever of them were learned.
+    of_orifices = "bulk_modulus" in calibration.parameters and left > 0.0
+    if has_further_effects(calibration) or of_orifices:
         beside_noise = math.sqrt(max(calibration.fit.excess - 1.0, 0.0))
     std = {
         name: math.hypot(CALIBRATED_SEVERITY_STD, left, law.further_std * beside_noise)

@@ -90,6 +90,13 @@ class Ring:
         )
 
 
+def is_same_ring(ring: Ring | None, other: Ring | None) -> bool:
+    """Whether two scans say the same, so that a search by the one ends where that by the other."""
+    if ring is None or other is None:
+        return ring is other
+    return abs(ring.stiffness - other.stiffness) < SCAN.std
+
+
 def find_ring(experiments: Sequence[Experiment], values: Mapping[str, float]) -> Ring | None:
     """Find the stiffness that explains the phase of the ring; None where none rings.
 

@@ -63,14 +63,25 @@ def test_the_default_limits(name, value, beyond):
     assert bool(reasons) is beyond
 
 
+def objections(fit, better_exponent=None):
+    return objections_to_estimate(
+        SimpleNamespace(fit=fit, estimates=(), better_exponent=better_exponent)
+    )
+
+
 def test_no_limit_is_judged_where_only_a_wrong_law_of_a_fault_explains_the_recording():
     doubtful = replace(NOISE, outliers=0.15)
     (item,) = found(doubtful, torque_motor_gain=(-0.19, 1e-3))
     assert (item.beyond, item.chance) == (None, None)
     assert item.limit == 0.1
-    assert objections_to_estimate(SimpleNamespace(fit=doubtful, estimates=())) == []
-    unexplained = SimpleNamespace(fit=replace(doubtful, unexplained_outliers=0.15), estimates=())
-    assert "15.0% of the residuals" in objections_to_estimate(unexplained)[0]
+    assert objections(doubtful) == []
+    (reason,) = objections(replace(doubtful, unexplained_outliers=0.15))
+    assert "15.0% of the residuals" in reason
+
+
+def test_a_better_exponent_of_clogging_is_an_objection():
+    (reason,) = objections(NOISE, better_exponent=2.0)
+    assert "contradicts servovalve.clogging_exponent: with 2" in reason
 
 
 @pytest.mark.parametrize("verdict", [Verdict.DEGRADED, Verdict.FAULT, Verdict.NOT_TESTED])

@@ -28,7 +28,7 @@ from ehadiag.assess.response_checks import (
     max_position_gain_error,
     objections_to_position,
 )
-from ehadiag.identify.experiment import build_experiment
+from ehadiag.identify.experiment import build_experiment, slow_ticks
 from ehadiag.identify.identification_session import identify
 from ehadiag_sim.broken_hardware import simulate_broken
 from ehadiag_sim.conditions import Faults
@@ -235,6 +235,19 @@ def test_a_broken_sensor_is_named(sound, kind):
     (reason,) = objections_to_position(fit(sound, broken_position(kind, sound[2].position)))
     assert kind in reason
     assert "position sensor" in reason
+
+
+def test_travel_of_a_jack_that_slips_is_none_of_it(sound):
+    """A jack that slips in steps travels otherwise; one that is fast, or a dead sensor, tells."""
+    model = identified_response(sound[2], sound[1])
+    slow = slow_ticks(model.position, sound[2].channels.position, 0.02 * sound[2].tick)
+    assert 0.05 < slow.mean() < 0.95
+    steps = sound[2].position + np.where(slow, 5e-4 * np.sign(np.sin(np.arange(len(slow)))), 0.0)
+    experiment = replace(sound[2], position=steps)
+    assert objections_to_position(fit_position(experiment, model))
+    assert objections_to_position(fit_position(experiment, model, slip_speed=0.02)) == []
+    dead = replace(sound[2], position=np.zeros_like(steps))
+    assert objections_to_position(fit_position(dead, model, slip_speed=0.02))
 
 
 def test_single_spikes_and_lost_samples_are_none_of_it(sound):

@@ -37,7 +37,7 @@ def estimate(name, value, std):
 
 def verdict(*pairs, rule=VerdictRule.INTERVAL):
     estimates = [estimate(f"S{i}", *pair) for i, pair in enumerate(pairs)]
-    return judge(SimpleNamespace(estimates=estimates, nuisances={}), Levels(rule=rule))
+    return judge(SimpleNamespace(estimates=estimates, friction_range=None), Levels(rule=rule))
 
 
 @pytest.mark.parametrize(

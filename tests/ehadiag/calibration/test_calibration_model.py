@@ -366,3 +366,10 @@ def test_a_later_recording_may_leave_what_the_calibration_left():
     assert not calibrated_explanation_test(fit(1.1))(residuals(1.0))
     assert calibrated_explanation_test(fit(1.5, 0.02))(residuals(1.0))
     assert not calibrated_explanation_test(fit(1.5, 0.02))(residuals(9.0))
+
+
+def test_what_orifices_leave_is_of_effects_that_no_model_has():
+    assert severity_std(1.1, "bulk_modulus") == pytest.approx(1e-4)
+    kintas, spool, jack = severity_std(2.0, "bulk_modulus")
+    assert kintas > 5.0 * severity_std(2.0)[0]
+    assert spool > kintas > jack

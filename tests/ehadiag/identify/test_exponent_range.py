@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from places import LOGS
 
 from ehadiag import Levels, Verdict, default_actuator
+from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.verdict import judge
+from ehadiag.core.actuator import Discrepancy
 from ehadiag.identify.estimates import interval95, over_exponents
 from ehadiag.identify.identification_result import (
     Estimate,
@@ -23,6 +26,8 @@ from ehadiag.identify.identification_result import (
 from ehadiag.identify.prior import unit_prior
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, parameter
+from firmware_iface.logs.reader import read_recording
+from firmware_iface.stored_test import bundled_tests
 
 STD = 1e-3
 NAMES = ("Kintas", "FSS", "FDJ")
@@ -78,14 +83,16 @@ def test_the_interval_holds_the_friction_of_every_exponent(kintas, friction, exp
     assert low - 1e-9 <= friction <= high + 1e-9
     assert found.named("Kintas") == identified(kintas, seen, 0.3).named("Kintas")
     assert found.covariance[1, 1] == pytest.approx(found.named("FSS").std ** 2)
+    assert found.named("FSS").shown, "doubt about the exponent is none about the test"
 
 
 @given(kintas=st.floats(0.1, 0.9), friction=st.floats(0.0, 0.5))
 def test_estimate_and_exponent_are_what_was_identified(kintas, friction):
-    """The ratio of friction and pressure gain, which is all that a recording shows, is kept."""
+    """The response is that with the largest exponent, which was searched with."""
     constants = plant_constants(ANY)
     found = over_exponents(identified(kintas, friction, 0.3), constants, (0.0, 2.0))
     seen = found.constants(constants)
+    assert seen.CLE == 2.0
     free = tuple(parameter(name) for name in ("Kintas", "FSS"))
     assert {item.name for item in free} < set(found.values)
     largest = plant_constants(with_exponent(2.0))
@@ -112,6 +119,16 @@ def test_the_verdict_covers_both_ends():
     assert verdict is Verdict.DEGRADED
 
 
+@pytest.mark.parametrize(
+    ("friction", "expected"), [(0.6, Verdict.NOT_TESTED), (0.8, Verdict.FAULT)]
+)
+def test_a_clogged_filter_does_not_decide_what_the_exponent_leaves_open(friction, expected):
+    """The filter's own severity is at the advisory level, the middle of the friction a fault."""
+    found = over_exponents(identified(0.5, friction, 0.3), plant_constants(ANY), (0.0, 2.0))
+    assert found.named("FSS").value > Levels().limit
+    assert judge(found, Levels())[0] is expected
+
+
 def test_discrepancy_grows_with_wear_and_with_what_is_left():
     prior = unit_prior(msgspec.structs.replace(ANY, discrepancy=type(ANY.discrepancy)()))
     size = [
@@ -122,6 +139,8 @@ def test_discrepancy_grows_with_wear_and_with_what_is_left():
     assert size[2] == pytest.approx(2.0 * size[1])
     assert size[3] == pytest.approx(2.0 * size[2])
     assert not any(unit_prior(default_actuator()).discrepancy.values()), "the reference's laws hold"
+    stiff = prior.discrepancy_covariance(FAULTS, {"Kintas": 0.0, "FSS": 0.8, "FDJ": 0.0}, 1.0)
+    assert np.sqrt(np.diag(stiff)) == pytest.approx([0.008, 0.024, 0.0])
 
 
 def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_pressure():
@@ -142,4 +161,23 @@ def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_p
 
 
 def test_judging_needs_no_effects():
-    assert judge(SimpleNamespace(estimates=(), nuisances={}), Levels())[0] is Verdict.HEALTHY
+    assert judge(SimpleNamespace(estimates=(), friction_range=None), Levels())[0] is Verdict.HEALTHY
+
+
+def test_doubt_about_a_law_widens_the_interval_and_hides_nothing():
+    recording = read_recording(LOGS / "paper-open-2.blf")
+    found = {
+        doubt: diagnose(
+            [recording],
+            msgspec.structs.replace(
+                default_actuator(), discrepancy=Discrepancy(Kintas=0.0, FSS=doubt, FDJ=0.0)
+            ),
+            bundled_tests().values(),
+        )
+        for doubt in (0.0, 0.2)
+    }
+    sure, doubtful = (found[doubt].identification.named("FSS") for doubt in (0.0, 0.2))
+    assert doubtful.value == sure.value == pytest.approx(0.6, abs=1e-3)
+    assert doubtful.std == pytest.approx(0.2 * 0.6, rel=0.4), "and by what the residuals add"
+    assert doubtful.shown
+    assert found[0.2].verdict is found[0.0].verdict is Verdict.DEGRADED

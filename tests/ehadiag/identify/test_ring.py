@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
 
-from ehadiag import default_actuator
+from ehadiag import Verdict, default_actuator
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.prior import ParameterPrior
-from ehadiag.identify.ring import Ring, find_ring, ring_prior
-from ehadiag_sim.conditions import Effects
+from ehadiag.identify.ring import Ring, find_ring, is_same_ring, ring_prior
+from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
-from firmware_iface.stored_test import resolve_test
+from firmware_iface.stored_test import bundled_tests, resolve_test
 
 
 def with_volume(volume):
@@ -94,9 +98,8 @@ def missing(actuator, name, begin, end):
     test = resolve_test(name)
     recording = simulate(actuator, test, step=1e-6).recording("simulated")
     experiment = build_experiment(recording.samples, recording.environment, test, actuator)
-    return float(
-        np.isnan(experiment.sliding.pressure)[round(1e3 * begin) : round(1e3 * end)].mean()
-    )
+    left = np.isnan(experiment.sliding(experiment.slip_speed()).pressure)
+    return float(left[round(1e3 * begin) : round(1e3 * end)].mean())
 
 
 @pytest.mark.parametrize(
@@ -107,5 +110,84 @@ def test_pressure_on_a_standing_jack_is_left_out(begin, end, share):
     assert missing(with_volume(0.9e-4), "closed", begin, end) == share
 
 
+def test_a_worn_jack_slips_at_more():
+    test = resolve_test("closed")
+    recording = simulate(with_volume(0.9e-4), test, step=1e-5).recording("simulated")
+    experiment = build_experiment(
+        recording.samples, recording.environment, test, with_volume(0.9e-4)
+    )
+    c = experiment.constants
+    ratio = experiment.slip_speed(0.5) / experiment.slip_speed()
+    assert ratio == pytest.approx((c.FDJ + 0.5 * (c.FDJ1 - c.FDJ)) / c.FDJ)
+
+
+@pytest.mark.parametrize(
+    ("ring", "other", "same"),
+    [
+        (Ring(0.1, 80.0), Ring(0.102, 80.1), True),
+        (Ring(0.1, 80.0), Ring(0.11, 80.4), False),
+        (Ring(0.1, 80.0), None, False),
+        (None, None, True),
+    ],
+)
+def test_two_scans_say_the_same(ring, other, same):
+    assert is_same_ring(ring, other) is same
+
+
 def test_a_second_stage_without_oil_leaves_nothing_out():
     assert missing(default_actuator(), "closed", 0.0, 5.5) == 0.0
+
+
+def calibrated(actuator):
+    """A unit of which hysteresis was learned, and something left."""
+    calibration = Calibration(
+        date="2026-01-02T03:04:05Z",
+        start=actuator.name,
+        effects={"hysteresis": 0.02},
+        parameters=("hysteresis",),
+        std=(1e-4,),
+        root=((1.0,),),
+        fit=FitQuality(excess=1.5, outliers=0.01, spool_rms=1.0, pressure_rms=1.2),
+        recordings=(CalibrationSource(name="a.blf", test="open"),),
+    )
+    return msgspec.structs.replace(actuator, calibration=calibration)
+
+
+@pytest.mark.slow
+def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
+    """The pressure of a slow jack rings at phases that no model foresees."""
+    test, actuator, worn = resolve_test("closed"), with_volume(0.9e-4), Faults(0.2, 0.1, 0.6)
+    unit = calibrated(actuator)
+    done = simulate(actuator, test, worn, effects=Effects(hysteresis=0.02), seed=3, step=1e-6)
+    recording = done.recording("simulated")
+    assert recording.samples is not None
+    experiment = build_experiment(recording.samples, recording.environment, test, unit)
+    slow = np.isnan(experiment.sliding(experiment.slip_speed(worn.FDJ)).pressure)
+    assert 0.3 < slow.mean() < 0.95
+    ticks = np.arange(len(slow))
+    ring = 4e5 * np.sin(2.0 * np.pi * 0.083 * ticks + np.cumsum(ticks % 50 == 0))
+    pressure = recording.samples.pressure + np.where(slow, ring, 0.0)
+    samples = replace(recording.samples, pressure=pressure)
+    found = diagnose([replace(recording, samples=samples)], unit, bundled_tests().values())
+    assert found.identification is not None
+    slips = experiment.slip_speed(worn.FDJ)
+    assert found.identification.slip_speed == pytest.approx(slips, rel=0.3)
+    assert found.identification.named("FDJ").value == pytest.approx(0.6, abs=0.01)
+    assert found.verdict is Verdict.DEGRADED
+    assert any("slips in steps below" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_a_wrong_exponent_of_clogging_is_contradicted_by_the_recording():
+    test, actuator, worn = resolve_test("open"), with_volume(0.9e-4), Faults(0.3, 0.6, 0.2)
+    series = msgspec.structs.replace(actuator.servovalve, clogging_exponent=2.0)
+    true = msgspec.structs.replace(actuator, servovalve=series)
+    effects = Effects(hysteresis=0.02)
+    recording = simulate(true, test, worn, effects=effects, seed=3, step=1e-6).recording("unit")
+    stated = {
+        exponent: diagnose([recording], calibrated(unit), bundled_tests().values())
+        for exponent, unit in ((0.0, actuator), (2.0, true))
+    }
+    assert stated[2.0].verdict is Verdict.DEGRADED
+    assert stated[0.0].verdict is Verdict.NOT_TESTED
+    assert any("contradicts servovalve.clogging_exponent: with 2" in r for r in stated[0.0].reasons)

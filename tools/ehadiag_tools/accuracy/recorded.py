@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
@@ -37,8 +38,8 @@ class RecordedUnit:
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--recordings", type=Path, required=True, metavar="FOLDER",
-        help="with recordings X-new-….blf and X-worn-….blf of units X, and truth.csv with the"
-        " columns file, Kintas, FSS, FDJ")  # fmt: skip
+        help="with recordings X-new-….blf, and others of X when worn, of units X, and truth.csv"
+        " with the columns file, Kintas, FSS, FDJ")  # fmt: skip
     add("--unit", action="append", metavar="X", help="may be repeated (all of truth.csv)")
     add(
         "--exponent",
@@ -78,7 +79,7 @@ def perform(case: RecordedUnit) -> Record:
         calibration = found.actuator.calibration
         record["learned"] = f"{calibration.fit.excess:.2f}, {', '.join(calibration.effects)}"
         for row in rows:
-            if "-worn-" in row["file"]:
+            if "-new-" not in row["file"]:
                 truth = [float(row[name]) for name in FAULT_NAMES]
                 record["worn"].append(_diagnosed(folder / row["file"], truth, found.actuator))
     return record
@@ -107,6 +108,7 @@ def _diagnosed(path: Path, truth: list[float], unit: Actuator) -> Record:
         "interval95": [list(item.interval95) for item in estimates],
         "bound": cramer_rao(found.experiments, truth).tolist(),
         "verdict": found.verdict.name.replace("_", " "),
+        "refused": list(found.reasons) if found.verdict is Verdict.NOT_TESTED else [],
     }
 
 
@@ -124,9 +126,25 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
         if worn:
             headings = ("recording", *FAULT_NAMES, "bounds", "covered", "verdict")
             yield from markdown(headings, _rows(worn))
-            error = np.abs(percent_errors(worn))
-            held = 100.0 * holds_truth(worn).mean()
-            yield f"\nmean {error.mean():.3f}, worst {error.max():.3f}, coverage {held:.0f} %"
+            yield from _summary(worn)
+
+
+def _summary(worn: Sequence[Record]) -> Iterator[str]:
+    """What was answered: mean and worst error of each severity, coverage; why the rest was not."""
+    answered = [item for item in worn if not item["refused"]]
+    yield f"\nanswered: {len(answered)} of {len(worn)}"
+    if answered:
+        error = np.abs(percent_errors(answered))
+        means, worst = error.mean(axis=0), error.max(axis=0)
+        each = (
+            f"{name} mean {mean:.3f}, worst {most:.3f}"
+            for name, mean, most in zip(FAULT_NAMES, means, worst, strict=True)
+        )
+        held = 100.0 * holds_truth(answered).mean()
+        yield f"{'; '.join(each)}; coverage {held:.0f} %"
+    for item in worn:
+        if item["refused"]:
+            yield f"{item['recording']}: {'; '.join(item['refused'])}"
 
 
 def _rows(worn: Sequence[Record]) -> Iterator[tuple[object, ...]]:
