@@ -22,7 +22,7 @@ from ehadiag_sim.simulation import Plant
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.errors import ConfigurationError, EhadiagError
-from firmware_iface.live_decode import BitRequest, LiveDecoder
+from firmware_iface.live_decode import BitRequest, BitStatus, LiveDecoder
 from firmware_iface.recording import BitReason, BitState, CommandMode
 from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S, Transport, TransportState
@@ -30,6 +30,8 @@ from firmware_iface.transport.frames import Frame
 
 if TYPE_CHECKING:
     from ehadiag_sim.foreign_plant import ForeignPlant
+    from ehadiag_sim.uds_server import UdsServer
+    from firmware_iface.tester import RequestProtocol
 
 MAX_SERIAL_NUMBER = 0xFFFF
 
@@ -61,9 +63,10 @@ class FccCore:
     None: the defaults; idle_telemetry: whether telemetry is sent between tests too; start_ns: time
     of the first tick, ns; bus_map: messages to send and accept; None: the default bus;
     channel_faults: damage to the readings of the channels; None: none; control: changes while it
-    runs; None: none; foreign: plant of another maker; None: the detailed simulator.
-    ConfigurationError: two tests with one number, a test at another rate than the controller; a
-    serial number, a converter's range or the rated current that the bus cannot carry.
+    runs; None: none; foreign: plant of another maker; None: the detailed simulator; protocol: how
+    tests are requested and watched, with `uds` by nothing else. ConfigurationError: two tests with
+    one number, a test at another rate than the controller; a serial number, a converter's range or
+    the rated current that the bus cannot carry.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class FccCore:
         channel_faults: Sequence[ChannelFault] = (),
         control: SimulatorControl | None = None,
         foreign: ForeignPlant | None = None,
+        protocol: RequestProtocol = "native",
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL_NUMBER:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL_NUMBER}")
@@ -118,6 +122,11 @@ class FccCore:
         self._sent_state: tuple[BitState, int] | None = None
         self._pending: deque[BitRequest] = deque()
         self.interlock_open = False
+        self._uds: UdsServer | None = None
+        if protocol == "uds":
+            from ehadiag_sim.uds_server import UdsServer  # noqa: PLC0415 - optional packages
+
+            self._uds = UdsServer(self, bus_map.uds_identifiers)
 
     @property
     def state(self) -> BitState:
@@ -139,8 +148,29 @@ class FccCore:
         """The actuator as it is now."""
         return self._plant
 
+    @property
+    def status(self) -> BitStatus:
+        """State of the test, its number and elapsed time, and the actuator's serial number."""
+        elapsed = self._elapsed / self._rate
+        return BitStatus(self._state, BitReason.NONE, self._test_id, elapsed, self._serial)
+
+    @property
+    def faults(self) -> Faults:
+        """Severities of the actuator as it is now."""
+        return self._faults or Faults()
+
+    @property
+    def offsets(self) -> tuple[float, ...]:
+        """Offsets of the sensors as they are now, SI."""
+        lsb = (self._sensors or Sensors()).offsets_lsb
+        pairs = zip(lsb, self._scales.channels, strict=True)
+        return tuple(count * channel.lsb for count, channel in pairs)
+
     def take(self, frame: Frame) -> None:
         """Take a frame off the bus; anything but a valid request is ignored."""
+        if self._uds is not None:
+            self._uds.take(frame)
+            return
         request = self._decoder.decode(frame)
         if isinstance(request, BitRequest):
             self._pending.append(request)
@@ -154,9 +184,10 @@ class FccCore:
         while self._pending:
             request = self._pending.popleft()
             if request.code == "start":
-                self._start(request.test_id)
+                self.start(request.test_id)
             elif request.code == "abort":
-                self._abort()
+                self.abort()
+        answers = [] if self._uds is None else self._uds.step()
         self._advance()
         running = self._state is BitState.RUNNING
         if running:
@@ -169,7 +200,7 @@ class FccCore:
         codes = self._plant.tick(command, mode)
         self._tick += 1
         frames: list[Frame] = []
-        frames += self._status()
+        frames += self._status() if self._uds is None else answers
         if running or self._idle_telemetry:
             frames += self._encoder.command(mode, command, test_id, 0)
             frames += self._encoder.telemetry(codes.tolist(), 0)
@@ -184,7 +215,8 @@ class FccCore:
             for i, frame in enumerate(frames)
         ]
 
-    def _start(self, test_id: int) -> None:
+    def start(self, test_id: int) -> BitReason:
+        """Start a test, or say why it is refused."""
         reason = self._objection(test_id)
         if reason is BitReason.NONE:
             test = self._tests[test_id]
@@ -198,6 +230,7 @@ class FccCore:
         else:
             self._refused = (reason, test_id)
             self._enter(BitState.REFUSED, test_id)
+        return reason
 
     def _objection(self, test_id: int) -> BitReason:
         demands = self._demands
@@ -217,7 +250,8 @@ class FccCore:
         )
         return next((reason for failed, reason in checks if failed), BitReason.NONE)
 
-    def _abort(self) -> None:
+    def abort(self) -> None:
+        """Command zero current from this tick on, if a test runs."""
         if self._state in (BitState.ARMING, BitState.RUNNING):
             self._refused = None  # of a second request in the same tick: no reason of an abort
             self._enter(BitState.ABORTED, self._test_id)
@@ -312,6 +346,7 @@ def emulated_computer(
     serial: int = 1,
     control: SimulatorControl | None = None,
     foreign: ForeignPlant | None = None,
+    protocol: RequestProtocol = "native",
 ) -> FccCore:
     """Return a computer with an actuator that may be broken, its kernels loaded.
 
@@ -319,10 +354,9 @@ def emulated_computer(
     own; bus_map: see `FccCore`, as for the parameters that follow; faults: severities of the
     faults; effects: effects beside the faults; sensors: errors of the converters; broken: kind of
     broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
-    noise; serial: serial number of the actuator; control, foreign: see `FccCore`. Returns the
-    emulated computer; its first tick has
-    the present date, also in simulated time. ConfigurationError: see `FccCore`; an unknown kind of
-    broken hardware.
+    noise; serial: serial number of the actuator; control, foreign, protocol: see `FccCore`. Returns
+    the emulated computer; its first tick has the present date, also in simulated time.
+    ConfigurationError: see `FccCore`; an unknown kind of broken hardware.
     """
     item = Hardware(actuator, effects or Effects(), sensors or Sensors())
     if broken:
@@ -339,6 +373,7 @@ def emulated_computer(
         channel_faults=item.channel_faults,
         control=control,
         foreign=foreign,
+        protocol=protocol,
         start_ns=time.time_ns(),
     )
     core.step()
