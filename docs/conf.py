@@ -1,7 +1,7 @@
 """Settings of the documentation site: the pages of this folder, plain Markdown, and the docstrings.
 
 `sphinx-build -W --keep-going -b html docs build/site` makes it. `python docs/conf.py` writes the
-table of parameters into its page.
+tables of parameters and of UDS services into their pages.
 """
 
 from __future__ import annotations
@@ -112,6 +112,66 @@ def parameter_table() -> str:
     return "\n".join(lines)
 
 
+UDS = HERE / "reference" / "uds.md"
+UDS_TABLES = re.compile(r"^## Services\n.*", re.MULTILINE | re.DOTALL)
+
+
+def uds_tables() -> str:
+    """Return the services, data and codes of UDS, as Markdown."""
+    from firmware_iface.uds import services as uds  # noqa: PLC0415 - has the package's path now
+
+    def rows(title: str, head: str, lines: list[str]) -> str:
+        rule = "| --- " * (head.count("|") + 1) + "|"
+        return "\n".join([f"## {title}", "", f"| {head} |", rule, *lines, ""])
+
+    routine, snapshot = f"{uds.TEST_STATUS.number:04X}", f"{uds.SNAPSHOT_RECORD:02X}"
+    status = uds.TEST_STATUS.name
+    calls = [
+        *(
+            (f"31 {action:02X} {routine}{option}", f"{action.name.lower()} of a test", status)
+            for action, option in zip(uds.RoutineAction, (" TEST", "", ""), strict=True)
+        ),
+        *((f"22 {item.number:04X}", item.meaning, item.name) for item in uds.DATA_RECORDS.values()),
+        ("19 02 MASK", "trouble codes with a bit of the mask", "mask, codes with their status"),
+        (f"19 04 CODE {snapshot}", "what set a trouble code", f"code, status, {uds.ONBOARD.name}"),
+        ("19 0A", "all trouble codes", "mask, codes with their status"),
+    ]
+    fields = [
+        f"| {record.name} | `{item.name}` | {item.size} | {_scale(item)} | {item.unit} | "
+        f"{item.meaning} |"
+        for record in (uds.TEST_STATUS, *uds.DATA_RECORDS.values())
+        for item in record.fields
+    ]
+    codes = [
+        f"| {item.code} | {item.number:06X} | {item.verdict.name.replace('_', ' ')} | "
+        f"{item.meaning} |"
+        for item in uds.TROUBLE_CODES
+    ]
+    refused = [
+        f"| {code:02X} | {code.name.lower().replace('_', ' ')} | "
+        f"{', '.join(_words(key) for key, value in uds.REFUSALS.items() if value is code)} |"
+        for code in uds.ResponseCode
+    ]
+    return "\n".join(
+        (
+            rows("Services", "request | meaning | answer", [f"| {' | '.join(c)} |" for c in calls]),
+            rows("Data", "answer | field | bytes | step | unit | meaning", fields),
+            rows("Trouble codes", "display | code | set while | meaning", codes),
+            rows("Negative responses", "code | meaning | of a start", refused),
+        )
+    )
+
+
+def _words(value: Any) -> str:
+    return str(value.name).lower().replace("_", " ")
+
+
+def _scale(item: Any) -> str:
+    if item.names is not None:
+        return ", ".join(f"{int(value)} {_words(value)}" for value in item.names)
+    return "text" if item.text else f"{item.scale:g}" + (", signed" if item.signed else "")
+
+
 def setup(app: Sphinx) -> None:
     """Connect what is above."""
     app.connect("html-page-context", make_accessible, priority=900)  # after the theme
@@ -122,3 +182,5 @@ def setup(app: Sphinx) -> None:
 if __name__ == "__main__":
     text = PARAMETERS.read_text("utf-8")
     PARAMETERS.write_text(PARAMETER_TABLE.sub(lambda _: parameter_table(), text), "utf-8")
+    text = UDS.read_text("utf-8")
+    UDS.write_text(UDS_TABLES.sub(lambda _: uds_tables(), text), "utf-8")

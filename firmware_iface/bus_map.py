@@ -20,6 +20,7 @@ from firmware_iface.mapping_file import (
     Policy,
     Protection,
     SignalRef,
+    UdsIdentifiers,
     si_factor,
 )
 from firmware_iface.recording import (
@@ -144,6 +145,8 @@ class BusMap:
     """Added already to the DBC's identifiers."""
     onboard: tuple[MessageMap, ...] = ()
     """Messages of what the computer has found by itself; no part of a recording's samples."""
+    uds: UdsIdentifiers | msgspec.UnsetType = msgspec.UNSET
+    """Identifiers of UDS as the mapping has them, without `id_offset`."""
 
     def find(self, role: str) -> tuple[MessageMap, Role] | None:
         """Message and signal of a role (`command.mode`); None if the mapping leaves it out."""
@@ -152,6 +155,20 @@ class BusMap:
                 if item.name == role:
                     return message, item
         return None
+
+    @property
+    def uds_identifiers(self) -> UdsIdentifiers:
+        """Identifiers of UDS; ConfigurationError: one would be none, or a mapped message's."""
+        given = UdsIdentifiers() if isinstance(self.uds, msgspec.UnsetType) else self.uds
+        pair = given.request_id + self.id_offset, given.response_id + self.id_offset
+        used = {item.can_id for item in (*self.messages.values(), *self.onboard)}
+        most = MAX_CAN_ID if given.extended else MAX_STANDARD_CAN_ID
+        if pair[0] == pair[1] or used & {*pair} or not 0 <= min(pair) <= max(pair) <= most:
+            raise ConfigurationError(
+                f"{self.name}: uds: request_id {pair[0]:#x} and response_id {pair[1]:#x} must be"
+                f" two identifiers of no mapped message, 0 … {most:#x}"
+            )
+        return UdsIdentifiers(*pair)
 
     def shifted(self, id_offset: int) -> BusMap:
         """Return the map of a sister unit, whose identifiers are so much greater.
@@ -283,6 +300,7 @@ def resolve(
         policy=tree.policy,
         channel=tree.channel,
         onboard=onboard,
+        uds=tree.uds,
     ).shifted(tree.id_offset)
 
 

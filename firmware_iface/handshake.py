@@ -142,6 +142,8 @@ class TimeLimits:
     """Listen only: until someone starts a test."""
     status: float = 1.0
     """Request to first answer."""
+    pending: float = 5.0
+    """The computer's word that the answer takes longer, to the answer."""
     arming: float = 10.0
     """Answer to running."""
     telemetry: float = MAX_SAMPLE_GAP_S
@@ -190,6 +192,7 @@ class Handshake:
     verdict: HandshakeResult | None = field(init=False, default=None)
     running_since: int | None = field(init=False, default=None)
     _since: int = field(init=False)
+    _patience: float = field(init=False, default=0.0)
     _last_ns: int = field(init=False, default=0)
     _aborted_at: int = field(init=False, default=0)
     _before: BitStatus | None = field(init=False, default=None)
@@ -223,8 +226,8 @@ class Handshake:
                 actions = [HandshakeAction.START]
             case Phase.WAITING if waited >= times.wait:
                 self._end(f"no test was started within {times.wait:g} s")
-            case Phase.REQUESTED if waited >= times.status:
-                actions = self._abort(f"no answer within {times.status:g} s of the request", now)
+            case Phase.REQUESTED if waited >= (limit := max(times.status, self._patience)):
+                actions = self._abort(f"no answer within {limit:.3g} s of the request", now)
             case Phase.ARMING if waited >= times.arming:
                 actions = self._abort(f"still arming after {times.arming:g} s", now)
             case Phase.RUNNING if (now - self._last_ns) / 1e9 >= times.telemetry:
@@ -296,6 +299,11 @@ class Handshake:
         if self._rest_telemetry or late or self.phase is Phase.RUNNING:
             return []
         return self._runs_on(now)
+
+    def on_pending(self, now: int) -> None:
+        """Hear that the answer to the request takes longer; as long as a test may arm."""
+        longer = (now - self._since) / 1e9 + self.times.pending
+        self._patience = min(longer, self.times.arming)
 
     def on_foreign_request(self, now: int) -> list[HandshakeAction]:
         """Take a request that someone else sent."""
@@ -382,7 +390,8 @@ class Handshake:
             stale = self._before is not None and self._before.state is BitState.REFUSED
             if not (stale and (now - self._since) / 1e9 < self.times.settle):
                 self._status = status
-                return self._close(f"refused: {REASON_TEXTS[status.reason]}", now)
+                why = status.refusal or REASON_TEXTS[status.reason]
+                return self._close(f"refused: {why}", now)
         return []
 
     def _progressed(self, now: int, status: BitStatus) -> list[HandshakeAction]:

@@ -31,6 +31,8 @@ class BitStatus:
     elapsed: float = 0.0
     """s."""
     serial: int | None = None
+    refusal: str = ""
+    """The computer's own word for a refusal without a reason."""
 
 
 @dataclass(frozen=True, slots=True)

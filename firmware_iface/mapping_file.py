@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 import msgspec
 
 from firmware_iface.errors import ConfigurationError
-from firmware_iface.recording import MAX_CAN_ID
+from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID
 
 UNIT_SCALES: dict[str, dict[str, tuple[float, float]]] = {
     "current": {"A": (1.0, 0.0), "mA": (1e-3, 0.0), "uA": (1e-6, 0.0)},
@@ -77,6 +77,7 @@ def si_factor(text: str, dimension: str, where: str) -> tuple[float, float]:
 
 
 MappingName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+CanIdentifier = Annotated[int, msgspec.Meta(ge=0, le=MAX_CAN_ID)]
 CodeNumber = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
 BitStateName = Literal["idle", "arming", "running", "complete", "aborted", "refused"]
 FaultAction = Literal["drop", "flag", "refuse"]
@@ -171,6 +172,18 @@ class OnboardSignals(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     std_FDJ: SignalRef | None = None
 
 
+class UdsIdentifiers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """CAN identifiers of UDS over ISO-TP; both of 11 bits, or of 29 where one is above 0x7FF."""
+
+    request_id: CanIdentifier = 0x7E0
+    response_id: CanIdentifier = 0x7E8
+
+    @property
+    def extended(self) -> bool:
+        """Whether the identifiers have 29 bits."""
+        return max(self.request_id, self.response_id) > MAX_STANDARD_CAN_ID
+
+
 class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How one message is guarded."""
 
@@ -226,5 +239,6 @@ class MappingFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     status: StatusSignals = StatusSignals()
     request: RequestSignals = RequestSignals()
     onboard: OnboardSignals = OnboardSignals()
+    uds: UdsIdentifiers | msgspec.UnsetType = msgspec.UNSET
     protection: Annotated[dict[MappingName, Protection], msgspec.Meta(max_length=256)] = {}
     policy: Policy = Policy()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
 
 from firmware_iface.alignment.align import assemble
 from firmware_iface.alignment.status import OnboardReader
@@ -100,6 +101,96 @@ class BitProgress:
     sample: Sample | None
 
 
+RequestProtocol: TypeAlias = Literal["native", "uds"]
+"""How a test is requested and watched; telemetry comes from the bus with either."""
+
+
+class Requester(Protocol):
+    """A protocol's side of a session: its requests, and what it hears besides telemetry."""
+
+    @property
+    def second_sender(self) -> str:
+        """What gives away that somebody else answers as the computer does; empty if nothing."""
+
+    @property
+    def pending(self) -> bool:
+        """Whether the last frame said that the answer to the request takes longer."""
+
+    @property
+    def awaited(self) -> bool:
+        """Whether what the computer finds itself is still to come."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the computer says of itself, one sentence each."""
+
+    def request(self, action: HandshakeAction, test_id: int, now: int) -> Sequence[Frame]:
+        """Return the frames to send for a request of a test."""
+
+    def take(self, frame: Frame, now: int) -> Sequence[BitStatus | BitRequest]:
+        """Take any frame of the bus, and return what it says of the test."""
+
+    def due(self, now: int) -> Sequence[Frame]:
+        """Return the frames to send now without a request of the handshake."""
+
+    def request_results(self) -> None:
+        """Begin to ask what the computer has found itself in the test, which is over."""
+
+    def onboard(self, test_id: int | None) -> OnboardResult | None:
+        """Return what the computer has found itself in a test; None: nothing."""
+
+
+class NativeRequester:
+    """The own messages: requests are frames of the mapping, all else comes unasked.
+
+    bus_map: which message and signal plays which role.
+    """
+
+    second_sender = ""
+    pending = False
+    notes = ()
+
+    def __init__(self, bus_map: BusMap) -> None:
+        self._encoder = Encoder(bus_map)
+        self._onboard = OnboardReader(bus_map)
+
+    @property
+    def awaited(self) -> bool:
+        """Whether the computer is at it, or has not yet said all."""
+        return self._onboard.awaited
+
+    def request(self, action: HandshakeAction, test_id: int, now: int) -> Sequence[Frame]:
+        """Return the frames to send for a request of a test."""
+        return self._encoder.request(action.value, test_id, now)
+
+    def take(self, frame: Frame, _now: int) -> Sequence[BitStatus | BitRequest]:
+        """Take any frame; the status is decoded with the telemetry."""
+        self._onboard.take(frame)
+        return ()
+
+    def due(self, _now: int) -> Sequence[Frame]:
+        """Return nothing: the computer sends its status of its own."""
+        return ()
+
+    def request_results(self) -> None:
+        """Ask nothing: the computer sends its result of its own."""
+
+    def onboard(self, test_id: int | None) -> OnboardResult | None:
+        """Return what the computer has found itself in a test; None: nothing."""
+        return self._onboard.of_test(test_id)
+
+
+def requester_of(bus_map: BusMap, protocol: RequestProtocol) -> Requester:
+    """Return a protocol's side of a session; ConfigurationError: its packages are not there."""
+    if protocol == "native":
+        return NativeRequester(bus_map)
+    if protocol != "uds":
+        raise ConfigurationError(f"protocol {protocol!r}: need one of native, uds")
+    from firmware_iface.uds.client import UdsClient  # noqa: PLC0415 - optional packages
+
+    return UdsClient(bus_map.uds_identifiers)
+
+
 @dataclass(frozen=True, slots=True)
 class RequestOutcome:
     """How the request ended."""
@@ -126,6 +217,8 @@ class RequestOutcome:
     """Files that hold the raw frames."""
     onboard: OnboardResult | None = None
     """What the computer has found itself; None where it did not say."""
+    notes: tuple[str, ...] = ()
+    """What the computer says of itself, one sentence each."""
 
 
 def run_test(
@@ -143,6 +236,7 @@ def run_test(
     progress: Callable[[BitProgress], None] | None = None,
     all_there: Callable[[], bool] | None = None,
     onboard_wait: float = 0.0,
+    protocol: RequestProtocol = "native",
 ) -> RequestOutcome:
     """Run one test, or with `transmit` false wait for one that someone else starts.
 
@@ -158,9 +252,10 @@ def run_test(
     progress: called with the state of the test as it runs; all_there: asked once, when the computer
     has said that the test is complete: whether no frame of it may still come, so that there is
     nothing left to listen for; onboard_wait: how long to listen on, s, for what the computer finds
-    itself, where it says that it is at it. Returns how the test ended, and the frames that were
-    recorded. ConfigurationError: `transmit` without a test number or on a transport that listens
-    only; InputOutputError: the recording cannot be written (an abort was requested).
+    itself, where it says that it is at it; protocol: how the test is requested and watched. Returns
+    how the test ended, and the frames that were recorded. ConfigurationError: `transmit` without a
+    test number or on a transport that listens only, a protocol whose packages are not there;
+    InputOutputError: the recording cannot be written (an abort was requested).
     """
     if transmit and not transport.transmits:
         raise ConfigurationError(f"{transport.name}: opened to listen only, nothing is sent")
@@ -174,7 +269,7 @@ def run_test(
         times=times or TimeLimits(),
         limits=limits or ChannelLimits(),
     )
-    session = _BitSession(transport, recorder, bus_map or default_map(), machine)
+    session = _BitSession(transport, recorder, bus_map or default_map(), machine, protocol)
     session.on_frame, session.progress, session.all_there = on_frame, progress, all_there
     session.onboard_wait = onboard_wait
     try:
@@ -188,14 +283,18 @@ class _BitSession:
     """Carries frames to the machine and its requests to the bus."""
 
     def __init__(
-        self, transport: Transport, recorder: Recorder | None, bus_map: BusMap, machine: Handshake
+        self,
+        transport: Transport,
+        recorder: Recorder | None,
+        bus_map: BusMap,
+        machine: Handshake,
+        protocol: RequestProtocol,
     ) -> None:
         self._transport = transport
         self._recorder = recorder
         self._machine = machine
         self._decoder = LiveDecoder(bus_map)
-        self._onboard = OnboardReader(bus_map)
-        self._encoder = Encoder(bus_map)
+        self._requester = requester_of(bus_map, protocol)
         self._frames = 0
         self._sample: Sample | None = None
         self._serial: int | None = None
@@ -239,7 +338,13 @@ class _BitSession:
             elif source.at_end:
                 machine.lost("the recording ends before the test does")
             self._act(machine.on_time(now))
+            self._send_due(now)
             self._report(now)
+
+    def _send_due(self, now: int) -> None:
+        """Send what the protocol asks for of its own, as long as the handshake goes on."""
+        if self._machine.transmit and self._machine.phase is not Phase.DONE:
+            self._send(self._requester.due(now))
 
     def _listen_on(self, source: FrameSource, stop: threading.Event) -> None:
         """Hear what the computer finds itself in the complete test."""
@@ -247,7 +352,10 @@ class _BitSession:
         if verdict is None or not verdict.complete:
             return
         until = source.now_ns() + round(self.onboard_wait * 1e9)
-        while self._onboard.awaited and source.now_ns() < until and not stop.is_set():
+        if self.onboard_wait and self._machine.transmit:
+            self._requester.request_results()
+        while self._requester.awaited and source.now_ns() < until and not stop.is_set():
+            self._send(self._requester.due(source.now_ns()))
             frame = source.receive(TESTER_POLL_S)
             if frame is not None:
                 self._take(frame, source.now_ns())
@@ -260,10 +368,16 @@ class _BitSession:
             self.on_frame(frame)
         if frame.sent:
             return
-        self._onboard.take(frame)
         content = self._decoder.decode(frame)
-        if self._decoder.second_sender:
-            self._act(self._machine.on_second_sender(now, self._decoder.second_sender))
+        answers = self._requester.take(frame, now)
+        if second := self._decoder.second_sender or self._requester.second_sender:
+            self._act(self._machine.on_second_sender(now, second))
+        if self._requester.pending:
+            self._machine.on_pending(now)
+        for item in (content, *answers):
+            self._take_content(item, now)
+
+    def _take_content(self, content: BitStatus | Sample | BitRequest | None, now: int) -> None:
         match content:
             case BitStatus():
                 if content.serial is not None:
@@ -294,7 +408,11 @@ class _BitSession:
         test_id = self._machine.test_id
         if test_id is None:
             raise AssertionError("a listener requests nothing")
-        for frame in self._encoder.request(action.value, test_id, self._transport.stamp_ns()):
+        self._send(self._requester.request(action, test_id, self._transport.now_ns()))
+
+    def _send(self, frames: Iterable[Frame]) -> None:
+        for item in frames:
+            frame = replace(item, time_ns=self._transport.stamp_ns())
             if self._recorder is not None:
                 self._recorder.write(replace(frame, sent=True))
             self._transport.send(frame)
@@ -336,5 +454,6 @@ class _BitSession:
             dropped=source.overflow,
             degraded=source.detail,
             recorded=self._recorder.paths if self._recorder else (),
-            onboard=self._onboard.of_test(self._machine.test_id) if verdict.complete else None,
+            onboard=self._requester.onboard(self._machine.test_id) if verdict.complete else None,
+            notes=self._requester.notes,
         )

@@ -112,6 +112,7 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
     options.add_report_option(parser)
     options.add_signals_option(parser)
     option_values.add_bus_options(parser)
+    option_values.add_protocol_option(parser)
     add_simulator_options(parser)
     show_usual(
         parser,
@@ -193,7 +194,13 @@ def _setups(arguments: argparse.Namespace, test: StoredTest) -> Sequence[Setup]:
     setups = [options.setup_of(item.arguments, item.label) for item in named]
     _refuse_contradictions(arguments)
     for setup in setups:
-        refuse_untestable(test, setup.actuator, setup.bus_map, transmit=not arguments.listen)
+        refuse_untestable(
+            test,
+            setup.actuator,
+            setup.bus_map,
+            transmit=not arguments.listen,
+            protocol=arguments.protocol,
+        )
     return setups
 
 
@@ -226,6 +233,7 @@ def _settings(arguments: argparse.Namespace, setup: Setup, simulation: _Simulati
         transmit=not arguments.listen,
         limits=ChannelLimits(**limits),
         onboard_wait_s=arguments.onboard_wait,
+        protocol=arguments.protocol,
         bitrate=option_values.bitrate_from_options(arguments, setup.bus_map),
         own_fault=simulation.own_fault,
     )
@@ -254,7 +262,7 @@ def _connection(
                 emulator_in_thread,
             )
 
-            settings = simulator_settings(arguments)
+            settings = simulator_settings(arguments) | {"protocol": arguments.protocol}
             xcp = options.xcp_ids(arguments)
             core = emulated_computer(setup.actuator, [test], setup.bus_map, xcp=xcp, **settings)
             if arguments.fast:

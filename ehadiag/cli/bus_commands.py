@@ -401,6 +401,7 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
     options.add_xcp_option(parser, "serve XCP on CAN, for measurement only")
     options.add_request_options(parser, "actuator", *options.BUS)
     option_values.add_bus_options(parser)
+    option_values.add_protocol_option(parser)
     add_simulator_options(parser)
     show_usual(
         parser,
@@ -435,7 +436,7 @@ def run_sim(arguments: argparse.Namespace) -> int:
     print_compiling_notice(simulation=True, identification=False)
     from ehadiag_sim.emulator import emulated_computer, run_emulator  # noqa: PLC0415 - loads kernels
 
-    settings = simulator_settings(arguments)
+    settings = simulator_settings(arguments) | {"protocol": arguments.protocol}
     xcp = options.xcp_ids(arguments)
     core = emulated_computer(actuator, tests, bus_map, xcp=xcp, **settings)
     with (

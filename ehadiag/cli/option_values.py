@@ -52,6 +52,17 @@ def add_actuators_options(parser: argparse.ArgumentParser) -> None:
     options.add_request_options(parser, "dbc", "id_offset")
 
 
+def add_protocol_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--protocol`."""
+    parser.add_argument(
+        "--protocol",
+        choices=("native", "uds"),
+        default="native",
+        help="how a test is requested and watched: by the bus's own messages (default), or by UDS"
+        " over ISO-TP, identifiers as the mapping's [uds] says, else 0x7E0 and 0x7E8",
+    )
+
+
 def arguments_of_actuators(arguments: argparse.Namespace) -> list[ActuatorArguments]:
     """Return the command line of each actuator.
 

@@ -28,7 +28,7 @@ from firmware_iface.errors import (
     printable,
     reason_of,
 )
-from firmware_iface.files import RESULT_MODE, Folder, write_errors
+from firmware_iface.files import RESULT_MODE, Folder, write_errors, write_file
 from firmware_iface.stored_test import COMMAND_UNITS, bundled_tests, resolve_test
 
 FILE_TEMPLATES = {
@@ -129,7 +129,8 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     """Add description and options of the command."""
     parser.description = (
         "Write monitor and identification as a static library with C headers for"
-        " another computer (no cross compiler is needed), simulation units, or an A2L file."
+        " another computer (no cross compiler is needed), simulation units, an A2L file, or the"
+        " description of the UDS services."
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--target", metavar="NAME", help="computer, see --list")
@@ -143,6 +144,12 @@ def define_export(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="A2L file (ASAM MCD-2 MC) of what the emulated computer measures by XCP",
     )
+    what.add_argument(
+        "--pdx",
+        metavar="FILE",
+        help="diagnostic description of the computer's UDS services (ODX 2.2); a file there is"
+        " replaced",
+    )
     what.add_argument("--list", action="store_true", help="list the targets and exit")
     parser.add_argument("--out", metavar="DIR", help="folder to write into")
     parser.add_argument(
@@ -152,7 +159,7 @@ def define_export(parser: argparse.ArgumentParser) -> None:
         metavar="H",
         help="mean time between false alarms of the monitor (default %(default)g)",
     )
-    options.add_request_options(parser, "actuator", "mapping", "dbc")
+    options.add_request_options(parser, "actuator", "mapping", "dbc", "id_offset")
     options.add_xcp_option(parser, "with --a2l: how the computer is reached")
     parser.set_defaults(run=run_export)
 
@@ -165,6 +172,13 @@ def run_export(arguments: argparse.Namespace) -> int:
         width = max(len(item.name) for item in TARGETS)
         for item in TARGETS:
             print_text(f"{item.name:<{width}}  {item.meaning}")
+        return 0
+    if arguments.pdx:
+        from ehadiag.export.pdx import pdx_content  # noqa: PLC0415 - not for help texts
+
+        identifiers = options.setup_of(arguments).bus_map.uds_identifiers
+        write_file(Path(arguments.pdx), pdx_content(identifiers), "diagnostic description")
+        print_text(printable(arguments.pdx))
         return 0
     if arguments.out is None:
         raise ConfigurationError("export: need --out DIR")

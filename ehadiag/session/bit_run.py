@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ehadiag.session.monitor_session import BitMonitor
     from firmware_iface.handshake import ChannelLimits
     from firmware_iface.logs.recorder import Recorder
-    from firmware_iface.tester import BitProgress, RequestOutcome
+    from firmware_iface.tester import BitProgress, RequestOutcome, RequestProtocol
     from firmware_iface.transport.base import Transport
     from firmware_iface.transport.frames import Frame
 
@@ -50,6 +50,8 @@ class BitSettings:
     """Time after the test in which the computer's own result is awaited, s."""
     bitrate: float | None = None
     """Of the bus, bit/s; None: unknown."""
+    protocol: RequestProtocol = "native"
+    """How the test is requested and watched."""
     own_fault: Callable[[], str] = str
     """Says after an incomplete test why this computer is the cause; empty where it is not."""
 
@@ -141,6 +143,7 @@ class BitTest:
                             progress=on_progress,
                             all_there=ahead.all_there,
                             onboard_wait=settings.onboard_wait_s,
+                            protocol=settings.protocol,
                         )
                     except InputOutputError as error:  # of the recording; the abort was requested
                         why = str(error)
@@ -257,15 +260,21 @@ def recording_path(folder: Path, test: StoredTest) -> Path:
 
 
 def refuse_untestable(
-    test: StoredTest, actuator: Actuator, bus_map: BusMap, *, transmit: bool
+    test: StoredTest,
+    actuator: Actuator,
+    bus_map: BusMap,
+    *,
+    transmit: bool,
+    protocol: RequestProtocol = "native",
 ) -> None:
     """Refuse a test that could not end in a verdict, before the surface moves.
 
     test: the stored test; actuator: data of the actuator; bus_map: the bus that will carry the
-    test; transmit: whether the test is to be requested. ConfigurationError: different rates, a bus
-    on which the test cannot be requested, or its end not seen.
+    test; transmit: whether the test is to be requested; protocol: how. ConfigurationError:
+    different rates, a bus on which the test cannot be requested, or its end not seen.
     """
-    from firmware_iface.codec import Encoder  # noqa: PLC0415 - loads cantools
+    from firmware_iface.handshake import HandshakeAction  # noqa: PLC0415 - loads cantools
+    from firmware_iface.tester import requester_of  # noqa: PLC0415 - loads cantools
 
     rates = {
         f"test {test.name!r}": test.rate,
@@ -275,10 +284,14 @@ def refuse_untestable(
     if max(rates.values()) > min(rates.values()) * (1.0 + RATE_TOLERANCE):
         each = ", ".join(f"{name} {rate:g} Hz" for name, rate in rates.items())
         raise ConfigurationError(f"different rates: {each}")
+    if protocol != "native" and not transmit:
+        raise ConfigurationError(
+            f"--listen sends nothing, --protocol {protocol} asks: leave one out"
+        )
     if transmit:
-        encoder = Encoder(bus_map)
-        for code in ("start", "abort"):
-            encoder.request(code, test.id)
+        requester = requester_of(bus_map, protocol)
+        for action in HandshakeAction:
+            requester.request(action, test.id, 0)
     elif bus_map.find("status.state") is None:
         raise ConfigurationError(
             f"--listen: the mapping {bus_map.name} has no status.state, and nothing else tells when"
@@ -297,10 +310,17 @@ def _finish_identification(
 
 
 def _with_outcome(recording: Recording, outcome: RequestOutcome) -> Recording:
-    """Return a recording with the serial number and the onboard result of its outcome."""
+    """Return a recording with what its outcome says of the computer and its unit."""
+    from firmware_iface.alignment.episodes import NO_STATUS_NOTE  # noqa: PLC0415 - loads python-can
+
     serial = outcome.serial if recording.serial is None else recording.serial
     onboard = outcome.onboard if outcome.onboard is not None else recording.onboard
-    return replace(recording, serial=serial, onboard=onboard)
+    notes, ended = [*recording.quality.notes, *outcome.notes], recording.outcome
+    if ended.state is None and outcome.outcome.state is not None:  # no status but on request
+        ended = outcome.outcome
+        notes = [note for note in notes if note != NO_STATUS_NOTE]
+    quality = replace(recording.quality, notes=tuple(notes))
+    return replace(recording, serial=serial, onboard=onboard, outcome=ended, quality=quality)
 
 
 def _traffic_text(recording: Recording, bus: str, listened: float) -> str:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.recording import Recording
     from firmware_iface.stored_test import StoredTest
+    from firmware_iface.tester import RequestProtocol
     from firmware_iface.transport.adapters import BusOptions
     from firmware_iface.transport.base import Transport
     from firmware_iface.transport.frames import Frame
@@ -86,6 +87,7 @@ def run_test(
     record: PathLike | None = None,
     limits: ChannelLimits | None = None,
     onboard_wait_s: float = ONBOARD_WAIT_S,
+    protocol: RequestProtocol = "native",
     stop: threading.Event | None = None,
     progress: Progress | None = None,
     snapshots: Callable[[Snapshot], None] | None = None,
@@ -109,6 +111,8 @@ def run_test(
         Values beyond which the test is aborted; None: none.
     onboard_wait_s : float
         Time after the test in which the computer's own result is awaited, s.
+    protocol : RequestProtocol
+        How the test is requested and watched: the bus's own messages, or "uds".
     stop : threading.Event | None
         When set, the abort is requested and its answer awaited; the result is NOT TESTED.
     progress : Progress | None
@@ -138,9 +142,11 @@ def run_test(
 
     setup = setup_for(request, {**options, "test": test})
     (stored,), channel = setup.named_tests, setup.bus_map.channel
-    refuse_untestable(stored, setup.actuator, setup.bus_map, transmit=transmit)
+    refuse_untestable(stored, setup.actuator, setup.bus_map, transmit=transmit, protocol=protocol)
     log_if_compiling()
-    settings = BitSettings(transmit=transmit, limits=limits, onboard_wait_s=onboard_wait_s)
+    settings = BitSettings(
+        transmit=transmit, limits=limits, onboard_wait_s=onboard_wait_s, protocol=protocol
+    )
     stop = stop or threading.Event()
     source = f"bus test {stored.name}" if record is None else os.fspath(record)
 
@@ -408,7 +414,7 @@ def run_simulator(
     on_degraded : Callable[[str], None] | None
         Called once when frames were lost on this side.
     conditions : Mapping[str, Any] | None
-        `faults`, `effects`, `sensors`, `broken`, `seed`, `serial` of
+        `faults`, `effects`, `sensors`, `broken`, `seed`, `serial`, `protocol` of
         `ehadiag_sim.emulator.emulated_computer`; None: a unit as new.
     request : Request | None
         Options as of `diagnose`; None: the usual ones.

@@ -245,10 +245,13 @@ def _episode(span: _Span, limit: int | None, status: StatusTable, axis: TickAxis
     )
 
 
+NO_STATUS_NOTE = "no status frames: nothing says how the test ended"
+
+
 def _end_notes(status: StatusTable, outcome: BitOutcome) -> tuple[str, ...]:
     """Note where nothing tells how a test ended."""
     if len(status.row) == 0:
-        return ("no status frames: nothing says how the test ended",)
+        return (NO_STATUS_NOTE,)
     if outcome.state is BitState.RUNNING:
         return ("the status frame that tells of the test's end is missing",)
     return ()

@@ -22,7 +22,7 @@ static bool receive(void *self, struct fcc_frame *frame, bool *got)
     if (count < 0) {
         return errno == EAGAIN || errno == EINTR;
     }
-    /* The filter lets in standard data frames of the request's identifier only. */
+    /* The filter lets in standard data frames of the requests' identifiers only. */
     if ((size_t)count == sizeof raw && raw.can_dlc == sizeof frame->data) {
         frame->id = (uint16_t)(raw.can_id & CAN_SFF_MASK);
         memcpy(frame->data, raw.data, sizeof frame->data);
@@ -48,8 +48,9 @@ static bool transmit(void *self, const struct fcc_frame *frame, uint32_t time_us
 static bool open_bus(const char *channel, struct fcc_bus *bus)
 {
     static int descriptor;
-    struct can_filter filter = {EHA_FCC_BIT_REQUEST_FRAME_ID,
-                                CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
+    const canid_t mask = CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG;
+    struct can_filter filters[] = {{EHA_FCC_BIT_REQUEST_FRAME_ID, mask},
+                                   {FCC_UDS_REQUEST_ID, mask}};
     struct sockaddr_can address;
 
     memset(&address, 0, sizeof address);
@@ -60,7 +61,7 @@ static bool open_bus(const char *channel, struct fcc_bus *bus)
     }
     descriptor = socket(PF_CAN, SOCK_RAW, CAN_RAW);
     if (descriptor < 0 ||
-        setsockopt(descriptor, SOL_CAN_RAW, CAN_RAW_FILTER, &filter, sizeof filter) != 0 ||
+        setsockopt(descriptor, SOL_CAN_RAW, CAN_RAW_FILTER, filters, sizeof filters) != 0 ||
         bind(descriptor, (struct sockaddr *)&address, sizeof address) != 0) {
         return false;
     }

@@ -46,7 +46,7 @@ static enum fcc_reason objection(const struct fcc_node *node, uint8_t test_id)
     return FCC_NO_REASON;
 }
 
-static void start(struct fcc_node *node, uint8_t test_id)
+enum fcc_reason fcc_node_start(struct fcc_node *node, uint8_t test_id)
 {
     enum fcc_reason reason = objection(node, test_id);
 
@@ -59,6 +59,16 @@ static void start(struct fcc_node *node, uint8_t test_id)
     } else if (!busy(node)) {
         enter(node, FCC_REFUSED, test_id);
     } /* otherwise the refusal is said once, and the running test goes on */
+    return reason;
+}
+
+bool fcc_node_abort(struct fcc_node *node)
+{
+    if (!busy(node)) {
+        return false;
+    }
+    enter(node, FCC_ABORTED, node->test_id);
+    return true;
 }
 
 /* Change the state when its time is up. */
@@ -123,9 +133,9 @@ struct fcc_command fcc_node_begin(struct fcc_node *node)
 
     for (i = 0; i < node->pending; i++) {
         if (node->requests[i].request_code == START) {
-            start(node, node->requests[i].request_test_id);
-        } else if (node->requests[i].request_code == ABORT && busy(node)) {
-            enter(node, FCC_ABORTED, node->test_id);
+            (void)fcc_node_start(node, node->requests[i].request_test_id);
+        } else if (node->requests[i].request_code == ABORT) {
+            (void)fcc_node_abort(node);
         }
     }
     node->pending = 0;

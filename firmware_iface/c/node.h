@@ -84,6 +84,12 @@ struct fcc_node {
 };
 
 void fcc_node_init(struct fcc_node *node, uint16_t serial, const struct fcc_rig *rig);
+
+/* What requests do, for another protocol (uds.h); before fcc_node_begin. An abort of no running
+ * test does nothing and is false. */
+enum fcc_reason fcc_node_start(struct fcc_node *node, uint8_t test_id);
+bool fcc_node_abort(struct fcc_node *node);
+
 void fcc_node_take(struct fcc_node *node, const struct fcc_frame *frame);
 struct fcc_command fcc_node_begin(struct fcc_node *node);
 size_t fcc_node_end(struct fcc_node *node, const uint16_t codes[4],

@@ -27,6 +27,7 @@ static void on_signal(int number)
 struct options {
     struct fcc_rig rig;
     double serial, jack, ticks;
+    bool uds; /* requests and status by UDS */
 };
 
 static bool number(const char *text, double low, double high, double *out)
@@ -47,6 +48,10 @@ static bool parse(int argc, char **argv, struct options *options)
 
         if (strcmp(name, "--interlock-open") == 0) {
             options->rig.interlock_open = true;
+            continue;
+        }
+        if (strcmp(name, "--uds") == 0) {
+            options->uds = true;
             continue;
         }
         if (++i == argc) {
@@ -87,31 +92,39 @@ struct fcc_rider fcc_bench_rider(void)
     return rider;
 }
 
-/* One tick: requests in, command held, frames out. */
-static bool run_tick(struct fcc_node *node, const struct fcc_rider *rider,
+/* One tick: requests in, command held, frames out; `uds` NULL: by the own messages. */
+static bool run_tick(struct fcc_node *node, struct fcc_uds *uds, const struct fcc_rider *rider,
                      const struct fcc_bus *bus, uint32_t time_us)
 {
-    struct fcc_frame frames[FCC_FRAMES_PER_TICK + FCC_RIDER_FRAMES];
+    struct fcc_frame frames[FCC_FRAMES_PER_TICK + FCC_RIDER_FRAMES + FCC_UDS_FRAMES];
     struct fcc_command command;
     uint16_t codes[4];
-    size_t i, count;
+    size_t i, count = 0;
     bool got = true;
 
     for (i = 0; i < MOST_READ && got; i++) {
         if (!bus->receive(bus->self, &frames[0], &got)) {
             return false;
         }
-        if (got) {
+        if (got && uds != NULL) {
+            fcc_uds_take(uds, &frames[0]);
+        } else if (got) {
             fcc_node_take(node, &frames[0]);
         }
     }
+    if (uds != NULL) {
+        count = fcc_uds_tick(uds, node, frames);
+    }
     command = fcc_node_begin(node);
     rider->convert(rider->self, &command, codes);
-    count = fcc_node_end(node, codes, frames);
+    count += fcc_node_end(node, codes, frames + count);
     if (rider->after != NULL) {
         count += rider->after(rider->self, node, codes, frames + count);
     }
     for (i = 0; i < count; i++) {
+        if (uds != NULL && frames[i].id == EHA_FCC_BIT_STATUS_FRAME_ID) {
+            continue;
+        }
         if (!bus->send(bus->self, &frames[i], time_us + (uint32_t)i * FRAME_US)) {
             return false;
         }
@@ -123,9 +136,10 @@ int fcc_run(int argc, char **argv, const char *channel,
             bool (*open_bus)(const char *channel, struct fcc_bus *bus),
             const struct fcc_rider *rider)
 {
-    struct options options = {{2070, 70, 1400, false}, 1, 0, 0};
+    struct options options = {{2070, 70, 1400, false}, 1, 0, 0, false};
     struct sigaction action;
     struct fcc_node node;
+    struct fcc_uds uds;
     struct fcc_bus bus;
     struct timespec due;
     uint32_t tick;
@@ -133,7 +147,7 @@ int fcc_run(int argc, char **argv, const char *channel,
     if (argc < 2 || argv[1][0] == '-' || !parse(argc, argv, &options)) {
         fprintf(stderr,
                 "usage: %s %s [--serial N] [--supply-MPa P] [--oil-degC T] [--jack-mm X]\n"
-                "       [--interlock-open] [--ticks N]\n",
+                "       [--interlock-open] [--ticks N] [--uds]\n",
                 argv[0], channel);
         return 2;
     }
@@ -148,6 +162,7 @@ int fcc_run(int argc, char **argv, const char *channel,
     if (rider->place != NULL) {
         rider->place(rider->self, options.jack);
     }
+    fcc_uds_init(&uds);
     fcc_node_init(&node, (uint16_t)options.serial, &options.rig);
     clock_gettime(CLOCK_MONOTONIC, &due);
     for (tick = 0; !stopped && (options.ticks == 0 || tick < options.ticks); tick++) {
@@ -158,7 +173,7 @@ int fcc_run(int argc, char **argv, const char *channel,
         }
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL) == EINTR && !stopped) {
         }
-        if (!run_tick(&node, rider, &bus, (tick + 1u) * FCC_TICK_US)) {
+        if (!run_tick(&node, options.uds ? &uds : NULL, rider, &bus, (tick + 1u) * FCC_TICK_US)) {
             fprintf(stderr, "%s: %s: bus lost: %s\n", argv[0], argv[1], strerror(errno));
             return 1;
         }

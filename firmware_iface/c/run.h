@@ -6,6 +6,7 @@
 #include <stdint.h>
 
 #include "node.h"
+#include "uds.h"
 
 /* A bus, without blocking. Both calls end the program by returning false when the bus is lost. */
 struct fcc_bus {

@@ -23,7 +23,7 @@ from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.errors import ConfigurationError, EhadiagError
-from firmware_iface.live_decode import BitRequest, LiveDecoder
+from firmware_iface.live_decode import BitRequest, BitStatus, LiveDecoder
 from firmware_iface.recording import CHANNEL_NAMES, BitReason, BitState, CommandMode
 from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S, Transport, TransportState
@@ -32,6 +32,8 @@ from firmware_iface.xcp import XcpIds, is_extended, measurements_of
 
 if TYPE_CHECKING:
     from ehadiag_sim.foreign_plant import ForeignPlant
+    from ehadiag_sim.uds_server import UdsServer
+    from firmware_iface.tester import RequestProtocol
 
 MAX_SERIAL_NUMBER = 0xFFFF
 
@@ -64,9 +66,10 @@ class FccCore:
     of the first tick, ns; bus_map: messages to send and accept; None: the default bus;
     channel_faults: damage to the readings of the channels; None: none; control: changes while it
     runs; None: none; foreign: plant of another maker; None: the detailed simulator; xcp:
-    identifiers of its XCP slave; None: it has none. ConfigurationError: two tests with one number,
-    a test at another rate than the controller; a serial number, a converter's range or the rated
-    current that the bus cannot carry; an XCP identifier that a message has.
+    identifiers of its XCP slave; None: it has none; protocol: how tests are requested and watched,
+    with `uds` by nothing else. ConfigurationError: two tests with one number, a test at another
+    rate than the controller; a serial number, a converter's range or the rated current that the bus
+    cannot carry; an XCP identifier that a message has.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class FccCore:
         control: SimulatorControl | None = None,
         foreign: ForeignPlant | None = None,
         xcp: XcpIds | None = None,
+        protocol: RequestProtocol = "native",
     ) -> None:
         if not 0 <= serial <= MAX_SERIAL_NUMBER:
             raise ConfigurationError(f"actuator serial {serial}: outside 0 … {MAX_SERIAL_NUMBER}")
@@ -126,6 +130,11 @@ class FccCore:
         self._sent_state: tuple[BitState, int] | None = None
         self._pending: deque[BitRequest] = deque()
         self.interlock_open = False
+        self._uds: UdsServer | None = None
+        if protocol == "uds":
+            from ehadiag_sim.uds_server import UdsServer  # noqa: PLC0415 - optional packages
+
+            self._uds = UdsServer(self, bus_map.uds_identifiers)
 
     @property
     def state(self) -> BitState:
@@ -147,10 +156,31 @@ class FccCore:
         """The actuator as it is now."""
         return self._plant
 
+    @property
+    def status(self) -> BitStatus:
+        """State of the test, its number and elapsed time, and the actuator's serial number."""
+        elapsed = self._elapsed / self._rate
+        return BitStatus(self._state, BitReason.NONE, self._test_id, elapsed, self._serial)
+
+    @property
+    def faults(self) -> Faults:
+        """Severities of the actuator as it is now."""
+        return self._faults or Faults()
+
+    @property
+    def offsets(self) -> tuple[float, ...]:
+        """Offsets of the sensors as they are now, SI."""
+        lsb = (self._sensors or Sensors()).offsets_lsb
+        pairs = zip(lsb, self._scales.channels, strict=True)
+        return tuple(count * channel.lsb for count, channel in pairs)
+
     def take(self, frame: Frame) -> None:
         """Take a frame off the bus; anything but a valid request is ignored."""
         if self._slave is not None:
             self._slave.take(frame)
+        if self._uds is not None:
+            self._uds.take(frame)
+            return
         request = self._decoder.decode(frame)
         if isinstance(request, BitRequest):
             self._pending.append(request)
@@ -164,9 +194,10 @@ class FccCore:
         while self._pending:
             request = self._pending.popleft()
             if request.code == "start":
-                self._start(request.test_id)
+                self.start(request.test_id)
             elif request.code == "abort":
-                self._abort()
+                self.abort()
+        answers = [] if self._uds is None else self._uds.step()
         self._advance()
         running = self._state is BitState.RUNNING
         if running:
@@ -179,7 +210,7 @@ class FccCore:
         codes = self._plant.tick(command, mode)
         self._tick += 1
         frames: list[Frame] = []
-        frames += self._status()
+        frames += self._status() if self._uds is None else answers
         if running or self._idle_telemetry:
             frames += self._encoder.command(mode, command, test_id, 0)
             frames += self._encoder.telemetry(codes.tolist(), 0)
@@ -216,7 +247,8 @@ class FccCore:
             **dict(zip(CHANNEL_NAMES, codes, strict=True)),
         }
 
-    def _start(self, test_id: int) -> None:
+    def start(self, test_id: int) -> BitReason:
+        """Start a test, or say why it is refused."""
         reason = self._objection(test_id)
         if reason is BitReason.NONE:
             test = self._tests[test_id]
@@ -230,6 +262,7 @@ class FccCore:
         else:
             self._refused = (reason, test_id)
             self._enter(BitState.REFUSED, test_id)
+        return reason
 
     def _objection(self, test_id: int) -> BitReason:
         demands = self._demands
@@ -249,7 +282,8 @@ class FccCore:
         )
         return next((reason for failed, reason in checks if failed), BitReason.NONE)
 
-    def _abort(self) -> None:
+    def abort(self) -> None:
+        """Command zero current from this tick on, if a test runs."""
         if self._state in (BitState.ARMING, BitState.RUNNING):
             self._refused = None  # of a second request in the same tick: no reason of an abort
             self._enter(BitState.ABORTED, self._test_id)
@@ -353,6 +387,7 @@ def emulated_computer(
     control: SimulatorControl | None = None,
     foreign: ForeignPlant | None = None,
     xcp: XcpIds | None = None,
+    protocol: RequestProtocol = "native",
 ) -> FccCore:
     """Return a computer with an actuator that may be broken, its kernels loaded.
 
@@ -360,8 +395,8 @@ def emulated_computer(
     own; bus_map: see `FccCore`, as for the parameters that follow; faults: severities of the
     faults; effects: effects beside the faults; sensors: errors of the converters; broken: kind of
     broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
-    noise; serial: serial number of the actuator; control, foreign, xcp: see `FccCore`. Returns the
-    emulated computer; its first tick has the present date, also in simulated time.
+    noise; serial: serial number of the actuator; control, foreign, xcp, protocol: see `FccCore`.
+    Returns the emulated computer; its first tick has the present date, also in simulated time.
     ConfigurationError: see `FccCore`; an unknown kind of broken hardware.
     """
     item = Hardware(actuator, effects or Effects(), sensors or Sensors())
@@ -380,6 +415,7 @@ def emulated_computer(
         control=control,
         foreign=foreign,
         xcp=xcp,
+        protocol=protocol,
         start_ns=time.time_ns(),
     )
     core.step()

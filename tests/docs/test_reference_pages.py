@@ -60,6 +60,11 @@ def test_the_table_of_parameters_is_that_of_the_registry() -> None:
     assert page["parameter_table"]() in page["PARAMETERS"].read_text("utf-8")
 
 
+def test_the_tables_of_uds_are_those_of_its_records() -> None:
+    page = runpy.run_path(str(ROOT / "docs" / "conf.py"))
+    assert page["UDS"].read_text("utf-8").endswith(page["uds_tables"]())
+
+
 REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs" / "reference" / "json.md").read_text()
 

@@ -122,6 +122,7 @@ def test_own_test_file_is_played_and_diagnosed(run: Run, tmp_path: Path) -> None
     [
         (["--supply", "10"], "refused: supply pressure low"),
         (["--oil-temperature", "-30"], "refused: oil too cold"),
+        (["--oil-temperature", "-30", "--protocol", "uds"], "refused: oil too cold"),
     ],
 )
 def test_refusal_is_not_tested(options: list[str], reason: str, run: Run) -> None:
@@ -129,6 +130,28 @@ def test_refusal_is_not_tested(options: list[str], reason: str, run: Run) -> Non
     (found,) = result.objects
     assert (result.code, found["verdict"], found["reasons"]) == (30, "NOT_TESTED", [reason])
     assert (found["test"], found["serial"]) == ("open", 1)
+
+
+def test_a_test_by_uds_has_the_same_verdict_and_the_computers_own(run: Run) -> None:
+    faults = ("--Kintas", "0.1", "--FSS", "0.05", "--FDJ", "0.2")
+    found = [
+        run(*FAST, "--test", "open", "--protocol", name, *faults).objects[0]
+        for name in ("native", "uds")
+    ]
+    estimates = [[item["faults"][name]["estimate"] for name in NAMES] for item in found]
+    assert estimates[0] == pytest.approx(estimates[1], abs=1e-3)
+    assert found[1]["verdict"] == "HEALTHY"
+    onboard = found[1]["recordings"][0]["onboard"]
+    assert [onboard["faults"][name]["estimate"] for name in NAMES] == pytest.approx(
+        [0.1, 0.05, 0.2]
+    )
+    assert "software ehadiag" in " ".join(found[1]["quality"]["notes"])
+
+
+def test_uds_cannot_listen(run: Run) -> None:
+    done = run("bit", "--test", "open", "--listen", "--protocol", "uds", "-i", "virtual", "-c", "x")
+    assert done.code == 2
+    assert "--listen sends nothing, --protocol uds asks" in done.message
 
 
 def test_exceeded_limit_aborts(run: Run) -> None:

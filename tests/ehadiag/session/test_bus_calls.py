@@ -114,6 +114,20 @@ def test_a_test_is_run_recorded_and_diagnosed(tmp_path: Path) -> None:
     assert checked.to_dict()["schema"] == "ehadiag.bus/1"
 
 
+def test_a_test_is_requested_by_uds() -> None:
+    core = emulated_computer(default_actuator(), [TESTS["open"]], faults=Faults(FSS=0.5),
+                             serial=12, protocol="uds")  # fmt: skip
+    with EmulatorTransport(core) as bus:
+        result = ehadiag.run_test(bus, "open", transmit=True, protocol="uds")
+    assert result.verdict is ehadiag.Verdict.DEGRADED
+    assert result.faults["FSS"].value == pytest.approx(0.5, abs=0.02)
+    assert result.serial == 12
+    assert any("trouble codes C1A01-00 DEGRADED" in note for note in result.notes)
+    assert not any("how the test ended" in note for note in result.notes)
+    with pytest.raises(ehadiag.ConfigurationError, match="need one of native, uds"):
+        ehadiag.run_test(bus, "open", transmit=True, protocol="xyz")  # type: ignore[arg-type]
+
+
 @pytest.mark.slow  # a whole test in real time
 def test_a_test_on_an_open_bus_of_python_can(computer: None, channel: str) -> None:
     with opened(channel) as bus, opened(channel) as witness:

@@ -13,6 +13,7 @@ from firmware_iface.transport.frames import Frame
 
 SOURCES = ROOT / "firmware_iface" / "c"
 FRAMES_PER_TICK = 5
+UDS_FRAMES_PER_TICK = 13
 NODE_WORDS = 512
 """Room for `struct fcc_node` in words of 8 bytes, several times its size."""
 
@@ -95,6 +96,7 @@ def load(path: Path) -> Any:
     library.fcc_link_feed.restype = c_bool
     library.fcc_node_begin.restype = CCommand
     library.fcc_node_end.restype = c_size_t
+    library.fcc_uds_tick.restype = c_size_t
     library.fcc_test_find.restype = ctypes.c_void_p
     library.fcc_test_ticks.argtypes = [ctypes.c_void_p]
     library.fcc_test_ticks.restype = c_uint16
@@ -145,6 +147,45 @@ class Node:
         return [frames[i].content for i in range(count)]
 
 
+class CFound(Structure):
+    _fields_ = (
+        ("state", c_uint8),
+        ("verdict", c_uint8),
+        ("runs", c_uint16),
+        ("severity", c_uint32 * 3),
+        ("deviation", c_uint32 * 3),
+    )
+
+
+class CUds(Structure):
+    """The part of `struct fcc_uds` that the caller keeps up to date."""
+
+    _fields_ = (
+        ("found", CFound),
+        ("offsets", c_int16 * 4),
+        ("software", ctypes.c_char * 16),
+        ("rest", c_uint8 * 1024),
+    )
+
+
+class UdsNode(Node):
+    """A node whose requests and status go by UDS."""
+
+    def __init__(self, library: Any, serial: int, rig: CRig) -> None:
+        super().__init__(library, serial, rig)
+        self.uds = CUds()
+        library.fcc_uds_init(ctypes.byref(self.uds))
+
+    def take(self, frame: Frame) -> None:
+        self._library.fcc_uds_take(ctypes.byref(self.uds), ctypes.byref(c_frame(frame)))
+
+    def answers(self) -> list[tuple[int, bytes]]:
+        frames = (CFrame * UDS_FRAMES_PER_TICK)()
+        count = self._library.fcc_uds_tick(ctypes.byref(self.uds), self._state, frames)
+        assert count <= UDS_FRAMES_PER_TICK
+        return [frames[i].content for i in range(count)]
+
+
 class Link:
     """`struct fcc_link`: bytes in, frames with their times in µs out."""
 
@@ -177,4 +218,15 @@ def link_packet(library: Any, frame: Frame, time_us: int) -> bytes:
     return bytes(packet)
 
 
-__all__ = ["SOURCES", "CRig", "Link", "Node", "c_frame", "link_packet", "load", "pack", "unpack"]
+__all__ = [
+    "SOURCES",
+    "CRig",
+    "Link",
+    "Node",
+    "UdsNode",
+    "c_frame",
+    "link_packet",
+    "load",
+    "pack",
+    "unpack",
+]

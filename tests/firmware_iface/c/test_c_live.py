@@ -31,6 +31,7 @@ REFUSALS = [
     (("--supply-MPa", "9"), 1, BitReason.SUPPLY_PRESSURE_LOW, "refused: supply pressure low"),
     (("--oil-degC", "-30"), 1, BitReason.OIL_TOO_COLD, "refused: oil too cold"),
     (("--interlock-open",), 1, BitReason.INTERLOCK_OPEN, "refused: interlock open"),
+    (("--interlock-open", "--uds"), 1, BitReason.INTERLOCK_OPEN, "refused: interlock open"),
 ]
 
 
@@ -56,6 +57,7 @@ def run(
     test_id: int,
     stop: threading.Event | None = None,
     progress: Callable[[BitProgress], None] | None = None,
+    protocol: tester.RequestProtocol = "native",
 ) -> tuple[tester.RequestOutcome, Recording]:
     frames: list[Frame] = []
     outcome = run_test(
@@ -67,6 +69,7 @@ def run(
         on_frame=frames.append,
         stop=stop,
         progress=progress,
+        protocol=protocol,
     )
     return outcome, assemble(FrameTable.from_frames(frames), BUS, "here")[0]
 
@@ -180,7 +183,8 @@ class TestSerialLink:
             running(c_build / "fcc-serial", wire[1], *options),
         ):
             wait_for_frames(transport)
-            outcome, _ = run(transport, test_id)
+            protocol = "uds" if "--uds" in options else "native"
+            outcome, _ = run(transport, test_id, protocol=protocol)
         assert (outcome.why, outcome.outcome.reason) == (why, reason)
 
     def test_requests_behind_noise_get_through(self, c_build: Path, wire: tuple[str, str]) -> None:
@@ -229,7 +233,8 @@ class TestSocketCan:
     ) -> None:
         with running(c_build / "fcc-can", "vcan0", *options):
             wait_for_frames(transport)
-            outcome, _ = run(transport, test_id)
+            protocol = "uds" if "--uds" in options else "native"
+            outcome, _ = run(transport, test_id, protocol=protocol)
         assert (outcome.why, outcome.outcome.reason) == (why, reason)
 
 
