@@ -78,8 +78,8 @@ def model_response(
         anchor.as_array(),
         response,
     )
-    counts = response[SIGNAL_ROWS]
-    return ModelResponse(*response[:SIGNAL_ROWS], np.flatnonzero(np.diff(counts, prepend=0.0)))
+    spool, pressure, position, counts = response
+    return ModelResponse(spool, pressure, position, np.flatnonzero(np.diff(counts, prepend=0.0)))
 
 
 class ScalarModel:
