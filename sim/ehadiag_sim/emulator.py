@@ -163,9 +163,9 @@ class FccCore:
         return BitStatus(self._state, BitReason.NONE, self._test_id, elapsed, self._serial)
 
     @property
-    def faults(self) -> Faults:
-        """Severities of the actuator as it is now."""
-        return self._faults or Faults()
+    def faults(self) -> Faults | None:
+        """Severities of the actuator as it is now; None: of a plant of another maker, unknown."""
+        return None if self._foreign is not None else self._faults or Faults()
 
     @property
     def offsets(self) -> tuple[float, ...]:

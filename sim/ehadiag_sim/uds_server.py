@@ -63,7 +63,7 @@ class NegativeResponseError(Exception):
 class UdsServer:
     """Answers the requests that come in a tick at its beginning, one after the other.
 
-    The result that it serves as its own is the simulated truth.
+    The result that it serves as its own is the simulated truth; of a foreign plant it has none.
     """
 
     def __init__(self, computer: FccCore, identifiers: UdsIdentifiers) -> None:
@@ -155,15 +155,15 @@ class UdsServer:
 
     def _onboard(self) -> dict[str, float | str]:
         """Return what the computer has found itself in its last test."""
-        last = self._last
-        done = last is not None and last.state is BitState.COMPLETE
+        last, truth = self._last, self._computer.faults
+        done = last is not None and last.state is BitState.COMPLETE and truth is not None
         state = OnboardState.DONE if done else OnboardState.GIVEN_UP
         if last is None:
             state = OnboardState.NOTHING
         elif last.state in ACTIVE_BIT_STATES:
             state = OnboardState.RECORDING
         verdict = self._verdict()
-        faults = {name: getattr(self._computer.faults, name) for name in ONBOARD_SEVERITIES}
+        faults = {name: getattr(truth, name, 0.0) for name in ONBOARD_SEVERITIES}
         return {
             "state": state,
             "test_id": (last.test_id or 0) if last else 0,
@@ -180,6 +180,8 @@ class UdsServer:
             return None
         if last.state is not BitState.COMPLETE:
             return OnboardVerdict.NOT_TESTED
+        if self._computer.faults is None:
+            return None
         worst = max(astuple(self._computer.faults))
         if worst < ADVISORY:
             return OnboardVerdict.HEALTHY

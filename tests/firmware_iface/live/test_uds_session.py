@@ -18,8 +18,10 @@ from test_live_session_limits import SharedBus
 from ehadiag import ConfigurationError, default_actuator
 from ehadiag_sim.emulator import EmulatorTransport, FccCore, Preconditions
 from ehadiag_sim.faulty_bus import FaultyTransport, MessageSilence
+from ehadiag_sim.uds_server import UdsServer
 from firmware_iface.bus_map import default_map
 from firmware_iface.handshake import ChannelLimits
+from firmware_iface.live_decode import BitStatus
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.mapping_file import UdsIdentifiers
@@ -409,3 +411,25 @@ def test_no_frame_breaks_client_or_server(frames: list[bytes], identifier: int) 
         server.take(frame)
         if number % 5 == 0:
             server.step()
+
+
+class ForeignComputer:
+    """What a server sees of a computer whose plant is another maker's: it has completed a test."""
+
+    state = BitState.COMPLETE
+    status = BitStatus(BitState.COMPLETE, test_id=NUMBER, elapsed=DURATION, serial=77)
+    faults = None
+    offsets = (0.0,) * 4
+
+
+def test_of_a_foreign_plant_there_is_no_own_result() -> None:
+    server = UdsServer(ForeignComputer(), UdsIdentifiers())  # type: ignore[arg-type]
+    for request, answer in (
+        (b"\x03\x22\x01\x20", b"\x10\x1a\x62\x01\x20\x04\x09\x1e"),
+        (b"\x03\x19\x02\x09", b"\x03\x59\x02\x19"),
+    ):
+        server.take(Frame(0, REQUEST, b"\x32" + bytes(7)))  # ends an answer under way
+        server.step()
+        server.take(Frame(0, REQUEST, request.ljust(8, b"\0")))
+        (frame,) = server.step()
+        assert frame.data[: len(answer)] == answer
