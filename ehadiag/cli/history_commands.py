@@ -230,7 +230,7 @@ def _plot(arguments: argparse.Namespace) -> None:
 
     levels = Levels()
     with open_named_history(arguments) as history:
-        whole, changes = history.entries(), history.events()
+        whole, changes = history.alike(arguments.unit)
     entries = counted_entries([item for item in whole if item.serial == arguments.unit])
     events = [item for item in changes if item.serial == arguments.unit]
     if not any(entry.severities for entry in entries):

@@ -92,7 +92,7 @@ def named_actuator(history: History, serial: int, named: str | None) -> str | No
     Returns the one named, else the only one that has this serial number. ConfigurationError:
     several have it and none was named, or the one named has not.
     """
-    known = [actuator for actuator, number in history.units() if number == serial]
+    known = [actuator for actuator, _ in history.units(serial)]
     if named is not None and known and named not in known:
         raise ConfigurationError(f"--actuator {named}: serial {serial} is of {', '.join(known)}")
     if named is None and len(known) > 1:

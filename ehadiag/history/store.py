@@ -274,12 +274,14 @@ class History:
             )
         return found[0]
 
-    def units(self) -> list[tuple[str, int]]:
-        """Return actuator and serial number of each unit."""
+    def units(self, serial: int | None = None) -> list[tuple[str, int]]:
+        """Return actuator and serial number of each unit, or of those with a serial number."""
+        where = "serial NOT NULL" if serial is None else "serial = ?"
         with self._one_line_errors():
             rows = self._rows(
-                "SELECT DISTINCT actuator, serial FROM diagnosis WHERE serial NOT NULL"
-                " ORDER BY actuator, serial"
+                f"SELECT DISTINCT actuator, serial FROM diagnosis WHERE {where}"
+                " ORDER BY actuator, serial",
+                () if serial is None else (serial,),
             )
         return [(str(row["actuator"]), int(row["serial"])) for row in rows]
 

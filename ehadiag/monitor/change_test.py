@@ -4,7 +4,12 @@ Of each parameter the others, within what is no change, are projected out of the
 counts at most as much as three mean ones, and by three of its deviations. The estimate over a span
 of blocks is divided by its scatter from block to block, since what a motion leaves unmodelled has
 no known law, and by what is no change. A change lasts: it counts by the lesser of two spans in a
-row that agree in sign. The threshold is one of the largest values in pieces of healthy motion, see
+row that agree in sign.
+
+What shows seldom, such as a clogged filter while the spool slews, is lost in such means. So each
+block also votes on a step of each parameter, up and down: for it where the step explains the block
+better, against it where worse, and not at all where the block shows nothing. Votes are summed up,
+never below zero. The threshold is one of the largest values in pieces of healthy motion, see
 `alarm_threshold`.
 """
 
@@ -38,6 +43,10 @@ MAX_BLOCK_DEVIATIONS: Final = 3.0
 """Largest score of a block, in deviations: a jack that stuck in the model alone is one block."""
 MIN_BLOCKS: Final = 4.0
 """Least effective number of blocks in a span, 1: fewer have no scatter."""
+VOTE_GAIN: Final = 50.0
+"""Squares of residuals by which a block's vote counts half."""
+VOTE_MARGIN: Final = 0.2
+"""Share of each vote that is taken off its sum: a change wins clearly more often than it loses."""
 CAUSES: Final = tuple(index for index in range(len(BANK)) if index != REST)
 """Places of the causes in the bank."""
 HEALTHY_SPREADS: Final = np.array([
@@ -46,12 +55,14 @@ HEALTHY_SPREADS: Final = np.array([
 ]).T  # fmt: skip
 """97 % of the values of healthy motion are below, by span and cause (tools/study free-motion
 --calibrate)."""
+VOTE_SPREAD: Final = 2.0
+"""The same of the sums of votes: with one vote, two of 24 healthy pieces raised an alarm."""
 PIECE_H: Final = 1.0 / 12.0
 """Length of the pieces of healthy motion whose largest values make the threshold, h."""
 GUMBEL: Final = (1.08, 0.54)
 """Location and scale of Gumbel's law of those values (the same command)."""
 TRIAL_BLOCKS: Final = 40
-"""Blocks in which causes are tried, 1: 20 s."""
+"""Blocks in which causes are tried, 1: 20 s, or since votes began."""
 TRIAL_STEPS: Final = (0.3, 1.0, 3.0, 9.0)
 """Sizes in which each cause is tried first, steps of the bank."""
 REFINED_CAUSES: Final = 3
@@ -112,7 +123,7 @@ class Change:
     """Whether it follows another one closely."""
 
 
-def alarm_threshold(hours: float) -> float:
+def alarm_threshold(hours: float, law: tuple[float, float] = GUMBEL) -> float:
     """Value of the test that healthy motion exceeds once in so many hours.
 
     The pieces of motion are exchangeable, whatever the correlation within one; expected numbers of
@@ -123,7 +134,7 @@ def alarm_threshold(hours: float) -> float:
         low, high = FALSE_ALARM_HOURS_RANGE
         raise ConfigurationError(f"hours between false alarms {hours:g}: need {low:g} … {high:g}")
     share = -math.expm1(-PIECE_H / hours)
-    return GUMBEL[0] - GUMBEL[1] * math.log(-math.log1p(-share))
+    return law[0] - law[1] * math.log(-math.log1p(-share))
 
 
 class ChangeTest:
@@ -151,8 +162,9 @@ class ChangeTest:
         self._ignored = 0
         self.value = 0.0
         """Of the test when it looked last, over its threshold."""
-        self.values: Array2 = np.zeros((len(SPANS), len(CAUSES)))
-        """Of each cause by span, normal deviates."""
+        self.values: Array2 = np.zeros((len(SPANS) + 2, len(CAUSES)))
+        """Of each cause: normal deviates by span, sums of votes for a step up and down."""
+        self._voting = np.zeros((2, len(CAUSES)), dtype=np.int64)
         self.reset()
 
     def reset(self) -> None:
@@ -192,6 +204,14 @@ class ChangeTest:
             self._bank.settle(rows)
             return None
         self._scores.append(self._bank.push(rows))
+        gain = self._scores[-1].gain[:, CAUSES]
+        votes = gain / (np.abs(gain) + VOTE_GAIN)
+        worn = np.arange(len(FAULT_NAMES))
+        # No wear falls; a step down is the second row, or the first one near the limit.
+        votes[(self._bank.steps[worn] > 0.0).astype(int), worn] = 0.0
+        sums = self.values[len(SPANS) :]
+        np.maximum(sums + votes - VOTE_MARGIN * np.abs(votes), 0.0, out=sums)
+        self._voting = np.where(sums < 1.0, 0, self._voting + 1)
         self._kept.append((rows, self._environment))
         self._looks += 1
         return self._look() if self._looks % STRIDE == 0 else None
@@ -202,8 +222,10 @@ class ChangeTest:
             span_values(scores[-span:], steady) if len(scores) >= span else None for span in SPANS
         ]
         self._spans.append(now)
-        values = np.zeros((len(SPANS), len(CAUSES)))
+        values = self.values.copy()
+        values[: len(SPANS)] = 0.0
         sizes = np.zeros_like(values)
+        sizes[len(SPANS) :] = [[1.0], [-1.0]]
         for place, (span, found) in enumerate(zip(SPANS, now, strict=True)):
             ago = span // STRIDE + 1
             before = self._spans[-ago][place] if len(self._spans) >= ago else None
@@ -211,7 +233,11 @@ class ChangeTest:
                 values[place] = _minmod(found[0], before[0])
                 sizes[place] = 0.5 * (found[1] + before[1])
         self.values = values
-        shares = np.abs(values) / HEALTHY_SPREADS / self._threshold
+        shares = np.abs(values) / self._threshold
+        shares[: len(SPANS)] /= HEALTHY_SPREADS
+        shares[len(SPANS) :] /= VOTE_SPREAD
+        # What changed is tried on blocks after the change: they must be enough.
+        shares[len(SPANS) :] *= self._voting >= SPANS[0]
         self.value = float(shares.max())
         self._since += STRIDE * BLOCK_S
         if self.value <= 1.0:
@@ -222,21 +248,28 @@ class ChangeTest:
         if self._looks < self._ignored:
             return None
         best = shares.argmax(axis=0), np.arange(len(CAUSES))
-        causes = self._causes(values[best], sizes[best])
+        voted = best[0] >= len(SPANS)
+        deviates = np.where(voted, np.sqrt(np.abs(values[best])), values[best])
+        row, column = map(int, np.unravel_index(int(shares.argmax()), shares.shape))
+        length = TRIAL_BLOCKS
+        if row >= len(SPANS):
+            length = min(int(self._voting[row - len(SPANS), column]) + 1, TRIAL_BLOCKS)
+        causes = self._causes(deviates, sizes[best], list(self._kept)[-length:])
         if not causes or (causes[0].name in FAULT_NAMES and abs(causes[0].size) < self._least):
             self._ignored = self._looks + max(SPANS)
+            self.values[len(SPANS) :] = 0.0
             return None
         self._since = 0.0
         return Change(causes, self.value, repeated=False)
 
-    def _causes(self, values: Array, sizes: Array) -> tuple[Cause, ...]:
+    def _causes(
+        self, values: Array, sizes: Array, blocks: list[tuple[Array2, Environment]]
+    ) -> tuple[Cause, ...]:
         """Try all causes in some sizes, the best ones about theirs, and order them by the gain."""
         found: dict[int, tuple[float, float]] = {}
 
         def try_sizes(trials: list[tuple[int, float]]) -> list[int]:
-            gains = self._bank.gains(
-                list(self._kept), [(CAUSES[place], size) for place, size in trials]
-            )
+            gains = self._bank.gains(blocks, [(CAUSES[place], size) for place, size in trials])
             for (place, size), gain in zip(trials, gains, strict=True):
                 if gain > found.get(place, (0.0, 0.0))[0]:
                     found[place] = gain, size
@@ -298,7 +331,7 @@ def span_values(scores: list[BlockScore], steady: Array) -> tuple[Array, Array]:
 MIN_INFORMATION: Final = 1e-3
 """Least information of a span, squares of steps: below there is nothing to see."""
 MAX_SIZES: Final = np.array(
-    [3.0, 6.0, 6.0, 60.0, 60.0, 5.0, 5.0, 10.0, 25.0, 200.0, 30.0, 30.0, 200.0, 50.0]
+    [4.5, 6.0, 6.0, 60.0, 60.0, 5.0, 5.0, 10.0, 25.0, 200.0, 30.0, 30.0, 200.0, 50.0]
 )
 """Largest sizes that are tried, steps, by cause: severities by 0.2 and 0.3, sensors by some
 percent or some tenths of their range; oil and supply by 90 K and 9 MPa."""

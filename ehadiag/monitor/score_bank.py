@@ -41,7 +41,7 @@ class BankParameter(NamedTuple):
 
 
 BANK: Final = (
-    BankParameter("Kintas", 0.15, 0.015),
+    BankParameter("Kintas", 0.1, 0.015),
     BankParameter("FSS", 0.05, 0.004),
     BankParameter("FDJ", 0.05, 0.004),
     BankParameter("spool_offset", 1e-6, 0.1e-6),
@@ -97,6 +97,9 @@ class BlockScore:
     """Shape (k,)."""
     information: Array2
     """Shape (k, k)."""
+    gain: Array2
+    """Squares of residuals that a step up or down explains, beyond what any parameter within what
+    is no change does; each square of limited size. Shape (2, k)."""
 
 
 class ScoreBank:
@@ -222,7 +225,24 @@ class ScoreBank:
         change = np.stack((np.ones_like(flowing), flowing)) * self.steps[MODELLED:, None] / noise
         _add(score, information, slice(MODELLED, None), (current - flowing) / noise, change, 1.0)
         part = np.linalg.inv(np.eye(len(BANK)) + information * (PASSING / self.steps) ** 2)
-        return BlockScore(part @ score, part @ information)
+        return BlockScore(part @ score, part @ information, self._gain(found))
+
+    def _gain(self, found: Array2) -> Array2:
+        """What a step of each parameter explains of a block, see `BlockScore`."""
+        residual, change = found[0], found[0] - found[1:]
+        before = np.minimum(residual**2, MAX_SQUARE)
+
+        def explained(off: Array) -> Array:
+            after = np.minimum((residual - off) ** 2, MAX_SQUARE)
+            return np.asarray((before - after).sum(axis=-1))
+
+        within = change * self.steady[:MODELLED, None]
+        least = max(
+            0.0, *(float(explained(share * within).max()) for share in (-1.0, -0.3, 0.3, 1.0))
+        )
+        out = np.zeros((2, len(BANK)))
+        out[:, :MODELLED] = explained(np.stack((change, -change))) - least
+        return out
 
     def gains(
         self, blocks: list[tuple[Array2, Environment]], trials: list[tuple[int, float]]

@@ -9,7 +9,8 @@ weighted answer was off widens or moves the interval (conformal calibration).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -63,14 +64,20 @@ class AveragingRules(NamedTuple):
     """Questions that even weights of the experts stand for."""
     even_misses: float = 2.0
     """Lives that the experts' own statement of their misses stands for."""
+    early: float = 1.4
+    """Lower half of that statement over the upper one, 1: what speeds up is commoner."""
     max_widening: float = 1.1
     """Largest ratio of the calibrated chances' distance from the median to the asked one, 1."""
-    alone_misses: float = 5.0
-    """The same as `even_misses`, without other lives: the past of one life says little."""
     law_power: float = 0.3
     """Power of a law's evidence in its weight, 1: the laws' disagreement stays in the interval."""
     level_shares: tuple[float, ...] = (1.0, 0.75, 0.5)
     """Levels of the past questions over the highest possible one, 1."""
+    level_power: float = 6.0
+    """Power of a past question's level, by which it counts among those of its life."""
+    run_on_share: float = 0.6
+    """Severity over the asked level from which a life that ended is run on to it, 1."""
+    run_on_powers: tuple[float, float] = (-1.0, 3.0)
+    """Least and largest power of the severity by which it is run on."""
     outlier_density: float = 0.02
     """Density per unit of the logarithm that each expert is given for what it never draws."""
     max_log_time: float = 8.0
@@ -237,8 +244,7 @@ def passage_of(life: Life, fleet: Fleet, level: float, seed: int) -> Passage:
     asked = _questions(lives, level)
     drawn, likely, names = _draw(asked, lives, fleet, own, rng)
     past = ~np.isnan(asked.answer)
-    per_life = 1.0 / np.maximum(np.bincount(asked.life[past], minlength=len(lives)), 1)
-    counted = per_life[asked.life]
+    counted = _counts(asked, past)
     truth = np.log(asked.answer[past] / asked.age[past])
     stacked = _stacked(drawn[:, past], likely[:, past], truth, counted[past])
     weights = stacked[:, None] * likely
@@ -246,7 +252,7 @@ def passage_of(life: Life, fleet: Fleet, level: float, seed: int) -> Passage:
     median, low, high = _middle(drawn, weights)
     off = truth - median[past]
     miss = off / np.where(off > 0.0, high[past] - median[past], median[past] - low[past])
-    calibrated = _calibrated(miss, counted[past], alone=not fleet.seen)
+    calibrated = _calibrated(miss, counted[past])
     middle, lower, upper = float(median[-1]), float(low[-1]), float(high[-1])
     logs = middle + np.where(calibrated > 0.0, upper - middle, middle - lower) * calibrated
     never = logs > rules.max_log_time - 0.01
@@ -295,6 +301,16 @@ def _questions(lives: Sequence[Life], level: float) -> _Questions:
     rows.append((len(lives) - 1, last, now.age[-1], now.value[-1], level, np.nan))
     columns = np.array(rows, dtype=np.float64).T
     return _Questions(columns[0].astype(np.int64), columns[1].astype(np.int64), *columns[2:])
+
+
+def _counts(asked: _Questions, past: NDArray[np.bool_]) -> Array:
+    """How much each question counts: a life by its highest level over the asked one."""
+    share = asked.level / asked.level[-1]
+    weight = np.where(past, share**AVERAGING_RULES.level_power, 0.0)
+    total, highest = np.zeros((2, int(asked.life.max()) + 1))
+    np.add.at(total, asked.life, weight)
+    np.maximum.at(highest, asked.life, np.where(past, share, 0.0))
+    return np.asarray(weight * (highest / np.maximum(total, 1e-12))[asked.life])
 
 
 def _draw(
@@ -373,7 +389,8 @@ def _draw_similar(
         life = lives[number]
         passed[row] = _crossed(life.value[: at + 1], life.age[: at + 1], points[row, :-1])
     apart, left, pace = (np.full((count, others), np.inf) for _ in range(3))
-    for other, life in enumerate(lives[:-1]):
+    run_on = partial(_run_on, level=float(asked.level.max()))
+    for other, life in enumerate(map(run_on, lives[:-1])):
         # A life that did not get as far is compared at the same ratio of severities.
         scale = np.minimum(asked.level, life.value.max()) / asked.level
         crossed = _crossed(life.value, life.age, points * scale[:, None])
@@ -391,6 +408,26 @@ def _draw_similar(
     pick = np.sum(total[:, None, :] < chance[..., None], axis=2)
     jitter = np.exp(0.1 * rng.standard_normal((count, rules.draws)))
     return [np.take_along_axis(column, pick, axis=1) * jitter for column in (left, left * pace)]
+
+
+def _run_on(life: Life, level: float) -> Life:
+    """Run a life that ended near a level on to it: its rate is a power of the severity."""
+    rules, top = AVERAGING_RULES, float(life.value[-1])
+    if not rules.run_on_share * level <= top < level:
+        return life
+    rates = np.diff(life.value[-3:]) / np.diff(life.age[-3:])
+    if rates.min() <= 0.0:
+        rates = np.full(2, (top - life.value[0]) / (life.age[-1] - life.age[0]))
+    middles = 0.5 * (life.value[-3:-1] + life.value[-2:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        power = np.log(rates[1] / rates[0]) / np.log(middles[1] / middles[0])
+    power = np.clip(np.nan_to_num(power), *rules.run_on_powers)
+    path = np.linspace(top, level, 9)
+    slowness = (middles[1] / path) ** power / rates[1]
+    steps = np.cumsum(0.5 * (slowness[1:] + slowness[:-1]) * np.diff(path))
+    return replace(
+        life, age=np.r_[life.age, life.age[-1] + steps], value=np.r_[life.value, path[1:]]
+    )
 
 
 def _crossed(value: Array, ages: Array, levels: Array) -> Array:
@@ -436,13 +473,13 @@ def _middle(drawn: Array, weights: Array) -> tuple[Array, Array, Array]:
     return median, np.minimum(low, median - 0.02), np.maximum(high, median + 0.02)
 
 
-def _calibrated(miss: Array, counted: Array, *, alone: bool) -> Array:
+def _calibrated(miss: Array, counted: Array) -> Array:
     """Quantiles of the misses at `CHANCES`, in half intervals, beside those that were stated."""
     rules = AVERAGING_RULES
     stated = ndtri((np.arange(99) + 0.5) / 99) / ndtri(0.9)
-    misses = rules.alone_misses if alone else rules.even_misses
+    stated = np.where(stated < 0.0, rules.early * stated, stated)
     every = np.r_[miss, stated]
-    weight = np.r_[counted, np.full(99, misses / 99)]
+    weight = np.r_[counted, np.full(99, rules.even_misses / 99)]
     order = np.argsort(every)
     at = np.cumsum(weight[order]) - 0.5 * weight[order]
     total = weight.sum()

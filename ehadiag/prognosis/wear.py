@@ -184,24 +184,31 @@ def filter_lives(
         rows = [getattr(life, name) for life in lives]
         return np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
 
-    value, slope = _on_scale(laws, padded("value"), slice(None))
-    noise = (padded("std")[..., None] * slope) ** 2
-    clock = _clock(laws, padded("age") / scale)
+    values, stds, ages = padded("value"), padded("std"), padded("age") / scale
     diffusion, walk = (laws.spread * usual) ** 2, (laws.walk * usual) ** 2
-    level, rate = value[:, 0], usual.copy()
-    pzz, pza, paa = noise[:, 0].copy(), np.zeros_like(rate), deviation**2
-    score, surprise = np.zeros_like(rate), np.zeros_like(rate)
-    kept = [[item.astype(np.float32)] for item in (level, rate, pzz, pza, paa, score, surprise)]
+    kept = np.empty((7, longest, *usual.shape), dtype=np.float32)
+
+    def seen(at: int) -> tuple[Array, Array, Array, Array]:
+        """Each life's diagnosis on the scale, the scale's slope there, its noise, the clock."""
+        value, slope = _on_scale(laws, values[:, at], slice(None))
+        return value, slope, (stds[:, at, None] * slope) ** 2, _clock(laws, ages[:, at])
+
+    level, _, pzz, clock = seen(0)
+    rate, paa = usual.copy(), deviation**2
+    pza, score, surprise = np.zeros((3, *usual.shape))
+    kept[:, 0] = level, rate, pzz, pza, paa, score, surprise
     for at in range(1, longest):
-        h = np.maximum(clock[:, at] - clock[:, at - 1], 1e-12)
+        before = clock
+        value, slope, noise, clock = seen(at)
+        h = np.maximum(clock - before, 1e-12)
         ahead = level + rate * h
         a = pzz + h * (2.0 * pza + h * paa + diffusion + walk * h * h / 3.0)
         b = pza + h * (paa + 0.5 * walk * h)
         c = paa + walk * h
-        total = a + noise[:, at]
-        off = value[:, at] - ahead
+        total = a + noise
+        off = value - ahead
         there = (count > at)[:, None]
-        density = -0.5 * (off * off / total + np.log(2.0 * np.pi * total)) + np.log(slope[:, at])
+        density = -0.5 * (off * off / total + np.log(2.0 * np.pi * total)) + np.log(slope)
         news = [
             ahead + a / total * off, rate + b / total * off, a - a * a / total, b - a * b / total,
             c - b * b / total, score + density, off / np.sqrt(total),
@@ -210,10 +217,8 @@ def filter_lives(
         level, rate, pzz, pza, paa, score, surprise = (
             np.where(there, new, old) for new, old in zip(news, olds, strict=True)
         )
-        for column, item in zip(kept, (level, rate, pzz, pza, paa, score, surprise), strict=True):
-            column.append(item.astype(np.float32))
-    rows = [np.array(column) for column in kept]
-    return Filtered(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], usual)
+        kept[:, at] = level, rate, pzz, pza, paa, score, surprise
+    return Filtered(kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], kept[6], usual)
 
 
 def draw_passages(

@@ -14,6 +14,7 @@ from ehadiag_tools.accuracy.valves import VALVES
 from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE
 from ehadiag_tools.bench import BENCH
 from ehadiag_tools.free_motion.motion import FREE_MOTION
+from ehadiag_tools.history_times import LARGE_HISTORY
 from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
 from ehadiag_tools.prognosis.units import PROGNOSIS
 from ehadiag_tools.rigs.daq import DAQ_RECORDINGS
@@ -25,8 +26,8 @@ from ehadiag_tools.study import Study, run_study
 
 STUDIES: tuple[Study[Any], ...] = (
     PAPER_CASES, CUBE, UNITS, RECORDED_UNITS, VALVES, ALARMS, HARDWARE, RECORDINGS,
-    FREE_MOTION, FOREIGN_BUSES, DAQ_RECORDINGS, MANY_RECORDINGS, PROGNOSIS, ONBOARD, ONBOARD_UNITS,
-    SOAK, BENCH, PICTURES,
+    FREE_MOTION, FOREIGN_BUSES, DAQ_RECORDINGS, MANY_RECORDINGS, PROGNOSIS, LARGE_HISTORY, ONBOARD,
+    ONBOARD_UNITS, SOAK, BENCH, PICTURES,
 )  # fmt: skip
 
 

@@ -316,6 +316,7 @@ def test_a_question_reads_its_own_rows(tmp_path: Path) -> None:
         with pytest.raises(ConfigurationError, match="has no diagnosis 102"):
             history.entry(102)
         assert history.units()[:2] == [("other", 7), ("reference-31", 1)]
+        assert history.units(1) == [("reference-31", 1)]
         entries, _ = history.alike(7, "reference-31")
         others = {item.serial for item in entries} - {7}
         assert len(others) == MAX_FLEET_UNITS

@@ -45,7 +45,7 @@ def blocks(rng: np.random.Generator, shift: float, place: int, count: int = 20) 
     for _ in range(count):
         slopes = rng.standard_normal((len(BANK), 500))
         residual = rng.standard_normal(500) + shift * slopes[place]
-        made.append(BlockScore(slopes @ residual, slopes @ slopes.T))
+        made.append(BlockScore(slopes @ residual, slopes @ slopes.T, np.zeros((2, len(BANK)))))
     return made
 
 
@@ -72,7 +72,9 @@ def test_one_block_however_large_is_no_change() -> None:
 
 
 def test_blocks_without_information_say_nothing() -> None:
-    none = BlockScore(np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK))))
+    none = BlockScore(
+        np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK))), np.zeros((2, len(BANK)))
+    )
     assert not span_values([none] * 20, STEADY)[0].any()
 
 
@@ -116,6 +118,26 @@ def test_a_change_is_named_with_its_size_and_an_unchanged_unit_is_silent() -> No
     assert (cause.name, cause.size) == ("FDJ", pytest.approx(0.1, abs=0.02))
     assert 0.0 < cause.stderr < 0.05
     assert changes_in(motion, (0.3, 0.3, 0.2), least=0.2) == []
+
+
+def test_a_filter_that_clogs_is_found_by_the_votes_of_the_blocks_that_show_it() -> None:
+    """Its values over spans stay below the threshold: most blocks show nothing of it."""
+    motion = Motion("stairs", "position", 26.0, WORN, 5, exact=True)
+    assert changes_in(motion, WORN) == []
+    cause = changes_in(motion, (0.2, 0.3, 0.3))[0]
+    assert (cause.name, cause.size) == ("Kintas", pytest.approx(0.1, abs=0.03))
+
+
+def test_blocks_vote_for_the_step_that_their_ticks_show() -> None:
+    moved = free_motion(ACTUATOR, Motion("stairs", "position", 12.0, WORN, 5, exact=True)).rows
+    bank = ScoreBank(ACTUATOR, (0.2, 0.3, 0.3), mode=CommandMode.POSITION)
+    bank.reset(float(moved[0, 2]))
+    gains = [bank.push(rows).gain for rows in moved.reshape(-1, 500, 5)]
+    place = BANK_NAMES.index("Kintas")
+    up, down = np.array(gains)[:, :, place].T
+    assert up.max() > 300.0
+    assert (up > 0.0).mean() > 0.4
+    assert (down <= 0.0).mean() > 0.8
 
 
 def test_supply_that_is_not_stated_is_no_cause_of_small_changes() -> None:

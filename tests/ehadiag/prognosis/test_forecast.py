@@ -185,6 +185,29 @@ def test_what_no_life_has_shown_is_called_extrapolated() -> None:
     assert of(worn(1, 6)).note == ""
 
 
+def running_away(serial: int, top: float) -> tuple[Life, float]:
+    """A life whose rate grows without bound, seen up to a severity; its age at 0.75."""
+    rng = np.random.default_rng(serial)
+    end = float(rng.uniform(1800.0, 2200.0))
+    age = np.arange(40.0, end, 40.0)
+    value = 0.06 * (1.0 / (1.0 - age / end) - 1.0) + NOISE * rng.standard_normal(len(age))
+    seen = slice(0, int(np.argmax(value > top)))
+    whole = Life(serial, age[seen], value[seen], np.full(len(age), NOISE)[seen], 0.0)
+    return whole, end * (1.0 - 1.0 / (1.0 + 0.75 / 0.06))
+
+
+def test_lives_that_ended_before_the_limit_are_run_on_as_they_grew() -> None:
+    """Scaled to the limit, they would last too long where growth speeds up."""
+    lives = [running_away(serial, 0.48)[0] for serial in range(400, 412)]
+    fleet, early = learn_fleet(lives, 2000.0), []
+    for serial in range(500, 510):
+        life, end = running_away(serial, 0.2)
+        left = of(life, fleet, (0.75,)).remaining[0]
+        assert left.low is not None
+        early.append(end - life.age[-1] < left.low)
+    assert np.mean(early) < 0.25
+
+
 def test_a_cover_of_fleets_own_lives() -> None:
     """Eighty per cent, give or take what forty lives allow."""
     inside = []

@@ -24,7 +24,16 @@ from scipy.stats import chi2, gumbel_r
 from ehadiag.compile.jit import Array, Array2, kernel
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.monitor.change_test import BLOCK_S, CAUSES, PIECE_H, SPANS, STRIDE, ChangeTest
+from ehadiag.monitor.change_test import (
+    BLOCK_S,
+    CAUSES,
+    PIECE_H,
+    SPANS,
+    STRIDE,
+    VOTE_SPREAD,
+    ChangeTest,
+    alarm_threshold,
+)
 from ehadiag.monitor.score_bank import BANK_NAMES, ScoreBank
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.plant_dynamics import STATE, advance_plant
@@ -326,12 +335,18 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--hours", type=float, default=10.0, metavar="H", help="between false alarms (%(default)g)")
     add("--changes", action="store_true", help="study changes instead, --cases rounds of all")
+    add("--cause", choices=dict(CHANGES), help="study its change in all kinds of motion instead")
     add("--calibrate", action="store_true", help="find the monitor's spreads and threshold instead")
     add("--piece", type=float, default=3600.0 * PIECE_H, metavar="S",
         help="length of a healthy piece (%(default)g)")  # fmt: skip
 
 
 def _cases(options: Options) -> list[MotionCase]:
+    if options.cause:
+        return [
+            MotionCase(_changed_kind(options.seed, options.cause, number), options.hours)
+            for number in range(len(KINDS) * len(CommandMode))
+        ]
     if options.changes:
         return [
             MotionCase(_changed(options.seed, *item), options.hours)
@@ -360,10 +375,19 @@ def _changed(seed: int, turn: int, number: int, mode: int) -> Motion:
     return changed(motion, *CHANGES[number], CHANGE_S)
 
 
+def _changed_kind(seed: int, cause: str, number: int) -> Motion:
+    """Piece of a kind and a mode with a middling change of a cause."""
+    sizes = [size for name, size in CHANGES if name == cause]
+    place = list(dict(CHANGES)).index(cause)
+    rng = np.random.default_rng((seed, place, number))
+    motion = random_motion(rng, number, CHANGED_PIECE_S, 1000 * seed + 100 * place + number)
+    return changed(motion, cause, sizes[len(sizes) // 2], CHANGE_S)
+
+
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     if options.calibrate:
-        yield from _calibration(records)
-    elif options.changes:
+        yield from _calibration(records, options.hours)
+    elif options.changes or options.cause:
         yield from _changes(records)
     else:
         yield from _false_alarms(records, options)
@@ -415,27 +439,60 @@ def _changes(records: Sequence[Record]) -> Iterator[str]:
                     counts[2] += likely[0] == change
                     names.append(" or ".join(likely))
             cells = ", ".join(delays), "; ".join(names)
-            rows.append((change, f"{size:g}", mode, *cells))
+            if part:
+                rows.append((change, f"{size:g}", mode, *cells))
     yield from markdown(("change", "size", "mode", "found after, s (motion)", "named"), rows)
     total, found, right, early = counts
     named = f"{right} of {found} with the right name first"
     yield f"\n{found} of {total} found, {named}; {early} alarms before"
 
 
-def _calibration(records: Sequence[Record]) -> Iterator[str]:
+def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
+    """Spreads and threshold; and alarms in each half of the pieces by those of the other half.
+
+    What alarms of a severity below the least change are ignored is not counted: the rate is an
+    upper one.
+    """
     values = [np.array(item["values"]) for item in records]
-    spreads = np.maximum(np.quantile(np.concatenate(values), SPREAD_SHARE, axis=0), 1.0)
-    spreads = np.ceil(10.0 * spreads) / 10.0
+    spreads = _spreads(values)
     names = [BANK_NAMES[place] for place in CAUSES]
     rows = [
         (name, *(f"{value:.1f}" for value in column))
-        for name, column in zip(names, spreads.T, strict=True)
+        for name, column in zip(names, spreads[: len(SPANS)].T, strict=True)
     ]
     yield from markdown(("cause", *(f"{span * BLOCK_S:g} s" for span in SPANS)), rows)
-    largest = np.array([(item / spreads).max() for item in values])
+    largest = _largest(values, spreads)
     location, scale = gumbel_r.fit(largest)
     yield f"\nlargest of each of {len(largest)} pieces: Gumbel's law, {location:.2f}, {scale:.2f}"
     yield "largest of all: " + ", ".join(f"{value:.2f}" for value in np.sort(largest)[::-1][:10])
+    alarms = 0
+    for half in range(2):
+        # Pieces come in pairs of modes.
+        mine = [item for place, item in enumerate(values) if place // 2 % 2 == half]
+        others = [item for place, item in enumerate(values) if place // 2 % 2 != half]
+        bounds = _spreads(others)
+        threshold = alarm_threshold(hours, gumbel_r.fit(_largest(others, bounds)))
+        alarms += int(np.sum(_largest(mine, bounds) > threshold))
+    seen = sum(item["motion"]["seconds"] for item in records) / 3600.0
+    low, high = garwood(alarms)
+    yield (
+        f"each half by the threshold of the other: {alarms} pieces with an alarm in {seen:.2f} h,"
+        f" {alarms / seen:.2f} an hour ({low / seen:.2f} … {high / seen:.2f}), stated"
+        f" {1.0 / hours:.2f}"
+    )
+
+
+def _spreads(values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Of the values over spans; that of a sum of votes is given."""
+    spreads = np.quantile(np.concatenate(values), SPREAD_SHARE, axis=0)
+    spreads[len(SPANS) :] = VOTE_SPREAD
+    return np.asarray(np.ceil(10.0 * np.maximum(spreads, 1.0)) / 10.0)
+
+
+def _largest(
+    values: Sequence[NDArray[np.float64]], spreads: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.array([(item / spreads).max() for item in values])
 
 
 FREE_MOTION = Study(

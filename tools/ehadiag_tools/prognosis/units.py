@@ -9,7 +9,7 @@ import argparse
 import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -145,17 +145,20 @@ def _event(serial: int, hours: float, resets: tuple[str, ...]) -> MaintenanceEve
 SHARES = (0.3, 0.5, 0.7, 0.9)
 """Shares of the last life at which remaining life is forecast, 1."""
 SETS = {"tuned": tuple(TUNED), "held-out": tuple(HELD_OUT), "all": tuple(LAWS)}
+UNITS_PER_FLEET = 4
+"""Number of units of a law that are forecast beside the same fleet."""
 CENSORED_SHARE = (0.3, 0.8)
 """Shares of its last life at which a unit of a censored fleet is taken out, 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class LifeCase:
-    """A simulated unit, its law of wear, its fleet, seed of all."""
+    """A simulated unit, its law of wear, size and number of its fleet, seed of all."""
 
     unit: int
     law: str
     fleet: int
+    group: int
     censored: bool
     seed: int
 
@@ -167,7 +170,7 @@ def perform(case: LifeCase) -> Record:
     alarm, and the quantiles of the forecast; None where there is no number.
     """
     unit = simulate_unit(case.law, case.unit, read_noise(), case.seed)
-    lives, fleet = _fleet(case.law, case.fleet, case.censored, case.seed)
+    lives, fleet = _fleet(case.law, case.fleet, case.group, case.censored, case.seed)
     length = unit.end - unit.born
     asked = []
     for share in SHARES:
@@ -184,12 +187,12 @@ def perform(case: LifeCase) -> Record:
     return {"asked": asked}
 
 
-@cache
-def _fleet(law: str, size: int, censored: bool, seed: int) -> tuple[list[Life], Fleet]:
+@lru_cache(maxsize=1)
+def _fleet(law: str, size: int, group: int, censored: bool, seed: int) -> tuple[list[Life], Fleet]:
     """Lives of further units of a law, and what is learned from them."""
     noise, lives = read_noise(), []
-    for number in range(size):
-        unit = simulate_unit(law, 10_000 + number, noise, seed)
+    for number in range(10_000 * (group + 1), 10_000 * (group + 1) + size):
+        unit = simulate_unit(law, number, noise, seed)
         share = np.random.default_rng((seed, number)).uniform(*CENSORED_SHARE) if censored else 1.0
         life, earlier = _lives_until(unit, float(share))
         lives += [item for item in (*earlier, life) if len(item.age) > 1]
@@ -209,10 +212,14 @@ def _lives_until(unit: WornUnit, share: float) -> tuple[Life, list[Life]]:
 
 def _cases(options: Options) -> list[LifeCase]:
     laws = SETS[options.laws]
+    each = -(-options.cases // len(laws))
     return [
-        LifeCase(unit, laws[unit % len(laws)], options.fleet, options.censored, options.seed)
-        for unit in range(options.cases)
-    ]
+        LifeCase(
+            place, law, options.fleet, place // UNITS_PER_FLEET, options.censored, options.seed
+        )
+        for law in laws
+        for place in range(each)
+    ]  # fmt: skip
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -223,7 +230,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     fleet = f"{options.fleet}{' taken out early' if options.censored else ''}"
-    yield f"{options.cases} units, laws {options.laws}, seed {options.seed}, fleet of {fleet}\n"
+    yield f"{len(records)} units, laws {options.laws}, seed {options.seed}, fleet of {fleet}\n"
     rows: list[tuple[str, ...]] = [("all", *_cells(records))]
     for law in SETS[options.laws]:
         part = [item for item in records if item["law"] == law]
