@@ -27,7 +27,7 @@ from ehadiag.model.simd_jack import (
     sensed_orifice_tick,
 )
 from ehadiag.model.simd_jack_pieces import jack_events
-from ehadiag.model.simd_layout import BLOCK, BlockTraits, block_part
+from ehadiag.model.simd_layout import BLOCK, MAX_JACK_HALVINGS, BlockTraits, block_part
 from ehadiag.model.simd_spool import (
     creep_lanes,
     deflect_lanes,
@@ -141,8 +141,8 @@ def advance_block(
 
     count, end: lanes with a candidate, and those that are computed; tick: s; has: what
     `tabulate_coefficients` has returned; with_jack: whether the jack goes along; level: halvings
-    of the tick for the jack, negative: by the spool's path. Returns the level. Spool and pressure
-    as they are sampled are then in the state.
+    of the tick for the jack, -1: by the spool's path, -2: one more than that. Returns the level.
+    Spool and pressure as they are sampled are then in the state.
     """
     state = block_part(address, BLOCK.state, BLOCK.path)
     path = block_part(address, BLOCK.path, BLOCK.coefficients)
@@ -171,7 +171,8 @@ def advance_block(
     if has.shaped:
         land_opening_lanes(end, path, coefficients)
     if level < 0:
-        level = orifice_level(tick, coefficients) if has.orifice else _jack_level(path)
+        finer = min(_jack_level(path) - 1 - level, MAX_JACK_HALVINGS)
+        level = orifice_level(tick, coefficients) if has.orifice else finer
     if with_jack:
         if has.senses or has.orifice:
             _other_jack_tick(

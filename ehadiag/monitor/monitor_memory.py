@@ -52,6 +52,8 @@ class MonitorSettings(NamedTuple):
     limit: float
     deviation: float
     """A lost command did not go on where the current is off by more, A."""
+    halvings: float
+    """Further halvings of the jack's ticks: 1 where severities are estimated."""
 
 
 class CommandMemory(NamedTuple):

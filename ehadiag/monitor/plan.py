@@ -140,6 +140,7 @@ def monitor_plan(
         threshold=design.threshold,
         limit=MAX_MONITOR_RESIDUAL,
         deviation=MAX_CURRENT_DEVIATION_LSB * channels.current.grain,
+        halvings=0.0,
     )
     control = control_law(law, 1.0 / law.rate)
     return np.array([*constants, *control, *settings], dtype=np.float64)

@@ -126,7 +126,7 @@ def push_tick(address: int, sample: tuple[float, float, float, float, float]) ->
     s, tick = settings_of(p), control_law_of(p).tick
     sensor, has = sensor_law_of_lane(coefficients, 0), lane_traits(coefficients, 0, int(s.plays))
     driven = _commanded(p, s, command, current, position)
-    advance_block(model, 1, 1, driven, tick, has, True, -1)
+    advance_block(model, 1, 1, driven, tick, has, True, -1 - int(s.halvings))
     sampled_positions(1, state, coefficients)
     read = ROWS.spool_sampled if has.senses else ROWS.spool
     p[MONITOR.predicted], p[MONITOR.predicted + 1] = state[read], state[ROWS.pressure_sampled]

@@ -47,6 +47,7 @@ PLAN_PRESSURE_WEIGHT = MONITOR_PLAN_SETTINGS + MonitorSettings._fields.index("pr
 """Where the plan has the reciprocal noise."""
 ANCHOR_SMALL_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_small")
 ANCHOR_LARGE_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_large")
+HALVINGS_PLACE = MONITOR.settings + MonitorSettings._fields.index("halvings")
 KINTAS, FSS, FDJ = 0, 1, 2
 """Places of the severities."""
 
@@ -138,7 +139,9 @@ def start_model_by(
     unit[UNIT_PRESSURE_OFFSET] = point[ONBOARD_GENES + 1] / plan[PLAN_PRESSURE_WEIGHT]
     state = address + BYTES_PER_NUMBER * ONBOARD.unit
     model = monitor_at(address, lane)
-    return int(prepare_monitor_by(model, constants_address, plan_address, state))
+    wrong = int(prepare_monitor_by(model, constants_address, plan_address, state))
+    array_at(model, (MONITOR_SIZE,))[HALVINGS_PLACE] = 1.0
+    return wrong
 
 
 @inlined_exact
