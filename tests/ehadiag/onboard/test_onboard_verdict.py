@@ -70,7 +70,9 @@ def judged(values, stds):
         )
         for name, value, std in zip(NAMES, values, stds, strict=True)
     ]
-    return verdict.judge(SimpleNamespace(estimates=estimates, nuisances={}), LEVELS)[0], estimates
+    return verdict.judge(
+        SimpleNamespace(estimates=estimates, nuisances={}, friction_range=None), LEVELS
+    )[0], estimates
 
 
 def test_the_deviations_are_those_of_the_package():
