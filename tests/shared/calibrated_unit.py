@@ -7,7 +7,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from ehadiag import Calibrated, Recording, bundled_tests, default_actuator
+from ehadiag import Calibrated, Diagnosis, Recording, bundled_tests, default_actuator
+from ehadiag.assess.diagnosis import diagnose
 from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag_sim.conditions import Faults
 from ehadiag_tools.simulator.units import COARSE_STEP, random_unit, record
@@ -28,3 +29,10 @@ def recording(
 def learned() -> Calibrated:
     both = [recording("open"), recording("closed", seed=2)]
     return calibrate(both, default_actuator(), TESTS.values())
+
+
+@lru_cache(maxsize=1)
+def diagnosis_when_worn() -> Diagnosis:
+    unit = learned().actuator
+    assert unit is not None
+    return diagnose([recording("open", (0.3, 0.45, 0.2), 3)], unit, TESTS.values())

@@ -10,7 +10,7 @@ from ehadiag_sim.simulation import Plant, simulate
 from ehadiag_tools.simulator.units import COARSE_STEP
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def coarse_step() -> Iterator[None]:
     """The simulator's own step is tested beside it; a conftest imports this."""
     with pytest.MonkeyPatch.context() as patch:

@@ -142,7 +142,7 @@ EXPECTED = {
     "recordings": "noise floor 0.577",
     "free-motion": "| both | 0.00 |",
     "foreign-buses": "| psi29 | 0.2 ms | 1 of 1 | 0 |",
-    "prognosis": "| all | 8 |",
+    "prognosis": "| all | 112 |",
     "bench": "| estimate | samples to estimate and interval, wall |",
     "pictures": "method-Kintas.png",
 }

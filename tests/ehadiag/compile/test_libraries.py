@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from ehadiag.compile import libraries, sources, worker
+from ehadiag.compile.elementary import C_FUNCTIONS
 from ehadiag.compile.elf import shared_library
 from ehadiag.export.targets import find_target
 from ehadiag.monitor.monitor_memory import prepare_monitor
@@ -109,7 +110,8 @@ def test_one_compilation_serves_all_values_of_a_table(
     arguments = (worker.PointerArgument(), worker.TableArgument("plan"), worker.PointerArgument())
     functions = (worker.CFunction("prepare", prepare_monitor, arguments),)
     one, two = ([n + 0.25 * k for n in range(171)] for k in (1, 2))
-    blank = worker.ObjectFile(functions, find_target("powerpc-e500mc").processor)
+    target = find_target("powerpc-e500mc").processor
+    blank = worker.ObjectFile(functions, target, replaced=C_FUNCTIONS)
     with Folder.at(tmp_path, 0o600) as folder:
         monkeypatch.setattr(sources, "cache_folder", lambda: folder)
         first = libraries.object_file(replace(blank, tables={"plan": one}))

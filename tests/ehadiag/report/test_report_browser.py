@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 from browser_pages import MODES, browser, objections, opened, overflow, show
+from calibrated_unit import diagnosis_when_worn, learned, of_calibrated_unit
 from places import LOGS
-from test_report_page import NOW, learned, worn_unit
 
 import ehadiag
 from ehadiag import Levels
@@ -20,7 +20,7 @@ from ehadiag.report.rendering import diagnosis_html_page
 from ehadiag.report.report_pages import calibration_page
 
 __all__ = ["browser"]
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, of_calibrated_unit]
 PLOT = ".bk-Figure, .bk-Column"
 
 
@@ -37,11 +37,11 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     out = {}
     for name, result in results.items():
         levels = strict if name == "failed" else Levels()
-        shown = result_of(worn_unit()) if result is None else result
+        shown = result_of(diagnosis_when_worn()) if result is None else result
         out[name] = folder / f"{name}.html"
         out[name].write_bytes(diagnosis_html_page(shown, levels, None))
     out["calibration"] = folder / "calibration.html"
-    out["calibration"].write_text(calibration_page(learned(), "1", NOW))
+    out["calibration"].write_text(calibration_page(learned(), "1", "2026-03-01T12:00:00.000Z"))
     return out
 
 

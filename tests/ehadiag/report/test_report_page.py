@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from calibrated_unit import TESTS, learned, of_calibrated_unit, recording
+from calibrated_unit import diagnosis_when_worn, learned, of_calibrated_unit
 from history_cases import an_entry, an_event
 from numpy.typing import NDArray
 from places import LOGS
@@ -23,7 +23,6 @@ from report_html import Page
 
 import ehadiag
 from ehadiag import Calibrated, Levels, default_actuator
-from ehadiag.assess.diagnosis import diagnose
 from ehadiag.calibration.unit_models import TriedModel
 from ehadiag.prognosis.units import prognosis_of
 from ehadiag.records import result_of
@@ -205,9 +204,7 @@ def residual(panel: Panel) -> NDArray[np.float64]:
 @pytest.mark.slow
 @of_calibrated_unit
 def test_page_and_picture_of_a_calibrated_unit_draw_the_response_that_was_fitted() -> None:
-    unit = learned().actuator
-    assert unit is not None
-    diagnosis = diagnose([recording("open", (0.3, 0.45, 0.2), 3)], unit, TESTS.values())
+    diagnosis = diagnosis_when_worn()
     found = diagnosis.identification
     assert found is not None
     (experiment,) = diagnosis.experiments
