@@ -182,12 +182,19 @@ class BusMap:
 
     @property
     def request_identifiers(self) -> frozenset[tuple[int, bool]]:
-        """Identifiers, and whether they are extended, of the messages that request something."""
-        return frozenset(
+        """Identifiers, and whether they are extended, of all that requests something.
+
+        The own messages of requests, and requests by UDS unless a mapped message has the identifier.
+        """
+        given = UdsIdentifiers() if isinstance(self.uds, msgspec.UnsetType) else self.uds
+        uds = UdsIdentifiers(given.request_id + self.id_offset, given.response_id + self.id_offset)
+        mapped = {(item.can_id, item.extended) for item in (*self.messages.values(), *self.onboard)}
+        own = {
             (message.can_id, message.extended)
             for message in self.messages.values()
             if any(role.name.startswith("request.") for role in message.roles)
-        )
+        }
+        return frozenset(own | ({(uds.request_id, uds.extended)} - mapped))
 
     @property
     def stated(self) -> tuple[StatedConverter | None, ...]:

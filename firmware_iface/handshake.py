@@ -143,7 +143,7 @@ class TimeLimits:
     status: float = 1.0
     """Request to first answer."""
     pending: float = 5.0
-    """The computer's word that the answer takes longer, to the answer."""
+    """Response pending to the answer."""
     arming: float = 10.0
     """Answer to running."""
     telemetry: float = MAX_SAMPLE_GAP_S
@@ -192,7 +192,7 @@ class Handshake:
     verdict: HandshakeResult | None = field(init=False, default=None)
     running_since: int | None = field(init=False, default=None)
     _since: int = field(init=False)
-    _patience: float = field(init=False, default=0.0)
+    _answer_limit: float = field(init=False, default=0.0)
     _last_ns: int = field(init=False, default=0)
     _aborted_at: int = field(init=False, default=0)
     _before: BitStatus | None = field(init=False, default=None)
@@ -226,7 +226,7 @@ class Handshake:
                 actions = [HandshakeAction.START]
             case Phase.WAITING if waited >= times.wait:
                 self._end(f"no test was started within {times.wait:g} s")
-            case Phase.REQUESTED if waited >= (limit := max(times.status, self._patience)):
+            case Phase.REQUESTED if waited >= (limit := max(times.status, self._answer_limit)):
                 actions = self._abort(f"no answer within {limit:.3g} s of the request", now)
             case Phase.ARMING if waited >= times.arming:
                 actions = self._abort(f"still arming after {times.arming:g} s", now)
@@ -301,9 +301,9 @@ class Handshake:
         return self._runs_on(now)
 
     def on_pending(self, now: int) -> None:
-        """Hear that the answer to the request takes longer; as long as a test may arm."""
+        """Extend the time limit of the answer to the request; as long as a test may arm."""
         longer = (now - self._since) / 1e9 + self.times.pending
-        self._patience = min(longer, self.times.arming)
+        self._answer_limit = min(longer, self.times.arming)
 
     def on_foreign_request(self, now: int) -> list[HandshakeAction]:
         """Take a request that someone else sent."""

@@ -106,7 +106,7 @@ RequestProtocol: TypeAlias = Literal["native", "uds"]
 
 
 class Requester(Protocol):
-    """A protocol's side of a session: its requests, and what it hears besides telemetry."""
+    """A protocol's side of a session: its requests, and what it receives besides telemetry."""
 
     @property
     def second_sender(self) -> str:
@@ -122,7 +122,7 @@ class Requester(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the computer says of itself, one sentence each."""
+        """Identification data of the computer, one sentence each."""
 
     def request(self, action: HandshakeAction, test_id: int, now: int) -> Sequence[Frame]:
         """Return the frames to send for a request of a test."""
@@ -132,6 +132,9 @@ class Requester(Protocol):
 
     def due(self, now: int) -> Sequence[Frame]:
         """Return the frames to send now without a request of the handshake."""
+
+    def withdraw(self) -> None:
+        """Forget a start that is not sent yet: the session has decided to end."""
 
     def request_results(self) -> None:
         """Begin to ask what the computer has found itself in the test, which is over."""
@@ -171,6 +174,9 @@ class NativeRequester:
     def due(self, _now: int) -> Sequence[Frame]:
         """Return nothing: the computer sends its status of its own."""
         return ()
+
+    def withdraw(self) -> None:
+        """Do nothing: a request is sent at once."""
 
     def request_results(self) -> None:
         """Ask nothing: the computer sends its result of its own."""
@@ -218,7 +224,7 @@ class RequestOutcome:
     onboard: OnboardResult | None = None
     """What the computer has found itself; None where it did not say."""
     notes: tuple[str, ...] = ()
-    """What the computer says of itself, one sentence each."""
+    """Identification data of the computer, one sentence each."""
 
 
 def run_test(
@@ -344,6 +350,8 @@ class _BitSession:
     def _send_due(self, now: int) -> None:
         """Send what the protocol asks for of its own, as long as the handshake goes on."""
         if self._machine.transmit and self._machine.phase is not Phase.DONE:
+            if self._machine.phase is Phase.CLOSING:
+                self._requester.withdraw()
             self._send(self._requester.due(now))
 
     def _listen_on(self, source: FrameSource, stop: threading.Event) -> None:

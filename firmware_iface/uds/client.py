@@ -131,7 +131,7 @@ PENDING_LIMIT_NS = 5_000_000_000
 ONBOARD_PERIOD_NS = 100_000_000
 """Between two requests of the computer's own result while it identifies."""
 MAX_ATTEMPTS = 3
-"""Times that what the computer says of itself is asked for without an answer."""
+"""Times that identification data are requested without an answer."""
 
 REFUSAL_REASONS: dict[int, BitReason] = {REFUSALS[reason]: reason for reason in REFUSALS}
 REFUSAL_REASONS[ResponseCode.CONDITIONS_NOT_CORRECT] = BitReason.NONE
@@ -161,8 +161,8 @@ class UdsClient:
 
     identifiers: of requests and responses. second_sender: what gives away that somebody else
     answers as the computer does; empty if nothing; pending: the last frame said that the whole
-    answer to the start takes longer; notes: what the computer says of itself after a test, one
-    sentence each.
+    answer to the start takes longer; notes: identification data of the computer after a test, one sentence
+    each.
     """
 
     second_sender: str
@@ -193,7 +193,7 @@ class UdsClient:
         """Return the frames that request something of a test; a start waits for its turn."""
         option = b""
         if action is HandshakeAction.START:
-            self._test_id, self._started, self._start_unanswered = test_id, True, True
+            self._test_id = test_id
             option = TEST_OPTION.encode({"test_id": test_id})
             self._queue.append(_routine(RoutineAction.START, option))
             return ()
@@ -256,7 +256,14 @@ class UdsClient:
         found = self._onboard
         return found if found is not None and found.is_of(test_id) else None
 
+    def withdraw(self) -> None:
+        """Remove a start that still waits for its turn."""
+        waiting = [item for item in self._queue if item.action is not RoutineAction.START]
+        self._queue = deque(waiting)
+
     def _send(self, exchange: _Exchange, now: int) -> None:
+        if exchange.action is RoutineAction.START:
+            self._started = self._start_unanswered = True
         self._open, self._open_until = exchange, now + self._limit
         self._link.send(exchange.payload)
 
@@ -290,8 +297,8 @@ class UdsClient:
         self._unsolicited += 1
         if self._unsolicited >= MIN_CONTRADICTIONS:
             self.second_sender = (
-                f"answers of {self._identifiers.response_id:#x} that nobody asked for: a second"
-                " sender on the bus"
+                f"unsolicited answers of {self._identifiers.response_id:#x}: a second sender on the"
+                " bus"
             )
 
     def _of_routine(
@@ -326,7 +333,7 @@ class UdsClient:
         return [_refused(self._test_id, code)]
 
     def _keep(self, exchange: _Exchange, data: bytes, now: int) -> None:
-        """Keep what the computer says of itself; what is damaged is left out."""
+        """Keep identification data of the computer; what is damaged is left out."""
         try:
             if exchange.record is None:
                 self._facts["trouble codes"] = _trouble_codes(data[1:])

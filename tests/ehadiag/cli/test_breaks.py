@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 import struct
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from places import LOGS
 from ehadiag.setup import Setup
 from firmware_iface.bus_map import default_map
 from firmware_iface.logs.recorder import Recorder
+from firmware_iface.mapping_file import UdsIdentifiers
 from firmware_iface.transport.frames import Frame
 
 HEALTHY = LOGS / "healthy-open.blf"
@@ -93,10 +95,24 @@ def test_replay_sends_no_request_of_a_recording_unless_asked_to(run: Run, log: l
     assert "the surface moves" in " ".join(run("replay", "--help").out.split())
 
 
+def test_replay_sends_no_request_by_uds(run: Run, tmp_path: Path) -> None:
+    start = Frame(0, 0x7E0, bytes((5, 0x31, 0x01, 0x02, 0x01, 1, 0xCC, 0xCC)))
+    with Recorder(tmp_path / "log.blf") as recorder:
+        for frame in (Frame(0, 0x110, bytes(8)), start, Frame(0, 0x7E8, bytes(8))):
+            recorder.write(frame)
+    sent, text = played(run)
+    assert sent == [0x110, 0x7E8]
+    assert text.endswith(", 1 requests left out (--with-requests)")
+    sent, _ = played(run, "--id-offset", "1")
+    assert sent == [0x110, 0x7E0, 0x7E8]
+    taken = replace(default_map(), uds=UdsIdentifiers(0x110, 0x7E8))
+    assert taken.request_identifiers == {(REQUEST_ID, False)}
+
+
 def test_replay_leaves_out_the_requests_of_a_mapped_bus(
     run: Run, log: list[int], tmp_path: Path
 ) -> None:
-    assert default_map().request_identifiers == {(REQUEST_ID, False)}
+    assert default_map().request_identifiers == {(REQUEST_ID, False), (0x7E0, False)}
     text = resources.files("firmware_iface").joinpath("data/eha_fcc.dbc").read_text()
     for word in ("BO_", "VAL_"):
         text = text.replace(f"{word} {REQUEST_ID} ", f"{word} {OTHER_REQUEST_ID} ")

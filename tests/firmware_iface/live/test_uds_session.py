@@ -20,7 +20,7 @@ from ehadiag_sim.emulator import EmulatorTransport, FccCore, Preconditions
 from ehadiag_sim.faulty_bus import FaultyTransport, MessageSilence
 from ehadiag_sim.uds_server import UdsServer
 from firmware_iface.bus_map import default_map
-from firmware_iface.handshake import ChannelLimits
+from firmware_iface.handshake import ChannelLimits, Phase, TimeLimits
 from firmware_iface.live_decode import BitStatus
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.logs.recorder import Recorder
@@ -49,13 +49,13 @@ class Between(EmulatorTransport):
     def __init__(self, core: FccCore, answer: Callable[[bytes], list[bytes] | None]) -> None:
         super().__init__(core)
         self._answer = answer
-        self._waiting: list[Frame] = []
+        self.waiting: list[Frame] = []
         self._other = IsoTpLink(RESPONSE, REQUEST)
         self.requests: list[bytes] = []
 
     def _receive(self, timeout: float) -> Frame | None:
-        if self._waiting:
-            return replace(self._waiting.pop(0), time_ns=self.now_ns())
+        if self.waiting:
+            return replace(self.waiting.pop(0), time_ns=self.now_ns())
         return super()._receive(timeout)
 
     def _send(self, frame: Frame) -> None:
@@ -69,7 +69,7 @@ class Between(EmulatorTransport):
             return
         for item in answers:
             self._other.send(item)
-        self._waiting += self._other.frames()
+        self.waiting += self._other.frames()
 
 
 def one_way(
@@ -214,6 +214,49 @@ def test_a_start_whose_answer_is_lost_is_found_out_by_the_results(make_core: Cor
         assert outcome_of(bus).why == ""
 
 
+def test_a_session_that_ends_sends_no_start_that_waits(make_core: CoreFactory) -> None:
+    def watch(progress: BitProgress) -> None:
+        if progress.phase is Phase.REQUESTED:
+            bus.requests.clear()
+            bus.waiting.append(Frame(0, REQUEST, b"\x03\x22\xf1\x8c".ljust(8, b"\xcc")))
+
+    core = make_core(protocol="uds")
+    with Between(core, one_way(RESULTS, [])) as bus:
+        outcome = outcome_of(bus, progress=watch, times=TimeLimits(quiet=1.0))
+    assert outcome.why == "another tester is on the bus"
+    assert RESULTS in bus.requests
+    assert START not in bus.requests
+    assert core.tests_started == 0
+
+
+class Slow(EmulatorTransport):
+    """The bus of a computer each of whose answers comes late."""
+
+    def __init__(self, core: FccCore) -> None:
+        super().__init__(core)
+        self._late: list[Frame] = []
+
+    def _receive(self, timeout: float) -> Frame | None:
+        if self._late and self._late[0].time_ns + 80_000_000 <= self.now_ns():
+            return replace(self._late.pop(0), time_ns=self.now_ns())
+        frame = super()._receive(timeout)
+        if frame is not None and frame.can_id == RESPONSE:
+            self._late.append(frame)
+            return None
+        return frame
+
+
+def test_the_refusal_of_an_earlier_test_is_not_taken_for_this_ones(make_core: CoreFactory) -> None:
+    core = make_core(protocol="uds")
+    core.interlock_open = True
+    core.take(Frame(0, REQUEST, b"\x05" + START + b"\0\0"))
+    core.step()
+    assert core.state is BitState.REFUSED
+    core.interlock_open = False
+    with Slow(core) as bus:
+        assert outcome_of(bus).why == ""
+
+
 def test_a_limit_ends_in_a_stop(make_core: CoreFactory) -> None:
     core = make_core(protocol="uds")
     with Between(core, lambda _: None) as bus:
@@ -263,7 +306,7 @@ def test_a_second_tester_ends_the_test(make_core: CoreFactory) -> None:
     assert outcome.abort_confirmed
 
 
-def test_answers_that_nobody_asked_for_are_a_second_sender(make_core: CoreFactory) -> None:
+def test_unsolicited_answers_are_a_second_sender(make_core: CoreFactory) -> None:
     core, count = make_core(protocol="uds"), [0]
 
     def beside(frame: Frame) -> Iterator[Frame]:
@@ -276,7 +319,7 @@ def test_answers_that_nobody_asked_for_are_a_second_sender(make_core: CoreFactor
 
     with SharedBus(core, beside) as bus:
         outcome = outcome_of(bus)
-    assert "answers of 0x7e8 that nobody asked for: a second sender on the bus" in outcome.why
+    assert "unsolicited answers of 0x7e8: a second sender on the bus" in outcome.why
     assert outcome.abort_confirmed
     assert core.state is BitState.ABORTED
 
@@ -382,10 +425,10 @@ def test_a_result_that_is_still_being_found_is_asked_for_anew(make_core: CoreFac
             if frame.data[1:4] == asked and left[0]:
                 left[0] -= 1
                 link.send(busy)
-                self._waiting += link.frames()
+                self.waiting += link.frames()
                 self.requests.append(asked)
             elif frame.data[0] >> 4 == 3 and link.take(frame) and (more := link.frames()):
-                self._waiting += more
+                self.waiting += more
             else:
                 super()._send(frame)
 
