@@ -184,7 +184,7 @@ class BusMap:
     def request_identifiers(self) -> frozenset[tuple[int, bool]]:
         """Identifiers, and whether they are extended, of all that requests something.
 
-        The own messages of requests, and requests by UDS unless a mapped message has the identifier.
+        The own messages of requests, and UDS unless a mapped message has the identifier.
         """
         given = UdsIdentifiers() if isinstance(self.uds, msgspec.UnsetType) else self.uds
         uds = UdsIdentifiers(given.request_id + self.id_offset, given.response_id + self.id_offset)

@@ -268,8 +268,8 @@ class LiveTicks:
 
     bus_map: mapping; all channels must come in one frame, and its counter and that of the command
     must count ticks; mode: of the commands to take; those of the other mode count as lost. None:
-    both, and `mode` says which the last command had. mode: of the commands; a tick that `take`
-    gives out has that of the command before it; lost: ticks whose telemetry did not come, or was
+    both, and the attribute `mode` is that of the last command before the tick that `take` gives
+    out; lost: ticks whose telemetry did not come, or was
     damaged; breaks: silences so long that the ticks began anew after them; conflicts: counter
     values that came with different payloads: a second sender. The `DOUBTFUL_TICKS` ticks after each
     are given out as lost: nothing tells which sender is right. ConfigurationError: a bus whose

@@ -42,6 +42,25 @@ class _Entry(NamedTuple):
     size: int
 
 
+def refuse_taken_identifiers(ids: XcpIds, bus_map: BusMap, *, uds: bool) -> None:
+    """Refuse identifiers that the bus has already.
+
+    ids: of the slave; bus_map: meaning of the bus; uds: whether UDS is spoken on it.
+    ConfigurationError: a message, or UDS, has one of them.
+    """
+    messages = (*bus_map.messages.values(), *bus_map.onboard)
+    taken = {(item.can_id, item.extended): f"message {item.name}" for item in messages}
+    if uds:
+        other = bus_map.uds_identifiers
+        taken |= {
+            (can_id, other.extended): "UDS" for can_id in (other.request_id, other.response_id)
+        }
+    for can_id in ids:
+        owner = taken.get((can_id, is_extended(can_id)))
+        if owner is not None:
+            raise ConfigurationError(f"XCP identifier {can_id:#x}: {owner} has it")
+
+
 class XcpTransport(Transport):
     """A bus as its reader expects it, with commands and channels measured by XCP.
 
@@ -51,16 +70,25 @@ class XcpTransport(Transport):
 
     bus: opened to send; it stays open when this one is closed; bus_map: meaning of the bus;
     channels: converters of the computer; mode: what the test commands; ids: identifiers of the
-    slave. ConfigurationError: the bus listens only, or has commands and channels in messages with
-    other signals; InputOutputError: no slave answers, or it refuses.
+    slave; uds: whether the test is requested by UDS. ConfigurationError: the bus listens only, has
+    commands and channels in messages with other signals, or one of the identifiers;
+    InputOutputError: no slave answers, or it refuses.
     """
 
     def __init__(
-        self, bus: Transport, bus_map: BusMap, channels: Channels, mode: CommandMode, ids: XcpIds
+        self,
+        bus: Transport,
+        bus_map: BusMap,
+        channels: Channels,
+        mode: CommandMode,
+        ids: XcpIds,
+        *,
+        uds: bool = False,
     ) -> None:
         super().__init__(f"{bus.name} by XCP", transmit=True)
         if not bus.transmits:
             raise ConfigurationError("XCP: measures on command, and needs a bus that sends")
+        refuse_taken_identifiers(ids, bus_map, uds=uds)
         self._bus, self._ids, self._mode = bus, ids, mode
         self._encoder = Encoder(bus_map, channels)
         self._replaced = frozenset(_replaced_identifiers(bus_map))
@@ -118,9 +146,9 @@ class XcpTransport(Transport):
         self._bus.send(frame)
 
     def _close(self) -> None:
-        with contextlib.suppress(InputOutputError, ConfigurationError):
-            self._request(Command.START_STOP_SYNCH, bytes(1))
-            self._request(Command.DISCONNECT)
+        for command, content in ((Command.START_STOP_SYNCH, bytes(1)), (Command.DISCONNECT, b"")):
+            with contextlib.suppress(InputOutputError, ConfigurationError):
+                self._request(command, content)
 
     def _is_answer(self, frame: Frame) -> bool:
         ours = self._ids.response
@@ -141,7 +169,11 @@ class XcpTransport(Transport):
                 content = struct.pack("<BBBI", 0xFF, entry.size, 0, entry.measurement.address)
                 self._request(Command.WRITE_DAQ, content)
         self._request(Command.SET_DAQ_LIST_MODE, struct.pack("<BHHBB", 0, 0, TICK_EVENT, 1, 0))
-        answer = self._request(Command.START_STOP_DAQ_LIST, struct.pack("<BH", 1, 0))
+        try:
+            answer = self._request(Command.START_STOP_DAQ_LIST, struct.pack("<BH", 1, 0))
+        except BaseException:  # the list may send all the same
+            self._close()
+            raise
         self._first = answer[1] if len(answer) > 1 else 0
 
     def _request(self, command: Command, content: bytes = b"") -> bytes:

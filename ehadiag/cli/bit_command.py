@@ -294,7 +294,7 @@ def _measured_by_xcp(
 
     mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
     channels = scales_of(setup.bus_map, setup.actuator).channels
-    return XcpTransport(bus, setup.bus_map, channels, mode, ids)
+    return XcpTransport(bus, setup.bus_map, channels, mode, ids, uds=arguments.protocol == "uds")
 
 
 def _bit_monitor(

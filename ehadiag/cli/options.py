@@ -158,7 +158,7 @@ def add_xcp_option(parser: argparse.ArgumentParser, help: str) -> None:
     parser.add_argument(
         "--xcp",
         nargs="?",
-        const="6F0:6F1",
+        const=True,
         metavar="REQ:RES",
         help=f"{help}; identifiers in hexadecimal (default 6F0:6F1)",
     )
@@ -168,9 +168,9 @@ def xcp_ids(arguments: argparse.Namespace) -> XcpIds | None:
     """Return the identifiers of `--xcp`; None without it."""
     if arguments.xcp is None:
         return None
-    from firmware_iface.xcp import parse_xcp_ids  # noqa: PLC0415 - loads numpy
+    from firmware_iface.xcp import XcpIds, parse_xcp_ids  # noqa: PLC0415 - loads numpy
 
-    return parse_xcp_ids(arguments.xcp)
+    return XcpIds() if arguments.xcp is True else parse_xcp_ids(arguments.xcp)
 
 
 def add_signals_option(parser: argparse.ArgumentParser) -> None:

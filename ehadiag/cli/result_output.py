@@ -235,7 +235,9 @@ class ResultWriter:
                 with report_failure(codes):
                     self._report(result, f"{stem}.html")
                     written.append(f"{stem}.html")
-            for kind in self._signals if result.can_be_drawn and not came.is_set() else ():
+            for kind in self._signals if stem is not None and result.can_be_drawn else ():
+                if came.is_set():
+                    break
                 with report_failure(codes):
                     self._write_signals(result, kind, f"{stem}.signals.{kind}")
                     written.append(f"{stem}.signals.{kind}")

@@ -7,11 +7,12 @@ import csv
 import os
 import sys
 import time
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
 from ehadiag.cli import options
-from ehadiag.cli.result_output import open_output_folder
+from ehadiag.cli.result_output import OutputFile, open_output_folder, refuse_overwriting
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.request import TEST
@@ -161,11 +162,11 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     )
     options.add_request_options(parser, "actuator", "mapping", "dbc", "id_offset")
     options.add_xcp_option(parser, "with --a2l: how the computer is reached")
-    parser.set_defaults(run=run_export)
+    parser.set_defaults(run=partial(run_export, parser))
 
 
-def run_export(arguments: argparse.Namespace) -> int:
-    """Write the export."""
+def run_export(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
+    """Write the export; `parser` knows the defaults."""
     if arguments.list:
         from ehadiag.export.targets import TARGETS  # noqa: PLC0415 - loads the compiler
 
@@ -173,10 +174,20 @@ def run_export(arguments: argparse.Namespace) -> int:
         for item in TARGETS:
             print_text(f"{item.name:<{width}}  {item.meaning}")
         return 0
+    if not (arguments.a2l or arguments.pdx):
+        for name in (*options.BUS, "xcp"):
+            if getattr(arguments, name) != parser.get_default(name):
+                raise ConfigurationError(
+                    f"--{name.replace('_', '-')}: needs --a2l or --pdx; libraries and simulation"
+                    " units know no bus"
+                )
     if arguments.pdx:
         from ehadiag.export.pdx import pdx_content  # noqa: PLC0415 - not for help texts
 
-        identifiers = options.setup_of(arguments).bus_map.uds_identifiers
+        bus_map = options.setup_of(arguments).bus_map
+        output = OutputFile("--pdx", arguments.pdx)
+        refuse_overwriting(arguments, [output], [("the DBC", bus_map.name)])
+        identifiers = bus_map.uds_identifiers
         write_file(Path(arguments.pdx), pdx_content(identifiers), "diagnostic description")
         print_text(printable(arguments.pdx))
         return 0

@@ -72,7 +72,6 @@ INTERFACE_DATA = """\
               taggedstruct {
                 "CAN_ID_MASTER" ulong;
                 "CAN_ID_SLAVE" ulong;
-                "BAUDRATE" ulong;
               };
             };
           };
@@ -82,7 +81,7 @@ INTERFACE_DATA = """\
 """Types of the interface's data, as far as this file has them (ASAM MCD-1 XCP 1.1)."""
 
 
-def a2l_text(actuator: Actuator, bus_map: BusMap, ids: XcpIds, bitrate: int = 1_000_000) -> str:
+def a2l_text(actuator: Actuator, bus_map: BusMap, ids: XcpIds) -> str:
     """Return the A2L file of a computer.
 
     Parameters
@@ -93,8 +92,6 @@ def a2l_text(actuator: Actuator, bus_map: BusMap, ids: XcpIds, bitrate: int = 1_
         What it states of converters comes before the actuator file.
     ids : XcpIds
         Identifiers of its XCP slave.
-    bitrate : int
-        Of the bus, bit/s.
 
     Returns
     -------
@@ -116,7 +113,7 @@ def a2l_text(actuator: Actuator, bus_map: BusMap, ids: XcpIds, bitrate: int = 1_
             *(f"      ALIGNMENT_{name} {size}" for size, name in ((1, "BYTE"), (2, "WORD"))),
             "      ALIGNMENT_LONG 4",
             "    /end MOD_COMMON",
-            *_interface(ids, period_ns, bitrate),
+            *_interface(ids, period_ns),
             *(line for item in measurements for line in _measurement(item)),
             '    /begin GROUP telemetry "all measurements" ROOT',
             "      /begin REF_MEASUREMENT",
@@ -134,7 +131,7 @@ def _listed(commands: type[Command]) -> str:
     return ", ".join(f'"{item.name}" = {item.value}' for item in commands)
 
 
-def _interface(ids: XcpIds, period_ns: int, bitrate: int) -> Iterator[str]:
+def _interface(ids: XcpIds, period_ns: int) -> Iterator[str]:
     required = (Command.CONNECT, Command.DISCONNECT, Command.GET_STATUS, Command.SYNCH)
     cycle, unit = event_cycle(period_ns)
     master, slave = (item | (EXTENDED_ID if is_extended(item) else 0) for item in ids)
@@ -159,7 +156,6 @@ def _interface(ids: XcpIds, period_ns: int, bitrate: int) -> Iterator[str]:
         "      /begin XCP_ON_CAN 0x0101",
         f"        CAN_ID_MASTER 0x{master:X}",
         f"        CAN_ID_SLAVE 0x{slave:X}",
-        f"        BAUDRATE {bitrate}",
         "      /end XCP_ON_CAN",
         "    /end IF_DATA",
     )

@@ -151,6 +151,10 @@ int fcc_run(int argc, char **argv, const char *channel,
                 argv[0], channel);
         return 2;
     }
+    if (options.uds && rider->after != NULL) {
+        fprintf(stderr, "%s: --uds: this node sends its own diagnosis by its messages only\n", argv[0]);
+        return 2;
+    }
     if (!open_bus(argv[1], &bus)) {
         fprintf(stderr, "%s: %s: %s\n", argv[0], argv[1], strerror(errno));
         return 1;

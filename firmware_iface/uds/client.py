@@ -161,8 +161,8 @@ class UdsClient:
 
     identifiers: of requests and responses. second_sender: what gives away that somebody else
     answers as the computer does; empty if nothing; pending: the last frame said that the whole
-    answer to the start takes longer; notes: identification data of the computer after a test, one sentence
-    each.
+    answer to the start takes longer; notes: identification data of the computer after a
+    test, one sentence each.
     """
 
     second_sender: str

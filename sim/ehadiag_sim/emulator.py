@@ -28,7 +28,8 @@ from firmware_iface.recording import CHANNEL_NAMES, BitReason, BitState, Command
 from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S, Transport, TransportState
 from firmware_iface.transport.frames import Frame
-from firmware_iface.xcp import XcpIds, is_extended, measurements_of
+from firmware_iface.xcp import XcpIds, measurements_of
+from firmware_iface.xcp_master import refuse_taken_identifiers
 
 if TYPE_CHECKING:
     from ehadiag_sim.foreign_plant import ForeignPlant
@@ -115,7 +116,7 @@ class FccCore:
         self.period_ns = round(1e9 / self._rate)
         self._slave = None
         if xcp is not None:
-            _refuse_taken_identifiers(xcp, bus_map)
+            refuse_taken_identifiers(xcp, bus_map, uds=protocol == "uds")
             self._slave = XcpSlave(measurements_of(self._scales.channels), xcp, self.period_ns)
         self._start_ns = start_ns
         self._tick = 0
@@ -293,6 +294,7 @@ class FccCore:
         elapsed = self._tick - self._since
         if self._state is BitState.ARMING and elapsed >= 0.1 * self._rate:
             self._count += 1
+            self._plant.close()
             self._plant = self._fresh_plant()
             self._enter(BitState.RUNNING, self._test_id)
         elif self._state is BitState.RUNNING and elapsed >= len(self._commands):
@@ -345,14 +347,6 @@ class FccCore:
         )
 
 
-def _refuse_taken_identifiers(xcp: XcpIds, bus_map: BusMap) -> None:
-    taken = {(item.can_id, item.extended): item.name for item in bus_map.messages.values()}
-    for can_id in xcp:
-        name = taken.get((can_id, is_extended(can_id)))
-        if name is not None:
-            raise ConfigurationError(f"XCP identifier {can_id:#x}: message {name} has it")
-
-
 def _by_number(tests: Iterable[StoredTest], actuator: Actuator) -> dict[int, StoredTest]:
     numbered: dict[int, StoredTest] = {}
     for test in tests:
@@ -397,11 +391,14 @@ def emulated_computer(
     broken hardware (`HARDWARE_FAULTS`), its sizes drawn by the seed; None: none; seed: seed of the
     noise; serial: serial number of the actuator; control, foreign, xcp, protocol: see `FccCore`.
     Returns the emulated computer; its first tick has the present date, also in simulated time.
-    ConfigurationError: see `FccCore`; an unknown kind of broken hardware.
+    ConfigurationError: see `FccCore`; an unknown kind of broken hardware, or one that a foreign
+    plant cannot have.
     """
     item = Hardware(actuator, effects or Effects(), sensors or Sensors())
     if broken:
         item = break_hardware(broken, np.random.default_rng(seed), item)
+        if foreign is not None and item.actuator != actuator:
+            raise ConfigurationError(f"broken hardware {broken!r}: is not of a foreign plant")
     core = FccCore(
         item.actuator,
         tests,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 import weakref
@@ -13,7 +14,7 @@ from typing import Any
 import msgspec
 
 from ehadiag_sim.conditions import Effects, Faults, Sensors
-from firmware_iface.errors import ConfigurationError, InputOutputError
+from firmware_iface.errors import ConfigurationError, InputOutputError, install_command
 from firmware_iface.files import read_toml
 
 
@@ -61,11 +62,13 @@ class ForeignPlant:
     """
 
     def __init__(self, path: Path, mapping: Path | None = None) -> None:
+        if not path.is_file():
+            raise ConfigurationError(f"plant {path}: is no file; name a unit (FMU)")
         try:
             import fmpy  # noqa: PLC0415 - an extra
         except ImportError:
             raise ConfigurationError(
-                f"plant {path}: needs FMPy: pip install 'fmpy>=0.3.20'"
+                f"plant {path}: needs FMPy: {install_command('fmu')}"
             ) from None
         beside = path.with_suffix(".toml")
         source = mapping or (beside if beside.exists() else None)
@@ -81,6 +84,9 @@ class ForeignPlant:
         except Exception as error:
             text = " ".join(str(error).split())
             raise ConfigurationError(f"{self.where}: no unit that FMPy reads: {text}") from None
+        if not self.description.fmiVersion.startswith(("2", "3")):
+            version = self.description.fmiVersion
+            raise ConfigurationError(f"{self.where}: is of FMI {version}; need FMI 2.0 or 3.0")
         if self.description.coSimulation is None:
             raise ConfigurationError(f"{self.where}: not for co-simulation")
         real = ("Real", "Float64")
@@ -98,10 +104,18 @@ class ForeignPlant:
                 f"{self.where}: no real variable {absent[0]!r}; name it in a mapping"
                 f" ({source or beside})"
             )
-        known = {item.name for kind in (Faults, Effects) for item in fields(kind)}
+        known = {
+            item.name
+            for kind in (Faults, Effects)
+            for item in fields(kind)
+            if "range" in item.metadata
+        }
         for name in self.mapping.conditions:
             if name not in known:
                 raise ConfigurationError(f"{source}: conditions: there is no {name!r}")
+        for item in (*signals, *conditions):
+            if item.scale == 0.0:
+                raise ConfigurationError(f"{source}: {item.variable}: scale must not be 0")
 
     def begin(self, tick: float, faults: Faults, effects: Effects, sensors: Sensors) -> ForeignRun:
         """Return a run of the plant, from its own start.
@@ -126,7 +140,13 @@ class ForeignPlant:
                 if target is not None:
                     place = _variable(target)
                     found[place.variable] = (float(value) - place.offset) / place.scale
-                elif value != getattr(default, entry.name) and entry.name not in PROBED:
+                elif value == getattr(default, entry.name) or entry.name in PROBED:
+                    continue
+                elif "range" not in entry.metadata:
+                    raise ConfigurationError(
+                        f"{self.where}: effects of {entry.name} cannot be played by a foreign plant"
+                    )
+                else:
                     raise ConfigurationError(
                         f"{self.where}: no variable for {entry.name}: name one under [conditions]"
                     )
@@ -177,10 +197,15 @@ class ForeignRun:
     def _read(self, current: float) -> None:
         references = [self._plant.references[item.variable] for item in self._outputs]
         raw = self._called(self._get, references)
-        self.spool, self.pressure, self.position = (
+        values = [
             item.scale * float(value) + item.offset
             for item, value in zip(self._outputs, raw, strict=True)
-        )
+        ]
+        if not all(map(math.isfinite, values)):
+            raise InputOutputError(
+                f"{self._plant.where}: an output is not finite at {self._time:.4g} s"
+            )
+        self.spool, self.pressure, self.position = values
         self.seen = (current, self.spool, self.pressure, self.position)
 
     def _put(self, values: Mapping[str, float]) -> None:
@@ -195,7 +220,11 @@ class ForeignRun:
             text = " ".join(str(error).split())
             raise InputOutputError(f"{self._plant.where}: {text}") from None
 
-    def __del__(self) -> None:
-        unit = getattr(self, "_unit", None)
+    def close(self) -> None:
+        """Free the unit; the run is over."""
+        unit, self._unit = getattr(self, "_unit", None), None
         if unit is not None:
             unit.freeInstance()
+
+    def __del__(self) -> None:
+        self.close()

@@ -100,6 +100,11 @@ class Plant:
         self._dynamics.change(faults, effects)
         self._converters.change(sensors, effects.unmodelled)
 
+    def close(self) -> None:
+        """Free what another maker's plant holds; the run is over."""
+        if not isinstance(self._dynamics, PlantDynamics):
+            self._dynamics.close()
+
     def tick(self, command: float, mode: CommandMode) -> NDArray[np.int64]:
         """Advance by one control tick; return the four ADC codes at its end, shape (4,).
 

@@ -282,6 +282,9 @@ class XcpSlave:
         if data[1] > 2:
             raise _CommandError(ErrorCode.MODE_NOT_VALID)
         for item in self._lists:
+            if data[1] == 1 and item.selected:  # it may have changed since it was selected
+                self._refuse_overlong(item)
+        for item in self._lists:
             if data[1] == 0:
                 item.running = False
             elif item.selected:

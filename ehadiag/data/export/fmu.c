@@ -30,7 +30,7 @@ typedef struct {
     double values[EHA_VALUES];
     double memory[EHA_MEMORY];
     double time;
-    int running; /* not 0: initialised, parameters are fixed */
+    int running; /* not 0: initialised: fixed parameters can no longer be set */
     void *environment;
     logger2 log2;
     logger3 log3;

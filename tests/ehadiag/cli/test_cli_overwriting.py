@@ -127,6 +127,28 @@ def test_a_report_replaces_neither_a_result_nor_another_report(place: Path, run:
     assert run("report", "v.json", "v.json").code == 0
 
 
+@pytest.mark.parametrize(
+    ("name", "said"), [("mapping.toml", "--mapping mapping.toml"), ("eha_fcc.dbc", "the DBC")]
+)
+def test_an_export_of_the_services_does_not_replace_what_it_reads(
+    name: str, said: str, place: Path, run: Run
+) -> None:
+    before = contents(place)
+    result = run("export", "--pdx", name, "--mapping", "mapping.toml")
+    assert result.code == 2
+    assert f"--pdx {name}: is {said}" in result.message
+    assert contents(place) == before
+
+
+@pytest.mark.parametrize("what", [("--target", "cortex-m4"), ("--fmu",)])
+def test_what_knows_no_bus_takes_no_mapping(what: tuple[str, ...], place: Path, run: Run) -> None:
+    for option in (("--mapping", "mapping.toml"), ("--dbc", "x"), ("--id-offset", 1), ("--xcp",)):
+        result = run("export", *what, "--out", "o", *option)
+        assert result.code == 2
+        assert result.message.startswith(f"ehadiag: {option[0]}: needs --a2l or --pdx")
+    assert not (place / "o").exists()
+
+
 def test_a_live_test_records_beside_its_history(place: Path, run: Run) -> None:
     result = run(
         "bit", "--simulate", "--fast", "--test", "open", "--record", "n.blf", "--history", "n.blf"

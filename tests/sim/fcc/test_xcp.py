@@ -231,9 +231,59 @@ def test_what_cannot_be_measured_by_xcp_is_said() -> None:
         connect(computer(), transmit=False)
     with pytest.raises(ConfigurationError, match="XCP identifier 0x110: message ServoTelemetry"):
         computer(XcpIds(0x6F0, 0x110))
+    with pytest.raises(ConfigurationError, match="XCP identifier 0x210: message OnboardVerdict"):
+        computer(XcpIds(0x6F0, 0x210))
+    bus = EmulatorTransport(computer())
+    for ids, uds, owner in (
+        (XcpIds(0x6F0, 0x110), False, "message ServoTelemetry"),
+        (XcpIds(0x7E8, 0x6F1), True, "UDS"),
+    ):
+        with pytest.raises(ConfigurationError, match=f"{owner} has it"):
+            XcpTransport(bus, default_map(), channels, CommandMode.POSITION, ids, uds=uds)
     for text in ("6F0", "6F0:6F0", "6G0:6F1", "6F0:20000000", "-1:2"):
         with pytest.raises(ConfigurationError, match="need two different ones in hexadecimal"):
             parse_xcp_ids(text)
+
+
+def test_a_list_that_grew_since_it_was_selected_is_not_started() -> None:
+    core = computer()
+    ask(core, CONNECT, *ONE_ENTRY, bytes((0xD3, 0, 0, 0, 0, 2)), bytes((0xE2, 0, 0, 0, 0, 0)))
+    ask(core, SPOOL_ENTRY, SPOOL_ENTRY, bytes((0xDE, 2, 0, 0)))
+    wide = bytes((0xE1, 0xFF, 7, 0)) + struct.pack("<I", ADDRESSES["tick"])
+    ask(core, bytes((0xE2, 0, 0, 0, 0, 0)), wide)
+    assert ask(core, bytes((0xDD, 1))) == bytes((0xFE, 0x2A))
+    assert answers(core) == []
+
+
+class Deaf(EmulatorTransport):
+    """A bus on which the answer to a command is lost."""
+
+    def __init__(self, core: FccCore, code: int) -> None:
+        super().__init__(core)
+        self.code, self.lost, self.sent = code, False, []
+
+    def _send(self, frame: Frame) -> None:
+        self.sent.append(frame.data[0])
+        self.lost = frame.data[0] == self.code
+        super()._send(frame)
+
+    def _receive(self, timeout: float) -> Frame | None:
+        frame = super()._receive(timeout)
+        ours = frame is not None and frame.can_id == IDS.response
+        return None if ours and self.lost and frame.data[0] == 0xFF else frame
+
+
+@pytest.mark.parametrize("code", [0xDD, 0xDE])
+def test_a_lost_answer_leaves_no_list_running(code: int) -> None:
+    core = computer()
+    bus = Deaf(core, code)
+    channels = scales_of(default_map(), default_actuator()).channels
+    try:
+        XcpTransport(bus, default_map(), channels, CommandMode.POSITION, IDS).close()
+    except InputOutputError:
+        assert code == 0xDE
+    assert bus.sent[-2:] == [0xDD, 0xFE]
+    assert answers(core) == []
 
 
 MASTER = """
