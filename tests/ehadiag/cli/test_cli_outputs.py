@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ from cli_result import COMMAND, Run
 from places import LOGS
 
 from ehadiag.history.store import History
+from firmware_iface.files import Folder
 from firmware_iface.logs.reader import read_frames
 
 HEALTHY, WORN = LOGS / "healthy-open.blf", LOGS / "paper-open-1.blf"
@@ -348,6 +350,18 @@ def test_signals_are_written_beside_a_result_once(run: Run, tmp_path: Path) -> N
     refused = run(*command, HEALTHY, "--out", "o", "--jobs", "2")
     assert refused.code == 2
     assert "--jobs: --signals needs samples" in refused.message
+
+
+def test_no_signals_are_written_without_their_result(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_folder: Folder, name: str, _content: bytes) -> None:
+        raise OSError(errno.ENOSPC, f"no space for {name}")
+
+    monkeypatch.setattr(Folder, "write_new", full)
+    result = run("diagnose", "--json", "--no-picture", "--signals", "mf4", WORN, "--out", "o")
+    assert "result o/paper-open-1.json" in result.message
+    assert list((tmp_path / "o").iterdir()) == []
 
 
 def test_no_signals_of_others_are_replaced(run: Run, tmp_path: Path) -> None:

@@ -325,6 +325,8 @@ def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place
         program = build_node(
             exported("host", place), tmp_path, option, "-fsanitize=address,undefined"
         )
+        refused = subprocess.run([program, "none", "--uds"], capture_output=True, check=False)
+        assert (refused.returncode, b"--uds: " in refused.stderr) == (2, True)
         with cable() as (here, there), subprocess.Popen([program, there, "--serial", "1"]) as node:
             try:
                 told, heard = told_by(here, out)
