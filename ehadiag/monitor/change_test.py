@@ -44,11 +44,11 @@ MAX_BLOCK_DEVIATIONS: Final = 3.0
 MIN_BLOCKS: Final = 4.0
 """Least effective number of blocks in a span, 1: fewer have no scatter."""
 VOTE_GAIN: Final = 50.0
-"""Gain, squares of deviations, at which a block's vote is one half: set by trial, so that a block
-of 500 ticks with errors of break-away cannot outvote several others."""
+"""Gain, squares of deviations, at which a block's vote is one half; a vote is below one, so that
+no block with a break-away elsewhere than in the model outvotes several others."""
 VOTE_MARGIN: Final = 0.2
-"""Share of each vote that is taken off its sum, set by trial: votes that win as often as they lose
-then fall to zero rather than wander."""
+"""Share of each vote that is taken off its sum, so that votes which win as often as they lose fall
+to zero rather than wander: a change wins clearly more often."""
 VOTE_CAP: Final = 1.5
 """Largest sum of votes, thresholds: a change that is over is soon forgotten."""
 CAUSES: Final = tuple(index for index in range(len(BANK)) if index != REST)
@@ -60,7 +60,7 @@ HEALTHY_SPREADS: Final = np.array([
 """97 % of the values of healthy motion are below, by span and cause (tools/study free-motion
 --calibrate)."""
 VOTE_SPREAD: Final = 2.0
-"""The same of the sums of votes: with one vote, two of 24 healthy pieces raised an alarm."""
+"""The same of the sums of votes: with 1, two of 24 healthy pieces raised an alarm."""
 PIECE_H: Final = 1.0 / 12.0
 """Length of the pieces of healthy motion whose largest values make the threshold, h; also the time
 constant of the sums of votes, so that those of a piece owe little to the time before it."""
@@ -105,8 +105,8 @@ class Cause:
     size: float
     """SI."""
     stderr: float
-    """Standard error by the scatter of blocks, SI; of a voted cause its size over the root of the sum
-    of votes, by order of magnitude alone."""
+    """Standard error by the scatter of blocks, SI; of a voted cause, which has no scatter, its size
+    over the root of the sum of votes: an order of magnitude."""
 
     def __str__(self) -> str:
         """What it is, its size and its standard error: `spool friction +0.04 ± 0.01`."""
@@ -349,8 +349,9 @@ MIN_INFORMATION: Final = 1e-3
 MAX_SIZES: Final = np.array(
     [4.5, 6.0, 6.0, 60.0, 60.0, 5.0, 5.0, 10.0, 25.0, 200.0, 30.0, 30.0, 200.0, 50.0]
 )
-"""Largest sizes that are tried, steps, by cause: severities by 0.2 and 0.3, sensors by some
-percent or some tenths of their range; oil and supply by 90 K and 9 MPa."""
+"""Largest sizes that are tried, steps, by cause: `Kintas` by 0.45 and frictions by 0.3, offsets of
+spool and pressure by 60 µm and 6 MPa, gains of the sensors by 10 to 50 %, null bias by 0.5 mA, load
+by 20 kN, supply and oil by 9 MPa and 90 K, current offset by 2 mA."""
 
 
 def _minmod(now: Array, before: Array) -> Array:

@@ -145,7 +145,7 @@ class VotingBank(ScoreBank):
     def gains(
         self, blocks: list[tuple[Array2, Environment]], trials: list[tuple[int, float]]
     ) -> list[float]:
-        return [float(BANK_NAMES[place] == "Kintas") for place, _ in trials]
+        return [float(len(blocks) * (BANK_NAMES[place] == "Kintas")) for place, _ in trials]
 
 
 def votes_of(test: ChangeTest, gain: float, count: int) -> list[Change]:
