@@ -486,7 +486,7 @@ def _notes_on_unchecked_positions(positions: Sequence[PositionFit | None]) -> tu
 def _notes_on_discrepancy(
     identification: Identification | None, actuator: Actuator, verdict: Verdict
 ) -> tuple[str, ...]:
-    if identification is None or verdict is Verdict.NOT_TESTED:
+    if identification is None:
         return ()
     fit = identification.fit
     slow = identification.slip_speed
@@ -498,7 +498,9 @@ def _notes_on_discrepancy(
         if slow
         else ()
     )
-    if not is_explained_by_discrepancy_alone(fit, actuator.calibration):
+    if verdict is Verdict.NOT_TESTED or not is_explained_by_discrepancy_alone(
+        fit, actuator.calibration
+    ):
         return out
     return (
         *out,

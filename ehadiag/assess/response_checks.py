@@ -226,8 +226,8 @@ def fit_position(
 ) -> PositionFit | None:
     """Fit the sensor's gain and drift; None where there are too few samples of the position.
 
-    slip_speed: m/s, below which the jack slips in steps that no model foresees: of travels with
-    such a part none counts in what is left.
+    slip_speed: m/s, below which the jack slips in steps that no model foresees: travels with such a
+    part are left out.
     """
     span = round(TRAVEL_SPAN_S / experiment.tick)
     measured = experiment.position[span:] - experiment.position[:-span]
@@ -236,6 +236,12 @@ def fit_position(
         return None
     model = modelled.position
     channels = experiment.channels
+    if slip_speed > 0.0:
+        slow = slow_ticks(model, channels.position, slip_speed * experiment.tick)
+        so_far = np.concatenate([[0], np.cumsum(slow)])
+        seen &= so_far[span:-1] == so_far[: -span - 1]
+        if seen.mean() < RESPONSE.min_fast_travel_share:
+            return None
     unit = np.sqrt(2.0) * max(experiment.position_noise, channels.position.lsb)
     travel = (model[span:] - model[:-span])[seen] / unit
     moves = (
@@ -245,12 +251,8 @@ def fit_position(
     columns = [travel, np.ones_like(travel)] if moves else [np.ones_like(travel)]
     values = measured[seen] / unit - (0.0 if moves else travel)
     solution, left = _robust_fit(np.column_stack(columns), values)
-    if slip_speed > 0.0:
-        slow = slow_ticks(model, channels.position, slip_speed * experiment.tick)
-        so_far = np.concatenate([[0], np.cumsum(slow)])
-        left = left[(so_far[span:-1] == so_far[: -span - 1])[seen]]
-    smoothed = np.abs(median_of_three(left)) if len(left) > 2 else np.zeros(1)
-    most = np.minimum(left**2, RESPONSE.min_travel_outlier**2) if len(left) else np.zeros(1)
+    smoothed = np.abs(median_of_three(left))
+    most = np.minimum(left**2, RESPONSE.min_travel_outlier**2)
     return PositionFit(
         gain=float(solution[0]) if moves else float("nan"),
         drift=float(solution[-1]) * unit / TRAVEL_SPAN_S,

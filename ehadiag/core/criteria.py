@@ -230,6 +230,8 @@ class ResponseCriteria(NamedTuple):
 
     min_travel_share: float = 0.25
     """Least share of measured travels for a check of the position sensor, 1."""
+    min_fast_travel_share: float = 0.05
+    """The same of travels of a jack that nowhere slips in steps, 1: a quarter of a second."""
     min_rms_travel_lsb: float = 10.0
     """Least rms travel over the span for a gain, LSB."""
     min_position_gain: float = 0.2

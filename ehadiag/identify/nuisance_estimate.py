@@ -293,7 +293,7 @@ class NuisanceEstimator:
             return estimate_about(experiments, settings, staged, considered)
         names = [item.name for item in staged.model.estimated]
         values = dict(zip(names, staged.found.density.x * staged.model.scale, strict=True))
-        slow = max(item.slip_speed(max(values["FDJ"], 0.0)) for item in experiments)
+        slow = max(item.slip_speed(min(max(values["FDJ"], 0.0), 1.0)) for item in experiments)
         sliding = [item.sliding(slow) for item in experiments]
         found = self._with(sliding, self.prior, values, before)
         better = None if found.explained else self._better_exponent(sliding, found)
@@ -310,7 +310,9 @@ class NuisanceEstimator:
     def _better_exponent(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate
     ) -> float | None:
-        """Return the other end of the exponents where one start explains far more of the spool.
+        """Return the end of the exponents farther from the stated one, where it explains far more.
+
+        One start decides, by what is left of the spool.
 
         A recording shows `FSS / k^m`, which any m explains: but not how a friction slows the spool,
         by which a bridge behind a filter differs from the linear first stage (PHY-43).
@@ -321,7 +323,7 @@ class NuisanceEstimator:
             return None
         other = 0.0 if stated > MAX_CLOGGING_EXPONENT / 2.0 else MAX_CLOGGING_EXPONENT
         c, values = experiments[0].constants, found.refined.values
-        bridge = c.GPF * c.XFM / c.PSR if other > 0.0 else 0.0
+        bridge = self.prior.bridge if other > 0.0 else 0.0
         others = [
             replace(item, constants=item.constants._replace(CLE=other, BRG=bridge))
             for item in experiments

@@ -21,7 +21,7 @@ from ehadiag.identify.estimates import (
 )
 from ehadiag.identify.linearisation import Derivatives, ParameterDensity
 from ehadiag.model.parameter import Parameter, ParameterKind, scaled_to_channels
-from ehadiag.model.plant import PlantConstants, plant_constants
+from ehadiag.model.plant import PlantConstants, bridge_stop, plant_constants
 from ehadiag.model.registry import FAULT_NAMES, FAULTS, REGISTRY, Unknowns, parameter
 from ehadiag.model.severities import FAULT_LAWS, doubling_severity
 from firmware_iface.errors import ConfigurationError
@@ -230,6 +230,8 @@ class UnitPrior:
     """Deviation of severities by wrong laws of the faults, by name, over the severity, 1."""
     exponents: tuple[float, float] = (0.0, 0.0)
     """Least and largest exponent of the pressure gain behind a clogged filter, 1."""
+    bridge: float = 0.0
+    """The constant `BRG` that the unit has with an exponent above 0, 1."""
 
     def loosened(self) -> UnitPrior:
         """Return the prior where the unit's effects have changed since the calibration."""
@@ -318,6 +320,7 @@ def unit_prior(actuator: Actuator) -> UnitPrior:
         found,
         severities=severities,
         exponents=(low, high),
+        bridge=bridge_stop(actuator.servovalve),
         discrepancy={name: getattr(actuator.discrepancy, name) for name in FAULT_NAMES},
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 from ehadiag.compile.jit import Array
 
 if TYPE_CHECKING:  # what a kernel imports is part of its cache key
-    from ehadiag.core.actuator import Actuator
+    from ehadiag.core.actuator import Actuator, Servovalve
     from firmware_iface.recording import Environment
 
 ConstantValue = Any
@@ -178,6 +178,11 @@ def relative_viscosity(temperature: float) -> float:
     return float((10.0 ** (10.0**y) - 0.7) / v1)
 
 
+def bridge_stop(valve: Servovalve) -> float:
+    """Flapper's stop over the gap of a nozzle of a bridge (`BRG`), at the rated supply."""
+    return valve.GPF * valve.XFM / valve.PSR
+
+
 def plant_constants(actuator: Actuator, environment: Environment | None = None) -> PlantConstants:
     """Constants of the unit as new, at the oil temperature and supply that the bus reports.
 
@@ -206,7 +211,7 @@ def plant_constants(actuator: Actuator, environment: Environment | None = None) 
         GQF=valve.GQF,
         GPF=valve.GPF,
         CLE=sum(valve.clogging_range) / 2.0,
-        BRG=valve.GPF * valve.XFM / valve.PSR if valve.clogging_range[1] > 0.0 else 0.0,
+        BRG=bridge_stop(valve) if valve.clogging_range[1] > 0.0 else 0.0,
         AS=valve.AS,
         MS=valve.MS,
         CS=valve.CS * viscosity,

@@ -43,6 +43,8 @@ MAX_PLAYS = 16
 """Largest number of plays of the hysteresis, 1."""
 LANE_NODES = 4
 """Pieces of the spool's path in a tick, 1."""
+QUARTER_UNITS = TICK_UNITS // LANE_NODES
+"""Finest steps of a quarter of a tick, 1."""
 
 
 class LaneRows(NamedTuple):

@@ -2,9 +2,10 @@
 
 For lanes that `ehadiag.model.simd_spool_halving` leaves.
 
-The vectors that else hold candidates hold instants here: the state after 1 … VECTOR_WIDTH steps of
-one length, each by a transition of its own from the same start. The first of them that lies past an
-event is looked into with shorter steps, down to the finest.
+Vectors, which elsewhere hold candidates, hold instants here: the state after 1 … VECTOR_WIDTH steps
+of one length, each by a transition of its own from the same start; with one lane, one instant after
+the other up to the first event. The step that ends past an event is looked into with shorter ones,
+down to the finest.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from ehadiag.model.simd_layout import (
     LANE_PATH_SLOPE,
     MAX_EVENT_PIECES,
     MOVING_ROWS,
+    QUARTER_UNITS,
     ROWS,
     STEP_SHIFTS,
     STEPS,
@@ -63,7 +65,6 @@ from ehadiag.model.spool_events import (
     state_after_event,
 )
 
-LANE_QUARTER_UNITS = TICK_UNITS // LANE_NODES
 EVENT_PIECES_START = LANE_PATH_ROWS * LANES
 """Behind the rows of the path: pieces (duration in s, place at the end, velocities) …"""
 EVENT_INSTANTS_START = EVENT_PIECES_START + 4 * MAX_EVENT_PIECES
@@ -84,7 +85,7 @@ def event_ticks(
 ) -> None:
     """Flapper and spool of busy lanes, of the first `count`, over a tick with events.
 
-    Events are located to tick / 2^finest_level. with_jack: whether the jack is to go along.
+    Events are located to tick / 2^`FINEST_LEVEL`. with_jack: whether the jack is to go along.
     """
     for i in range(count):
         if state[ROWS.busy * LANES + i] != 0.0:
@@ -302,9 +303,7 @@ def _event_tick(
         n = 0
         while n < steps:
             # On to the next node of the path, or to the last step.
-            taken = min(
-                steps - n, (LANE_QUARTER_UNITS - (done & (LANE_QUARTER_UNITS - 1))) >> shift
-            )
+            taken = min(steps - n, (QUARTER_UNITS - (done & (QUARTER_UNITS - 1))) >> shift)
             n += taken
             o = EVENT_INSTANTS_START + n - 1
             s = SpoolState(
@@ -326,15 +325,15 @@ def _event_tick(
             if switches:
                 s = state_after_event(t, event, s)
                 kinks = kinks or event == EVENTS.stop or (s.direction != 0 and s.vs == 0.0)
-            at_node = done & (LANE_QUARTER_UNITS - 1) == 0
+            at_node = done & (QUARTER_UNITS - 1) == 0
             if at_node or (switches and count < MAX_EVENT_PIECES - LANE_NODES):
                 o = EVENT_PIECES_START + 4 * count
                 path[o], path[o + 1], path[o + 2], path[o + 3] = since * unit, s.xs, from_vs, end_vs
                 from_vs, since = s.vs, 0
                 count += 1
             if at_node:
-                path[(LANE_PATH + done // LANE_QUARTER_UNITS) * LANES + i] = s.xs
-                path[(LANE_PATH_SLOPE + done // LANE_QUARTER_UNITS) * LANES + i] = s.vs
+                path[(LANE_PATH + done // QUARTER_UNITS) * LANES + i] = s.xs
+                path[(LANE_PATH_SLOPE + done // QUARTER_UNITS) * LANES + i] = s.vs
         level = 0 if fine or steps == whole else level + 1
     if kinks and with_jack:
         _jack_over_pieces(i, tick, from_xs, count, state, path, coefficients)

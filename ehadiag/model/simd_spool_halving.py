@@ -39,14 +39,12 @@ from ehadiag.model.simd_layout import (
     LANE_PATH_SLOPE,
     MAX_TICK_EVENTS,
     QUARTER_HALVINGS,
+    QUARTER_UNITS,
     ROWS,
     TICK_UNITS,
     spool_laws,
 )
 from ehadiag.model.spool_events import WIRE_TOLERANCE
-
-QUARTER_UNITS = float(TICK_UNITS // LANE_NODES)
-"""Finest steps of a quarter of a tick, 1."""
 
 
 class _Motion(NamedTuple):
@@ -268,9 +266,9 @@ def _halved(
     zero = s.d * 0.0
     good = where(mine, 1.0, zero)
     before, since, events, kinks = s.vs, zero, zero, zero
-    cuts = 0
+    cuts, quarter = 0, float(QUARTER_UNITS)
     for node in range(LANE_NODES):
-        done, limit, hunts, begin = zero, QUARTER_UNITS + zero, good, QUARTER_HALVINGS
+        done, limit, hunts, begin = zero, quarter + zero, good, QUARTER_HALVINGS
         while any_lane(hunts != 0.0):
             # On to the node at once, where no event may hide before it (the first time); where one
             # may, by shorter and shorter steps up to it, the last of them twice.
@@ -305,11 +303,11 @@ def _halved(
                     before, since = where(found, vs, before), where(found, 0.0, since)
                     events = where(found, events + 1.0, events)
                     good = where(events > MAX_TICK_EVENTS * 1.0, 0.0, good)
-            going, begin = (good != 0.0) & (done < QUARTER_UNITS), QUARTER_HALVINGS - 1
+            going, begin = (good != 0.0) & (done < quarter), QUARTER_HALVINGS - 1
             hunts = zero
             if any_lane(going):
                 # Past an event on to the node at once, and so on.
-                rest = where(going, QUARTER_UNITS - done, 0.0)
+                rest = where(going, quarter - done, 0.0)
                 new, found, stops = _advanced(
                     t,
                     tables,
@@ -328,9 +326,9 @@ def _halved(
                 goes = going & ~found
                 s = _chosen(goes, new, s)
                 since = where(goes, since + rest, since)
-                done = where(goes, QUARTER_UNITS, done)
+                done = where(goes, quarter, done)
                 hunts = where(going & found & (good != 0.0), 1.0, zero)
-                limit = QUARTER_UNITS + zero
+                limit = quarter + zero
         _cut(pieces, cuts, since * unit, s.xs, before, s.vs)
         cuts += 1
         since, before = zero, s.vs
@@ -367,7 +365,7 @@ def halved_lanes(
 ) -> bool:
     """Flapper and spool of the busy lanes before `end` over a tick with events.
 
-    Events are located to tick / 2^finest_level. Lanes that must be computed alone stay busy and
+    Events are located to tick / 2^`FINEST_LEVEL`. Lanes that must be computed alone stay busy and
     unchanged; returns whether there are any. with_jack: whether the jack takes the pieces of the
     spool's path that events cut; backlash: whether any lane has some; slides, free_slides, rings:
     transitions over 2^0 … 2^QUARTER_HALVINGS finest steps, see `ehadiag.model.simd_layout`.

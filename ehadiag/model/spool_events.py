@@ -1,8 +1,7 @@
 """Events of flapper and spool, and friction that falls with the spool's velocity.
 
-With Stribeck's friction the part that fades with the
-velocity is held over a step at the mean of its start and end; steps that are too long for that are
-halved.
+With Stribeck's friction the part that fades with the velocity is held over a step at the mean of
+its start and end; steps that are too long for that are halved.
 """
 
 from __future__ import annotations

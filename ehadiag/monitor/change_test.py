@@ -8,9 +8,9 @@ row that agree in sign.
 
 What shows seldom, such as a clogged filter while the spool slews, is lost in such means. So each
 block also votes on a step of each parameter, up and down: for it where the step explains the block
-better, against it where worse, and not at all where the block shows nothing. Votes are summed up,
-never below zero. The threshold is one of the largest values in pieces of healthy motion, see
-`alarm_threshold`.
+better, against it where worse, and not at all where the step moves the block by less than noise.
+Votes are summed up, never below zero, and forgotten within some minutes. The threshold is one of
+the largest values in pieces of healthy motion, see `alarm_threshold`.
 """
 
 from __future__ import annotations
@@ -44,9 +44,13 @@ MAX_BLOCK_DEVIATIONS: Final = 3.0
 MIN_BLOCKS: Final = 4.0
 """Least effective number of blocks in a span, 1: fewer have no scatter."""
 VOTE_GAIN: Final = 50.0
-"""Squares of residuals by which a block's vote counts half."""
+"""Gain, squares of deviations, at which a block's vote is one half; a vote is below one, so that
+no block with a break-away elsewhere than in the model outvotes several others."""
 VOTE_MARGIN: Final = 0.2
-"""Share of each vote that is taken off its sum: a change wins clearly more often than it loses."""
+"""Share of each vote that is taken off its sum, so that votes which win as often as they lose fall
+to zero rather than wander: a change wins clearly more often."""
+VOTE_CAP: Final = 1.5
+"""Largest sum of votes, thresholds: a change that is over is soon forgotten."""
 CAUSES: Final = tuple(index for index in range(len(BANK)) if index != REST)
 """Places of the causes in the bank."""
 HEALTHY_SPREADS: Final = np.array([
@@ -56,9 +60,10 @@ HEALTHY_SPREADS: Final = np.array([
 """97 % of the values of healthy motion are below, by span and cause (tools/study free-motion
 --calibrate)."""
 VOTE_SPREAD: Final = 2.0
-"""The same of the sums of votes: with one vote, two of 24 healthy pieces raised an alarm."""
+"""The same of the sums of votes: with 1, two of 24 healthy pieces raised an alarm."""
 PIECE_H: Final = 1.0 / 12.0
-"""Length of the pieces of healthy motion whose largest values make the threshold, h."""
+"""Length of the pieces of healthy motion whose largest values make the threshold, h; also the time
+constant of the sums of votes, so that those of a piece owe little to the time before it."""
 GUMBEL: Final = (1.08, 0.54)
 """Location and scale of Gumbel's law of those values (the same command)."""
 TRIAL_BLOCKS: Final = 40
@@ -100,7 +105,8 @@ class Cause:
     size: float
     """SI."""
     stderr: float
-    """Standard error by the scatter of blocks, SI."""
+    """Standard error by the scatter of blocks, SI; of a voted cause, which has no scatter, its size
+    over the root of the sum of votes: an order of magnitude."""
 
     def __str__(self) -> str:
         """What it is, its size and its standard error: `spool friction +0.04 ± 0.01`."""
@@ -128,7 +134,9 @@ def alarm_threshold(hours: float, law: tuple[float, float] = GUMBEL) -> float:
 
     The pieces of motion are exchangeable, whatever the correlation within one; expected numbers of
     alarms add up even where pieces are not independent. Beyond the hours of the study Gumbel's law
-    of their largest values is extrapolated. Hours out of range raise ConfigurationError.
+    of their largest values is extrapolated. Of votes the rate is not shown: their spread was set on
+    the motion that counts false alarms, and their sums outlast a piece. Hours out of range raise
+    ConfigurationError.
     """
     if not FALSE_ALARM_HOURS_RANGE[0] <= hours <= FALSE_ALARM_HOURS_RANGE[1]:
         low, high = FALSE_ALARM_HOURS_RANGE
@@ -164,12 +172,17 @@ class ChangeTest:
         """Of the test when it looked last, over its threshold."""
         self.values: Array2 = np.zeros((len(SPANS) + 2, len(CAUSES)))
         """Of each cause: normal deviates by span, sums of votes for a step up and down."""
-        self._voting = np.zeros((2, len(CAUSES)), dtype=np.int64)
         self.reset()
 
     def reset(self) -> None:
         """Begin anew after a silence: the spool is anywhere."""
         self._count, self._settling = 0, SETTLING_BLOCKS
+        self._clear_votes()
+
+    def _clear_votes(self) -> None:
+        """Begin the sums of votes anew."""
+        self.values[len(SPANS) :] = 0.0
+        self._voting = np.zeros((2, len(CAUSES)), dtype=np.int64)
 
     def tune(self, environment: Environment) -> None:
         """Take this oil and supply from the next block on."""
@@ -210,7 +223,9 @@ class ChangeTest:
         # No wear falls; a step down is the second row, or the first one near the limit.
         votes[(self._bank.steps[worn] > 0.0).astype(int), worn] = 0.0
         sums = self.values[len(SPANS) :]
-        np.maximum(sums + votes - VOTE_MARGIN * np.abs(votes), 0.0, out=sums)
+        sums *= math.exp(-BLOCK_S / (3600.0 * PIECE_H))
+        sums += votes - VOTE_MARGIN * np.abs(votes)
+        np.clip(sums, 0.0, VOTE_CAP * VOTE_SPREAD * self._threshold, out=sums)
         self._voting = np.where(sums < 1.0, 0, self._voting + 1)
         self._kept.append((rows, self._environment))
         self._looks += 1
@@ -257,8 +272,9 @@ class ChangeTest:
         causes = self._causes(deviates, sizes[best], list(self._kept)[-length:])
         if not causes or (causes[0].name in FAULT_NAMES and abs(causes[0].size) < self._least):
             self._ignored = self._looks + max(SPANS)
-            self.values[len(SPANS) :] = 0.0
+            self._clear_votes()
             return None
+        self._clear_votes()
         self._since = 0.0
         return Change(causes, self.value, repeated=False)
 
@@ -333,8 +349,9 @@ MIN_INFORMATION: Final = 1e-3
 MAX_SIZES: Final = np.array(
     [4.5, 6.0, 6.0, 60.0, 60.0, 5.0, 5.0, 10.0, 25.0, 200.0, 30.0, 30.0, 200.0, 50.0]
 )
-"""Largest sizes that are tried, steps, by cause: severities by 0.2 and 0.3, sensors by some
-percent or some tenths of their range; oil and supply by 90 K and 9 MPa."""
+"""Largest sizes that are tried, steps, by cause: `Kintas` by 0.45 and frictions by 0.3, offsets of
+spool and pressure by 60 µm and 6 MPa, gains of the sensors by 10 to 50 %, null bias by 0.5 mA, load
+by 20 kN, supply and oil by 9 MPa and 90 K, current offset by 2 mA."""
 
 
 def _minmod(now: Array, before: Array) -> Array:

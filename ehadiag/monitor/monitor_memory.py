@@ -125,6 +125,8 @@ MODEL = block_places(1, MONITOR.model)
 """Places of the parts of a monitor's model in its memory."""
 MONITOR_SIZE: Final = MODEL.end
 """Numbers of a monitor, 1."""
+if MODEL.coefficients - MODEL.path < PLANT_FIELDS:  # see `prepare_monitor_by`
+    raise AssertionError("a unit's constants have no room where a monitor's path will be")
 
 control_law_of = unpacker(ControlLaw, MONITOR.control_law)
 settings_of = unpacker(MonitorSettings, MONITOR.settings)

@@ -241,7 +241,8 @@ class ScoreBank:
             0.0, *(float(explained(share * within).max()) for share in (-1.0, -0.3, 0.3, 1.0))
         )
         out = np.zeros((2, len(BANK)))
-        out[:, :MODELLED] = explained(np.stack((change, -change))) - least
+        shown = (change**2).sum(axis=-1) > 1.0
+        out[:, :MODELLED] = np.where(shown, explained(np.stack((change, -change))) - least, 0.0)
         return out
 
     def gains(

@@ -310,9 +310,10 @@ def c_monitor_health(address: int, plan_address: int) -> int:
         bits += HEALTH.command
     if health.beyond != 0.0:
         bits += HEALTH.beyond
-    for i in range(MODEL.state, MODEL.path):
-        if not math.isfinite(p[i]):
-            return bits + HEALTH.model
+    for first, end in ((MONITOR.control, MONITOR.command), (MODEL.state, MODEL.path)):
+        for i in range(first, end):
+            if not math.isfinite(p[i]):
+                return bits + HEALTH.model
     return bits
 
 

@@ -248,6 +248,7 @@ def test_travel_of_a_jack_that_slips_is_none_of_it(sound):
     assert objections_to_position(fit_position(experiment, model, slip_speed=0.02)) == []
     dead = replace(sound[2], position=np.zeros_like(steps))
     assert objections_to_position(fit_position(dead, model, slip_speed=0.02))
+    assert fit_position(dead, model, slip_speed=1.0) is None
 
 
 def test_single_spikes_and_lost_samples_are_none_of_it(sound):

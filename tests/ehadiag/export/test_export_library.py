@@ -221,9 +221,10 @@ def test_a_monitor_without_samples_is_not_able_to_judge(loaded):
     assert health(loaded, numbers) == 0
 
 
-def test_a_model_without_numbers_is_not_able_to_judge(loaded):
+@pytest.mark.parametrize("index", [MONITOR.control, MODEL.state + ROWS.spool])
+def test_a_model_without_numbers_is_not_able_to_judge(loaded, index):
     numbers = ready(loaded)
-    numbers[MODEL.state + ROWS.spool] = np.nan
+    numbers[index] = np.nan
     pushed(loaded, numbers, [0.0] * 5)
     assert health(loaded, numbers) & HEALTH.model
 

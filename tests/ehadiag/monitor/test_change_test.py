@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from ehadiag import CommandMode, ConfigurationError, Monitor, default_actuator
+from ehadiag.compile.jit import Array2
 from ehadiag.monitor.change_test import (
     CAUSES,
     GUMBEL,
     PIECE_H,
+    VOTE_CAP,
     Cause,
+    Change,
     ChangeTest,
     alarm_threshold,
     span_values,
@@ -126,6 +129,49 @@ def test_a_filter_that_clogs_is_found_by_the_votes_of_the_blocks_that_show_it() 
     assert changes_in(motion, WORN) == []
     cause = changes_in(motion, (0.2, 0.3, 0.3))[0]
     assert (cause.name, cause.size) == ("Kintas", pytest.approx(0.1, abs=0.03))
+
+
+class VotingBank(ScoreBank):
+    """A bank whose blocks show of the filter what the command says, and of all else nothing."""
+
+    def settle(self, rows: Array2) -> None:
+        """Run no model."""
+
+    def push(self, rows: Array2) -> BlockScore:
+        gain = np.zeros((2, len(BANK)))
+        gain[:, BANK_NAMES.index("Kintas")] = rows[0, 0]
+        return BlockScore(np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK))), gain)
+
+    def gains(
+        self, blocks: list[tuple[Array2, Environment]], trials: list[tuple[int, float]]
+    ) -> list[float]:
+        return [float(len(blocks) * (BANK_NAMES[place] == "Kintas")) for place, _ in trials]
+
+
+def votes_of(test: ChangeTest, gain: float, count: int) -> list[Change]:
+    """Changes found in so many blocks of one tick with that gain."""
+    found = (test.push((gain, 0.0, 0.0, 0.0, 0.0)) for _ in range(count))
+    return [item for item in found if item is not None]
+
+
+def test_a_voted_change_that_comes_and_goes_leaves_the_next_one_to_be_found() -> None:
+    test = ChangeTest(VotingBank(ACTUATOR, WORN), 2.0, 100.0)
+    first, *later = votes_of(test, 1000.0, 7200)
+    assert first.causes[0].name == "Kintas"
+    assert all(item.repeated for item in later)
+    assert max(item.value for item in later) <= VOTE_CAP
+    votes_of(test, -20.0, 60)
+    assert votes_of(test, -20.0, 300) == []
+    assert [item.repeated for item in votes_of(test, 1000.0, 60)][:1] == [False]
+
+
+def test_votes_begin_anew_after_a_silence() -> None:
+    test = ChangeTest(VotingBank(ACTUATOR, WORN), 2.0, 100.0)
+    votes_of(test, 1000.0, 15)
+    assert test.values[-2, 0] > 5.0
+    test.reset()
+    assert not test.values.any()
+    assert votes_of(test, 1000.0, 15) == []
 
 
 def test_blocks_vote_for_the_step_that_their_ticks_show() -> None:

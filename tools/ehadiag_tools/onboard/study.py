@@ -352,7 +352,7 @@ def _random_cases(options: Options) -> list[OnboardUnit]:
     return out
 
 
-def _random_report(records: Sequence[Record], _random_options: Options) -> Iterator[str]:
+def _random_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     rows, far = [], []
     for (test,), part in grouped(records, "test").items():
         stated = [item for item in part if item["verdict"] != NOT_TESTED]
