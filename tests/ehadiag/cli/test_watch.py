@@ -183,7 +183,7 @@ def test_a_change_that_lasts_is_an_alarm_that_says_what_changed(bus_map: BusMap)
     assert alarms[0].causes[0].size == pytest.approx(0.1, abs=0.02)
     assert str(alarms[0].causes[0]).startswith("jack friction +0.1")
     assert (alarms[0].during, alarms[0].signal) == ("", "")
-    assert alarms[0].tick == 21_000
+    assert alarms[0].tick == 16_000
     assert watcher.alarms == len(alarms)
 
 
