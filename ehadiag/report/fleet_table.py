@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import TYPE_CHECKING
 
 from markupsafe import Markup
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
     from ehadiag.estimate import Severity
     from ehadiag.prognosis.units import Prognosis
 
-FLEET_HEAD = ("unit", "verdict", "worst", "time left", "trend", "last test", "actuator", "")
+FLEET_HEAD = (
+    "unit", "verdict", "worst", "what to do", "time left", "trend", "last test", "actuator", "",
+)  # fmt: skip
 WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
 
 
@@ -54,27 +57,37 @@ class FleetUnit:
     prognosis: Prognosis | None = None
 
 
-def fleet_rows(units: Sequence[FleetUnit], levels: Levels) -> list[list[Cell]]:
-    """Return the lines of the table, worst first.
+def fleet_summary(units: Sequence[FleetUnit]) -> str:
+    """Say how many units have which verdict, worst first."""
+    counts = [(word, sum(unit.verdict == word for unit in units)) for word in WORST_FIRST]
+    return ", ".join(f"{n} {word.replace('_', ' ')}" for word, n in counts if n)
 
-    units: in any order; levels: advisory level and limit, for the sparklines. Returns cells under
-    `FLEET_HEAD`.
+
+def fleet_table(
+    units: Sequence[FleetUnit], levels: Levels
+) -> tuple[tuple[str, ...], list[list[Cell]]]:
+    """Return head and lines of the table, worst first, without columns that nothing fills.
+
+    units: in any order; levels: advisory level and limit. Returns names of the columns; cells.
     """
     ordered = sorted(units, key=lambda unit: (WORST_FIRST.index(unit.verdict), -_worst(unit)[1]))
-    return [_row(unit, levels) for unit in ordered]
+    rows = [_row(unit, levels) for unit in ordered]
+    filled = [any(cell.text for cell in column) for column in zip(*rows, strict=True)]
+    return tuple(compress(FLEET_HEAD, filled)), [list(compress(row, filled)) for row in rows]
 
 
 def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
     name, value = _worst(unit)
-    worst = "none" if value < 0.0 else f"{plain_name(name)} {100.0 * value:.0f} %"
+    worst = "none" if value < 0.0 else f"{plain_name(name)} {100.0 * value:.0f}\N{NO-BREAK SPACE}%"
     serial = "unknown" if unit.serial is None else str(unit.serial)
     return [
         Cell(serial, unit.link),
         Cell(unit.word, kind=unit.verdict),
         Cell(worst),
+        Cell(_action(unit, levels)),
         Cell(_left(unit.prognosis)),
         Cell(_sparkline(unit.past, levels)),
-        Cell(unit.tested[:16].replace("T", " ")),
+        Cell(f"{unit.tested[:10]} {unit.tested[11:16]} UTC" if unit.tested else "unknown"),
         Cell(printable(unit.actuator)),
         Cell("report", unit.report) if unit.report else Cell(""),
     ]
@@ -87,6 +100,15 @@ def _worst(unit: FleetUnit) -> tuple[str, float]:
     return max(known, key=lambda pair: pair[1], default=("", -1.0))
 
 
+def _action(unit: FleetUnit, levels: Levels) -> str:
+    """What to do about the worst severity, if it has reached a level."""
+    name, value = _worst(unit)
+    advice = next((item.advice for item in unit.severities if item.name == name), "")
+    if value < levels.advisory or not advice:
+        return "Nothing" if unit.verdict == Verdict.HEALTHY.name else ""
+    return advice[0].upper() + advice[1:] if value >= levels.limit else f"Plan to {advice}"
+
+
 def _left(prognosis: Prognosis | None) -> str:
     """Time until the first severity reaches the limit."""
     if prognosis is None:
@@ -96,7 +118,7 @@ def _left(prognosis: Prognosis | None) -> str:
     if known and min(known) <= 0.0:
         return "limit reached"
     unit = "h" if prognosis.unit == "hours" else prognosis.unit
-    return f"{float(f'{min(known):.2g}'):g} {unit}" if known else "no number"
+    return f"{float(f'{min(known):.2g}'):g} {unit}" if known else "not known yet"
 
 
 def _sparkline(values: Sequence[float], levels: Levels) -> str:

@@ -131,8 +131,14 @@ def _draw_panel(axis: Axes, panel: Panel, dates: bool) -> None:
     axis.set_ylabel(panel.y_label)
     axis.yaxis.set_label_coords(-0.077, 0.5)
     if len(panel.curves) > 1:
+        # Rows in the order of the curves; matplotlib fills columns.
+        found = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
+        labels = [curve.label for curve in panel.curves]
+        columns = 5 if len(labels) <= 5 else (len(labels) + 1) // 2
+        labels = [label for start in range(columns) for label in labels[start::columns]]
         axis.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, ncols=5,
+            [found[label] for label in labels], labels,
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, ncols=columns,
             borderaxespad=0.1, markerscale=1.5,
         )  # fmt: skip
     if panel.full_scale is not None and not panel.empty:

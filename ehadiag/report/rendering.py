@@ -87,7 +87,11 @@ def index_html_page(
     to it; levels: advisory level and limit; history: health history, for trends and remaining life;
     None: none is drawn. Returns HTML.
     """
-    from ehadiag.report.fleet_table import FLEET_HEAD, FleetUnit, fleet_rows  # noqa: PLC0415
+    from ehadiag.report.fleet_table import (  # noqa: PLC0415
+        FleetUnit,
+        fleet_summary,
+        fleet_table,
+    )
     from ehadiag.report.head import verdict_word  # noqa: PLC0415
     from ehadiag.report.page_parts import templates_of  # noqa: PLC0415 - bokeh is slow
 
@@ -115,7 +119,8 @@ def index_html_page(
             )
         )
     template = templates_of("ehadiag.report").get_template("index.html.j2")
-    page_text = template.render(head=FLEET_HEAD, rows=fleet_rows(units, levels))
+    head, rows = fleet_table(units, levels)
+    page_text = template.render(head=head, rows=rows, summary=fleet_summary(units))
     return page_text.encode("utf-8", errors="backslashreplace")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ehadiag.core.conversion import Conversion
 from ehadiag.history.records import Entry, MaintenanceEvent
+from ehadiag.report.head import percent, plain_name, remaining_sentences
 from ehadiag.report.picture import (
     Area,
     Curve,
@@ -22,6 +23,8 @@ from ehadiag.report.picture import (
 )
 from firmware_iface.errors import printable
 from firmware_iface.recording import CommandMode, Samples
+
+LEVEL_WORDS = (("advisory", "advisory level"), ("limit", "limit"))
 
 if TYPE_CHECKING:
     from ehadiag.prognosis.forecast import Forecast
@@ -36,7 +39,9 @@ def history_picture(
     At least one of the entries has severities.
     """
     column = trend_column(entries, events, prognosis, numbered=False)
-    return Picture(f"{printable(entries[-1].actuator)}, serial {entries[-1].serial}", (column,))
+    title = f"unit {entries[-1].serial}, actuator {printable(entries[-1].actuator)}"
+    first = remaining_sentences(prognosis)[:1]
+    return Picture("\n".join([title, *first]), (column,))
 
 
 def trend_column(
@@ -49,8 +54,8 @@ def trend_column(
     """Describe a unit's severities over hours or cycles, where the prognosis uses them, else time.
 
     Entries without hours (or cycles) are left out. Both levels are drawn, and of each forecast the
-    median and the 80 % interval. Curves are broken at events, which are marked by their numbers
-    from 1, or by their texts.
+    median and the 80 % interval, up to some time after the first severity reaches the limit. Curves
+    are broken at events, which are marked by their numbers from 1, or by their texts.
     """
     unit = prognosis.unit if prognosis.used else None
     levels = prognosis.levels
@@ -69,11 +74,11 @@ def trend_column(
         if rows:
             rows += [(at, *3 * (math.nan,)) for at, _ in changes]
             x, y, lows, highs = np.array(sorted(rows, key=itemgetter(0)), dtype=np.float64).T
-            curves.append(Curve(name, f"severity {index % 3}", y, x, lows, highs))
+            curves.append(Curve(plain_name(name), f"severity {index % 3}", y, x, lows, highs))
             low, high = min(low, np.nanmin(lows)), max(high, np.nanmax(highs))
     lines = [
-        ReferenceLine(level, role, role)
-        for level, role in zip(levels, ("advisory", "limit"), strict=True)
+        ReferenceLine(level, role, f"{words} {percent(level)}")
+        for level, (role, words) in zip(levels, LEVEL_WORDS, strict=True)
     ]
     numbers = {id(event): number for number, event in enumerate(events, start=1)}
     lines += [
@@ -91,7 +96,18 @@ def trend_column(
         "severity, 95 % interval", "", np.array([at for at, _ in placed]), tuple(curves),
         lines=tuple(lines), areas=areas, y_range=(low - 0.02 * high, 1.05 * high),
     )  # fmt: skip
-    return PictureColumn("", (panel,), unit or "time", dates=unit is None)
+    until = None if unit is None else _until(prognosis, [at for at, _ in placed])
+    x_range = None if until is None else (placed[0][0] - 0.02 * (until - placed[0][0]), until)
+    return PictureColumn("", (panel,), unit or "time", dates=unit is None, x_range=x_range)
+
+
+def _until(prognosis: Prognosis, known: Sequence[float]) -> float | None:
+    """End of the picture: the slower severities' forecasts may reach far beyond what matters."""
+    medians = [item.remaining[-1].median for item in prognosis.forecasts]
+    ahead = [max(value, 0.0) for value in medians if value is not None]
+    if not ahead or not known:
+        return None
+    return known[-1] + max(1.5 * min(ahead), 0.5 * (known[-1] - known[0]))
 
 
 def _fan(item: Forecast, role: str) -> tuple[list[Area], list[Curve]]:
@@ -110,7 +126,7 @@ def _fan(item: Forecast, role: str) -> tuple[list[Area], list[Curve]]:
     medians, lows, highs, levels = np.array([(0.0, 0.0, 0.0, item.value), *ahead]).T
     border = np.concatenate([lows, highs[::-1]])
     area = Area(role, item.at + border, np.concatenate([levels, levels[::-1]]))
-    return [area], [Curve(f"{item.name}, forecast", role, levels, item.at + medians)]
+    return [area], [Curve(f"{plain_name(item.name)}, forecast", role, levels, item.at + medians)]
 
 
 def _abscissa(item: Entry | MaintenanceEvent, unit: str | None) -> float | None:

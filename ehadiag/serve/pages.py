@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from markupsafe import Markup
+from msgspec import structs
 
 from ehadiag.assess.verdict import Verdict
+from ehadiag.core.actuator import Advice
 from ehadiag.core.conventions import MAX_RESULT_BYTES
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.prognosis.units import prognosis_of
 from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
-from ehadiag.report.fleet_table import FLEET_HEAD, Cell, FleetUnit, fleet_rows
-from ehadiag.report.head import percent, plain_name, verdict_word
+from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table
+from ehadiag.report.head import INCONCLUSIVE, percent, plain_name, verdict_word
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
 from ehadiag.report.trend_bus_pictures import trend_column
@@ -31,6 +33,7 @@ from firmware_iface.files import read_small_file
 
 if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
+    from ehadiag.estimate import Severity
     from ehadiag.history.records import Entry, MaintenanceEvent
 
 MAX_PAGE_ROWS = 500
@@ -61,7 +64,7 @@ class Pages:
         self._levels = levels
         self._tests = tuple(tests)
         self._simulated = simulated
-        self._fleet: tuple[object, list[list[Cell]]] = (None, [])
+        self._fleet: tuple[object, tuple[str, ...], list[list[Cell]], str] = (None, (), [], "")
         self._live: Page | None = None
 
     def __call__(self, path: str) -> Page | None:
@@ -105,12 +108,14 @@ class Pages:
         stamp = place.stat().st_mtime_ns if place is not None and place.exists() else None
         if stamp != self._fleet[0] or stamp is None:
             try:
-                self._fleet = stamp, fleet_rows(self._units(), self._levels)[:MAX_PAGE_ROWS]
+                units = self._units()
+                self._fleet = stamp, *fleet_table(units, self._levels), fleet_summary(units)
             except EhadiagError as error:  # the other pages do without it
-                self._fleet, none = (None, []), str(error)
+                self._fleet, none = (None, (), [], ""), str(error)
         if place is None:
             none = "No history is kept: --history."
-        return self._list("Fleet", "/", FLEET_HEAD, self._fleet[1], none=none)
+        _, head, rows, summary = self._fleet
+        return self._list("Fleet", "/", head, rows[:MAX_PAGE_ROWS], none=none, summary=summary)
 
     def _units(self) -> list[FleetUnit]:
         entries, events = self._kept()
@@ -131,14 +136,33 @@ class Pages:
                 serial=serial,
                 actuator=last.actuator,
                 verdict=last.verdict,
-                word=last.verdict.replace("_", " "),
-                severities=last.severities,
+                word=_word(last),
+                severities=self._advised(last) if serial in futures else last.severities,
                 past=[_worst_value(entry) for entry in by_unit[serial] if entry.severities],
                 tested=last.tested or last.appended,
                 link="" if serial is None else f"/history/{serial}",
                 prognosis=futures.get(serial) if serial is not None else None,
             )
             for serial, last in newest.items()
+        ]
+
+    def _advised(self, entry: Entry) -> list[Severity]:
+        """Severities with what to do about them, which only the whole result has."""
+        assert self._history is not None
+        with History(self._history) as history:
+            line = history.entry(entry.number).result
+        try:
+            known = Result.from_json(line).severities
+        except (EhadiagError, ValueError):  # a row of a table that was imported
+            known = {}
+        return [
+            structs.replace(
+                item,
+                advice=known[item.name].advice
+                if item.name in known
+                else getattr(Advice(), item.name, ""),
+            )
+            for item in entry.severities
         ]
 
     def _unit_page(self, serial: int) -> Page:
@@ -148,11 +172,14 @@ class Pages:
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
         lines = [
-            f"{item.name}: {future.unit} to {name} {level:g}: {remaining_text(left)}"
+            f"{plain_name(item.name)}: {name} {percent(level)} in {future.unit}:"
+            f" {remaining_text(left)}"
             for item in future.forecasts
             for (name, level), left in zip(named_levels(future), item.remaining, strict=True)
         ]
-        lines += [f"{item.name} {item.alarm}" for item in future.forecasts if item.alarm]
+        lines += [
+            f"{plain_name(item.name)} {item.alarm}" for item in future.forecasts if item.alarm
+        ]
         own = [item for item in events if item.serial == serial]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
         used = counted_entries(mine)
@@ -222,12 +249,14 @@ class Pages:
         none: str,
         lines: Sequence[str] = (),
         plots: dict[str, Any] | None = None,
+        summary: str = "",
     ) -> Page:
         scripts, elements = embed_plots(plots or {})
         return _page(
             "list.html.j2",
             scripts,
             title=title,
+            summary=summary,
             here=here,
             head=head,
             rows=rows,
@@ -245,9 +274,15 @@ def _diagnosed(entry: Entry) -> list[Cell]:
     )
     return [
         Cell(printable(entry.tested or entry.appended)),
-        Cell(entry.verdict.replace("_", " "), kind=entry.verdict),
+        Cell(_word(entry), kind=entry.verdict),
         Cell(severities or "none"),
     ]
+
+
+def _word(entry: Entry) -> str:
+    """Word for a verdict that people see, as `verdict_word`."""
+    inconclusive = entry.verdict == Verdict.NOT_TESTED.name and entry.severities
+    return INCONCLUSIVE if inconclusive else entry.verdict.replace("_", " ")
 
 
 def _worst_value(entry: Entry) -> float:

@@ -158,7 +158,7 @@ def test_a_trend_has_levels_and_a_forecast_and_is_broken_at_an_event():
     column = trend_column(worn, [event], future(worn, [event]))
     (panel,) = column.panels
     assert [(line.at, line.label) for line in panel.lines] == [
-        (0.25, "advisory"), (0.75, "limit"), (750.0, "1"),
+        (0.25, "advisory level 25 %"), (0.75, "limit 75 %"), (750.0, "1"),
     ]  # fmt: skip
     kintas = panel.curves[0]
     assert np.isnan(kintas.y[np.asarray(kintas.x) == 750.0]).all()
@@ -166,6 +166,21 @@ def test_a_trend_has_levels_and_a_forecast_and_is_broken_at_an_event():
     ahead = [curve for curve in panel.curves if curve.role.startswith("forecast")]
     assert ahead
     assert ahead[0].y[-1] == 0.75
+
+
+def test_a_slow_severity_does_not_squeeze_the_trend_of_a_fast_one():
+    """The picture ends some time after the first limit, not with the longest forecast."""
+    worn = [an_entry(1, 100.0 * n, (0.002 * n, 0.05 * n, 0.003 * n)) for n in range(1, 13)]
+    found = future(worn)
+    column = trend_column(worn, [], found)
+    assert column.x_range
+    start, end = column.x_range
+    left = {item.name: item.remaining[-1].median for item in found.forecasts}
+    assert start <= 100.0
+    assert 1200.0 + left["FSS"] < end < 1200.0 + left["Kintas"]
+    first, second = history_picture(worn, [], found).title.splitlines()
+    assert first == f"unit {worn[0].serial}, actuator {worn[0].actuator}"
+    assert second.startswith("Spool friction reaches its limit in about")
 
 
 def test_picture(stated):

@@ -8,8 +8,10 @@ import os
 import socket
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
+from history_cases import an_entry
 from page_sessions import fail, talk
 
 from ehadiag import ConfigurationError, Levels
@@ -208,6 +210,22 @@ def test_history_shows_units_and_escapes_their_texts(tmp_path):
         assert "<script>alert" not in text
         assert "DEGRADED" in text
     assert '<a href="/history/7">7</a>' in units
+
+
+def test_the_fleet_says_what_to_do_worst_unit_first(tmp_path):
+    place = tmp_path / "history.db"
+    worn = [an_entry(serial, 100.0, (0.1, spool, 0.1)) for serial, spool in ((3, 0.1), (9, 0.9))]
+    shut = replace(worn[0], serial=5, verdict="NOT_TESTED")
+    with History(place, create=True) as history:
+        history.append_all([replace(worn[0], verdict="HEALTHY"),
+                            replace(worn[1], verdict="FAULT"), shut])  # fmt: skip
+    with site(tmp_path, place, watch=None) as (port, _):
+        _, page, _ = request(port, "/")
+    assert "<h1>Fleet: 1 FAULT, 1 NOT TESTED, 1 HEALTHY</h1>" in page
+    places = [page.index(f'href="/history/{serial}"') for serial in (9, 5, 3)]
+    assert places == sorted(places)
+    assert "Replace the servovalve" in page
+    assert ">INCONCLUSIVE<" in page
 
 
 def test_only_reports_of_the_folder_are_served_and_as_strangers(tmp_path):
