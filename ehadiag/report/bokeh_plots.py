@@ -55,8 +55,10 @@ def plot_column(column: PictureColumn, most: int = MAX_PAGE_VALUES) -> LayoutDOM
             plot.add_tools(cross.clone())
             plot.xaxis.visible = False
             plots.append(plot)
-    for part in column.parts:
-        label = Label(x=part.start, y=2, y_units="screen", text=f" {part.label}")
+    for number, part in enumerate(column.parts):
+        # In two rows: on a narrow page neighbours would overlap.
+        place = 2 + 13 * (number % 2)
+        label = Label(x=part.start, y=place, y_units="screen", text=f" {part.label}")
         label.text_color, label.text_font_size = TEXT_COLOUR, "11px"
         plots[0].add_layout(label)
     plots[-1].xaxis.visible = True
@@ -107,7 +109,8 @@ def _plot_panel(plot: figure, panel: Panel, scale: float) -> None:
         legend = plot.legend[0]
         legend.update(
             location="left", orientation="horizontal", click_policy="hide", border_line_color=None,
-            label_text_font_size="11px", background_fill_alpha=0.0, margin=0, padding=2, ncols=3,
+            label_text_font_size="11px", background_fill_alpha=0.0, margin=0, padding=2,
+            ncols=2 if any(len(curve.label) > 13 for curve in panel.curves) else 3,
         )  # fmt: skip
         plot.center = [item for item in plot.center if item is not legend]
         plot.add_layout(legend, "above")
@@ -138,7 +141,7 @@ def _plot_curve(
     """Draw a curve; return what was drawn last of it."""
     style = STYLES[role]
     look: dict[str, Any] = {"source": source, "line_color": style.colour}
-    if label:
+    if label and not role.startswith("forecast"):  # dotted in its severity's colour
         look["legend_label"] = label
     drawn: GlyphRenderer[Any] | None = None
     if style.line:

@@ -78,7 +78,7 @@ def fleet_table(
 
 def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
     name, value = _worst(unit)
-    worst = "none" if value < 0.0 else f"{plain_name(name)} {100.0 * value:.0f}\N{NO-BREAK SPACE}%"
+    worst = "none" if value < 0.0 else f"{plain_name(name)} {100.0 * value:.0f} %"
     serial = "unknown" if unit.serial is None else str(unit.serial)
     return [
         Cell(serial, unit.link),

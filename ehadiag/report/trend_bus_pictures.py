@@ -105,7 +105,7 @@ def _until(prognosis: Prognosis, known: Sequence[float]) -> float | None:
     """End of the picture: the slower severities' forecasts may reach far beyond what matters."""
     medians = [item.remaining[-1].median for item in prognosis.forecasts]
     ahead = [max(value, 0.0) for value in medians if value is not None]
-    if not ahead or not known:
+    if not ahead or len(known) < 2:
         return None
     return known[-1] + max(1.5 * min(ahead), 0.5 * (known[-1] - known[0]))
 
