@@ -6,6 +6,7 @@ tables of parameters and of UDS services into their pages.
 
 from __future__ import annotations
 
+import argparse
 import math
 import re
 import sys
@@ -49,6 +50,8 @@ def adapt(_app: Sphinx, page: str, source: list[str]) -> None:
     """Link files outside this folder; fill the gallery; make the navigation from the lists."""
     if page == "gallery":
         source[0] += gallery()
+    if page == "reference/command-line":
+        source[0] = with_options(source[0])
     source[0] = OUTSIDE.sub(r"](path:\1)", source[0])
     if page not in CONTENTS:
         return
@@ -69,6 +72,47 @@ def gallery() -> str:
     text = EXAMPLES.read_text("utf-8").partition("\n\n")[2].replace("](../docs/", "](")
     text = text.replace("](diagnose.ipynb)", "](path:../examples/diagnose.ipynb)")
     return SCRIPT.sub(r"```{literalinclude} ../\1\n:language: python\n```\n\n\g<0>", text)
+
+
+OPTIONS = re.compile(r"^<!-- options: (.*) -->$", re.MULTILINE)
+
+
+def with_options(text: str) -> str:
+    """Fill the tables of options into the page of the command line, from the commands' help.
+
+    An option that two commands have with the same help stands in the table `shared` alone.
+    """
+    from ehadiag.cli.main import parser_and_commands  # noqa: PLC0415 - loads all commands
+
+    _, parsers = parser_and_commands()
+    found: dict[tuple[str, str], list[str]] = {}
+    for command, parser in parsers.items():
+        for item in parser._actions:
+            if item.option_strings and item.help and item.dest not in ("help", "help_all"):
+                names = ", ".join(f"`{_call(item, name)}`" for name in item.option_strings)
+                meaning = parser._get_formatter()._expand_help(item)
+                row = (names, meaning.replace("|", "\\|"))
+                found.setdefault(row, []).append(command)
+    shared = [
+        f"| {names} | {meaning} | {', '.join(sorted(commands))} |"
+        for (names, meaning), commands in found.items() if len(commands) > 1
+    ]  # fmt: skip
+    tables = {"shared": ["| option | meaning | of |", "| --- | --- | --- |", *shared]}
+    for command in parsers:
+        own = [row for row, commands in found.items() if commands == [command]]
+        lines = [f"| {names} | {meaning} |" for names, meaning in own]
+        tables[command] = ["| option | meaning |", "| --- | --- |", *lines] if own else []
+    return OPTIONS.sub(lambda match: "\n".join(tables[match[1]]), text)
+
+
+def _call(item: argparse.Action, name: str) -> str:
+    """Write an option with its value, as in a table."""
+    if item.nargs == 0:
+        return name
+    value = item.metavar or "|".join(map(str, item.choices or [item.dest.upper()]))
+    words = value if isinstance(value, str) else " ".join(value)
+    words = f"[{words}]" if item.nargs == "?" else words
+    return f"{name} {words}".replace("|", "\\|")
 
 
 def name_types(

@@ -50,8 +50,8 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
         tuple[str, ...],
         _option(
             "--test",
-            "test that a log may be of, besides the stored ones; repeatable."
-            " Given once, it also stands for logs that carry no test number",
+            "further test that a log may contain; repeatable."
+            " One alone also applies to logs without a test number",
             TEST,
             project=True,
             file=True,
@@ -60,7 +60,9 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
     joint: Annotated[
         bool, _option("--joint", "the logs are of one actuator: one estimate from all of them")
     ] = False
-    every_test: Annotated[bool, _option("--all", "every test in a log, not its last one")] = False
+    every_test: Annotated[
+        bool, _option("--all", "every test in a log (default: the last complete one)")
+    ] = False
     merge: Annotated[
         bool,
         _option(

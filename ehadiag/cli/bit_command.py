@@ -99,8 +99,7 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
         type=options.positive_number,
         default=ONBOARD_WAIT_S,
         metavar="S",
-        help="how long to wait after the test for what the flight-control computer finds itself,"
-        " where it says that it is at it (default 60)",
+        help="wait after the test for the flight-control computer's own result, s (default 60)",
     )
     options.add_xcp_option(parser, "measure command and channels by XCP, not by telemetry")
     options.add_screen_options(parser)

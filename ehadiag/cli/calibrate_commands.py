@@ -278,15 +278,17 @@ def define_design(parser: argparse.ArgumentParser) -> None:
         type=options.positive_count,
         default=200,
         metavar="N",
-        help="tests to look at (200)",
+        help="tests to try, some 0.2 s each (default 200)",
     )
     options.add_request_options(parser, "seed")
-    parser.add_argument("--name", metavar="NAME", help="of the better test (NAME-designed)")
+    parser.add_argument(
+        "--name", metavar="NAME", help="of the better test (default: the test's with -designed)"
+    )
     parser.add_argument(
         "--id",
         type=options.positive_count,
         metavar="N",
-        help="number of the better test on the bus, 1 … 255 (the test's and 100)",
+        help="number of the better test on the bus, 1 … 255 (default: the test's and 100)",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     show_usual(

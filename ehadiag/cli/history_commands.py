@@ -65,7 +65,9 @@ def define_history(parser: argparse.ArgumentParser) -> None:
     def verb(
         name: str, what: str, function: Callable[[argparse.Namespace], None]
     ) -> argparse.ArgumentParser:
-        made = verbs.add_parser(name, help=what, description=f"{what}.", allow_abbrev=False)
+        made = verbs.add_parser(
+            name, help=what, description=f"{what[0].upper()}{what[1:]}.", allow_abbrev=False
+        )
         add_history_option(made, again=True)
         made.set_defaults(verb_function=function)
         return made

@@ -34,14 +34,16 @@ def add_history_option(parser: argparse.ArgumentParser, *, again: bool = False) 
     )
 
 
-def add_usage_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--hours` and `--cycles`."""
+def add_usage_options(
+    parser: argparse.ArgumentParser, when: str = "since it was new, for the health history"
+) -> None:
+    """Add `--hours` and `--cycles`; when: at what time the unit has them."""
     for name, what in (("hours", "operating hours"), ("cycles", "cycles")):
         parser.add_argument(
             f"--{name}",
             type=_nonnegative_number,
             metavar="N",
-            help=f"{what} of the unit since it was new, for the health history",
+            help=f"{what} of the unit {when}",
         )
 
 

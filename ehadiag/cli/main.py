@@ -250,5 +250,8 @@ def parser_and_commands(
         if command in (name, None):
             function = f"define_{name.replace('-', '_')}"
             getattr(import_module(f"ehadiag.cli.{module}"), function)(made)
-            made.add_argument("-v", "--verbose", action="store_true", help="tell more on the way")
+            made.add_argument(
+                "-v", "--verbose", action="store_true",
+                help="print versions, options in force and their origin, and logs of libraries",
+            )  # fmt: skip
     return parser, subparsers.choices

@@ -55,7 +55,7 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
         help="chance to reach the limit before the next inspection: a date, or hours (cycles, days)"
         " from now",
     )
-    add_usage_options(parser)
+    add_usage_options(parser, "today (default: at its last diagnosis)")
     add_history_option(parser)
     options.add_request_options(parser, *options.LEVELS)
     options.add_request_options(

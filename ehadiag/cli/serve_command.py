@@ -43,7 +43,7 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
         type=options.port_number,
         default=DEFAULT_PORT,
         metavar="N",
-        help=f"0: any that is free ({DEFAULT_PORT})",
+        help=f"port on 127.0.0.1 (default {DEFAULT_PORT}); 0: any free one",
     )
     parser.add_argument(
         "--allow-tests",
