@@ -250,11 +250,10 @@ MAX_TEST_ID = 255
 def define_design(parser: argparse.ArgumentParser) -> None:
     """Add description and options of the command."""
     parser.description = (
-        "Score a test by the Cramér-Rao bound of each severity while sensor offsets,\n"
-        "nuisances and the data that have a tolerance are unknown; with --out, search a better\n"
-        "test within limits and write it. Nothing is sent to any bus."
+        "Score how well a test shows each severity (Cramér-Rao bound), with offsets, effects and"
+        " uncertain data unknown; with --out, search a better test within limits and write it."
+        " Nothing is sent to any bus."
     )
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument(
         "--test",
         default="open",

@@ -39,6 +39,7 @@ from ehadiag.request import Request, request_options
 from ehadiag.result import Result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
+    counting_bar,
     exit_code_of_inputs,
     print_compiling_notice,
     print_status,
@@ -280,16 +281,18 @@ def run_report(arguments: argparse.Namespace) -> int:
     reads = [("the result", name) for name in results]
     refuse_overwriting(arguments, pages, [*reads, ("the DBC", setup.bus_map.name)])
     codes, written = [], []
-    for name in results:
-        try:
-            written.append(
-                (_write_report(arguments, Path(name), levels), _page_path_of(Path(name)))
-            )
-        except EhadiagError as error:
-            print_status(str(error))
-            codes.append(error.exit_code)
-        else:
-            codes.append(0)
+    with counting_bar(len(results), "reports") as count:
+        for name in results:
+            try:
+                written.append(
+                    (_write_report(arguments, Path(name), levels), _page_path_of(Path(name)))
+                )
+            except EhadiagError as error:
+                print_status(str(error))
+                codes.append(error.exit_code)
+            else:
+                codes.append(0)
+            count()
     if arguments.index:
         page = index_html_page(written, Path(arguments.index), levels, history_path(arguments))
         write_file(Path(arguments.index), page, "index")

@@ -17,7 +17,7 @@ from ehadiag.cli.history_options import (
     open_named_history,
     usage_from_options,
 )
-from ehadiag.terminal.output import print_text, render_for_terminal, write_output
+from ehadiag.terminal.output import counting_bar, print_text, render_for_terminal, write_output
 from firmware_iface.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -89,8 +89,12 @@ def run_rul(arguments: argparse.Namespace) -> int:
     with open_named_history(arguments) as history:
         if arguments.all:
             both = (levels.advisory, levels.limit)
-            every = all_prognoses(history, both, arguments.in_unit, arguments.seed)
-            found = sorted(every, key=_urgency)
+            found = []
+            with counting_bar(len(history.units()), "units") as count:
+                for item in all_prognoses(history, both, arguments.in_unit, arguments.seed):
+                    found.append(item)
+                    count()
+            found.sort(key=_urgency)
         else:
             actuator = named_actuator(history, arguments.unit, arguments.actuator)
             if actuator is None:

@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 
 from ehadiag.cli import options
+from ehadiag.cli.command_parser import show_usual
 from ehadiag.cli.result_output import OutputFile, open_output_folder, refuse_overwriting
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
@@ -162,6 +163,14 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     )
     options.add_request_options(parser, "actuator", "mapping", "dbc", "id_offset")
     options.add_xcp_option(parser, "with --a2l: how the computer is reached")
+    show_usual(
+        parser,
+        "--target --list --out --actuator --hours --fmu --a2l --pdx --help-all",
+        examples=(
+            "ehadiag export --target cortex-m7 --out eha-m7",
+            "ehadiag export --fmu --out units",
+        ),
+    )
     parser.set_defaults(run=partial(run_export, parser))
 
 

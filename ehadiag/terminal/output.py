@@ -194,11 +194,11 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[str, float], None]
 
 
 @contextmanager
-def counting_bar(total: int) -> Iterator[Callable[[], None]]:
+def counting_bar(total: int, what: str = "recordings") -> Iterator[Callable[[], None]]:
     """Show how many of so many are done, and how fast, on standard error, in a log as lines."""
     if not sys.stderr.isatty():
         lines, done = _ProgressLines(), itertools.count(1)
-        yield lambda: lines.update(f"{total} recordings:", next(done) / total)
+        yield lambda: lines.update(f"{total} {what}:", next(done) / total)
         return
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import (  # noqa: PLC0415
@@ -221,7 +221,7 @@ def counting_bar(total: int) -> Iterator[Callable[[], None]]:
 
         def advance() -> None:
             speed = display.tasks[0].speed
-            rate = "" if speed is None else f"{speed:.1f} recordings/s"
+            rate = "" if speed is None else f"{speed:.1f} {what}/s"
             display.update(task, advance=1, rate=rate)
 
         yield advance

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,19 @@ def test_an_index_lists_the_results_worst_first_with_links(run: Run) -> None:
     assert ">time left<" not in page  # without a history there is none
     twice = run("report", *names, "--index", "o/healthy-open.html")
     assert (twice.code, "name another file" in twice.message) == (2, True)
+
+
+def test_many_reports_show_how_many_are_done(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = []
+
+    @contextmanager
+    def bar(total: int, what: str) -> Iterator[Callable[[], None]]:
+        yield lambda: counted.append((total, what))
+
+    monkeypatch.setattr("ehadiag.cli.diagnose_commands.counting_bar", bar)
+    run("diagnose", "--no-picture", "--out", "o", HEALTHY, WORN)
+    run("report", "o/healthy-open.json", "o/paper-open-4.json", "o/none.json")
+    assert counted == 3 * [(3, "reports")]
 
 
 def test_a_trend_where_there_is_a_history(run: Run) -> None:
