@@ -308,20 +308,13 @@ CLOSED_LOSSES = """\
 | 1 % | 0.0 % | 20 of 20 | 1.8 |
 | 5 % | 0.2 … 0.4 % | 20 of 20 | 1.9 |
 | 10 % | 0.8 … 1.3 % | 20 of 20 | 2.2 |
-| 12 % | 1.1 … 1.8 % | 25 of 28 | 2.7 |
 | 15 % | 1.8 … 2.8 % | 23 of 28 | 20.5 |
 | 20 % | 3.4 … 4.4 % | 15 of 20 | 10.4 |
 | a dropout of 50, 100 or 200 ms | 0.9 % | 61 of 68 | 3.1 |
-| 20 dropouts of 5 ms | 1.4 … 1.5 % | 26 of 28 | 2.3 |
 | 40 dropouts of 5 ms | 2.8 … 2.9 % | 26 of 28 | 4.9 |
 | 10 dropouts of 20 ms | 3.2 … 3.5 % | 16 of 16 | 11.9 |
 """
 """Measured by closed_losses.py."""
-
-
-SECOND_SENDER = """
-[A second sender](second-sender.md) is dropped, or the answer is NOT TESTED and names it.
-"""
 
 
 def by_outcome(lines: list[tuple[str, ...]]) -> str:
@@ -340,35 +333,30 @@ def table() -> str:
     logs = by_outcome([(item.name, item.stated) for item in LOG_CASES])
     return f"""# What a damaged harness does to a test
 
-Each fault is injected between the emulated computer and the tester, in a short test (samples that
-arrive are those of the sound bus to the last bit, unless damage passes the check sum) and in the
-stored test `open`. The tables are printed by `python tests/firmware_iface/live/fault_cases.py`, and
-`test_live_faults.py` checks each line. *The same verdict*: each estimate is within its 95 %
-interval, too.
+Each fault is injected between emulated computer and tester, in a short test and in `open`. `python
+tests/firmware_iface/live/fault_cases.py` prints the tables, and `test_live_faults.py` checks each
+line. *The same verdict*: each estimate is within its 95 % interval, too.
 
 | fault | what comes of it |
 | --- | --- |
 {rows}
 ## Closed loop
 
-Losses of up to 10 %, late frames, a pause of 0.1 s and damaged frames with a valid CRC give the
-same outcomes in closed loop. A lost jack position follows from the current measured in the next
-tick. Where that is lost too, the position is interpolated, and its noise is unknown:
+Up to 10 % of losses, late frames, a pause of 0.1 s and damaged frames with a valid CRC do the same
+in closed loop. A lost jack position follows from the current of the next tick; where that is lost
+too, it is interpolated:
 
 {CLOSED_LOSSES}
-*Interpolated*: share of ticks with an interpolated position. *From truth*: largest distance of an
-accepted estimate, in stated standard deviations. So **above 1.5 % interpolated there is a verdict
-only where [the response shows the
-positions](../explanation/frames-to-ticks.md#what-cannot-be-observed)**, up to 10 % (not in this
-table), and none for a controller with an integral or derivative part.
+*Interpolated*: share of ticks. *From truth*: largest distance of an accepted estimate, in stated
+deviations. **Above 1.5 % there is a verdict only where [the response shows the
+positions](../explanation/frames-to-ticks.md#what-cannot-be-observed)**, up to 10 %, and none for a
+controller with an integral or derivative part.
 
 ## What a damaged log does to a diagnosis
 
-A damaged recording of the same test, read by `ehadiag diagnose`:
-
 | log | diagnosis |
 | --- | --- |
-{logs}{SECOND_SENDER}"""
+{logs}"""
 
 
 if __name__ == "__main__":
