@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
 from typing import TYPE_CHECKING
 
 from markupsafe import Markup
@@ -72,8 +71,8 @@ def fleet_table(
     """
     ordered = sorted(units, key=lambda unit: (WORST_FIRST.index(unit.verdict), -_worst(unit)[1]))
     rows = [_row(unit, levels) for unit in ordered]
-    filled = [any(cell.text for cell in column) for column in zip(*rows, strict=True)]
-    return tuple(compress(FLEET_HEAD, filled)), [list(compress(row, filled)) for row in rows]
+    filled = [n for n in range(len(FLEET_HEAD)) if any(row[n].text for row in rows)]
+    return tuple(FLEET_HEAD[n] for n in filled), [[row[n] for n in filled] for row in rows]
 
 
 def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
