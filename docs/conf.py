@@ -1,7 +1,7 @@
 """Settings of the documentation site: the pages of this folder, plain Markdown, and the docstrings.
 
-`sphinx-build -W --keep-going -b html docs build/site` makes it. `python docs/conf.py` writes the
-tables of parameters and of UDS services into their pages.
+`sphinx-build -W --keep-going -b html docs build/site` makes it. Tables of options, parameters and
+UDS services are made from the code where a page has `<!-- NAME -->`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import argparse
 import math
 import re
 import sys
+from functools import cache
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
@@ -47,11 +48,10 @@ HEAD = re.compile(r"^(?=[A-Z][a-z]+$)", re.MULTILINE)
 
 
 def adapt(_app: Sphinx, page: str, source: list[str]) -> None:
-    """Link files outside this folder; fill the gallery; make the navigation from the lists."""
+    """Link files outside this folder; fill in what is made; make the navigation from the lists."""
     if page == "gallery":
         source[0] += gallery()
-    if page == "reference/command-line":
-        source[0] = with_options(source[0])
+    source[0] = with_tables(source[0])
     source[0] = OUTSIDE.sub(r"](path:\1)", source[0])
     if page not in CONTENTS:
         return
@@ -74,11 +74,24 @@ def gallery() -> str:
     return SCRIPT.sub(r"```{literalinclude} ../\1\n:language: python\n```\n\n\g<0>", text)
 
 
-OPTIONS = re.compile(r"^<!-- options: (.*) -->$", re.MULTILINE)
+TABLE = re.compile(r"^<!-- (.*) -->$", re.MULTILINE)
 
 
-def with_options(text: str) -> str:
-    """Fill the tables of options into the page of the command line, from the commands' help.
+def with_tables(text: str) -> str:
+    """Fill tables that are made from the code into a page."""
+    return TABLE.sub(lambda match: table(match[1]), text)
+
+
+def table(name: str) -> str:
+    """Return a table by its name in the page."""
+    if name == "parameters":
+        return parameter_table()
+    return uds_tables() if name == "UDS services" else option_tables()[name]
+
+
+@cache
+def option_tables() -> dict[str, str]:
+    """Return the table of each command's options, made from its help.
 
     An option that two commands have with the same help stands in the table `shared` alone.
     """
@@ -102,7 +115,7 @@ def with_options(text: str) -> str:
         own = [row for row, commands in found.items() if commands == [command]]
         lines = [f"| {names} | {meaning} |" for names, meaning in own]
         tables[command] = ["| option | meaning |", "| --- | --- |", *lines] if own else []
-    return OPTIONS.sub(lambda match: "\n".join(tables[match[1]]), text)
+    return {f"options: {name}": "\n".join(lines) for name, lines in tables.items()}
 
 
 def _call(item: argparse.Action, name: str) -> str:
@@ -134,10 +147,6 @@ def make_accessible(
         context["body"] = SCROLLED.sub(r'\g<0> tabindex="0"', context["body"])
 
 
-PARAMETERS = HERE / "reference" / "parameters.md"
-PARAMETER_TABLE = re.compile(r"^\| name \|.*?(?=\n\n)", re.MULTILINE | re.DOTALL)
-
-
 def parameter_table() -> str:
     """Return the rows of the registry of parameters, as Markdown."""
     from ehadiag.model.registry import REGISTRY  # noqa: PLC0415 - loads kernels
@@ -154,10 +163,6 @@ def parameter_table() -> str:
             cells[:2], cells[4] = ["`datum_NAME`", "dNAME"], f"{error}NAME: {meanings}"
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-UDS = HERE / "reference" / "uds.md"
-UDS_TABLES = re.compile(r"^## Services\n.*", re.MULTILINE | re.DOTALL)
 
 
 def uds_tables() -> str:
@@ -221,10 +226,3 @@ def setup(app: Sphinx) -> None:
     app.connect("html-page-context", make_accessible, priority=900)  # after the theme
     app.connect("source-read", adapt)
     app.connect("autodoc-process-docstring", name_types, priority=400)  # before numpydoc
-
-
-if __name__ == "__main__":
-    text = PARAMETERS.read_text("utf-8")
-    PARAMETERS.write_text(PARAMETER_TABLE.sub(lambda _: parameter_table(), text), "utf-8")
-    text = UDS.read_text("utf-8")
-    UDS.write_text(UDS_TABLES.sub(lambda _: uds_tables(), text), "utf-8")

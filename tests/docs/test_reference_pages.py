@@ -28,9 +28,11 @@ from ehadiag.cli.main import main
 from ehadiag.estimate import Severity
 from ehadiag.history.store import History
 from ehadiag.live import Alarm, BusState, Ending, Residuals, RunningTest, Snapshot
+from ehadiag.model.registry import REGISTRY
 from ehadiag_tools.accuracy.cases import PAPER
 from firmware_iface.bus_report import BusReport, MessageReport, RangeUse
 from firmware_iface.recording import CHANNELS, BitReason, BitState, OnboardState
+from firmware_iface.uds.services import DATA_RECORDS, TROUBLE_CODES
 
 GLOSSARY = (ROOT / "docs" / "reference" / "glossary.md").read_text()
 TERMS, SYMBOLS = GLOSSARY.split("## Symbols")
@@ -55,14 +57,22 @@ def test_terms_are_in_alphabetical_order() -> None:
     assert terms == sorted(terms)
 
 
-def test_the_table_of_parameters_is_that_of_the_registry() -> None:
-    page = runpy.run_path(str(ROOT / "docs" / "conf.py"))
-    assert page["parameter_table"]() in page["PARAMETERS"].read_text("utf-8")
+def as_on_the_site(page: str) -> str:
+    """A page with the tables that are made from the code."""
+    text = (ROOT / "docs" / "reference" / page).read_text("utf-8")
+    return str(runpy.run_path(str(ROOT / "docs" / "conf.py"))["with_tables"](text))
 
 
-def test_the_tables_of_uds_are_those_of_its_records() -> None:
-    page = runpy.run_path(str(ROOT / "docs" / "conf.py"))
-    assert page["UDS"].read_text("utf-8").endswith(page["uds_tables"]())
+def test_the_site_has_every_parameter_of_the_registry() -> None:
+    names = {cell.strip("`") for cell in first_cells(as_on_the_site("parameters.md"))}
+    data = {item.name for item in REGISTRY if item.name == f"datum_{item.symbol.lstrip('d')}"}
+    assert names == {item.name for item in REGISTRY} - data | {"datum_NAME"}
+
+
+def test_the_site_has_every_service_of_uds() -> None:
+    page = as_on_the_site("uds.md")
+    assert all(f"22 {item.number:04X}" in page for item in DATA_RECORDS.values())
+    assert all(f"{item.number:06X}" in page for item in TROUBLE_CODES)
 
 
 REPOSITORY = Path(__file__).parents[2]
