@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.identify.estimates import interval95
@@ -61,8 +62,7 @@ class InstantRules(NamedTuple):
 INSTANTS = InstantRules()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SampledTest:
+class _SampledTest(msgspec.Struct, frozen=True, eq=False):
     """An experiment whose samples an acquisition took within the control ticks."""
 
     experiment: Experiment
@@ -104,8 +104,7 @@ class _SampledTest:
         return self.experiment.constants.DLY - self.acquired.lead + before
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Clock:
+class _Clock(msgspec.Struct, frozen=True, eq=False):
     """Ticks on the acquisition's clock: lead (s) and drift (1) later than they were found."""
 
     lead: float = 0.0
@@ -193,8 +192,7 @@ class _Response:
         return value, slope / self._step
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
+class _Fit(msgspec.Struct, frozen=True, eq=False):
     """Severities and clock, and what they leave of the samples."""
 
     severities: Array

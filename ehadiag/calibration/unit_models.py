@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.core.actuator import Actuator, SecondStage
@@ -60,8 +60,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class CalibratedValue:
+class CalibratedValue(msgspec.Struct, frozen=True):
     """One thing that was learned of the unit; SI."""
 
     name: str
@@ -77,8 +76,7 @@ class CalibratedValue:
     """Whether the recordings show it: else little is known but its usual size."""
 
 
-@dataclass(frozen=True, slots=True)
-class TriedModel:
+class TriedModel(msgspec.Struct, frozen=True):
     """A model that was tried."""
 
     words: str
@@ -88,8 +86,7 @@ class TriedModel:
     """Bayesian information criterion, less the best one's."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibrated:
+class Calibrated(msgspec.Struct, frozen=True, eq=False):
     """A calibration, or why there is none."""
 
     recordings: tuple[Recording, ...]
@@ -226,8 +223,7 @@ NEARLY_NEW_PRIOR = ParameterPrior(0.02, 0.05)
 """A severity of a unit that is said to be as new."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnitModel:
+class UnitModel(msgspec.Struct, frozen=True):
     """One class of actuator.
 
     Attributes
@@ -295,8 +291,7 @@ class UnitModel:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LearnedModel:
+class LearnedModel(msgspec.Struct, frozen=True, eq=False):
     """What recordings say if a model holds.
 
     Attributes

@@ -7,10 +7,11 @@ import contextlib
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
 
 from ehadiag.api import compile_kernels
 from ehadiag.batch.journal import ResultJournal
@@ -172,8 +173,7 @@ def _unexpected(setup: Setup, log: str, error: Exception) -> Result:
     return setup.failure(log, text, InputOutputError.exit_code)
 
 
-@dataclass(frozen=True, slots=True)
-class _BatchTask:
+class _BatchTask(msgspec.Struct, frozen=True):
     """One recording to diagnose for one of the actuators on its bus."""
 
     unit: int

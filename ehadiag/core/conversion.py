@@ -5,11 +5,11 @@ What the mapping states comes first, then the actuator file, then the step that 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, ConverterSpec

@@ -8,9 +8,9 @@ position.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,8 +144,7 @@ COMMAND_FRAME_TOLERANCE = {
 the converter's half range, 20 µA and 50 µm of the default ones."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CurrentTrace:
+class CurrentTrace(msgspec.Struct, frozen=True, eq=False):
     """Commanded current of each tick."""
 
     current: Array

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,8 +68,7 @@ class StageRules(NamedTuple):
 SEARCH_STAGES = StageRules()
 
 
-@dataclass(frozen=True, slots=True)
-class FirstApproximation:
+class FirstApproximation(msgspec.Struct, frozen=True):
     """Result of the one-dimensional searches."""
 
     values: Mapping[str, float]
@@ -77,8 +76,7 @@ class FirstApproximation:
     evaluations: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstApproximationInputs:
+class FirstApproximationInputs(msgspec.Struct, frozen=True, eq=False):
     """All that the one-dimensional searches look at."""
 
     unknowns: Unknowns

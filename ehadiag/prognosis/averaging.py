@@ -9,11 +9,12 @@ weighted answer was off widens or moves the interval (conformal calibration).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr, ndtri
 
@@ -87,8 +88,7 @@ class AveragingRules(NamedTuple):
 AVERAGING_RULES = AveragingRules()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fleet:
+class Fleet(msgspec.Struct, frozen=True, eq=False):
     """What other lives of a severity say."""
 
     lives: int

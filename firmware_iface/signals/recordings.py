@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.bus_map import BusMap
@@ -260,8 +261,7 @@ def _environment(signals: Mapping[str, RecordedSignal]) -> Environment:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Interpretation:
+class Interpretation(msgspec.Struct, frozen=True):
     """What the content of recordings means."""
 
     bus_map: BusMap

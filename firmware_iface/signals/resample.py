@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from firmware_iface.recording import FloatArray, IntArray, RecordedSignal
@@ -45,8 +45,7 @@ class HeldLimits(NamedTuple):
 HELD = HeldLimits()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TickClock:
+class TickClock(msgspec.Struct, frozen=True, eq=False):
     """Beginnings of control ticks on the logger's clock."""
 
     begin: FloatArray
@@ -119,8 +118,7 @@ def held_on_ticks(
     return clock, rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SignalGroup:
+class SignalGroup(msgspec.Struct, frozen=True, eq=False):
     """Held signals that change together."""
 
     roles: tuple[str, ...]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from history_cases import an_entry, an_event
+from msgspec.structs import replace
 from scipy import stats
 
 from ehadiag.history.records import Usage
