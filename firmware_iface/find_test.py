@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -30,7 +30,7 @@ from firmware_iface.recording import (
 from firmware_iface.stored_test import RATE_TOLERANCE, Controller, StoredTest
 
 
-class MatchLimits(NamedTuple):
+class MatchLimits(msgspec.Struct, frozen=True):
     """Limits by which a stored test is found in samples."""
 
     commands: int = 100

@@ -89,7 +89,7 @@ class Channels(NamedTuple):
     position: Channel
 
 
-class StatedConverter(NamedTuple):
+class StatedConverter(msgspec.Struct, frozen=True):
     """What a mapping says of one converter, SI; None: nothing."""
 
     low: float | None = None

@@ -10,7 +10,6 @@ of dirty pictures, J. R. Statist. Soc. B 48(3), 1986).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -97,7 +96,7 @@ def _widened_estimate(item: Estimate, hidden: Sequence[str]) -> Estimate:
     return replace(item, std=std, interval95=interval95(item.value, std))
 
 
-class ReconstructionRules(NamedTuple):
+class ReconstructionRules(msgspec.Struct, frozen=True):
     """Search for lost positions and misplaced rows."""
 
     response_ticks: int = 30

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,7 +46,7 @@ def identified_response(experiment: Experiment, identification: Identification) 
     )
 
 
-class DelayRegression(NamedTuple):
+class DelayRegression(msgspec.Struct, frozen=True):
     """Regression of delays, and fit of the position sensor."""
 
     rounding_ticks: float = 0.15

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,7 +28,7 @@ from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 __all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
 
 
-class InstantRules(NamedTuple):
+class InstantRules(msgspec.Struct, frozen=True):
     """Estimation of sampling instants."""
 
     rounds: int = 3
@@ -120,7 +119,7 @@ class _Clock(msgspec.Struct, frozen=True, eq=False):
         return (taken.acquired.lead + self.lead) % taken.experiment.tick
 
 
-class _Samples(NamedTuple):
+class _Samples(msgspec.Struct, frozen=True):
     """One sample of spool and pressure for each tick."""
 
     value: Array
@@ -217,7 +216,7 @@ class _Fit(msgspec.Struct, frozen=True, eq=False):
         return cls(severities, clock, samples, model, slope, cost)
 
 
-class _Step(NamedTuple):
+class _Step(msgspec.Struct, frozen=True):
     severities: Array
     """Change of the severities, shape (k,)."""
     lead: float

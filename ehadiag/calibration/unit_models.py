@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -115,7 +114,7 @@ PLAYS_OF_SMOOTH_HYSTERESIS = 8
 """Plays of a smooth hysteresis: more of them do the same within the noise."""
 
 
-class SearchRules(NamedTuple):
+class SearchRules(msgspec.Struct, frozen=True):
     """Budgets of the searches of a calibration, and what leads to another search."""
 
     max_runs: int = 4000
@@ -151,7 +150,7 @@ class SearchRules(NamedTuple):
     break-aways."""
 
 
-class CalibrationCriteria(NamedTuple):
+class CalibrationCriteria(msgspec.Struct, frozen=True):
     """What a calibration needs, and what it may leave."""
 
     min_recordings: int = 2

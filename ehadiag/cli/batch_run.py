@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -274,6 +275,9 @@ class _BatchRun:
                     raise  # nothing else is lost, and the place is shown
                 self._fail(_unexpected(setup, item.name, error))
                 continue
+            if at == 0:
+                # Printing's libraries take 25 ms to load, beside kernels that need no interpreter.
+                threading.Thread(target=self._results.load, daemon=True).start()
             for recording, log in reading.each():
                 found, code = diagnose_and_deliver(
                     setup, self._results, [recording], reading.files, [log], reading.seconds

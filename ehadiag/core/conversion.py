@@ -23,7 +23,7 @@ from firmware_iface.recording import (
 )
 
 
-class StepLimits(NamedTuple):
+class StepLimits(msgspec.Struct, frozen=True):
     """Limits by which the step of a converter shows in its values."""
 
     levels: int = 30

@@ -6,7 +6,6 @@ A variant has segments that are longer or shorter, larger or smaller, faster or 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,7 +23,7 @@ from firmware_iface.stored_test import (
 )
 
 
-class VariantRules(NamedTuple):
+class VariantRules(msgspec.Struct, frozen=True):
     """Bounds of the variants of a test, and the search among them."""
 
     length_factors: tuple[float, float] = (0.5, 2.0)

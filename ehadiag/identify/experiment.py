@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -40,7 +39,7 @@ from firmware_iface.recording import (
 from firmware_iface.stored_test import StoredTest, TimeWindow
 
 
-class RestRules(NamedTuple):
+class RestRules(msgspec.Struct, frozen=True):
     """Rest of an actuator before its test."""
 
     displaced_share: float = 0.3e6 / PRESSURE_CHANNEL.full_scale

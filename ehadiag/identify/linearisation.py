@@ -8,7 +8,6 @@ Bruyninckx, De Schutter, IEEE Trans. Automatic Control 47(8), 2002).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,7 +20,7 @@ from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
 
 
-class DifferenceRules(NamedTuple):
+class DifferenceRules(msgspec.Struct, frozen=True):
     """Differences of residuals at a point."""
 
     step: float = 5e-5

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -53,7 +52,7 @@ from ehadiag.model.parameter import Parameter
 from ehadiag.model.residual_models import SimdModel
 
 
-class RestartRules(NamedTuple):
+class RestartRules(msgspec.Struct, frozen=True):
     """Restarts of a search."""
 
     spread_share: float = 0.1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,7 +32,7 @@ SPOOL_OFFSET_ALIAS = "null_bias"
 where it saturates the search may stop at a wrong pair."""
 
 
-class PriorWidths(NamedTuple):
+class PriorWidths(msgspec.Struct, frozen=True):
     """Widths of densities about starts, as shares of the prior's."""
 
     hint: float = 0.1

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,7 +22,7 @@ from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
 
 
-class RingScan(NamedTuple):
+class RingScan(msgspec.Struct, frozen=True):
     """Scan of the oil's stiffness."""
 
     least: float = -0.6

@@ -8,7 +8,6 @@ position.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -83,7 +82,7 @@ CODE_RESOLUTION_RATIOS = 2.0 ** -np.arange(9)
 """Of the converter's step: those of a computer that calculates in its codes."""
 
 
-class CommandRules(NamedTuple):
+class CommandRules(msgspec.Struct, frozen=True):
     """Reconstruction of commands and currents."""
 
     min_misfit_gain: float = 30.0

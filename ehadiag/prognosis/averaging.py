@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -46,7 +45,7 @@ MIN_SEVERITY = 1e-3
 LIBRARY_NAMES = ("similar lives", "similar lives, own pace")
 
 
-class AveragingRules(NamedTuple):
+class AveragingRules(msgspec.Struct, frozen=True):
     """Settings of the average; chosen on the study's tuned laws (`tools/study prognosis`)."""
 
     max_lives: int = 40
@@ -108,7 +107,7 @@ class Fleet(msgspec.Struct, frozen=True, eq=False):
     """How much of each life each parameter set explains, shape (lives, sets)."""
 
 
-class Passage(NamedTuple):
+class Passage(msgspec.Struct, frozen=True):
     """Distribution of the time to a level."""
 
     quantiles: Array
@@ -204,7 +203,7 @@ def _explained(scores: Array) -> Array:
     return shares
 
 
-class _Questions(NamedTuple):
+class _Questions(msgspec.Struct, frozen=True):
     """Questions with answers; a row each."""
 
     life: NDArray[np.int64]

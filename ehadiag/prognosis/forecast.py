@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,7 +16,7 @@ from ehadiag.prognosis.lives import Life
 __all__ = ["Forecast", "RemainingLife", "forecast", "learn_fleet"]
 
 
-class ForecastRules(NamedTuple):
+class ForecastRules(msgspec.Struct, frozen=True):
     """What a forecast needs, and what raises an alarm."""
 
     min_diagnoses: int = 3

@@ -8,7 +8,6 @@ from the filtered state. Equations and literature: docs/explanation/remaining-li
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -40,7 +39,7 @@ LAW_NAMES = (
 )  # fmt: skip
 
 
-class Laws(NamedTuple):
+class Laws(msgspec.Struct, frozen=True):
     """Parameter sets of all laws; shape (sets,) each."""
 
     law: NDArray[np.int64]

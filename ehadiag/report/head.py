@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -89,7 +89,7 @@ class Head(msgspec.Struct, frozen=True):
         )
 
 
-class _Explanation(NamedTuple):
+class _Explanation(msgspec.Struct, frozen=True):
     """Plain words for the reasons that a pattern finds."""
 
     pattern: str

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 CurveValues = NDArray[np.float64]
 
 
-class CurveStyle(NamedTuple):
+class CurveStyle(msgspec.Struct, frozen=True):
     """How a curve looks, in the words of bokeh."""
 
     colour: str

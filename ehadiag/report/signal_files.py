@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 
 from ehadiag import __version__
@@ -88,7 +89,7 @@ def signal_file(result: Result, kind: str) -> bytes:
     return _mdf4(library, result, responses) if kind == "mf4" else _mcap(library, result, responses)
 
 
-class _Trace(NamedTuple):
+class _Trace(msgspec.Struct, frozen=True):
     """One quantity of a signal over time."""
 
     name: str
@@ -104,7 +105,7 @@ class _Event(NamedTuple):
     signal: str
 
 
-class _Response(NamedTuple):
+class _Response(msgspec.Struct, frozen=True):
     """One recording's signals and events."""
 
     source: str

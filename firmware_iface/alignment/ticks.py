@@ -8,7 +8,7 @@ frames are placed where the measured signals then run smoothly.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from firmware_iface.protection import NO_POSITION, unwrap
 from firmware_iface.recording import BoolArray, FloatArray, IntArray
 
 
-class StampLimits(NamedTuple):
+class StampLimits(msgspec.Struct, frozen=True):
     """Limits by which frames are placed by their time stamps."""
 
     envelope_block: int = 500
@@ -150,7 +150,7 @@ def _envelope(slack: FloatArray) -> FloatArray:
     return np.asarray(near + np.interp(np.arange(count), centre, edge))
 
 
-class GapLimits(NamedTuple):
+class GapLimits(msgspec.Struct, frozen=True):
     """Limits by which gaps among late frames are placed."""
 
     shift: int = 12

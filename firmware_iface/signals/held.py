@@ -9,7 +9,6 @@ loop together with the jack position of the tick before). The most likely ticks 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,7 +27,7 @@ from firmware_iface.signals.resample import (
 from firmware_iface.stored_test import Controller
 
 
-class Placement(NamedTuple):
+class Placement(msgspec.Struct, frozen=True):
     """Limits, costs and noise by which held values are placed on ticks."""
 
     candidates: int = 10

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -91,7 +90,7 @@ def recordings_of_signals(
     return tuple(replace(first, as_measured=other) for first, other in zip(*found, strict=True))
 
 
-class TickReading(NamedTuple):
+class TickReading(msgspec.Struct, frozen=True):
     """One way to put signals on ticks."""
 
     clock: TickClock

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,7 +22,7 @@ from firmware_iface.recording import FloatArray, IntArray, RecordedSignal
 from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 
 
-class HeldLimits(NamedTuple):
+class HeldLimits(msgspec.Struct, frozen=True):
     """Limits by which a signal holds its values for a tick, and its changes are counted."""
 
     changes_per_tick: float = 1.1
