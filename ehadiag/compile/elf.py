@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-
-import msgspec
+from typing import NamedTuple
 
 PAGE = 0x10000
 """Alignment of segments, bytes: the largest page of AArch64."""
@@ -22,7 +21,7 @@ FIXED_TAGS = {"hash": 4, "strings": 5, "symbols": 6, "string_bytes": 10, "symbol
 """Entries of the dynamic section (DT_HASH, DT_STRTAB, DT_SYMTAB, DT_STRSZ, DT_SYMENT)."""
 
 
-class Section(msgspec.Struct, frozen=True):
+class Section(NamedTuple):
     """Header of a section of an object file."""
 
     name: int

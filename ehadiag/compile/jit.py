@@ -14,9 +14,8 @@ import struct
 from collections.abc import Callable
 from functools import cached_property, update_wrapper
 from importlib import import_module
-from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +28,7 @@ Array3 = Annotated[Array, 3]
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class ArrayKind(msgspec.Struct, frozen=True):
+class ArrayKind(NamedTuple):
     """Array that a kernel takes: contiguous, rows first."""
 
     dtype: np.dtype[Any]
