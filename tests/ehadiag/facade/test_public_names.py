@@ -89,7 +89,7 @@ def test_the_import_alone_loads_nothing() -> None:
         ("Levels", {"msgspec"}),
         ("load_actuator", {"msgspec", "numpy"}),
         ("load_test", {"msgspec", "numpy"}),
-        ("Recording", {"numpy"}),
+        ("Recording", {"numpy", "msgspec"}),
         ("read", {"msgspec", "numpy"}),
         ("simulate", {"msgspec", "numpy"}),
         ("diagnose", {"msgspec", "numpy"}),
