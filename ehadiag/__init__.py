@@ -7,6 +7,8 @@
 The names below are loaded when they are first used: the import itself costs nothing.
 """
 
+__version__ = "0.2.0"
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ehadiag.api import calibrate, diagnose, diagnose_many, read, save_actuator, simulate
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
     )
     from firmware_iface.recording import CommandMode, Recording, Samples
     from firmware_iface.stored_test import StoredTest, bundled_tests, load_test
-
-    __version__: str
 
 __all__ = [
     "Actuator",
@@ -116,17 +116,12 @@ if not TYPE_CHECKING:  # or a type checker would take any name for granted
 
     def __getattr__(name: str) -> object:
         """Load a public name when it is first used (PEP 562)."""
-        if name == "__version__":
-            from importlib.metadata import version  # noqa: PLC0415 - as lazy as the rest
+        home = next((home for home, names in _HOMES.items() if name in names), None)
+        if home is None:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module  # noqa: PLC0415
 
-            value: object = version("ehadiag")
-        else:
-            home = next((home for home, names in _HOMES.items() if name in names), None)
-            if home is None:
-                raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-            from importlib import import_module  # noqa: PLC0415
-
-            value = getattr(import_module(home), name)
+        value: object = getattr(import_module(home), name)
         globals()[name] = value
         return value
 

@@ -12,7 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -24,8 +23,7 @@ from firmware_iface.recording import CommandMode
 LIVE_SCHEMA = "ehadiag.live/1"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BusState:
+class BusState(msgspec.Struct, frozen=True, kw_only=True):
     """How the bus is."""
 
     name: str
@@ -45,8 +43,7 @@ class BusState:
     """Frames that this program was too slow for."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunningTest:
+class RunningTest(msgspec.Struct, frozen=True, kw_only=True):
     """The built-in test that is under way, or was last."""
 
     name: str
@@ -62,8 +59,7 @@ class RunningTest:
     """Until its end."""
 
 
-@dataclass(frozen=True, slots=True)
-class Signals:
+class Signals(msgspec.Struct, frozen=True):
     """The four signals and the command: a short history, the newest value last.
 
     All tuples are of one length, some ten seconds long; of each twentieth of a second the least and
@@ -82,8 +78,7 @@ class Signals:
     position_mm: tuple[float | None, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Residuals:
+class Residuals(msgspec.Struct, frozen=True, kw_only=True):
     """What a monitor finds: measured less modelled, and the cumulative sums that raise alarms.
 
     Residuals are in units of noise, None where the sample was lost. Sums are shares of the
@@ -100,8 +95,7 @@ class Residuals:
     pressure_below: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Alarm:
+class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """An alarm of a monitor."""
 
     time: str
@@ -125,8 +119,7 @@ class Alarm:
         return "most likely " + "; or ".join(self.causes)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ending:
+class Ending(msgspec.Struct, frozen=True, kw_only=True):
     """How the session ended."""
 
     verdict: str
@@ -135,8 +128,7 @@ class Ending:
     reasons: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Snapshot:
+class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """One look at a session.
 
     Texts are as others wrote them (names of actuators and tests); `to_dict` and `to_json` have them
@@ -155,7 +147,7 @@ class Snapshot:
     test: RunningTest | None = None
     mode: str | None = None
     """`current` or `position`: what the flight-control computer says that its commands are."""
-    signals: Signals = field(default_factory=Signals)
+    signals: Signals = msgspec.field(default_factory=Signals)
     residuals: Residuals | None = None
     alarms: tuple[Alarm, ...] = ()
     """The latest, newest last."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
+from ehadiag import __version__
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import date_text, fingerprint
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity, finite
@@ -157,15 +158,16 @@ def configuration_of(request: Request, sources: Sources) -> Configuration:
 def package() -> Package:
     """Name and version of this package, and of what affects the digits."""
     import platform  # noqa: PLC0415
-    from importlib.metadata import version  # noqa: PLC0415 - reads a file for each
+
+    import numpy  # noqa: PLC0415
 
     from ehadiag.compile.libraries import compiler_versions  # noqa: PLC0415 - not for old results
 
     return Package(
         name="ehadiag",
-        version=version("ehadiag"),
+        version=__version__,
         python=platform.python_version(),
-        numpy=version("numpy"),
+        numpy=numpy.__version__,
         numba=compiler_versions().get("numba", ""),
     )
 

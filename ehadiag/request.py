@@ -11,7 +11,7 @@ import numbers
 import operator
 import os
 from functools import cache
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -246,7 +246,7 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
         return round(self.max_log_size_MiB * (1 << 20))
 
 
-class Option(NamedTuple):
+class Option(msgspec.Struct, frozen=True):
     """A field of `Request`, as command line, files of defaults and errors need it."""
 
     name: str

@@ -7,12 +7,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 
 import msgspec
+from msgspec.structs import replace
 
 from ehadiag.api import (
     PathLike,
@@ -135,8 +136,7 @@ class Deadline:
         return f"no estimate within {self._seconds:g} s: given up in the {stage} (see --time-limit)"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedTest:
+class RecordedTest(msgspec.Struct, frozen=True, eq=False):
     """What was read of one recording's files."""
 
     recordings: tuple[Recording, ...]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
 import msgspec
+from msgspec.structs import replace
 
 from firmware_iface.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, SignalLayout, cached_dbc
 from firmware_iface.errors import ConfigurationError
@@ -86,8 +85,7 @@ ConverterOrUnset: TypeAlias = StatedConverter | msgspec.UnsetType
 """Unset where nothing is said, so that the fingerprint of a mapping is that of what it says."""
 
 
-@dataclass(frozen=True, slots=True)
-class Role:
+class Role(msgspec.Struct, frozen=True):
     """A signal in its role: SI value = physical * gain + bias."""
 
     name: str
@@ -99,8 +97,7 @@ class Role:
     """What the mapping says of the converter behind a channel, SI."""
 
 
-@dataclass(frozen=True, slots=True)
-class MessageMap:
+class MessageMap(msgspec.Struct, frozen=True):
     """One message that carries roles, and how it is guarded."""
 
     name: str
@@ -127,8 +124,7 @@ class MessageMap:
         return any(role.name.startswith("channels.") for role in self.roles)
 
 
-@dataclass(frozen=True, slots=True)
-class BusMap:
+class BusMap(msgspec.Struct, frozen=True):
     """All messages in use, by name, and the numbers that stand for states."""
 
     name: str
@@ -216,7 +212,7 @@ def default_map(dbc: Path | str | None = None) -> BusMap:
     InputOutputError: the DBC cannot be read; ConfigurationError: not a DBC, or one of other names
     than the default mapping's.
     """
-    folder = resources.files("firmware_iface").joinpath("data")
+    folder = Path(__file__).parent / "data"
     where = "bundled mapping eha_fcc.toml"
     tree = decode_toml(folder.joinpath("eha_fcc.toml").read_bytes(), MappingFile, where)
     if dbc is None:

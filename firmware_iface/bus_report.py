@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.frame_faults import drop_conflicts, too_many_conflicts
 from firmware_iface.alignment.ticks import TickAxis, place_frames
@@ -53,8 +54,7 @@ def bit_state_text(messages: Mapping[str, Decoded], bus_map: BusMap) -> str:
     return words
 
 
-@dataclass(frozen=True, slots=True)
-class MessageReport:
+class MessageReport(msgspec.Struct, frozen=True):
     """One mapped message."""
 
     name: str
@@ -89,8 +89,7 @@ class MessageReport:
     """See `counter`."""
 
 
-@dataclass(frozen=True, slots=True)
-class RangeUse:
+class RangeUse(msgspec.Struct, frozen=True):
     """Use of one converter channel: raw codes seen, codes possible (None for floats), SI values,
     the last of them."""
 
@@ -104,8 +103,7 @@ class RangeUse:
     saturated: int
 
 
-@dataclass(frozen=True, slots=True)
-class BusReport:
+class BusReport(msgspec.Struct, frozen=True):
     """What was heard."""
 
     duration: float

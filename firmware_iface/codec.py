@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from firmware_iface.bus_map import BusMap, MessageMap, Role, default_map
@@ -39,14 +40,14 @@ def channels_in(table: FrameTable, bus_map: BusMap) -> frozenset[int]:
 
     Requests do not count: they are the tester's.
     """
-    numbers = np.unique(table.channel)
+    numbers = np.flatnonzero(np.bincount(table.channel))
     if len(numbers) == 1:
         return frozenset(numbers[numbers > 0].tolist())
     found: set[int] = set()
     for message in bus_map.messages.values():
         if not all(role.name.startswith("request.") for role in message.roles):
             row, *_ = sound_rows(table, rows_of(table, message), message)
-            found.update(np.unique(table.channel[row]).tolist())
+            found.update(np.flatnonzero(np.bincount(table.channel[row])).tolist())
     return frozenset(found - {0})
 
 
@@ -73,8 +74,7 @@ def choose_channel(chosen: int | None, present: frozenset[int]) -> tuple[int | N
     return chosen, ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Decoded:
+class Decoded(msgspec.Struct, frozen=True, eq=False):
     """The frames of one message; n of them passed the checks."""
 
     message: MessageMap
@@ -119,8 +119,7 @@ class Decoded:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DecodedTable:
+class DecodedTable(msgspec.Struct, frozen=True, eq=False):
     """All messages of a frame table; rows of frames that belong to none, and of error frames."""
 
     messages: Mapping[str, Decoded]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.util import find_spec
 from itertools import islice
 from typing import Any, Literal
 
@@ -25,8 +25,7 @@ WORD_BITS = 64
 PIECE_BITS = 32
 
 
-@dataclass(frozen=True, slots=True)
-class SignalLayout:
+class SignalLayout(msgspec.Struct, frozen=True):
     """Place and number format of one signal."""
 
     name: str
@@ -224,7 +223,10 @@ def cached_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
     if folder is None:
         return parse_dbc(text, name)
     with folder:
-        key = hashlib.sha256(f"{CACHE_FORMAT} {version('cantools')} ".encode() + text).hexdigest()
+        parser = find_spec("cantools")
+        # Another version of cantools is another file; what it is called takes 15 ms to find out.
+        stamp = os.stat(parser.origin).st_mtime_ns if parser and parser.origin else 0
+        key = hashlib.sha256(f"{CACHE_FORMAT} {stamp} ".encode() + text).hexdigest()
         kept = _read_cache(folder, f"{key}.json")
         if kept is None:
             kept = parse_dbc(text, name)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from firmware_iface.recording import (
@@ -29,7 +30,7 @@ from firmware_iface.recording import (
 from firmware_iface.stored_test import RATE_TOLERANCE, Controller, StoredTest
 
 
-class MatchLimits(NamedTuple):
+class MatchLimits(msgspec.Struct, frozen=True):
     """Limits by which a stored test is found in samples."""
 
     commands: int = 100
@@ -55,8 +56,7 @@ COMMAND_TOLERANCE = {CommandMode.CURRENT: 2e-6, CommandMode.POSITION: 5e-6}
 """A, m: distance of a command from the test's from which on it is held to be of another tick."""
 
 
-@dataclass(frozen=True, slots=True)
-class CandidateTests:
+class CandidateTests(msgspec.Struct, frozen=True):
     """What may have been played, and where to look for it."""
 
     tests: tuple[StoredTest, ...]
@@ -69,8 +69,7 @@ class CandidateTests:
     """Where it has ended; None: anywhere."""
 
 
-@dataclass(frozen=True, slots=True)
-class MatchedTest:
+class MatchedTest(msgspec.Struct, frozen=True):
     """A stored test in a stream of samples."""
 
     test: StoredTest

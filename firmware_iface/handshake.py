@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
+import msgspec
+
 from firmware_iface.live_decode import BitStatus, Sample
 from firmware_iface.recording import (
     ACTIVE_BIT_STATES,
@@ -22,8 +24,7 @@ LIMITED_CHANNELS = ("position", "pressure", "current")
 """Channels that can have a limit."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelLimits:
+class ChannelLimits(msgspec.Struct, frozen=True):
     """Magnitudes that end the test when exceeded; None is not watched.
 
     A limit counts as exceeded after `samples` successive samples of its channel beyond it: the CRC
@@ -132,8 +133,7 @@ class HandshakeAction(Enum):
     ABORT = "abort"
 
 
-@dataclass(frozen=True, slots=True)
-class TimeLimits:
+class TimeLimits(msgspec.Struct, frozen=True):
     """Longest durations of each step, s."""
 
     settle: float = 0.06
@@ -160,8 +160,7 @@ class TimeLimits:
     """Between two abort requests."""
 
 
-@dataclass(frozen=True, slots=True)
-class HandshakeResult:
+class HandshakeResult(msgspec.Struct, frozen=True):
     """How the handshake ended."""
 
     complete: bool

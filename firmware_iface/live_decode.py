@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
+
+import msgspec
 
 from firmware_iface.bus_map import BusMap, MessageMap, Role, default_map
 from firmware_iface.codec import value_ends
@@ -21,8 +22,7 @@ from firmware_iface.slow_values import SlowValueWatch, brings_slow_values
 from firmware_iface.transport.frames import Frame
 
 
-@dataclass(frozen=True, slots=True)
-class BitStatus:
+class BitStatus(msgspec.Struct, frozen=True):
     """One valid `BitStatus` message."""
 
     state: BitState
@@ -35,8 +35,7 @@ class BitStatus:
     """The computer's own word for a refusal without a reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(msgspec.Struct, frozen=True):
     """One valid telemetry message: A, m, Pa, m; the last known value of what it does not bring."""
 
     current: float
@@ -47,8 +46,7 @@ class Sample:
     """Channels that this very message brings."""
 
 
-@dataclass(frozen=True, slots=True)
-class BitRequest:
+class BitRequest(msgspec.Struct, frozen=True):
     """One valid `BitRequest` message; code `start`, `abort`, or empty for an unknown number."""
 
     code: str

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import struct
 from collections import OrderedDict
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +22,7 @@ CRC_FINAL_XOR = 0xFF
 next byte, and the payload without the check sum's own byte (BUS-6)."""
 
 
-class CounterLimits(NamedTuple):
+class CounterLimits(msgspec.Struct, frozen=True):
     """Limits by which counters are unwrapped."""
 
     trusted_step: int = 16
@@ -215,7 +215,7 @@ MAX_RESTART_COUNT = 1
 """First count, at most, of a counter that a computer restarts together with a change of state."""
 
 
-class ConflictLimits(NamedTuple):
+class ConflictLimits(msgspec.Struct, frozen=True):
     """Limits beyond which conflicting counters show a second sender."""
 
     share: float = 0.02

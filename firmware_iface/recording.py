@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +27,7 @@ DEFAULT_LEVELS: Final = 4096.0
 """Codes of the 12-bit converters of PHY-21."""
 
 
-@dataclass(frozen=True, slots=True)
-class Channel:
+class Channel(msgspec.Struct, frozen=True):
     """One converter channel: mid-tread rounding, saturating at its ends."""
 
     name: str
@@ -90,7 +89,7 @@ class Channels(NamedTuple):
     position: Channel
 
 
-class StatedConverter(NamedTuple):
+class StatedConverter(msgspec.Struct, frozen=True):
     """What a mapping says of one converter, SI; None: nothing."""
 
     low: float | None = None
@@ -114,8 +113,7 @@ MAX_SAMPLE_GAP_S = 0.25
 """Longest span of a test without a sample, s; a longer one makes it NOT TESTED."""
 
 
-@dataclass(frozen=True, slots=True)
-class Scales:
+class Scales(msgspec.Struct, frozen=True):
     """How finely, and how far, a flight-control computer sees its actuator and its commands."""
 
     channels: Channels = CHANNELS
@@ -173,8 +171,7 @@ class OnboardState(IntEnum):
     GIVEN_UP = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedSignal:
+class RecordedSignal(msgspec.Struct, frozen=True, eq=False):
     """One signal as recorded."""
 
     time: FloatArray
@@ -209,8 +206,7 @@ class Acquisition(NamedTuple):
     signals: tuple[RecordedSignal, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class Samples(msgspec.Struct, frozen=True, eq=False):
     """Samples of one test on its own tick grid: row k is control tick k of the test.
 
     All arrays have shape (ticks,). A row that did not arrive, or that failed a check, is NaN:
@@ -290,8 +286,7 @@ class Samples:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Environment:
+class Environment(msgspec.Struct, frozen=True):
     """Median over the test; None where the bus did not say."""
 
     supply_pressure: float | None = None
@@ -306,8 +301,7 @@ class Environment:
     """Standard deviation of supply less return pressure by their steps on the bus, Pa."""
 
 
-@dataclass(frozen=True, slots=True)
-class MessageCounts:
+class MessageCounts(msgspec.Struct, frozen=True):
     """Validity of one message over the span of a recording."""
 
     received: int = 0
@@ -324,12 +318,11 @@ class MessageCounts:
     range_errors: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Quality:
+class Quality(msgspec.Struct, frozen=True):
     """How good a recording is: counts per message and per channel."""
 
-    messages: Mapping[str, MessageCounts] = field(default_factory=dict)
-    saturated: Mapping[str, int] = field(default_factory=dict)
+    messages: Mapping[str, MessageCounts] = msgspec.field(default_factory=dict)
+    saturated: Mapping[str, int] = msgspec.field(default_factory=dict)
     """Samples at a converter's end, per channel."""
     foreign: int = 0
     """Frames with other identifiers."""
@@ -344,8 +337,7 @@ class Quality:
         return sum(int(getattr(item, count)) for item in self.messages.values())
 
 
-@dataclass(frozen=True, slots=True)
-class BitOutcome:
+class BitOutcome(msgspec.Struct, frozen=True):
     """How the test ended, as the flight-control computer says."""
 
     state: BitState | None = None
@@ -353,8 +345,7 @@ class BitOutcome:
     reason: BitReason = BitReason.NONE
 
 
-@dataclass(frozen=True, slots=True)
-class OnboardResult:
+class OnboardResult(msgspec.Struct, frozen=True):
     """What the flight-control computer says that it has found itself in a test (BUS-18)."""
 
     test_id: int | None
@@ -373,8 +364,7 @@ class OnboardResult:
         return None in (test_id, self.test_id) or test_id == self.test_id
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Recording:
+class Recording(msgspec.Struct, frozen=True, eq=False):
     """One test of one actuator, as acquired."""
 
     source: str

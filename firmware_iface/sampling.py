@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from firmware_iface.recording import FloatArray, RecordedSignal
 
 
-class SamplingLimits(NamedTuple):
+class SamplingLimits(msgspec.Struct, frozen=True):
     """Limits between the rules by which measured signals come to ticks."""
 
     nearest: float = 0.75

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +19,7 @@ from firmware_iface.protection import CONFLICTS
 from firmware_iface.recording import BoolArray, FloatArray, IntArray
 
 
-class SlowValueLimits(NamedTuple):
+class SlowValueLimits(msgspec.Struct, frozen=True):
     """Limits beyond which the frames of a slow message are of two senders."""
 
     excess: float = 1.25
@@ -174,7 +174,7 @@ class SlowValueWatch:
         return self._found
 
 
-class _SlowFrame(NamedTuple):
+class _SlowFrame(msgspec.Struct, frozen=True):
     time_ns: int
     counter: int | None
     data: bytes

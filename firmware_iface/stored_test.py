@@ -7,7 +7,6 @@ each stage of the diagnosis uses. A rig's computer may store others: a test is a
 from __future__ import annotations
 
 import itertools
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -185,9 +184,9 @@ def encode_test(test: StoredTest) -> bytes:
 
 def bundled_tests() -> dict[str, StoredTest]:
     """Return the stored tests that come with the package (PHY-25, PHY-26), by name."""
-    folder = resources.files("firmware_iface").joinpath("data/tests")
+    folder = Path(__file__).parent / "data/tests"
     tests = {}
-    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
+    for entry in sorted(folder.iterdir()):
         if entry.name.endswith(".toml"):
             where = f"bundled test {entry.name}"
             test = _checked(decode_toml(entry.read_bytes(), StoredTest, where), where)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
+
+import msgspec
+from msgspec.structs import replace
 
 from firmware_iface.alignment.align import assemble
 from firmware_iface.alignment.status import OnboardReader
@@ -89,8 +91,7 @@ MIN_STALL_NS = 100_000_000
 bus."""
 
 
-@dataclass(frozen=True, slots=True)
-class BitProgress:
+class BitProgress(msgspec.Struct, frozen=True):
     """What a display shows while a test runs."""
 
     phase: Phase
@@ -197,8 +198,7 @@ def requester_of(bus_map: BusMap, protocol: RequestProtocol) -> Requester:
     return UdsClient(bus_map.uds_identifiers)
 
 
-@dataclass(frozen=True, slots=True)
-class RequestOutcome:
+class RequestOutcome(msgspec.Struct, frozen=True):
     """How the request ended."""
 
     complete: bool

@@ -6,7 +6,8 @@ import contextlib
 import struct
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple
+
+import msgspec
 
 from firmware_iface.bus_map import BusMap
 from firmware_iface.codec import Encoder
@@ -35,7 +36,7 @@ COMMAND_SCALE = 1e-9
 """SI value of one step of the measured commands."""
 
 
-class _Entry(NamedTuple):
+class _Entry(msgspec.Struct, frozen=True):
     """A measurement in an ODT, or the first byte of one."""
 
     measurement: Measurement

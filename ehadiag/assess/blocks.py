@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +26,7 @@ SIGNS = {"GQF": -1.0}
 """Sign of the severity that does what more of a datum does, where it is not +1."""
 
 
-class BlockRules(NamedTuple):
+class BlockRules(msgspec.Struct, frozen=True):
     """Which sample is of which block."""
 
     slew_share: float = 0.1
@@ -154,7 +154,7 @@ def words_of_pulls(pulls: Mapping[str, Mapping[str, float]]) -> str:
     return "not explained, in severities: " + "; ".join(parts)
 
 
-class StepRules(NamedTuple):
+class StepRules(msgspec.Struct, frozen=True):
     """Break-aways of the spool in slow ramps."""
 
     noise_stds: float = 5.0

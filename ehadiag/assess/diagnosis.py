@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
+import msgspec
 import numpy as np
 
 from ehadiag.assess.acceptance import (
@@ -79,8 +79,7 @@ from firmware_iface.recording import Recording
 from firmware_iface.stored_test import StoredTest
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Diagnosis:
+class Diagnosis(msgspec.Struct, frozen=True, eq=False):
     """Verdict on one actuator, and all that led to it."""
 
     recordings: tuple[Recording, ...]

@@ -10,10 +10,10 @@ of dirty pictures, J. R. Statist. Soc. B 48(3), 1986).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
@@ -96,7 +96,7 @@ def _widened_estimate(item: Estimate, hidden: Sequence[str]) -> Estimate:
     return replace(item, std=std, interval95=interval95(item.value, std))
 
 
-class ReconstructionRules(NamedTuple):
+class ReconstructionRules(msgspec.Struct, frozen=True):
     """Search for lost positions and misplaced rows."""
 
     response_ticks: int = 30
@@ -130,8 +130,7 @@ class ReconstructionRules(NamedTuple):
 RECONSTRUCTION = ReconstructionRules()
 
 
-@dataclass(frozen=True, slots=True)
-class SampleChange:
+class SampleChange(msgspec.Struct, frozen=True):
     """A lost jack position that is filled in, or rows of samples moved by some ticks."""
 
     begin: int

@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from ehadiag.assess.acceptance import is_explained_by_discrepancy_alone
@@ -147,7 +147,7 @@ def _limit(item: Effect) -> str:
 CULPRIT_SIGNALS = ("spool", "pressure")
 
 
-class SuspectSearch(NamedTuple):
+class SuspectSearch(msgspec.Struct, frozen=True):
     """Search for parameters that would explain a recording."""
 
     difference: float = 0.2

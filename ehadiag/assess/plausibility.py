@@ -9,8 +9,8 @@ actuator is refused too: a search would take minutes and explain the recording b
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from ehadiag.assess.response_checks import TRAVEL_SPAN_S, median_of_three
@@ -36,8 +36,7 @@ UNIT_ERROR_FACTORS: tuple[tuple[float, str], ...] = (
 """Measured over true value, and what makes that."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelRelation:
+class ChannelRelation(msgspec.Struct, frozen=True):
     """Slope of one channel over another, as measured, over what the actuator's data say."""
 
     upper: str

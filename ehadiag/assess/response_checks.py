@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
@@ -46,7 +46,7 @@ def identified_response(experiment: Experiment, identification: Identification) 
     )
 
 
-class DelayRegression(NamedTuple):
+class DelayRegression(msgspec.Struct, frozen=True):
     """Regression of delays, and fit of the position sensor."""
 
     rounding_ticks: float = 0.15
@@ -69,8 +69,7 @@ class DelayRegression(NamedTuple):
 DELAYS = DelayRegression()
 
 
-@dataclass(frozen=True, slots=True)
-class Delay:
+class Delay(msgspec.Struct, frozen=True):
     """Delay of a signal's samples."""
 
     name: str
@@ -205,8 +204,7 @@ TRAVEL_SPAN_S = 0.1
 """Span over which measured and modelled travel of the jack are compared, s."""
 
 
-@dataclass(frozen=True, slots=True)
-class PositionFit:
+class PositionFit(msgspec.Struct, frozen=True):
     """Measured travel of the jack against the modelled one."""
 
     gain: float

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.identify.estimates import interval95
@@ -28,7 +28,7 @@ from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 __all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
 
 
-class InstantRules(NamedTuple):
+class InstantRules(msgspec.Struct, frozen=True):
     """Estimation of sampling instants."""
 
     rounds: int = 3
@@ -61,8 +61,7 @@ class InstantRules(NamedTuple):
 INSTANTS = InstantRules()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SampledTest:
+class _SampledTest(msgspec.Struct, frozen=True, eq=False):
     """An experiment whose samples an acquisition took within the control ticks."""
 
     experiment: Experiment
@@ -104,8 +103,7 @@ class _SampledTest:
         return self.experiment.constants.DLY - self.acquired.lead + before
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Clock:
+class _Clock(msgspec.Struct, frozen=True, eq=False):
     """Ticks on the acquisition's clock: lead (s) and drift (1) later than they were found."""
 
     lead: float = 0.0
@@ -121,7 +119,7 @@ class _Clock:
         return (taken.acquired.lead + self.lead) % taken.experiment.tick
 
 
-class _Samples(NamedTuple):
+class _Samples(msgspec.Struct, frozen=True):
     """One sample of spool and pressure for each tick."""
 
     value: Array
@@ -193,8 +191,7 @@ class _Response:
         return value, slope / self._step
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
+class _Fit(msgspec.Struct, frozen=True, eq=False):
     """Severities and clock, and what they leave of the samples."""
 
     severities: Array
@@ -219,7 +216,7 @@ class _Fit:
         return cls(severities, clock, samples, model, slope, cost)
 
 
-class _Step(NamedTuple):
+class _Step(msgspec.Struct, frozen=True):
     severities: Array
     """Change of the severities, shape (k,)."""
     lead: float

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from statistics import NormalDist
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import VERDICT
@@ -42,8 +43,7 @@ class VerdictRule(StrEnum):
     """The estimates alone."""
 
 
-@dataclass(frozen=True, slots=True)
-class Levels:
+class Levels(msgspec.Struct, frozen=True):
     """Levels of a severity, 0 … 1, and the rule by which it is compared with them.
 
     Levels that are not 0 < advisory < limit <= 1 raise ConfigurationError.

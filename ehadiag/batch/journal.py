@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import msgspec
 
@@ -58,7 +58,7 @@ LogKey = tuple[int, str, int, int]
 """Place of the setup that found it; path, size and time of the last change of a log."""
 
 
-class _StoredLine(NamedTuple):
+class _StoredLine(msgspec.Struct, frozen=True):
     """A result that an earlier call left."""
 
     log: str

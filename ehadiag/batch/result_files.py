@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import msgspec
 
@@ -206,7 +206,7 @@ def _ends_as_parquet(file: BinaryIO, size: int) -> bool:
     return RESULTS_SCHEMA_MARK in file.read(PARQUET_FOOTER_BYTES)
 
 
-class TableFormat(NamedTuple):
+class TableFormat(msgspec.Struct, frozen=True):
     """A format of tables with one row a result."""
 
     write: Callable[[str], AbstractContextManager[ResultSink]]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from ehadiag import __version__
 from ehadiag.core.conventions import fingerprint, start_text
 from ehadiag.result import ListedTest
 from ehadiag.setup import log_of
@@ -78,11 +79,9 @@ def _listed(item: Recording, number: int) -> ListedTest:
 
 def _index_name(setup: Setup, files: tuple[PathLike, ...]) -> str:
     """Name of an index, of all that a list depends on: files, meaning, tests, version."""
-    from importlib.metadata import version  # noqa: PLC0415 - reads a file
-
     sources, request, budget = setup.sources, setup.request, setup.budget
     content = (
-        version("ehadiag"),
+        __version__,
         [log_of(path) for path in files],
         (sources.tests_sha256, sources.columns_sha256, sources.mapping.sha256),
         fingerprint(setup.actuator.controller),

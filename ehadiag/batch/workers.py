@@ -8,9 +8,10 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
 
 from ehadiag.batch.result_files import is_result_table
 from ehadiag.core.conventions import SIGNAL_FILE_SUFFIXES
@@ -25,8 +26,7 @@ MAX_LIST_BYTES = 64 << 20
 """A list of a hundred thousand long names is a tenth of it."""
 
 
-@dataclass(frozen=True, slots=True)
-class LogInput:
+class LogInput(msgspec.Struct, frozen=True):
     """One recording to diagnose."""
 
     name: str

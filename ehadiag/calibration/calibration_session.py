@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
 from functools import partial
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.assess.acceptance import (
@@ -58,8 +58,7 @@ __all__ = [
 NOTE_HARDLY_SHOWN = "the recordings hardly show it: little is known but its usual size"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LearnedParameters:
+class LearnedParameters(msgspec.Struct, frozen=True, eq=False):
     """What was learned of the unit's own parameters.
 
     Attributes

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.core.actuator import Actuator, SecondStage
@@ -60,8 +59,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class CalibratedValue:
+class CalibratedValue(msgspec.Struct, frozen=True):
     """One thing that was learned of the unit; SI."""
 
     name: str
@@ -77,8 +75,7 @@ class CalibratedValue:
     """Whether the recordings show it: else little is known but its usual size."""
 
 
-@dataclass(frozen=True, slots=True)
-class TriedModel:
+class TriedModel(msgspec.Struct, frozen=True):
     """A model that was tried."""
 
     words: str
@@ -88,8 +85,7 @@ class TriedModel:
     """Bayesian information criterion, less the best one's."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibrated:
+class Calibrated(msgspec.Struct, frozen=True, eq=False):
     """A calibration, or why there is none."""
 
     recordings: tuple[Recording, ...]
@@ -118,7 +114,7 @@ PLAYS_OF_SMOOTH_HYSTERESIS = 8
 """Plays of a smooth hysteresis: more of them do the same within the noise."""
 
 
-class SearchRules(NamedTuple):
+class SearchRules(msgspec.Struct, frozen=True):
     """Budgets of the searches of a calibration, and what leads to another search."""
 
     max_runs: int = 4000
@@ -154,7 +150,7 @@ class SearchRules(NamedTuple):
     break-aways."""
 
 
-class CalibrationCriteria(NamedTuple):
+class CalibrationCriteria(msgspec.Struct, frozen=True):
     """What a calibration needs, and what it may leave."""
 
     min_recordings: int = 2
@@ -226,8 +222,7 @@ NEARLY_NEW_PRIOR = ParameterPrior(0.02, 0.05)
 """A severity of a unit that is said to be as new."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnitModel:
+class UnitModel(msgspec.Struct, frozen=True):
     """One class of actuator.
 
     Attributes
@@ -295,8 +290,7 @@ class UnitModel:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LearnedModel:
+class LearnedModel(msgspec.Struct, frozen=True, eq=False):
     """What recordings say if a model holds.
 
     Attributes

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
 
 from ehadiag.api import compile_kernels
 from ehadiag.batch.journal import ResultJournal
@@ -172,8 +174,7 @@ def _unexpected(setup: Setup, log: str, error: Exception) -> Result:
     return setup.failure(log, text, InputOutputError.exit_code)
 
 
-@dataclass(frozen=True, slots=True)
-class _BatchTask:
+class _BatchTask(msgspec.Struct, frozen=True):
     """One recording to diagnose for one of the actuators on its bus."""
 
     unit: int
@@ -274,6 +275,9 @@ class _BatchRun:
                     raise  # nothing else is lost, and the place is shown
                 self._fail(_unexpected(setup, item.name, error))
                 continue
+            if at == 0:
+                # Printing's libraries take 25 ms to load, beside kernels that need no interpreter.
+                threading.Thread(target=self._results.load, daemon=True).start()
             for recording, log in reading.each():
                 found, code = diagnose_and_deliver(
                     setup, self._results, [recording], reading.files, [log], reading.seconds

@@ -8,9 +8,10 @@ from __future__ import annotations
 import argparse
 import os
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from ehadiag.cli import options
 from ehadiag.cli.options import positive_count
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
     from firmware_iface.transport.base import Transport
 
 
-@dataclass(frozen=True, slots=True)
-class ActuatorArguments:
+class ActuatorArguments(msgspec.Struct, frozen=True):
     """One of the actuators that a command line names."""
 
     arguments: argparse.Namespace

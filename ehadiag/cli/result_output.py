@@ -11,8 +11,9 @@ import errno
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli.defaults import DEFAULTS_FILE_NAME, user_defaults_file
@@ -40,8 +41,7 @@ RESULT_SUFFIXES = (".json", ".png", ".html")
 """Suffixes of the files that an output folder has for each result."""
 
 
-@dataclass(frozen=True, slots=True)
-class OutputFile:
+class OutputFile(msgspec.Struct, frozen=True):
     """A file that a call is to write whole, and by which option it was named."""
 
     option: str

@@ -8,7 +8,6 @@ of the cache folder, else one is compiled into it. All levels of a processor giv
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import hashlib
 import json
 import os
@@ -21,6 +20,8 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Kernel
 from ehadiag.compile.sources import (
@@ -274,7 +275,7 @@ def object_file(wanted: ObjectFile) -> bytes:
     blank = {name: _placeholder(name, len(numbers)) for name, numbers in wanted.tables.items()}
     code = cached(
         f"export-{KERNEL_DIGEST(repr(made_by).encode()).hexdigest()[:16]}.kernel",
-        lambda: object_code(dataclasses.replace(wanted, tables=blank)),
+        lambda: object_code(replace(wanted, tables=blank)),
     )
     for name, numbers in wanted.tables.items():
         code = _with_table(code, blank[name], numbers)

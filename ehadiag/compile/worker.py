@@ -5,44 +5,40 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
+
+import msgspec
 
 from firmware_iface.errors import ConfigurationError, EhadiagError, install_command
 
 
-@dataclass(frozen=True, slots=True)
-class PointerArgument:
+class PointerArgument(msgspec.Struct, frozen=True):
     """Argument of a C function whose address the kernel is given."""
 
 
-@dataclass(frozen=True, slots=True)
-class DoublesArgument:
+class DoublesArgument(msgspec.Struct, frozen=True):
     """Argument of a C function that points to doubles, which the kernel is given as a tuple."""
 
     count: int
     """How many; 1: a number, not a tuple."""
 
 
-@dataclass(frozen=True, slots=True)
-class TableArgument:
+class TableArgument(msgspec.Struct, frozen=True):
     """Not an argument of the C function: the kernel is given the address of constants."""
 
     name: str
     """Of the table."""
 
 
-@dataclass(frozen=True, slots=True)
-class SlotArguments:
+class SlotArguments(msgspec.Struct, frozen=True):
     """The only argument of a C function that points to all of the kernel's (`ehadiag.compile.jit`).
 
     The result is written to the first slot.
     """
 
 
-@dataclass(frozen=True, slots=True)
-class CFunction:
+class CFunction(msgspec.Struct, frozen=True):
     """A C function, `int name(pointer, …)`, and the kernel behind it."""
 
     name: str
@@ -54,8 +50,7 @@ class CFunction:
     """In the order of the kernel's."""
 
 
-@dataclass(frozen=True, slots=True)
-class Processor:
+class Processor(msgspec.Struct, frozen=True):
     """What code is emitted for, in LLVM's names."""
 
     triple: str
@@ -79,17 +74,16 @@ class Processor:
     """Whether code may be large: loops are unrolled and vectorised."""
 
 
-@dataclass(frozen=True, slots=True)
-class ObjectFile:
+class ObjectFile(msgspec.Struct, frozen=True):
     """An object file to be made."""
 
     functions: Sequence[CFunction]
     """The C functions in it."""
     processor: Processor
     """The target."""
-    tables: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    tables: Mapping[str, Sequence[float]] = msgspec.field(default_factory=dict)
     """Constants by name."""
-    replaced: Mapping[str, Any] = field(default_factory=dict)
+    replaced: Mapping[str, Any] = msgspec.field(default_factory=dict)
     """Functions of one number of the C library, and the kernels that stand for them."""
     allowed: frozenset[str] = frozenset()
     """What else of the C library the code may call."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -353,7 +352,7 @@ def load_actuator(path: Path | str) -> Actuator:
 
 def default_actuator() -> Actuator:
     """Return the reference actuator, which comes with the package."""
-    text = resources.files("ehadiag").joinpath("data/actuator.toml").read_bytes()
+    text = Path(__file__).parents[1].joinpath("data/actuator.toml").read_bytes()
     return _checked(decode_toml(text, Actuator, "bundled actuator.toml"), "bundled actuator.toml")
 
 

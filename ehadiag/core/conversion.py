@@ -5,11 +5,11 @@ What the mapping states comes first, then the actuator file, then the step that 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, ConverterSpec
@@ -23,7 +23,7 @@ from firmware_iface.recording import (
 )
 
 
-class StepLimits(NamedTuple):
+class StepLimits(msgspec.Struct, frozen=True):
     """Limits by which the step of a converter shows in its values."""
 
     levels: int = 30

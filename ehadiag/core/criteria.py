@@ -9,13 +9,14 @@ Recorded units: `tools/study recorded-units`; random units: `tools/study units`;
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import NamedTuple
+
+import msgspec
 
 NOISE_OUTLIER_SHARE = 2.0 * NormalDist().cdf(-3.0)
 """Share of residuals of noise alone beyond three deviations, 1: 0.0027."""
 
 
-class VerdictCriteria(NamedTuple):
+class VerdictCriteria(msgspec.Struct, frozen=True):
     """Chances that decide a verdict."""
 
     max_chance_false_healthy: float = 0.025
@@ -34,7 +35,7 @@ class VerdictCriteria(NamedTuple):
 VERDICT = VerdictCriteria()
 
 
-class RecordingCriteria(NamedTuple):
+class RecordingCriteria(msgspec.Struct, frozen=True):
     """Limits of a recording that can be judged."""
 
     max_frame_delay_s: float = 0.05
@@ -74,7 +75,7 @@ class RecordingCriteria(NamedTuple):
 RECORDING = RecordingCriteria()
 
 
-class ReadingCriteria(NamedTuple):
+class ReadingCriteria(msgspec.Struct, frozen=True):
     """Limits of plausible units, signs, motion and actuator data."""
 
     max_reading_factor: float = 10.0
@@ -103,7 +104,7 @@ class ReadingCriteria(NamedTuple):
 READINGS = ReadingCriteria()
 
 
-class FitCriteria(NamedTuple):
+class FitCriteria(msgspec.Struct, frozen=True):
     """Limits of residuals that count as explained, and signs of what explains the others."""
 
     max_outlier_share: float = 0.015
@@ -168,7 +169,7 @@ class FitCriteria(NamedTuple):
 FIT = FitCriteria()
 
 
-class GiveUpCriteria(NamedTuple):
+class GiveUpCriteria(msgspec.Struct, frozen=True):
     """Residuals after which a search is repeated, ends, or is given up."""
 
     outliers: tuple[float, ...] = (0.3, 0.05)
@@ -225,7 +226,7 @@ class GiveUpCriteria(NamedTuple):
 GIVE_UP = GiveUpCriteria()
 
 
-class ResponseCriteria(NamedTuple):
+class ResponseCriteria(msgspec.Struct, frozen=True):
     """Limits of position sensor, supply and delays against the identified response."""
 
     min_travel_share: float = 0.25
@@ -272,7 +273,7 @@ class ResponseCriteria(NamedTuple):
 RESPONSE = ResponseCriteria()
 
 
-class LossCriteria(NamedTuple):
+class LossCriteria(msgspec.Struct, frozen=True):
     """Limits of lost and misplaced samples."""
 
     max_guessed_share: float = 0.015

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
-from typing import NamedTuple
+
+import msgspec
 
 
 def _capped_variance(deviations: float) -> float:
@@ -14,7 +15,7 @@ def _capped_variance(deviations: float) -> float:
     return 1.0 - 2.0 * deviations * normal.pdf(deviations) / inside
 
 
-class EstimationRules(NamedTuple):
+class EstimationRules(msgspec.Struct, frozen=True):
     """Noise, cost and uncertainty of residuals; those of a refinement are `RefinementRules`."""
 
     noise_lsb: float = math.sqrt(0.5**2 + 1.0 / 12.0)
@@ -53,7 +54,7 @@ class EstimationRules(NamedTuple):
 ESTIMATION = EstimationRules()
 
 
-class RefinementRules(NamedTuple):
+class RefinementRules(msgspec.Struct, frozen=True):
     """A round that narrows a density, see `ehadiag.identify.posterior`."""
 
     cross_variances: float = 3.0
@@ -78,7 +79,7 @@ class RefinementRules(NamedTuple):
 REFINEMENT = RefinementRules()
 
 
-class AnchorRules(NamedTuple):
+class AnchorRules(msgspec.Struct, frozen=True):
     """Re-anchoring of the modelled spool on the measured one."""
 
     gain: float = 0.3

@@ -6,8 +6,6 @@ A variant has segments that are longer or shorter, larger or smaller, faster or 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -25,7 +23,7 @@ from firmware_iface.stored_test import (
 )
 
 
-class VariantRules(NamedTuple):
+class VariantRules(msgspec.Struct, frozen=True):
     """Bounds of the variants of a test, and the search among them."""
 
     length_factors: tuple[float, float] = (0.5, 2.0)
@@ -47,8 +45,7 @@ PENALTY_BEYOND_LIMITS = 1e3
 """Figure, 1, of a test beyond its limits, plus the excess, which leads the search back."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class VariantSpace:
+class VariantSpace(msgspec.Struct, frozen=True, eq=False):
     """Variants of a test as points: logarithms of factors, 0 for the test itself."""
 
     test: StoredTest
@@ -133,8 +130,7 @@ def _rounded_number(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-@dataclass(frozen=True, slots=True)
-class MotionLimits:
+class MotionLimits(msgspec.Struct, frozen=True):
     """Largest motion, pressure and duration of a test."""
 
     travel: float
@@ -157,8 +153,7 @@ class MotionLimits:
         return max(max(shares) - 1.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Proposal:
+class Proposal(msgspec.Struct, frozen=True, eq=False):
     """A test that was found."""
 
     test: StoredTest

@@ -8,8 +8,8 @@ unknown.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +27,7 @@ from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
 from firmware_iface.stored_test import StoredTest
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlayedTest:
+class PlayedTest(msgspec.Struct, frozen=True, eq=False):
     """A test as an actuator would answer it."""
 
     experiment: Experiment
@@ -106,8 +105,7 @@ SCORED_SEVERITIES = ((0.05, 0.05, 0.05), (0.3, 0.3, 0.3), (0.6, 0.6, 0.6))
 """Severities at which a test is scored: nearly as new, degraded, worn."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Bound:
+class Bound(msgspec.Struct, frozen=True, eq=False):
     """The Cramér-Rao bound at one point, all other unknowns free."""
 
     severities: tuple[float, ...]
@@ -122,8 +120,7 @@ class Bound:
     """Parameters of which the test shows nothing."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Score:
+class Score(msgspec.Struct, frozen=True, eq=False):
     """What a test shows, and what it asks of the actuator."""
 
     bounds: tuple[Bound, ...]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.metadata import version
 
+from ehadiag import __version__
 from ehadiag.core.actuator import Actuator
 from ehadiag_sim.scales import scales_of
 from firmware_iface.bus_map import BusMap
@@ -104,7 +104,7 @@ def a2l_text(actuator: Actuator, bus_map: BusMap, ids: XcpIds) -> str:
         (
             "ASAP2_VERSION 1 61",
             f'/begin PROJECT {IDENTITY} "flight-control computer of an electrohydraulic actuator"',
-            f'  /begin HEADER "written by ehadiag {version("ehadiag")}"',
+            f'  /begin HEADER "written by ehadiag {__version__}"',
             "  /end HEADER",
             f'  /begin MODULE {IDENTITY} ""',
             INTERFACE_DATA.replace("@COMMANDS@", _listed(Command)),

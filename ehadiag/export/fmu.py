@@ -9,10 +9,11 @@ import sys
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib import metadata
 from typing import Any, Final
 
+import msgspec
+
+from ehadiag import __version__
 from ehadiag.compile.elementary import C_FUNCTIONS, ROUNDING_FUNCTIONS
 from ehadiag.compile.libraries import object_file
 from ehadiag.compile.worker import (
@@ -56,8 +57,7 @@ from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import Folder
 
 
-@dataclass(frozen=True, slots=True)
-class FmuVariable:
+class FmuVariable(msgspec.Struct, frozen=True):
     """A number that a unit shows to its master."""
 
     name: str
@@ -110,7 +110,7 @@ def model_description(
             "modelName": model,
             "instantiationToken" if three else "guid": token,
             "description": meaning,
-            "generationTool": f"ehadiag {metadata.version('ehadiag')}",
+            "generationTool": f"ehadiag {__version__}",
             "variableNamingConvention": "flat",
         },
     )
@@ -177,8 +177,7 @@ FMU_BINARY_FOLDERS: Final = {
 """Folder of the binary in FMI 2.0 and 3.0."""
 
 
-@dataclass(frozen=True, slots=True)
-class _FmuModel:
+class _FmuModel(msgspec.Struct, frozen=True):
     """What is packed into a unit."""
 
     name: str
@@ -195,7 +194,7 @@ class _FmuModel:
     """Numbers that an instance keeps."""
     hooks: str
     """`eha_start` and `eha_tick_once`, in C."""
-    allowed: frozenset[str] = field(default_factory=frozenset)
+    allowed: frozenset[str] = msgspec.field(default_factory=frozenset)
     """What of the C library its code may call."""
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from importlib import metadata, resources
+from importlib import resources
 from string import Template
 from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from ehadiag import __version__
 from ehadiag.compile.elementary import (
     C_FUNCTIONS,
     ROUNDING_FUNCTIONS,
@@ -145,7 +146,7 @@ def export_library(
         )
     )
     library = static_library("eha.o", code, [item.name for item in EXPORTED_FUNCTIONS])
-    names = {"version": metadata.version("ehadiag"), "target": target.name}
+    names = {"version": __version__, "target": target.name}
     files = {
         STATIC_LIBRARY_FILE: library,
         HEADER_FILE: _library_header(actuator, target, design, hours, plan, names),
@@ -255,7 +256,7 @@ def make_manifest(files: Mapping[str, bytes], **facts: Any) -> bytes:
     """Describe in JSON files by name, the versions that made them, and further facts."""
     content = {
         "schema": EXPORT_SCHEMA,
-        "versions": {"ehadiag": metadata.version("ehadiag"), **tool_versions()},
+        "versions": {"ehadiag": __version__, **tool_versions()},
         "kernel_sources": source_hash("ehadiag.onboard.c_interface"),
         **facts,
         "files": {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 
 import numpy as np
 
+from ehadiag import __version__
 from ehadiag.assess.acceptance import residual_limits
 from ehadiag.assess.verdict import Levels
 from ehadiag.compile.jit import Array
@@ -62,9 +62,7 @@ def library_plan(
 
 def identity_of(actuator: Actuator, digest: float, *, single: bool = False) -> LibraryIdentity:
     """Identity of a library: digest of its plan."""
-    major, minor, patch = (
-        int(part) for part in re.findall(r"\d+", metadata.version("ehadiag"))[:3]
-    )
+    major, minor, patch = (int(part) for part in re.findall(r"\d+", __version__)[:3])
     version = 1e6 * major + 1e3 * minor + patch
     serial = actuator.calibration.serial if actuator.calibration else None
     return LibraryIdentity(version, digest, float(serial or 0), SMALLEST[single])

@@ -16,8 +16,10 @@ import struct
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+
+import msgspec
+from msgspec.structs import replace
 
 from ehadiag.compile.worker import Processor
 from firmware_iface.errors import ConfigurationError, InputOutputError
@@ -107,8 +109,7 @@ def link_shared(
         return Path(place, name).read_bytes()
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
+class Target(msgspec.Struct, frozen=True):
     """A computer, for the compiler that is in numba and for that of the user."""
 
     name: str

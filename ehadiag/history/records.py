@@ -12,12 +12,13 @@ import math
 import os
 import stat
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.core.conventions import utc_text
 from ehadiag.estimate import Effect, Severity
@@ -66,8 +67,7 @@ def user_history_path() -> Path | None:
     return None
 
 
-@dataclass(frozen=True, slots=True)
-class Usage:
+class Usage(msgspec.Struct, frozen=True):
     """How long a unit had been in use.
 
     Attributes
@@ -101,8 +101,7 @@ class Usage:
         return self.hours is not None or self.cycles is not None
 
 
-@dataclass(frozen=True, slots=True)
-class SourceRecord:
+class SourceRecord(msgspec.Struct, frozen=True):
     """A recording that a diagnosis was made from."""
 
     path: str
@@ -113,8 +112,7 @@ class SourceRecord:
     """Hash of the decoded samples, the same in whatever format they were kept; None without any."""
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(msgspec.Struct, frozen=True):
     """One diagnosis."""
 
     appended: str
@@ -150,8 +148,7 @@ class Entry:
         return self.tested or self.appended
 
 
-@dataclass(frozen=True, slots=True)
-class MaintenanceEvent:
+class MaintenanceEvent(msgspec.Struct, frozen=True):
     """What was done to a unit."""
 
     appended: str
@@ -175,8 +172,7 @@ MAX_DATE_ROUNDING_S = 2.0
 """Time, s, by which formats of logs round dates."""
 
 
-@dataclass(frozen=True, slots=True)
-class _RecordingIdentity:
+class _RecordingIdentity(msgspec.Struct, frozen=True):
     """Identity of a recording, whatever file it is in."""
 
     samples: str

@@ -7,8 +7,7 @@ told the measured current itself is the input.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
+import msgspec
 import numpy as np
 
 from ehadiag.compile.jit import Array
@@ -18,7 +17,7 @@ from firmware_iface.recording import Acquisition, Channels, Samples
 from firmware_iface.stored_test import Controller, StoredTest
 
 
-class CodeLimits(NamedTuple):
+class CodeLimits(msgspec.Struct, frozen=True):
     """Limits by which a current tells the code of the position that it follows."""
 
     linear: float = 0.95

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from statistics import NormalDist
 from types import MappingProxyType
 
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_NOISE_EXCESS, WEAR_EXCESS_FACTOR, FitQuality

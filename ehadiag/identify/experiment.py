@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
@@ -39,7 +39,7 @@ from firmware_iface.recording import (
 from firmware_iface.stored_test import StoredTest, TimeWindow
 
 
-class RestRules(NamedTuple):
+class RestRules(msgspec.Struct, frozen=True):
     """Rest of an actuator before its test."""
 
     displaced_share: float = 0.3e6 / PRESSURE_CHANNEL.full_scale
@@ -79,8 +79,7 @@ class RestRules(NamedTuple):
 REST = RestRules()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Experiment:
+class Experiment(msgspec.Struct, frozen=True, eq=False):
     """One recorded test, ready for identification; arrays of shape (n,)."""
 
     test: StoredTest
@@ -119,7 +118,7 @@ class Experiment:
     """Standard deviation of supply less return pressure by the bus's steps, Pa."""
     acquired: Acquisition | None = None
     """How the samples were measured separately; None: they are the computer's own."""
-    sampled: Array = field(default_factory=lambda: np.empty(0))
+    sampled: Array = msgspec.field(default_factory=lambda: np.empty(0))
     """When the channels of `acquired` were sampled, s on its clock; empty without it."""
 
     @property

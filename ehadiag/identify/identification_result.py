@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from ehadiag.compile.jit import Array
@@ -13,8 +13,7 @@ from ehadiag.model.plant import PlantConstants
 from ehadiag.model.registry import SENSOR_OFFSETS, Unknowns, parameter
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(msgspec.Struct, frozen=True):
     """One severity as each stage left it."""
 
     name: str
@@ -32,8 +31,7 @@ class Estimate:
     """Whether the test shows this fault at all."""
 
 
-@dataclass(frozen=True, slots=True)
-class Nuisance:
+class Nuisance(msgspec.Struct, frozen=True):
     """An effect of the installation, as estimated; SI."""
 
     value: float
@@ -42,8 +40,7 @@ class Nuisance:
     """The estimate stands at a bound."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(msgspec.Struct, frozen=True):
     """How well the model explains the recording."""
 
     spool_rms: float
@@ -70,8 +67,7 @@ class Fit:
     the capped one where a few samples are far off."""
 
 
-@dataclass(frozen=True, slots=True)
-class IdentificationTiming:
+class IdentificationTiming(msgspec.Struct, frozen=True):
     """Seconds spent."""
 
     first: float
@@ -79,8 +75,7 @@ class IdentificationTiming:
     refine: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Identification:
+class Identification(msgspec.Struct, frozen=True, eq=False):
     """Faults of the actuator as the recordings show them."""
 
     estimates: tuple[Estimate, ...]
@@ -108,7 +103,7 @@ class Identification:
     friction_range: tuple[float, float] | None = None
     """Least and largest `FSS` by the exponents of clogging that the actuator file allows; None
     where it states one."""
-    response: Mapping[str, float] = field(default_factory=dict)
+    response: Mapping[str, float] = msgspec.field(default_factory=dict)
     """What the identified response has in place of estimates that are of a range, by name, SI."""
 
     def named(self, name: str) -> Estimate:

@@ -8,11 +8,12 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
@@ -80,8 +81,7 @@ class NuisanceMode(Enum):
     """From the start."""
 
 
-@dataclass(frozen=True, slots=True)
-class InterimEstimate:
+class InterimEstimate(msgspec.Struct, frozen=True):
     """Severities as a test that still runs shows them."""
 
     stage: str

@@ -7,9 +7,10 @@ in steps, in the last round.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
@@ -37,8 +38,7 @@ from ehadiag.model.severities import SEARCH_STDS
 SEARCH_OPTIMUM_STD = np.array(SEARCH_STDS)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Refinement:
+class Refinement(msgspec.Struct, frozen=True, eq=False):
     """Optimum of the robust least squares; k parameters, N ticks."""
 
     parameters: tuple[Parameter, ...]
@@ -68,7 +68,7 @@ class Refinement:
     """How often the model was re-anchored at the optimum."""
     information: Array | None = None
     """What was known beforehand: inverse covariance, in units of `scale`; shape (k, k)."""
-    daily: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    daily: Array = msgspec.field(default_factory=lambda: np.zeros((0, 0, 0)))
     """As `considered`, of those that the last round moved; shape (d, signals, N)."""
 
     @property

@@ -8,10 +8,10 @@ Bruyninckx, De Schutter, IEEE Trans. Automatic Control 47(8), 2002).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
@@ -20,7 +20,7 @@ from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
 
 
-class DifferenceRules(NamedTuple):
+class DifferenceRules(msgspec.Struct, frozen=True):
     """Differences of residuals at a point."""
 
     step: float = 5e-5
@@ -43,8 +43,7 @@ class DifferenceRules(NamedTuple):
 DIFFERENCES = DifferenceRules()
 
 
-@dataclass(frozen=True, slots=True)
-class ConsideredParameter:
+class ConsideredParameter(msgspec.Struct, frozen=True):
     """A parameter with a narrow density about 0.
 
     That of a day moves in the last round alone; that of an instant is held, and its uncertainty
@@ -61,8 +60,7 @@ class ConsideredParameter:
     to bend: what it does is worked out from how fast they change, without a run of the model."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResidualSlope:
+class ResidualSlope(msgspec.Struct, frozen=True, eq=False):
     """Residuals at a point and how they change about it."""
 
     x: Array
@@ -254,8 +252,7 @@ MIN_SINGULAR_RATIO = 1e-6
 """Singular value, over the largest, below which a direction is not seen."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ParameterDensity:
+class ParameterDensity(msgspec.Struct, frozen=True, eq=False):
     """A normal density of the parameters."""
 
     x: Array
@@ -265,8 +262,7 @@ class ParameterDensity:
     c)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearModel:
+class LinearModel(msgspec.Struct, frozen=True, eq=False):
     """Residuals as a linear function about a point."""
 
     x: Array
@@ -340,8 +336,7 @@ def linearised_on_cross(model: Derivatives, density: ParameterDensity) -> Linear
     return cross.lines(model, model.many(cross.points))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoordinateCross:
+class CoordinateCross(msgspec.Struct, frozen=True, eq=False):
     """Points of `linearised_on_cross`: the mean of a density, and two on each coordinate."""
 
     points: Array

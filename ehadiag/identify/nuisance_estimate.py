@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
@@ -65,8 +66,7 @@ AMBIGUOUS_STDS = {name: law.ambiguous_std for name, law in FAULT_LAWS.items()}
 LinearisationMethod = Callable[[Derivatives, ParameterDensity], LinearModel]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NuisanceEstimate:
+class NuisanceEstimate(msgspec.Struct, frozen=True, eq=False):
     """Estimate of the free parameters from recordings."""
 
     refined: Refinement
@@ -234,8 +234,7 @@ def would_effect_explain(effect: Parameter, found: NuisanceEstimate) -> bool:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class NuisanceEstimator:
+class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
     prior: UnitPrior

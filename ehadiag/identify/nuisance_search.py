@@ -7,11 +7,11 @@ recording is explained or further ones will not help.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
@@ -52,7 +52,7 @@ from ehadiag.model.parameter import Parameter
 from ehadiag.model.residual_models import SimdModel
 
 
-class RestartRules(NamedTuple):
+class RestartRules(msgspec.Struct, frozen=True):
     """Restarts of a search."""
 
     spread_share: float = 0.1
@@ -74,8 +74,7 @@ NUISANCE_RUN_BUDGET = 1600
 """Runs of the model after which no further start is made, 1."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StartEnd:
+class StartEnd(msgspec.Struct, frozen=True, eq=False):
     """End of one start."""
 
     x: Array
@@ -83,8 +82,7 @@ class StartEnd:
     cost: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MultistartResult:
+class MultistartResult(msgspec.Struct, frozen=True, eq=False):
     """Best end of a search from several starts."""
 
     density: ParameterDensity
@@ -222,13 +220,12 @@ def _best_along_alias(model: Derivatives, best: MultistartResult, alias: str) ->
 GiveUpTest = Callable[[Array, int], bool]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NuisanceSearchSettings:
+class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     """Parameters that are estimated, their priors, and end of the search."""
 
     free: Sequence[Parameter]
     """Parameters that are estimated."""
-    priors: Mapping[str, ParameterPrior] = field(default_factory=dict)
+    priors: Mapping[str, ParameterPrior] = msgspec.field(default_factory=dict)
     """Priors of some of them by name."""
     joint: JointPrior | None = None
     """Prior of some others together."""
@@ -253,8 +250,7 @@ class NuisanceSearchSettings:
     """See `multistart_search`."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StagedSearchResult:
+class StagedSearchResult(msgspec.Struct, frozen=True, eq=False):
     """Result of a search in stages."""
 
     model: Derivatives

@@ -7,9 +7,10 @@ of the last part leads to the optimum of the whole (a measurement update of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
@@ -53,8 +54,7 @@ CONSIDERED_PARAMETERS = (
 moves fastest."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstPart:
+class FirstPart(msgspec.Struct, frozen=True, eq=False):
     """Optimum on the first part of one or more tests."""
 
     refined: Refinement
@@ -71,8 +71,7 @@ class FirstPart:
         return [item.with_noise(noise) for item, noise in zip(experiments, self.noise, strict=True)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StartResiduals:
+class StartResiduals(msgspec.Struct, frozen=True, eq=False):
     """Residuals of a free-running model on the first parts of the tests at some severities."""
 
     residuals: Array
@@ -299,8 +298,7 @@ def _deviations(normal: Array) -> Array:
     return np.sqrt(np.diag(np.linalg.inv(normal + MIN_LAST_PART_INFORMATION * np.eye(len(normal)))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PartRows:
+class _PartRows(msgspec.Struct, frozen=True, eq=False):
     """Ticks of first and last parts among those of all tests.
 
     spans: s, the last part of each test; none of one that ends too early. first, last: ticks of the

@@ -8,9 +8,10 @@ Särkkä, IEEE Trans. Signal Processing 63(20), 2015).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
@@ -63,8 +64,7 @@ def no_interruption() -> None:
     """Continue a search."""
 
 
-@dataclass(frozen=True, slots=True)
-class SearchSchedule:
+class SearchSchedule(msgspec.Struct, frozen=True):
     """Pace and end of a search that narrows a density."""
 
     least_ratio: float
@@ -103,8 +103,7 @@ FEW_UNKNOWNS_SCHEDULE = SearchSchedule(
 """Schedule for few unknowns: until the estimate is independent of the search before."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PosteriorResult:
+class PosteriorResult(msgspec.Struct, frozen=True, eq=False):
     """Result of a search."""
 
     density: ParameterDensity

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator, Calibration
@@ -32,7 +32,7 @@ SPOOL_OFFSET_ALIAS = "null_bias"
 where it saturates the search may stop at a wrong pair."""
 
 
-class PriorWidths(NamedTuple):
+class PriorWidths(msgspec.Struct, frozen=True):
     """Widths of densities about starts, as shares of the prior's."""
 
     hint: float = 0.1
@@ -46,16 +46,14 @@ class PriorWidths(NamedTuple):
 WIDTHS = PriorWidths()
 
 
-@dataclass(frozen=True, slots=True)
-class ParameterPrior:
+class ParameterPrior(msgspec.Struct, frozen=True):
     """Prior of one parameter: a normal density, in its unit."""
 
     mean: float
     std: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JointPrior:
+class JointPrior(msgspec.Struct, frozen=True, eq=False):
     """Prior of several parameters together: a normal density, in their units."""
 
     names: tuple[str, ...]
@@ -179,8 +177,7 @@ _USUAL = frozenset(item.name for item in REGISTRY if item.basic)
 _FURTHER = frozenset(item.name for item in REGISTRY if item.kind is ParameterKind.NUISANCE) - _USUAL
 
 
-@dataclass(frozen=True, slots=True)
-class DatumAlias:
+class DatumAlias(msgspec.Struct, frozen=True):
     """A datum that is held, and how far it may be off: the severity is off by as much."""
 
     datum: Parameter
@@ -204,21 +201,20 @@ class DatumAlias:
         return float((datum - there)[place] / (fault - there)[place]) * self.std
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UnitPrior:
+class UnitPrior(msgspec.Struct, frozen=True, eq=False):
     """Prior of a unit before a recording of it is seen."""
 
     free: tuple[Parameter, ...] = ()
     """Parameters that are estimated because of it, besides severities and nuisances."""
-    priors: Mapping[str, ParameterPrior] = field(default_factory=dict)
+    priors: Mapping[str, ParameterPrior] = msgspec.field(default_factory=dict)
     """Prior of each of them alone, by name."""
     joint: JointPrior | None = None
     """Prior of several together."""
     aliases: tuple[DatumAlias, ...] = ()
-    about: Mapping[str, float] = field(default_factory=dict)
+    about: Mapping[str, float] = msgspec.field(default_factory=dict)
     """Effects that the unit's constants already have, by name, SI: what is free is a deviation from
     them."""
-    std: Mapping[str, float] = field(default_factory=dict)
+    std: Mapping[str, float] = msgspec.field(default_factory=dict)
     """Further standard deviation of severities by name, 1."""
     explains: ExplanationTest = is_noise
     """Of residuals, shape (signals, N): whether no more is left than of the unit as new."""
@@ -226,7 +222,7 @@ class UnitPrior:
     """Whether a calibration explained the unit as new to the noise."""
     severities: tuple[Parameter, ...] = FAULTS
     """The faults, with the bounds of their search."""
-    discrepancy: Mapping[str, float] = field(default_factory=dict)
+    discrepancy: Mapping[str, float] = msgspec.field(default_factory=dict)
     """Deviation of severities by wrong laws of the faults, by name, over the severity, 1."""
     exponents: tuple[float, float] = (0.0, 0.0)
     """Least and largest exponent of the pressure gain behind a clogged filter, 1."""

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +22,7 @@ from ehadiag.model.registry import SENSOR_OFFSETS, parameter
 from ehadiag.model.residual_models import SimdModel
 
 
-class RingScan(NamedTuple):
+class RingScan(msgspec.Struct, frozen=True):
     """Scan of the oil's stiffness."""
 
     least: float = -0.6
@@ -54,8 +53,7 @@ SPOOL_PARAMETERS = (
 search may have bent it to a wrong phase."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ring:
+class Ring(msgspec.Struct, frozen=True):
     """Stiffness of the oil that explains the ring."""
 
     stiffness: float

@@ -7,10 +7,11 @@ have ended away from the optimum, and further attempts search wider.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.criteria import FIT
@@ -37,8 +38,7 @@ from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
 from ehadiag.model.residual_models import SimdModel
 
 
-@dataclass(frozen=True, slots=True)
-class AttemptPlan:
+class AttemptPlan(msgspec.Struct, frozen=True):
     """How a further attempt searches.
 
     deviation: of the genetic search about its start, severities.
@@ -64,8 +64,7 @@ FULL_WINDOW_PLAN = AttemptPlan(0.02)
 the window."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SeverityAttempt:
+class SeverityAttempt(msgspec.Struct, frozen=True, eq=False):
     """One search and its refinement."""
 
     found: SearchResult

@@ -8,9 +8,8 @@ position.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,7 +82,7 @@ CODE_RESOLUTION_RATIOS = 2.0 ** -np.arange(9)
 """Of the converter's step: those of a computer that calculates in its codes."""
 
 
-class CommandRules(NamedTuple):
+class CommandRules(msgspec.Struct, frozen=True):
     """Reconstruction of commands and currents."""
 
     min_misfit_gain: float = 30.0
@@ -144,8 +143,7 @@ COMMAND_FRAME_TOLERANCE = {
 the converter's half range, 20 µA and 50 µm of the default ones."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CurrentTrace:
+class CurrentTrace(msgspec.Struct, frozen=True, eq=False):
     """Commanded current of each tick."""
 
     current: Array

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.identify import compact_ga
@@ -52,8 +53,7 @@ PYGAD_PARENTS, PYGAD_ELITE, PYGAD_MUTATION_PROBABILITY = 3, 1, 0.8
 """Of pygad: parents of a generation, individuals kept, probability that a gene mutates."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SearchResult:
+class SearchResult(msgspec.Struct, frozen=True, eq=False):
     """Outcome of one global search."""
 
     best: Array
@@ -97,8 +97,7 @@ class Solver(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class CompactGa:
+class CompactGa(msgspec.Struct, frozen=True):
     """The compact genetic algorithm (`ehadiag.identify.compact_ga`)."""
 
     budget: int = 600
@@ -108,7 +107,7 @@ class CompactGa:
     """Individuals drawn a generation."""
     tolerance: float = 1e-6
     """Done when the deviation of every gene is below."""
-    name: str = field(default="cga", init=False)
+    name: ClassVar[str] = "cga"
 
     def with_budget(self, budget: int) -> CompactGa:
         """Return the same kind of solver with another number of evaluations.
@@ -155,8 +154,7 @@ class CompactGa:
         return SearchResult(best, float(state.best[0]), used, len(history), np.array(history))
 
 
-@dataclass(frozen=True, slots=True)
-class PygadGa:
+class PygadGa(msgspec.Struct, frozen=True):
     """pygad's genetic algorithm on the same objective.
 
     The mutation's range shrinks geometrically with the generations, from the deviation to
@@ -167,7 +165,7 @@ class PygadGa:
     population: int = 16
     finest: float = 5e-6
     """Range of the mutation in the last generation."""
-    name: str = field(default="pygad", init=False)
+    name: ClassVar[str] = "pygad"
 
     def with_budget(self, budget: int) -> PygadGa:
         """Return the same solver with another number of evaluations."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +32,7 @@ from ehadiag.model.simd_jack import driven_jack_costs
 from firmware_iface.stored_test import StoredTest, TimeWindow
 
 
-class StageRules(NamedTuple):
+class StageRules(msgspec.Struct, frozen=True):
     """Grids and stages of the global search."""
 
     coarse_points: int = 32
@@ -68,8 +68,7 @@ class StageRules(NamedTuple):
 SEARCH_STAGES = StageRules()
 
 
-@dataclass(frozen=True, slots=True)
-class FirstApproximation:
+class FirstApproximation(msgspec.Struct, frozen=True):
     """Result of the one-dimensional searches."""
 
     values: Mapping[str, float]
@@ -77,8 +76,7 @@ class FirstApproximation:
     evaluations: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstApproximationInputs:
+class FirstApproximationInputs(msgspec.Struct, frozen=True, eq=False):
     """All that the one-dimensional searches look at."""
 
     unknowns: Unknowns
@@ -238,7 +236,7 @@ def _vertex(grid: Array, values: Array, best: int) -> float:
     return float(grid[best] + shift * (grid[1] - grid[0]))
 
 
-class _Creep(NamedTuple):
+class _Creep(msgspec.Struct, frozen=True):
     """Span in which the jack creeps, driven by the spool as it was measured.
 
     test: which of the tests it is of.

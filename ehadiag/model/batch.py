@@ -5,17 +5,16 @@ A candidate is one set of physical constants that may be those of the unit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array, Array2
 
 
-@dataclass(frozen=True, slots=True)
-class Anchor:
+class Anchor(msgspec.Struct, frozen=True):
     """Re-anchoring of the modelled spool and jack on the measured ones, once a tick.
 
     The innovation is filtered, f += gain (e - f); a sample further off than `large` moves the model

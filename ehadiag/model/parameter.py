@@ -8,9 +8,11 @@ name. The ends of the friction scales (FSS1, FDJ1) have no tolerance.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.model.plant import PLANT_FIELDS, ConstantValue, PlantConstants
@@ -50,8 +52,7 @@ class UsualSizes(NamedTuple):
 USUAL = UsualSizes()
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
+class Parameter(msgspec.Struct, frozen=True):
     """One scalar that can be estimated."""
 
     name: str

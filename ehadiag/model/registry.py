@@ -8,9 +8,9 @@ calibration.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -190,8 +190,7 @@ def parameter(name: str) -> Parameter:
 _BY_NAME = {item.name: item for item in REGISTRY}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Unknowns:
+class Unknowns(msgspec.Struct, frozen=True, eq=False):
     """Which parameters are estimated, and about which constants: the space that is searched."""
 
     free: tuple[Parameter, ...]

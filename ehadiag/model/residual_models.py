@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,8 +31,7 @@ from ehadiag.model.simd_residuals import (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ModelResponse:
+class ModelResponse(msgspec.Struct, frozen=True, eq=False):
     """Modelled response of each tick when it is sampled, arrays of shape (n,)."""
 
     spool: Array

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from ehadiag.compile.jit import Array, Array2
@@ -96,8 +96,7 @@ BUS_CAUSES: Final = {
 """Causes that the registry has no name for."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cause:
+class Cause(msgspec.Struct, frozen=True):
     """What may have changed, by how much."""
 
     name: str
@@ -117,8 +116,7 @@ class Cause:
         return f"{short} {size:+.{places}f} ± {error:.{places}f}{unit}"
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(msgspec.Struct, frozen=True):
     """A change that was found."""
 
     causes: tuple[Cause, ...]

@@ -8,8 +8,8 @@ follows Siegmund, Sequential Analysis, Springer 1985, section 2.6.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from ehadiag.compile.jit import Array
@@ -35,8 +35,7 @@ FALSE_ALARM_HOURS_RANGE = (1e-4, 1e7)
 """Range of the mean time between false alarms, h."""
 
 
-@dataclass(frozen=True, slots=True)
-class CusumDesign:
+class CusumDesign(msgspec.Struct, frozen=True):
     """Both in units of the noise."""
 
     reference: float

@@ -10,9 +10,9 @@ large (P. J. Huber, Annals of Mathematical Statistics 35, 1964).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
+import msgspec
 import numpy as np
 
 from ehadiag.compile.jit import Array, Array2
@@ -89,8 +89,7 @@ PAUSE_TICKS: Final = 5
 """Ticks without pressure after the last undecided one, 1: the jack may still stick."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BlockScore:
+class BlockScore(msgspec.Struct, frozen=True, eq=False):
     """Score and information of a block, in steps of the bank."""
 
     score: Array

@@ -9,11 +9,11 @@ weighted answer was off widens or moves the interval (conformal calibration).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtr, ndtri
 
@@ -45,7 +45,7 @@ MIN_SEVERITY = 1e-3
 LIBRARY_NAMES = ("similar lives", "similar lives, own pace")
 
 
-class AveragingRules(NamedTuple):
+class AveragingRules(msgspec.Struct, frozen=True):
     """Settings of the average; chosen on the study's tuned laws (`tools/study prognosis`)."""
 
     max_lives: int = 40
@@ -87,8 +87,7 @@ class AveragingRules(NamedTuple):
 AVERAGING_RULES = AveragingRules()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fleet:
+class Fleet(msgspec.Struct, frozen=True, eq=False):
     """What other lives of a severity say."""
 
     lives: int
@@ -108,7 +107,7 @@ class Fleet:
     """How much of each life each parameter set explains, shape (lives, sets)."""
 
 
-class Passage(NamedTuple):
+class Passage(msgspec.Struct, frozen=True):
     """Distribution of the time to a level."""
 
     quantiles: Array
@@ -204,7 +203,7 @@ def _explained(scores: Array) -> Array:
     return shares
 
 
-class _Questions(NamedTuple):
+class _Questions(msgspec.Struct, frozen=True):
     """Questions with answers; a row each."""
 
     life: NDArray[np.int64]

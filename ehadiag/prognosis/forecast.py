@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.prognosis.averaging import CHANCES, Fleet, learn_fleet, passage_of, surprises
@@ -16,7 +16,7 @@ from ehadiag.prognosis.lives import Life
 __all__ = ["Forecast", "RemainingLife", "forecast", "learn_fleet"]
 
 
-class ForecastRules(NamedTuple):
+class ForecastRules(msgspec.Struct, frozen=True):
     """What a forecast needs, and what raises an alarm."""
 
     min_diagnoses: int = 3
@@ -42,8 +42,7 @@ NOTE_NO_WEAR = "no wear falls; if something was done, append it as an event"
 INTERVAL_CHANCES = (0.1, 0.5, 0.9)
 
 
-@dataclass(frozen=True, slots=True)
-class RemainingLife:
+class RemainingLife(msgspec.Struct, frozen=True):
     """Hours, cycles or days until a severity reaches a level."""
 
     level: float
@@ -66,8 +65,7 @@ class RemainingLife:
         return float(np.interp(time, self.quantiles, CHANCES, left=0.0, right=1.0))
 
 
-@dataclass(frozen=True, slots=True)
-class Forecast:
+class Forecast(msgspec.Struct, frozen=True):
     """The future of one severity of one unit."""
 
     name: str

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,8 +22,7 @@ MIN_RENEWAL_FALL_STDS = 3.0
 """Deviations by which a severity falls where an event that names none renewed it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Life:
+class Life(msgspec.Struct, frozen=True, eq=False):
     """Diagnoses of one severity of a unit since it was new or renewed; shape (diagnoses,) each."""
 
     serial: int

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from ehadiag.history.records import counted_entries, current_utc_text
@@ -29,8 +29,7 @@ MIN_DAYS_FOR_DATES = 7.0
 """Days between first and last diagnosis, from which on use a day is known well enough for dates."""
 
 
-@dataclass(frozen=True, slots=True)
-class Prognosis:
+class Prognosis(msgspec.Struct, frozen=True):
     """Forecasts of one unit."""
 
     serial: int

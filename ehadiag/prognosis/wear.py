@@ -8,9 +8,8 @@ from the filtered state. Equations and literature: docs/explanation/remaining-li
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainc, ndtr
@@ -40,7 +39,7 @@ LAW_NAMES = (
 )  # fmt: skip
 
 
-class Laws(NamedTuple):
+class Laws(msgspec.Struct, frozen=True):
     """Parameter sets of all laws; shape (sets,) each."""
 
     law: NDArray[np.int64]
@@ -128,8 +127,7 @@ def _age(laws: Laws, clock: Array, sets: NDArray[np.int64]) -> Array:
     return np.asarray(np.minimum(at, MAX_CLOCK) ** (1.0 / laws.power[sets]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Filtered:
+class Filtered(msgspec.Struct, frozen=True, eq=False):
     """What the filter knows after each diagnosis; shape (diagnoses, lives, sets) each."""
 
     level: NDArray[np.float32]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import msgspec
 from markupsafe import Markup
 
 from ehadiag.assess.verdict import Verdict
@@ -23,8 +23,7 @@ FLEET_HEAD = (
 WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
+class Cell(msgspec.Struct, frozen=True):
     """One cell of a list."""
 
     text: str
@@ -33,8 +32,7 @@ class Cell:
     kind: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class FleetUnit:
+class FleetUnit(msgspec.Struct, frozen=True):
     """One line of the table."""
 
     serial: int | None

@@ -8,10 +8,11 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
+
+import msgspec
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import display_unit
@@ -26,8 +27,7 @@ INCONCLUSIVE = "INCONCLUSIVE"
 """Word for a test that ran and was identified, but not explained; its verdict is NOT TESTED."""
 
 
-@dataclass(frozen=True, slots=True)
-class Bar:
+class Bar(msgspec.Struct, frozen=True):
     """One severity as it is drawn."""
 
     name: str
@@ -44,8 +44,7 @@ class Bar:
     """Against the levels, in words."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reason:
+class Reason(msgspec.Struct, frozen=True):
     """Why there is no verdict."""
 
     cause: str
@@ -56,8 +55,7 @@ class Reason:
     """What to do; empty: nothing general can be said."""
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class Head(msgspec.Struct, frozen=True):
     """Content of the head of a result."""
 
     word: str
@@ -91,7 +89,7 @@ class Head:
         )
 
 
-class _Explanation(NamedTuple):
+class _Explanation(msgspec.Struct, frozen=True):
     """Plain words for the reasons that a pattern finds."""
 
     pattern: str

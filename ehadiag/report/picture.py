@@ -6,16 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 CurveValues = NDArray[np.float64]
 
 
-class CurveStyle(NamedTuple):
+class CurveStyle(msgspec.Struct, frozen=True):
     """How a curve looks, in the words of bokeh."""
 
     colour: str
@@ -63,8 +63,7 @@ BAND_COLOURS = {
 """Colour of a band by its role."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+class Curve(msgspec.Struct, frozen=True, eq=False):
     """One curve of a panel."""
 
     label: str
@@ -79,8 +78,7 @@ class Curve:
     high: CurveValues | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Band:
+class Band(msgspec.Struct, frozen=True):
     """A span of the horizontal axis with a colour of its own."""
 
     start: float
@@ -90,8 +88,7 @@ class Band:
     label: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ReferenceLine:
+class ReferenceLine(msgspec.Struct, frozen=True):
     """A line across a panel."""
 
     at: float
@@ -101,8 +98,7 @@ class ReferenceLine:
     upright: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Area:
+class Area(msgspec.Struct, frozen=True, eq=False):
     """A filled polygon, such as what a forecast spans."""
 
     role: str
@@ -111,8 +107,7 @@ class Area:
     y: CurveValues
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Panel:
+class Panel(msgspec.Struct, frozen=True, eq=False):
     """Curves over one vertical axis."""
 
     name: str
@@ -186,8 +181,7 @@ class Panel:
         return gap if np.isfinite(gap).any() else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PictureColumn:
+class PictureColumn(msgspec.Struct, frozen=True, eq=False):
     """Panels one below the other over one horizontal axis: the response of one recording."""
 
     title: str
@@ -210,8 +204,7 @@ class PictureColumn:
         return any(len(panel.curves) > 2 for panel in self.panels)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class Picture(msgspec.Struct, frozen=True, eq=False):
     """Columns side by side under one title."""
 
     title: str

@@ -9,11 +9,11 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from ehadiag import __version__
 from ehadiag.assess.verdict import Levels
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def diagnosis_html_page(result: Result, levels: Levels, history: Path | None) ->
     from ehadiag.report.report_pages import diagnosis_page  # noqa: PLC0415 - bokeh is slow
 
     trend = None if history is None else _unit_trend(result, levels, history)
-    page = diagnosis_page(result, levels, version("ehadiag"), current_utc_text(), trend)
+    page = diagnosis_page(result, levels, __version__, current_utc_text(), trend)
     return page.encode("utf-8", errors="backslashreplace")
 
 
@@ -129,7 +129,7 @@ def calibration_html_page(found: Calibrated) -> bytes:
     from ehadiag.history.records import current_utc_text  # noqa: PLC0415
     from ehadiag.report.report_pages import calibration_page  # noqa: PLC0415 - bokeh is slow
 
-    page = calibration_page(found, version("ehadiag"), current_utc_text())
+    page = calibration_page(found, __version__, current_utc_text())
     return page.encode("utf-8", errors="backslashreplace")
 
 

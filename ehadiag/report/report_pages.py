@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -40,8 +39,7 @@ MAX_PAGE_RESPONSES = 4
 """Number of responses drawn: two seconds of processor time, and less than three megabytes."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnitTrend:
+class UnitTrend(msgspec.Struct, frozen=True):
     """The unit's history and prognosis."""
 
     entries: Sequence[Entry]

@@ -10,11 +10,11 @@ import contextlib
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
@@ -90,7 +90,7 @@ def _sensor_law(constants: PlantConstants) -> SensorLaw:
     return law
 
 
-class ResponseSignal(NamedTuple):
+class ResponseSignal(msgspec.Struct, frozen=True):
     """A signal of a response, as people read it."""
 
     key: str

@@ -14,14 +14,15 @@ import math
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from importlib import import_module, resources
-from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 
+from ehadiag import __version__
 from ehadiag.core.conventions import SIGNAL_FILE_KINDS
 from ehadiag.report.picture import CurveValues, Panel, PictureColumn
 from ehadiag.report.response_signals import RESPONSE_SIGNALS, ResponseSignal, response_columns
@@ -88,7 +89,7 @@ def signal_file(result: Result, kind: str) -> bytes:
     return _mdf4(library, result, responses) if kind == "mf4" else _mcap(library, result, responses)
 
 
-class _Trace(NamedTuple):
+class _Trace(msgspec.Struct, frozen=True):
     """One quantity of a signal over time."""
 
     name: str
@@ -104,7 +105,7 @@ class _Event(NamedTuple):
     signal: str
 
 
-class _Response(NamedTuple):
+class _Response(msgspec.Struct, frozen=True):
     """One recording's signals and events."""
 
     source: str
@@ -167,7 +168,7 @@ def _properties(result: Result) -> dict[str, str]:
         low, high = item.interval95 or (None, None)
         out |= {name: item.estimate, f"{name}_std": item.std}
         out |= {f"{name}_low95": low, f"{name}_high95": high}
-    out["ehadiag"] = version("ehadiag")
+    out["ehadiag"] = __version__
     return {name: printable(str(value)) for name, value in out.items() if value not in (None, "")}
 
 
@@ -236,7 +237,7 @@ def _header_comment(properties: dict[str, str]) -> str:
 def _mcap(mcap: Any, result: Result, responses: list[_Response]) -> bytes:
     out = io.BytesIO()
     writer = mcap.Writer(out)
-    writer.start(profile="", library=f"ehadiag {version('ehadiag')}")
+    writer.start(profile="", library=f"ehadiag {__version__}")
     first = min(item.start_ns for item in responses)
     properties = _properties(result)
     log = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(LOG_SCHEMA).encode())

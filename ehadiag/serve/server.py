@@ -11,11 +11,12 @@ import json
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import unquote, urlsplit
+
+import msgspec
 
 from ehadiag.serve.sessions import NO_SNAPSHOT, BusyError, SessionRunner
 from firmware_iface.errors import ConfigurationError, EhadiagError, reason_of
@@ -30,8 +31,7 @@ HTML_CONTENT_TYPE = "text/html; charset=utf-8"
 JSON_CONTENT_TYPE = "application/json"
 
 
-@dataclass(frozen=True, slots=True)
-class Page:
+class Page(msgspec.Struct, frozen=True):
     """What a request gets."""
 
     body: bytes
@@ -40,8 +40,7 @@ class Page:
     """Its Content-Security-Policy."""
 
 
-@dataclass(frozen=True, slots=True)
-class Site:
+class Site(msgspec.Struct, frozen=True):
     """What is served.
 
     pages: gives the page of a path such as `/history/7`; None: there is none; sessions: whose

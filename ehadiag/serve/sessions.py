@@ -17,10 +17,11 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
+
+import msgspec
 
 from ehadiag.core.interruption import (
     INTERRUPTED_EXIT_CODE,
@@ -56,8 +57,7 @@ class Session(NamedTuple):
     """Gives the arguments for a simulated unit with other severities; None: it is a real one."""
 
 
-@dataclass(frozen=True, slots=True)
-class SessionsStatus:
+class SessionsStatus(msgspec.Struct, frozen=True):
     """State of the sessions.
 
     number: counts the changes; snapshot: the newest one, a line of JSON; `null` before the first;

@@ -8,9 +8,11 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+
+import msgspec
+from msgspec.structs import replace
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.live import Snapshot, publish
@@ -38,8 +40,7 @@ Connection = AbstractContextManager[tuple["Transport", "Recorder | None"]]
 """Opens a bus and the recording of its frames; the test closes the recording."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BitSettings:
+class BitSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How a test is run."""
 
     transmit: bool

@@ -14,7 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import msgspec
 
 from ehadiag.api import PathLike, log_if_compiling, setup_for
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
@@ -385,7 +387,7 @@ def check_bus(
     return check_frames(table, setup.bus_map, setup.actuator, setup.tests, source)
 
 
-class SimulatorRun(NamedTuple):
+class SimulatorRun(msgspec.Struct, frozen=True):
     """What the simulated computer did."""
 
     ticks: int

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
+
+import msgspec
+from msgspec.structs import replace
 
 from ehadiag.core.actuator import Actuator
 from firmware_iface.bus_map import BusMap
@@ -20,8 +22,7 @@ BUS_SCHEMA = "ehadiag.bus/1"
 STATUS_ROLE_PREFIXES = ("status.", "command.test_id", "request.")
 
 
-@dataclass(frozen=True, slots=True)
-class BusCheck:
+class BusCheck(msgspec.Struct, frozen=True):
     """Report on the frames of a bus; print it, or `to_dict`."""
 
     source: str
@@ -41,7 +42,7 @@ class BusCheck:
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `check-bus --json`."""
         head = {"schema": BUS_SCHEMA, "source": valid_text(self.source)}
-        return {**head, **asdict(self.report), "test": self.test or None}
+        return {**head, **msgspec.to_builtins(self.report), "test": self.test or None}
 
     def __str__(self) -> str:
         """Return the report as lines of text."""

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import stated_channels
@@ -43,8 +44,7 @@ CUSUM_SIDES = (("spool", "above"), ("spool", "below"), ("pressure", "above"), ("
 ENVIRONMENT_KEYS = ("supply_pressure", "return_pressure", "oil_temperature")
 
 
-@dataclass(frozen=True, slots=True)
-class MonitorAlarm:
+class MonitorAlarm(msgspec.Struct, frozen=True):
     """An alarm as the monitor raises it."""
 
     signal: str

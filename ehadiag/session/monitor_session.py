@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
+
+import msgspec
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, date_text
@@ -24,13 +25,12 @@ if TYPE_CHECKING:
     from firmware_iface.transport.frames import Frame
 
 
-@dataclass(frozen=True, slots=True)
-class AlarmOutlets:
+class AlarmOutlets(msgspec.Struct, frozen=True):
     """Where alarms go, beside the screen; the context finishes them."""
 
-    log: AlarmLog = field(default_factory=AlarmLog)
-    surroundings: AlarmRecorder = field(default_factory=AlarmRecorder)
-    command: AlarmCommand = field(default_factory=AlarmCommand)
+    log: AlarmLog = msgspec.field(default_factory=AlarmLog)
+    surroundings: AlarmRecorder = msgspec.field(default_factory=AlarmRecorder)
+    command: AlarmCommand = msgspec.field(default_factory=AlarmCommand)
 
     def __enter__(self) -> Self:
         return self
@@ -41,8 +41,7 @@ class AlarmOutlets:
         self.log.close()
 
 
-@dataclass(frozen=True, slots=True)
-class MonitorSummary:
+class MonitorSummary(msgspec.Struct, frozen=True):
     """What came of watching a bus."""
 
     alarms: tuple[Alarm, ...]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import MAX_RESULT_BYTES
@@ -20,8 +20,7 @@ STATED_AS_OFFSETS = {item.name for item in SENSOR_OFFSETS}
 """Effects that a result states as offsets of the fit."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnitState:
+class UnitState(msgspec.Struct, frozen=True):
     """Severities, offsets, noise and effects that a monitor starts from."""
 
     source: str
@@ -31,7 +30,7 @@ class UnitState:
     """Offsets of the sensors of spool (m) and pressure (Pa)."""
     noise: tuple[float, float] | None = None
     """Noise of spool (m) and pressure (Pa); None: as specified."""
-    effects: Mapping[str, float] = field(default_factory=dict)
+    effects: Mapping[str, float] = msgspec.field(default_factory=dict)
     """Effects of the unit, by the registry's names; SI."""
     serial: int | None = None
 

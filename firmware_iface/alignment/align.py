@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.episodes import Episode, find_episodes
 from firmware_iface.alignment.frame_faults import (

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.status import (
     START_SCATTER_TICKS,
@@ -24,8 +24,7 @@ MAX_GRID_TICKS = 1_000_000
 END_STATES = (BitState.COMPLETE, BitState.ABORTED)
 
 
-@dataclass(frozen=True, slots=True)
-class Episode:
+class Episode(msgspec.Struct, frozen=True):
     """One test."""
 
     first: int
@@ -46,8 +45,7 @@ class Episode:
     """Why it is not one test on one unit."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Span:
+class _Span(msgspec.Struct, frozen=True):
     """Ticks of a test as one source tells them; `after` and `before` are the idle neighbours."""
 
     start: int

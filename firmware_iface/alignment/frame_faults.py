@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.episodes import Episode
 from firmware_iface.alignment.ticks import TickAxis
@@ -17,8 +18,7 @@ from firmware_iface.recording import BoolArray, FloatArray, IntArray, MessageCou
 from firmware_iface.slow_values import repeated_frames, slow_value_conflict
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Conflicts:
+class Conflicts(msgspec.Struct, frozen=True, eq=False):
     """Frames of one message that were dropped because others had their counter."""
 
     row: IntArray

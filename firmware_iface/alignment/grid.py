@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import msgspec
 import numpy as np
 
 from firmware_iface.alignment.episodes import Episode
@@ -20,8 +19,7 @@ from firmware_iface.recording import (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RowBounds:
+class RowBounds(msgspec.Struct, frozen=True, eq=False):
     """Finds the frames of a span of ticks without going through all of them."""
 
     axis: TickAxis
@@ -66,8 +64,7 @@ class RowBounds:
 MIN_FROZEN_TICKS = 100
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TickGrid:
+class TickGrid(msgspec.Struct, frozen=True, eq=False):
     """One test's tick grid, and the rows of the table that can hold its frames."""
 
     episode: Episode
@@ -108,8 +105,7 @@ class TickGrid:
         return GridColumn(out, saturated, host)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GridColumn:
+class GridColumn(msgspec.Struct, frozen=True, eq=False):
     """A role on the grid; NaN, False and -1 where no frame brought it."""
 
     value: FloatArray

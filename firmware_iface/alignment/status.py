@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.ticks import TickAxis
 from firmware_iface.bus_map import ONBOARD_SEVERITIES, BusMap
@@ -23,8 +24,7 @@ MAX_HOLE_TICKS = 3
 """Ticks without a frame up to which the next frame still tells the present tick."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StatusTable:
+class StatusTable(msgspec.Struct, frozen=True, eq=False):
     """Status frames as columns, shape (n,); NaN or -1 where the bus does not say."""
 
     row: IntArray

@@ -6,9 +6,8 @@ begin anew.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.episodes import Episode
 from firmware_iface.alignment.frame_faults import drop_conflicts

@@ -8,10 +8,11 @@ frames are placed where the measured signals then run smoothly.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from firmware_iface.codec import Decoded, DecodedTable
@@ -19,7 +20,7 @@ from firmware_iface.protection import NO_POSITION, unwrap
 from firmware_iface.recording import BoolArray, FloatArray, IntArray
 
 
-class StampLimits(NamedTuple):
+class StampLimits(msgspec.Struct, frozen=True):
     """Limits by which frames are placed by their time stamps."""
 
     envelope_block: int = 500
@@ -53,8 +54,7 @@ class StampLimits(NamedTuple):
 STAMPS = StampLimits()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LateStamps:
+class LateStamps(msgspec.Struct, frozen=True, eq=False):
     """Ticks of a message's frames, from 0 at its first one, and how late their stamps are."""
 
     tick: IntArray
@@ -150,7 +150,7 @@ def _envelope(slack: FloatArray) -> FloatArray:
     return np.asarray(near + np.interp(np.arange(count), centre, edge))
 
 
-class GapLimits(NamedTuple):
+class GapLimits(msgspec.Struct, frozen=True):
     """Limits by which gaps among late frames are placed."""
 
     shift: int = 12
@@ -224,8 +224,7 @@ def _corners(tick: IntArray, values: FloatArray) -> float:
     return float(np.minimum(4.0 * off**2, GAPS.corner_cost).sum())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TickAxis:
+class TickAxis(msgspec.Struct, frozen=True, eq=False):
     """Unlimited tick numbers of the frames of a table."""
 
     ticks: Mapping[str, IntArray]
@@ -470,8 +469,7 @@ def _with_others(
     return replace(axis, ticks=ticks, rows=rows, every=every, notes=tuple(notes))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ComputerClock:
+class _ComputerClock(msgspec.Struct, frozen=True, eq=False):
     """The computer's clock as the earliest stamps of a message without a counter tell it."""
 
     time_ns: IntArray

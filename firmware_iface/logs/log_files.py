@@ -15,10 +15,11 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+
+import msgspec
 
 from firmware_iface.errors import (
     ConfigurationError,
@@ -34,8 +35,7 @@ if TYPE_CHECKING:
     from firmware_iface.transport.frames import FrameTable
 
 
-@dataclass(frozen=True, slots=True)
-class Budget:
+class Budget(msgspec.Struct, frozen=True):
     """What reading one recording may cost; a recording that costs more is refused in one line."""
 
     frames: int = 20_000_000
@@ -48,7 +48,7 @@ class Budget:
     """Frames held in memory at once, some 25 bytes each and ten times as many while they are
     decoded; a test that is longer is cut off and said to be.
     """
-    progress: Callable[[float], None] | None = field(default=None, compare=False)
+    progress: Callable[[float], None] | None = None
     """Is called now and then with the share of the file that is read, 0 … 1."""
 
 
@@ -115,8 +115,7 @@ def _mebibytes(size: int) -> str:
 GZIP_SUFFIX = ".gz"
 
 
-@dataclass(frozen=True, slots=True)
-class UnpackedLog:
+class UnpackedLog(msgspec.Struct, frozen=True):
     """A log that can be opened as it is."""
 
     path: Path
@@ -261,8 +260,7 @@ class LogReader(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True)
-class FoundReader:
+class FoundReader(msgspec.Struct, frozen=True):
     """A reader of one log."""
 
     reader: Any

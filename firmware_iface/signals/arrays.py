@@ -9,11 +9,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from firmware_iface.errors import (
@@ -32,8 +32,7 @@ MATLAB_REFERENCES = "#"
 """Begins the names of MATLAB's own groups."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArrayChannel:
+class ArrayChannel(msgspec.Struct, frozen=True):
     """One channel of a file; read when it is needed."""
 
     length: int

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from firmware_iface.find_test import MatchedTest
@@ -20,7 +20,7 @@ from firmware_iface.sampling import sampling_interval
 from firmware_iface.stored_test import Controller
 
 
-class ClockFit(NamedTuple):
+class ClockFit(msgspec.Struct, frozen=True):
     """How the phase of a logger's clock is fitted to a test."""
 
     min_samples: int = 100
@@ -64,7 +64,7 @@ class ClockFit(NamedTuple):
 CLOCK = ClockFit()
 
 
-class FittedClock(NamedTuple):
+class FittedClock(msgspec.Struct, frozen=True):
     """Ticks on the clock of a logger.
 
     begin: of one tick, near the test's middle, s; rate: length of a tick over the nominal one, less
@@ -79,7 +79,7 @@ class FittedClock(NamedTuple):
     by: str
 
 
-class Deviation(NamedTuple):
+class Deviation(msgspec.Struct, frozen=True):
     """How far what was recorded is from the test."""
 
     residuals: Callable[[float, float], FloatArray]

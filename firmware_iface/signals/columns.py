@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -86,11 +85,10 @@ class _ColumnsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     environment: _Environment = _Environment()
 
 
-@dataclass(frozen=True, slots=True)
-class ColumnMap:
+class ColumnMap(msgspec.Struct, frozen=True):
     """Columns by role; roles without one are looked for by their usual names."""
 
-    columns: Mapping[str, Column] = field(default_factory=dict)
+    columns: Mapping[str, Column] = msgspec.field(default_factory=dict)
     """By role, as `channels.spool`; `time` for the time stamps."""
     tick_ns: int = 1_000_000
     """Control period."""

@@ -9,9 +9,8 @@ loop together with the jack position of the tick before). The most likely ticks 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from firmware_iface.find_test import MatchedTest
@@ -28,7 +27,7 @@ from firmware_iface.signals.resample import (
 from firmware_iface.stored_test import Controller
 
 
-class Placement(NamedTuple):
+class Placement(msgspec.Struct, frozen=True):
     """Limits, costs and noise by which held values are placed on ticks."""
 
     candidates: int = 10
@@ -84,8 +83,7 @@ class Placement(NamedTuple):
 PLACEMENT = Placement()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Arrivals:
+class Arrivals(msgspec.Struct, frozen=True, eq=False):
     """New values in order of arrival."""
 
     at: FloatArray
@@ -98,8 +96,7 @@ class Arrivals:
     """Ticks between two looks of the logger: as much later a value may be seen than it came."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExpectedCommand:
+class ExpectedCommand(msgspec.Struct, frozen=True, eq=False):
     """What the tests on a stretch of ticks command."""
 
     command: FloatArray
@@ -132,8 +129,7 @@ class ExpectedCommand:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ArrivalClock:
+class ArrivalClock(msgspec.Struct, frozen=True):
     """When values that are not late come, less their ticks: a straight line over the arrivals."""
 
     slope: float
@@ -146,8 +142,7 @@ class ArrivalClock:
         return self.slope * arrival + self.level
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlacedValues:
+class PlacedValues(msgspec.Struct, frozen=True, eq=False):
     """Ticks of values, and how late they came."""
 
     tick: IntArray
@@ -330,8 +325,7 @@ def _roughness(position: FloatArray) -> float:
 HELD_COMMAND_ROLES = ("command.position", "command.current")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldRows:
+class HeldRows(msgspec.Struct, frozen=True, eq=False):
     """Held values on the ticks of the computer."""
 
     clock: TickClock

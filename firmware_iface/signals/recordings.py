@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.bus_map import BusMap
@@ -90,7 +90,7 @@ def recordings_of_signals(
     return tuple(replace(first, as_measured=other) for first, other in zip(*found, strict=True))
 
 
-class TickReading(NamedTuple):
+class TickReading(msgspec.Struct, frozen=True):
     """One way to put signals on ticks."""
 
     clock: TickClock
@@ -260,8 +260,7 @@ def _environment(signals: Mapping[str, RecordedSignal]) -> Environment:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Interpretation:
+class Interpretation(msgspec.Struct, frozen=True):
     """What the content of recordings means."""
 
     bus_map: BusMap

@@ -14,16 +14,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from firmware_iface.recording import FloatArray, IntArray, RecordedSignal
 from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 
 
-class HeldLimits(NamedTuple):
+class HeldLimits(msgspec.Struct, frozen=True):
     """Limits by which a signal holds its values for a tick, and its changes are counted."""
 
     changes_per_tick: float = 1.1
@@ -45,8 +44,7 @@ class HeldLimits(NamedTuple):
 HELD = HeldLimits()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TickClock:
+class TickClock(msgspec.Struct, frozen=True, eq=False):
     """Beginnings of control ticks on the logger's clock."""
 
     begin: FloatArray
@@ -119,8 +117,7 @@ def held_on_ticks(
     return clock, rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SignalGroup:
+class SignalGroup(msgspec.Struct, frozen=True, eq=False):
     """Held signals that change together."""
 
     roles: tuple[str, ...]

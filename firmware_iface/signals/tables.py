@@ -10,8 +10,9 @@ import itertools
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
 from firmware_iface.errors import (
@@ -34,7 +35,7 @@ from firmware_iface.recording import FloatArray, RecordedSignal
 from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
 
 
-class EvenClockLimits(NamedTuple):
+class EvenClockLimits(msgspec.Struct, frozen=True):
     """Limits by which stamps are replaced by an even clock."""
 
     block: int = 200

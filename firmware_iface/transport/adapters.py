@@ -14,9 +14,11 @@ import os
 import socket
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import msgspec
+from msgspec.structs import replace
 
 from firmware_iface.errors import (
     ConfigurationError,
@@ -70,8 +72,7 @@ DEFAULT_INTERFACE_ADVICE = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class BusOptions:
+class BusOptions(msgspec.Struct, frozen=True):
     """Options of a bus, named as python-can names them; None leaves its default."""
 
     interface: str
@@ -86,7 +87,7 @@ class BusOptions:
     """Accept CAN FD frames."""
     app_name: str | None = None
     """Vector's application name."""
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, Any] = msgspec.field(default_factory=dict)
     """Further keyword arguments of the interface (python-can's `--bus-kwargs`)."""
     allow_multicast: bool = False
     """Let udp_multicast join a group beyond the loopback interface."""

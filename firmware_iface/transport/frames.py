@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
 from enum import IntEnum
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,8 +18,7 @@ MAX_CHANNEL = 0xFFFF
 """Largest number of an adapter channel that is told apart."""
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(msgspec.Struct, frozen=True):
     """One data or error frame."""
 
     time_ns: int
@@ -51,8 +50,7 @@ class Frame:
             raise ValueError(f"payload of {len(self.data)} bytes, at most {MAX_PAYLOAD}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameTable:
+class FrameTable(msgspec.Struct, frozen=True, eq=False):
     """Many frames as columns, in order of arrival; n rows."""
 
     time_ns: IntArray
@@ -81,7 +79,7 @@ class FrameTable:
 
     def rows(self, chosen: slice | BoolArray | IntArray) -> FrameTable:
         """Some of the rows; in the same order, or in that of the numbers given."""
-        return FrameTable(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
+        return FrameTable(**{name: getattr(self, name)[chosen] for name in self.__struct_fields__})
 
     @classmethod
     def from_frames(cls, frames: Iterable[Frame]) -> FrameTable:
@@ -103,9 +101,9 @@ def concatenate(tables: Sequence[FrameTable]) -> FrameTable:
         data[:, : table.data.shape[1]] = table.data
         wide.append(data)
     rest = {
-        item.name: np.concatenate([getattr(table, item.name) for table in tables])
-        for item in fields(FrameTable)
-        if item.name != "data"
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in FrameTable.__struct_fields__
+        if name != "data"
     }
     return FrameTable(data=np.concatenate(wide), **rest)
 

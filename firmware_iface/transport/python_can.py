@@ -11,7 +11,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Self
+
+import msgspec
 
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.recording import MAX_CAN_ID, MAX_STANDARD_CAN_ID
@@ -28,7 +30,7 @@ MEMINFO_DROPS = 8
 """Place of the number of dropped frames among them."""
 
 
-class BusTimes(NamedTuple):
+class BusTimes(msgspec.Struct, frozen=True):
     """Times of a bus that takes no frames, s."""
 
     send: float = 0.5

@@ -15,7 +15,9 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
+
+import msgspec
 
 from firmware_iface.errors import BusLostError, ConfigurationError, InputOutputError
 from firmware_iface.recording import MAX_STANDARD_CAN_ID
@@ -31,7 +33,7 @@ MAX_CODED_BYTES = PACKET_BYTES + 1
 TIME_WRAP_US = 1 << 32
 
 
-class PortTimes(NamedTuple):
+class PortTimes(msgspec.Struct, frozen=True):
     """Times of a serial port, s."""
 
     read: float = 0.01

@@ -9,7 +9,9 @@ import logging
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from firmware_iface.bus_map import ONBOARD_SEVERITIES
 from firmware_iface.errors import ConfigurationError, install_command
@@ -139,8 +141,7 @@ REFUSAL_REASONS[ResponseCode.CONDITIONS_NOT_CORRECT] = BitReason.NONE
 BUSY_ONBOARD = (OnboardState.RECORDING, OnboardState.IDENTIFYING)
 
 
-@dataclass(frozen=True, slots=True)
-class _Exchange:
+class _Exchange(msgspec.Struct, frozen=True):
     """A request, and what it expects."""
 
     service: ServiceId

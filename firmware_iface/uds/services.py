@@ -6,8 +6,9 @@ Server, client, PDX and the reference page are all made of these records.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntEnum
+
+import msgspec
 
 from firmware_iface.bus_map import ONBOARD_SEVERITIES
 from firmware_iface.recording import CHANNELS, BitReason, BitState, OnboardState
@@ -16,8 +17,7 @@ TEXT_FILL = b"\0"
 """What follows a text in its field."""
 
 
-@dataclass(frozen=True, slots=True)
-class DataField:
+class DataField(msgspec.Struct, frozen=True):
     """One value of a record, big-endian: value = number * scale, or a text."""
 
     name: str
@@ -48,8 +48,7 @@ class DataField:
         return number if self.scale == 1.0 else number * self.scale
 
 
-@dataclass(frozen=True, slots=True)
-class DataRecord:
+class DataRecord(msgspec.Struct, frozen=True):
     """Fields that follow one another in a payload, under a number of their own."""
 
     name: str
@@ -181,8 +180,7 @@ SNAPSHOT_RECORD = 1
 """Number of the only snapshot of a trouble code; it holds `ONBOARD`."""
 
 
-@dataclass(frozen=True, slots=True)
-class TroubleCode:
+class TroubleCode(msgspec.Struct, frozen=True):
     """A trouble code of 0x19: set while the computer's last test ended so."""
 
     number: int

@@ -10,10 +10,11 @@ import math
 import struct
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from msgspec.structs import replace
 
 from firmware_iface.errors import BusLostError
 from firmware_iface.protection import crc8

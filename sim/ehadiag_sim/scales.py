@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import largest_value, range_is_stated, stated_channels

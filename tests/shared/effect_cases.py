@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag import default_actuator
 from ehadiag.model.batch import NO_ANCHOR, SIGNAL_ROWS, Batch

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from identify_cases import own_experiment
+from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
@@ -103,9 +104,9 @@ def test_a_unit_is_the_same_each_time_and_a_group_changes_no_other_effect() -> N
     first, second = units.draw_unit(case), units.draw_unit(case)
     assert first == second
     assert first[0].serial == 3
-    other = units.draw_unit(replace(case, case=4))
+    other = units.draw_unit(dataclasses.replace(case, case=4))
     assert other[0].effects != first[0].effects
-    sensed = units.draw_unit(replace(case, groups=("sensing",)))
+    sensed = units.draw_unit(dataclasses.replace(case, groups=("sensing",)))
     assert sensed[0].effects == first[0].effects
     assert sensed[1] == first[1]
     assert sensed[0].sensors.filter_time > 0.0
@@ -181,7 +182,7 @@ def test_each_search_of_the_pictures_has_its_least_gap_at_the_truth(name: str) -
     experiment = pictures.worn_experiment()
     truth = getattr(pictures.WORN_UNIT, name)
     below, there, above = (
-        pictures.gap_of(experiment, replace(pictures.WORN_UNIT, **{name: value}), name)
+        pictures.gap_of(experiment, dataclasses.replace(pictures.WORN_UNIT, **{name: value}), name)
         for value in (truth - 0.01, truth, truth + 0.01)
     )
     assert there < 1.2

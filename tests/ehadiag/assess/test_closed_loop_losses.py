@@ -6,11 +6,10 @@ told by the response and put back.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Diagnosis, Recording, Verdict, bundled_tests, default_actuator

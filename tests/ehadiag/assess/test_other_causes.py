@@ -6,11 +6,11 @@ A supply lower than its probe says, seen where the measured pressure is cut off.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Actuator, ConfigurationError, Verdict, bundled_tests, default_actuator

@@ -7,10 +7,9 @@ that the identified actuator must have made.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from other_actuator import with_data
 from places import LOGS
 

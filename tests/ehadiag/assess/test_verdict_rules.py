@@ -5,7 +5,6 @@ A diagnosis that is fed while the test runs: what is worked out, and what is lef
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
+from msgspec.structs import replace
 
 from ehadiag import Levels, Recording, Samples, Verdict, bundled_tests, default_actuator
 from ehadiag.assess.diagnosis import DiagnosisSession, diagnose
@@ -112,9 +112,9 @@ def cut(recording, ticks):
     """The recording as it was after so many ticks."""
     samples = recording.samples
     arrays = {
-        field.name: getattr(samples, field.name)[..., :ticks]
-        for field in fields(Samples)
-        if isinstance(getattr(samples, field.name), np.ndarray)
+        name: getattr(samples, name)[..., :ticks]
+        for name in Samples.__struct_fields__
+        if isinstance(getattr(samples, name), np.ndarray)
     }
     return replace(recording, samples=replace(samples, **arrays))
 

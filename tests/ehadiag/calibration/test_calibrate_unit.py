@@ -7,13 +7,12 @@ sheet's: no severity from 0 up explains it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from calibrated_unit import TESTS, UNIT, learned, of_calibrated_unit, recording
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from ehadiag import Verdict, default_actuator, load_actuator
 from ehadiag.assess.diagnosis import diagnose
@@ -229,7 +228,7 @@ def test_severities_reach_below_zero_by_what_the_data_may_be_off():
 def test_such_a_unit_is_learned_by_its_data_alone():
     errors = DataErrors(FSS0=-0.04, FDJ0=-0.03, KSF=0.02)
     effects = Effects(hysteresis=0.02, backlash=1e-6, null_bias=5e-5, data=errors)
-    unit = replace(Unit(effects=effects), serial=3)
+    unit = Unit(effects=effects, serial=3)
     both = [record(unit, TESTS[name], seed=5, step=COARSE_STEP) for name in ("open", "closed")]
     found = calibrate(both, default_actuator(), TESTS.values())
     assert found.reasons == ()

@@ -6,13 +6,14 @@ could not explain: how far it widens intervals and raises limits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ehadiag import bundled_tests, default_actuator
 from ehadiag.assess.acceptance import residual_limits

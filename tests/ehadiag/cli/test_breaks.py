@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import shutil
 import struct
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
 import can
 import pytest
 from cli_result import Run
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag.setup import Setup

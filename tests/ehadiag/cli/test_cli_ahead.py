@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from cli_result import Run
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Recording, StoredTest, default_actuator

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_result import Run
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Diagnosis, Recording, Verdict, bundled_tests, default_actuator

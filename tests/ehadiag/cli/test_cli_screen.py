@@ -13,10 +13,10 @@ import pickle
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 from cli_result import Run
+from msgspec.structs import replace
 from rich.console import Console
 
 from ehadiag.cli.main import main, parse_arguments

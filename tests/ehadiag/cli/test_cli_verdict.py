@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 from cli_result import Run
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from ehadiag.compile import libraries, sources, worker
 from ehadiag.compile.elementary import C_FUNCTIONS

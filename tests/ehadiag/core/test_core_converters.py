@@ -6,7 +6,6 @@ file and the command line give them.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib import resources
 
 import msgspec
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from other_actuator import with_data
 
 from ehadiag import (

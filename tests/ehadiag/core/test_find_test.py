@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ehadiag import CommandMode, Recording, Samples, bundled_tests, default_actuator
 from firmware_iface.find_test import CandidateTests, extract_tests, match_test

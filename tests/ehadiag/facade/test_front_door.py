@@ -7,13 +7,13 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bus_synth import START, make_truth, play
+from msgspec.structs import replace
 from places import LOGS, ROOT
 
 import ehadiag

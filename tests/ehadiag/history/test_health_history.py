@@ -13,13 +13,13 @@ import sqlite3
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from history_cases import an_entry, an_event
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from ehadiag import ConfigurationError, InputOutputError
 from ehadiag.history.records import EVENT_TABLE, Entry, SourceRecord, Usage, counted_entries

@@ -6,13 +6,12 @@ taken from the rest before a test, if there was one.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from ehadiag import CommandMode, Samples, Verdict, bundled_tests, default_actuator
 from ehadiag.assess.diagnosis import diagnose

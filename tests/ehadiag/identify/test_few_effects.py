@@ -6,11 +6,12 @@ units whose data differ from their file by its tolerance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ehadiag import default_actuator
 from ehadiag.assess.acceptance import objections_to_estimate

@@ -5,7 +5,6 @@ Severities of actuators with effects that their data do not tell.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from identify_cases import recorded
+from msgspec.structs import replace
 
 from ehadiag import default_actuator
 from ehadiag.core.actuator import MAX_NOISE_EXCESS

@@ -5,12 +5,12 @@ The last round of a refinement: what the vector kernels are off is taken out.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from identify_cases import named, own_experiment, recorded
+from msgspec.structs import replace
 
 from ehadiag.identify.estimates import estimate_covariance
 from ehadiag.identify.experiment import lay_out_spans, unknowns_of

@@ -5,14 +5,13 @@ The last part of a test, added to the optimum of the rest.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from identify_cases import named, own_experiment, recorded
+from msgspec.structs import replace
 
 from ehadiag import Samples, default_actuator
 from ehadiag.identify.estimates import estimate_covariance
@@ -50,9 +49,9 @@ def recording(request):
 def first_ticks_of(samples, ticks):
     """The samples as they were after so many ticks."""
     arrays = {
-        field.name: getattr(samples, field.name)[..., :ticks]
-        for field in fields(Samples)
-        if isinstance(getattr(samples, field.name), np.ndarray)
+        name: getattr(samples, name)[..., :ticks]
+        for name in Samples.__struct_fields__
+        if isinstance(getattr(samples, name), np.ndarray)
     }
     return replace(samples, **arrays)
 
@@ -78,7 +77,7 @@ def figures_of(result):
 
 
 def structs_of(item):
-    return [getattr(item, field.name) for field in fields(item)]
+    return [getattr(item, name) for name in item.__struct_fields__]
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,10 @@
 """Stated deviations against what happens, on linear problems whose answer is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from ehadiag.core.estimation_rules import ESTIMATION
 from ehadiag.identify.estimates import estimate_covariance, interval95

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 
-import msgspec
 import numpy as np
 import pytest
 from effect_cases import batch_of, unknowns_of
+from msgspec.structs import replace
 
 from ehadiag import default_actuator
 from ehadiag.compile import libraries
@@ -47,7 +46,7 @@ def kernels(tmp_path_factory):
         code = object_code(
             ObjectFile(
                 [CFunction("run", run_blocks, SlotArguments())],
-                dataclasses.replace(level, fast=False),
+                replace(level, fast=False),
                 replaced=C_FUNCTIONS | (ROUNDING_FUNCTIONS if not level.rounds else {}),
                 lanes=width,
             )
@@ -69,8 +68,8 @@ def kernels(tmp_path_factory):
 @pytest.mark.parametrize("effects", EFFECTS.values(), ids=EFFECTS)
 def test_each_width_has_the_same_bits(kernels, effects, kind):
     linear = default_actuator()
-    stage = msgspec.structs.replace(linear.second_stage, kind=kind)
-    actuator = msgspec.structs.replace(linear, second_stage=stage)
+    stage = replace(linear.second_stage, kind=kind)
+    actuator = replace(linear, second_stage=stage)
     rng = np.random.default_rng(5)
     zeros = np.zeros((SIGNAL_ROWS, len(CURRENT)))
     zeros[0] = 30e-6 * np.sin(np.arange(len(CURRENT)) * 0.05)
@@ -81,7 +80,7 @@ def test_each_width_has_the_same_bits(kernels, effects, kind):
     points = np.column_stack(
         [rng.random((19, 3)), *(np.full(19, value) for value in effects.values())]
     )
-    model = SimdModel(batch, dataclasses.replace(space, base=base))
+    model = SimdModel(batch, replace(space, base=base))
     found = {}
     for width, kernel in kernels.items():
         work = block_scratch(model.levels.copy(), width)

@@ -6,13 +6,13 @@ Recordings that carry no verdict: what the host refuses, on board too.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Verdict, bundled_tests, default_actuator

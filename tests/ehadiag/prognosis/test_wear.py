@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from history_cases import an_entry, an_event
+from msgspec.structs import replace
 from scipy import stats
 
 from ehadiag.history.records import Usage
@@ -65,7 +64,8 @@ def test_each_law_follows_its_own_noiseless_path() -> None:
 def test_passages_are_those_of_simulated_paths(law: str) -> None:
     rng = np.random.default_rng(1)
     index, number, far, rate = int(sets_of(law)[5]), 3000, 0.3, 0.4
-    laws = LAWS._replace(
+    laws = replace(
+        LAWS,
         power=np.ones_like(LAWS.power), exponent=np.zeros_like(LAWS.power), table=np.tile(
             np.linspace(-0.05, 1.05, len(LAWS.table))[:, None], len(LAWS.law)
         ),

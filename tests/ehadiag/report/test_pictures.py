@@ -6,7 +6,6 @@ that its diagnoses stated. Events of a modelled motion, and which ticks of a lon
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from msgspec import structs
+from msgspec.structs import replace
 from places import LOGS
 
 import ehadiag

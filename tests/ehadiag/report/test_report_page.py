@@ -9,7 +9,6 @@ import base64
 import hashlib
 import json
 import re
-from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 from calibrated_unit import diagnosis_when_worn, learned, of_calibrated_unit
 from history_cases import an_entry, an_event
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from places import LOGS
 from report_html import Page

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-
 import numpy as np
 import pytest
 from bus_synth import (
@@ -21,6 +19,7 @@ from bus_synth import (
     recordings,
     tick_of,
 )
+from msgspec.structs import replace
 
 from ehadiag import CommandMode
 from firmware_iface.recording import BitReason, BitState
@@ -136,7 +135,7 @@ def test_idle_frames_loss_and_no_status(encoder, bus_map, truth, seed):
 
 def content(recording):
     samples = recording.samples
-    arrays = [getattr(samples, field.name) for field in fields(samples)]
+    arrays = [getattr(samples, name) for name in samples.__struct_fields__]
     rest = replace(recording, samples=None)
     return repr(rest), [np.asarray(item).tolist() for item in arrays]
 

@@ -7,7 +7,6 @@ number, state and time base must be one through a test.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from bus_synth import (
     recordings,
     tick_of,
 )
+from msgspec.structs import replace
 
 from firmware_iface.alignment.align import assemble
 from firmware_iface.alignment.frame_faults import judge_frames

@@ -6,13 +6,12 @@ sender under the telemetry's identifier: never a verdict, always its name.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from bus_synth import COMMAND, ENVIRONMENT, TELEMETRY, TICK, assert_truthful, make_truth, one, play
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import CommandMode, bundled_tests, default_actuator

@@ -1,6 +1,5 @@
 """Live assembly of ticks: each once, in order, whatever the bus loses, repeats or swaps."""
 
-import dataclasses
 import math
 import sys
 from functools import lru_cache
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from ehadiag import CommandMode, ConfigurationError
 from firmware_iface.bus_map import default_map, load_map
@@ -107,7 +107,7 @@ def test_damaged_frames_are_lost_ones():
     _, bad = pairs[10]
     data = bytes([bad.data[0] ^ 1]) + bad.data[1:]
     frames = flat(pairs)
-    frames[21] = dataclasses.replace(bad, data=data)
+    frames[21] = replace(bad, data=data)
     live, ticks = run(frames)
     assert live.lost == 1
     assert np.isnan(ticks[10][1:]).all()
@@ -132,9 +132,7 @@ def test_commands_of_the_other_mode_are_not_taken():
 
 def test_after_a_long_silence_ticks_begin_anew():
     pairs = frames_of(20)
-    later = [
-        dataclasses.replace(frame, time_ns=frame.time_ns + 2000 * MS) for frame in flat(pairs[15:])
-    ]
+    later = [replace(frame, time_ns=frame.time_ns + 2000 * MS) for frame in flat(pairs[15:])]
     live, ticks = run([*flat(pairs[:10]), *later])
     assert (len(ticks), live.lost, live.breaks) == (15, 0, 1)
 
@@ -236,11 +234,10 @@ def test_ticks_that_no_single_frame_tells_are_refused(paged, change, match):
 
 def test_a_bus_without_counters_is_told():
     plain = {
-        name: dataclasses.replace(item, counter=None, counts_ticks=False)
-        for name, item in MAP.messages.items()
+        name: replace(item, counter=None, counts_ticks=False) for name, item in MAP.messages.items()
     }
     with pytest.raises(ConfigurationError, match="counter of ticks") as caught:
-        LiveTicks(dataclasses.replace(MAP, messages=plain))
+        LiveTicks(replace(MAP, messages=plain))
     assert "\n" not in str(caught.value)
 
 

@@ -5,13 +5,13 @@ import json
 import math
 import shutil
 import subprocess
-from dataclasses import replace
 
 import c_side
 import numpy as np
 import pytest
 from exported import exported
 from live_ends import cable
+from msgspec.structs import replace
 from onboard_frames import DATABASE
 from onboard_node import bare_node, build_bare_node, build_node, write_played
 from places import LOGS

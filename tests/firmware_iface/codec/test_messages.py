@@ -5,7 +5,6 @@ What a computer says it has found itself: put together live and from a log, of t
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib import resources
 
 import cantools.database
@@ -14,6 +13,7 @@ import pytest
 from bus_synth import START, make_truth, play, recordings
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from onboard_frames import SEVERITIES, findings, progress
 from places import ROOT
 

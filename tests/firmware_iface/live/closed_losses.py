@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from fault_cases import Case, run
+from msgspec.structs import replace
 
 from ehadiag import Recording, Verdict, bundled_tests, default_actuator
 from ehadiag.assess import diagnosis, lost_samples
@@ -94,7 +95,7 @@ LIMIT = LOSSES_BORNE.max_guessed_share
 
 
 def main(seeds: int) -> None:
-    lost_samples.LOSSES = LOSSES_BORNE._replace(max_guessed_share=1.0)
+    lost_samples.LOSSES = replace(LOSSES_BORNE, max_guessed_share=1.0)
     found: dict[str, list[Outcome]] = {}
     for seed in range(seeds):
         truth = PAPER[seed % len(PAPER)]

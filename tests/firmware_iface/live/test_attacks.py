@@ -5,12 +5,12 @@ from __future__ import annotations
 import threading
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import can
 import pytest
 from fault_cases import DURATION, NUMBER, TELEMETRY
 from live_ends import LOADED_MACHINE, computer_on
+from msgspec.structs import replace
 from test_live_session_limits import OURS, SharedBus
 
 from ehadiag_sim.emulator import FccCore

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from bus_synth import STATUS, make_truth, one, play
+from msgspec.structs import replace
 
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import Encoder

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import fault_cases
@@ -16,6 +15,7 @@ import pytest
 from fault_cases import CASES, Case, Run, right_and_wrong, run
 from fault_diagnosis import Diagnoser, Judged, deviations, objection
 from fault_logs import KEPT, LOG_CASES, NOISE, LogCase, collected, noise
+from msgspec.structs import replace
 from places import ROOT
 
 from ehadiag import Verdict

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from firmware_iface.handshake import ChannelLimits, Handshake, HandshakeAction, Phase, TimeLimits
 from firmware_iface.live_decode import BitStatus, Sample

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
 import can
 import pytest
 from fault_cases import DURATION, NUMBER, TELEMETRY
+from msgspec.structs import replace
 
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
 from firmware_iface import tester

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from bus_synth import ENVIRONMENT, START, TICK, make_truth, one, play
+from msgspec.structs import replace
 from test_live_session_limits import outcome_of
 
 from ehadiag import default_actuator

@@ -46,13 +46,13 @@ wait
 exit $code
 """
 CLIENT = """
-import dataclasses, json
+import json, msgspec
 from firmware_iface.tester import run_test
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.python_can import PythonCanTransport
 with PythonCanTransport(BusOptions("udp_multicast"), transmit=True) as bus:
     found = run_test(bus, test_id=2, duration=0.4, transmit=True, protocol="uds", onboard_wait=20)
-print(json.dumps(dataclasses.asdict(found), default=str))
+print(json.dumps(msgspec.to_builtins(found), default=str))
 """
 
 

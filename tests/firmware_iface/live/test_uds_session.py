@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -13,6 +12,7 @@ import pytest
 from fault_cases import DURATION, NUMBER
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from test_live_session_limits import SharedBus
 
 from ehadiag import ConfigurationError, default_actuator

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from bus_synth import START, make_truth, play
+from msgspec.structs import replace
 from test_logs import write
 
 from firmware_iface.bus_map import default_map

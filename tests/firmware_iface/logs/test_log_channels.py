@@ -5,8 +5,6 @@ Of several tests in a log one is judged: what is passed over is always said.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from bus_synth import (
     COMMAND,
@@ -18,6 +16,7 @@ from bus_synth import (
     play,
     recordings,
 )
+from msgspec.structs import replace
 
 from ehadiag import ConfigurationError, InputOutputError
 from firmware_iface.bus_map import default_map

@@ -7,7 +7,6 @@ import csv
 import gc
 import gzip
 import sys
-from dataclasses import fields, replace
 
 import can
 import numpy as np
@@ -15,6 +14,7 @@ import pytest
 from bus_synth import START, assert_truthful, make_truth, play
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import CommandMode, ConfigurationError, EhadiagError, InputOutputError, bundled_tests
@@ -48,9 +48,9 @@ def write(path, frames):
 
 
 def same_samples(a, b):
-    for field in fields(a):
-        if field.name != "host_ns":
-            np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
+    for name in a.__struct_fields__:
+        if name != "host_ns":
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 @pytest.mark.parametrize("name", sorted(TRUTH))

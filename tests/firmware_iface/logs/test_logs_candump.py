@@ -9,7 +9,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -18,6 +17,7 @@ import pytest
 from bus_synth import START
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import InputOutputError

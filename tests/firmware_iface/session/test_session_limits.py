@@ -6,10 +6,10 @@ The report of check-bus.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 from bus_synth import COMMAND, START, TELEMETRY, TICK, flip, make_truth, play, tick_of
+from msgspec.structs import replace
 
 from ehadiag.core.criteria import RECORDING
 from firmware_iface.bus_report import render_bus_report, report_bus

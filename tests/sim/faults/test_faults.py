@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from bus_synth import (
     COMMAND,
@@ -23,6 +21,7 @@ from bus_synth import (
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from firmware_iface.bus_map import default_map
 from firmware_iface.codec import Encoder

@@ -1,9 +1,8 @@
 """compare_logs: the simulator, driven by a recording's currents, reproduces the recording."""
 
-import dataclasses
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ehadiag import bundled_tests, default_actuator
 from ehadiag_sim.conditions import Effects, Faults
@@ -41,7 +40,7 @@ def test_replay_bridges_lost_rows(run):
     lost[[300, 301, 302]] = True
     channels = ("current", "spool", "pressure", "position")
     holes = {name: np.where(lost, np.nan, getattr(samples, name)) for name in channels}
-    holed = dataclasses.replace(samples, **holes)
+    holed = replace(samples, **holes)
     again = replay(ACTUATOR, holed, run.command, FAULTS, Effects(), STEP)
     single = lost & ~np.roll(lost, -1)
     assert single.sum() > 50
