@@ -7,8 +7,6 @@
 The names below are loaded when they are first used: the import itself costs nothing.
 """
 
-__version__ = "0.2.0"
-
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ehadiag.api import calibrate, diagnose, diagnose_many, read, save_actuator, simulate
@@ -16,6 +14,7 @@ if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels, Verdict
     from ehadiag.calibration.unit_models import Calibrated
     from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+    from ehadiag.core.conventions import __version__
     from ehadiag.estimate import Effect, Severity
     from ehadiag.history.records import Usage
     from ehadiag.history.store import History
@@ -83,6 +82,7 @@ _HOMES = {
     "ehadiag.assess.verdict": ("Levels", "Verdict"),
     "ehadiag.calibration.unit_models": ("Calibrated",),
     "ehadiag.core.actuator": ("Actuator", "default_actuator", "load_actuator"),
+    "ehadiag.core.conventions": ("__version__",),
     "firmware_iface.errors": (
         "BusLostError",
         "ConfigurationError",

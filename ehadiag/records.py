@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from ehadiag import __version__
 from ehadiag.assess.verdict import Verdict
-from ehadiag.core.conventions import date_text, fingerprint
+from ehadiag.core.conventions import __version__, date_text, fingerprint
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity, finite
 from ehadiag.request import Request
 from ehadiag.result import (

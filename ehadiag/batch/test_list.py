@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ehadiag import __version__
-from ehadiag.core.conventions import fingerprint, start_text
+from ehadiag.core.conventions import __version__, fingerprint, start_text
 from ehadiag.result import ListedTest
 from ehadiag.setup import log_of
 from firmware_iface.files import private_folder

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import msgspec
 
+__version__ = "0.2.0"
 EXPONENT_NAME = "clogging_exponent"
 FRICTION_NAME = "FSS"
 """Effect and severity that a recording shows by their ratio alone."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
-
-import msgspec
+from typing import NamedTuple
 
 
 def _capped_variance(deviations: float) -> float:
@@ -15,7 +14,7 @@ def _capped_variance(deviations: float) -> float:
     return 1.0 - 2.0 * deviations * normal.pdf(deviations) / inside
 
 
-class EstimationRules(msgspec.Struct, frozen=True):
+class EstimationRules(NamedTuple):
     """Noise, cost and uncertainty of residuals; those of a refinement are `RefinementRules`."""
 
     noise_lsb: float = math.sqrt(0.5**2 + 1.0 / 12.0)
@@ -54,7 +53,7 @@ class EstimationRules(msgspec.Struct, frozen=True):
 ESTIMATION = EstimationRules()
 
 
-class RefinementRules(msgspec.Struct, frozen=True):
+class RefinementRules(NamedTuple):
     """A round that narrows a density, see `ehadiag.identify.posterior`."""
 
     cross_variances: float = 3.0
@@ -79,7 +78,7 @@ class RefinementRules(msgspec.Struct, frozen=True):
 REFINEMENT = RefinementRules()
 
 
-class AnchorRules(msgspec.Struct, frozen=True):
+class AnchorRules(NamedTuple):
     """Re-anchoring of the modelled spool on the measured one."""
 
     gain: float = 0.3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ehadiag import __version__
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import __version__
 from ehadiag_sim.scales import scales_of
 from firmware_iface.bus_map import BusMap
 from firmware_iface.xcp import (

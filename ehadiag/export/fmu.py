@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import msgspec
 
-from ehadiag import __version__
 from ehadiag.compile.elementary import C_FUNCTIONS, ROUNDING_FUNCTIONS
 from ehadiag.compile.libraries import object_file
 from ehadiag.compile.worker import (
@@ -24,7 +23,7 @@ from ehadiag.compile.worker import (
     TableArgument,
 )
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, __version__
 from ehadiag.export.library import (
     MANIFEST_FILE,
     fill_template,

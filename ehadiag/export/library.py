@@ -11,7 +11,6 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from ehadiag import __version__
 from ehadiag.compile.elementary import (
     C_FUNCTIONS,
     ROUNDING_FUNCTIONS,
@@ -29,7 +28,7 @@ from ehadiag.compile.worker import (
     tool_versions,
 )
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, __version__
 from ehadiag.export.plan import library_plan
 from ehadiag.export.targets import (
     Target,

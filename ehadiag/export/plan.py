@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ehadiag import __version__
 from ehadiag.assess.acceptance import residual_limits
 from ehadiag.assess.verdict import Levels
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import __version__
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.criteria import FIT, RECORDING, VERDICT
 from ehadiag.identify.prior import DAILY_PRIORS, calibration_covariance, unit_prior

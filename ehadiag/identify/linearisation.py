@@ -8,6 +8,7 @@ Bruyninckx, De Schutter, IEEE Trans. Automatic Control 47(8), 2002).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,7 +21,7 @@ from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
 
 
-class DifferenceRules(msgspec.Struct, frozen=True):
+class DifferenceRules(NamedTuple):
     """Differences of residuals at a point."""
 
     step: float = 5e-5

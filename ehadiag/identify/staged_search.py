@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -32,7 +32,7 @@ from ehadiag.model.simd_jack import driven_jack_costs
 from firmware_iface.stored_test import StoredTest, TimeWindow
 
 
-class StageRules(msgspec.Struct, frozen=True):
+class StageRules(NamedTuple):
     """Grids and stages of the global search."""
 
     coarse_points: int = 32

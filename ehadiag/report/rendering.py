@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from ehadiag import __version__
 from ehadiag.assess.verdict import Levels
+from ehadiag.core.conventions import __version__
 
 if TYPE_CHECKING:
     from ehadiag.calibration.unit_models import Calibrated

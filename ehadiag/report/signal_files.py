@@ -22,8 +22,7 @@ from xml.etree import ElementTree
 import msgspec
 import numpy as np
 
-from ehadiag import __version__
-from ehadiag.core.conventions import SIGNAL_FILE_KINDS
+from ehadiag.core.conventions import SIGNAL_FILE_KINDS, __version__
 from ehadiag.report.picture import CurveValues, Panel, PictureColumn
 from ehadiag.report.response_signals import RESPONSE_SIGNALS, ResponseSignal, response_columns
 from ehadiag.result import Result

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from importlib import resources
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
@@ -62,7 +63,7 @@ def test_another_file_is_another_entry(folder: Path) -> None:
 
 def test_another_cantools_is_another_entry(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cached_dbc(TEXT, "a")
-    monkeypatch.setattr(dbc, "version", lambda _: "0.0")
+    monkeypatch.setattr(dbc, "find_spec", lambda _: ModuleSpec("cantools", None, origin=__file__))
     cached_dbc(TEXT, "a")
     assert len(list(folder.iterdir())) == 2
 

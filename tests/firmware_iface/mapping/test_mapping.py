@@ -267,7 +267,7 @@ def test_scales_of_a_rig_are_those_of_its_files(rig):
 def test_mapping_states_a_converter_in_the_signals_unit(rig):
     bus = stated(rig, 'unit = "um", scale = 1000.0, range = [-900.0, 900.0], resolution = 0.5')
     said = bus.stated
-    assert said[1] == pytest.approx((-0.9e-3, 0.9e-3, 0.5e-6))
+    assert msgspec.structs.astuple(said[1]) == pytest.approx((-0.9e-3, 0.9e-3, 0.5e-6))
     assert said[0] is said[2] is said[3] is None
     channel = scales_of(bus, load_actuator(rig / "actuator.toml")).channels.spool
     assert (channel.full_scale, channel.lsb) == pytest.approx((0.9e-3, 0.5e-6))
