@@ -18,7 +18,7 @@ import numpy as np
 from numba import types
 from numba.core.registry import cpu_target
 
-from ehadiag.compile.frontend import compiled, modules_of, numba_type
+from ehadiag.compile.frontend import compiled, modules_of, numba_type, order_bytes
 from ehadiag.compile.worker import (
     CFunction,
     DoublesArgument,
@@ -156,6 +156,7 @@ def emitted(wanted: ObjectFile) -> bytes:
     """
     processor, replaced = wanted.processor, wanted.replaced
     machine = _machine(processor)
+    order_bytes("<" if machine.layout.startswith("e") else ">")
     main = _parsed(_head(machine) + _front(wanted.functions, wanted.tables, replaced), machine)
     names = {item.name for item in wanted.functions}
     kernels = list(_kernels(wanted.functions, replaced))

@@ -168,6 +168,12 @@ TARGETS: tuple[Target, ...] = (
         Processor("riscv64-unknown-linux-gnu", "generic-rv64", "+m,+a,+f,+d,+c", "lp64d"),
         ("-march=rv64gc", "-mabi=lp64d"),
     ),
+    Target(
+        "powerpc-e500mc",
+        "Freescale e500mc, 32 bits, big-endian, Linux",
+        Processor("powerpc-unknown-linux-gnu", "e500mc", rounds=False, roots=False),
+        ("-mcpu=e500mc",),
+    ),
 )
 
 

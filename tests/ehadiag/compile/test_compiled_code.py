@@ -6,6 +6,7 @@ Arithmetic of single precision out of that of doubles: against numpy's, number b
 from __future__ import annotations
 
 import ctypes
+import struct
 from typing import NamedTuple
 
 import llvmlite.binding as llvm
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array2, brief_kernel, kernel
 from ehadiag.compile.object_code import single_precision
 from ehadiag.compile.vector import array_at
+from ehadiag.compile.worker import CFunction, ObjectFile, PointerArgument, Processor, object_code
 
 
 @brief_kernel
@@ -46,12 +48,40 @@ def weighted(pair: Pair, index: NDArray[np.int64], negative: bool) -> float:
     return -total if negative else total
 
 
+TABLE = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+
+
+@brief_kernel
+def replace_by_table(address: int) -> int:
+    """Write the number of a constant array that a place in it names."""
+    number = array_at(address, (1,))
+    place = int(number[0])
+    number[0] = TABLE[place // 3, place % 3]
+    return place
+
+
 @pytest.mark.parametrize("compiled", [False, True])
 def test_an_array_at_an_address_is_that_memory(compiled):
     memory = np.arange(8.0)
     code = last_set if compiled else last_set.py_func
     assert code(memory.ctypes.data, 40.0) == 6.0
     np.testing.assert_array_equal(memory, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 40.0, 7.0])
+
+
+@pytest.mark.parametrize(
+    ("triple", "order"),
+    [("", "="), ("aarch64-unknown-linux-gnu", "<"), ("powerpc-unknown-linux-gnu", ">")],
+)
+def test_a_constant_array_has_the_byte_order_of_the_target(triple, order):
+    function = CFunction("f", replace_by_table, (PointerArgument(),))
+    code = object_code(ObjectFile((function,), Processor(triple)))
+    assert struct.pack(f"{order}6d", *TABLE.ravel()) in code
+
+
+def test_a_number_of_a_constant_array_is_that_of_its_place():
+    number = np.array([5.0])
+    assert replace_by_table(number.ctypes.data) == 5
+    assert number[0] == 0.6
 
 
 def test_arguments_reach_a_kernel_as_they_are_annotated():

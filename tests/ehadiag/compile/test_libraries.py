@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from ehadiag.compile import libraries, sources, worker
 from ehadiag.compile.elementary import C_FUNCTIONS
 from ehadiag.compile.elf import shared_library
+from ehadiag.export.targets import find_target
 from ehadiag.monitor.monitor_memory import prepare_monitor
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import Folder
@@ -109,7 +110,7 @@ def test_one_compilation_serves_all_values_of_a_table(
     arguments = (worker.PointerArgument(), worker.TableArgument("plan"), worker.PointerArgument())
     functions = (worker.CFunction("prepare", prepare_monitor, arguments),)
     one, two = ([n + 0.25 * k for n in range(171)] for k in (1, 2))
-    target = worker.Processor("powerpc-unknown-linux-gnu", "e500mc", rounds=False, roots=False)
+    target = find_target("powerpc-e500mc").processor
     blank = worker.ObjectFile(functions, target, replaced=C_FUNCTIONS)
     with Folder.at(tmp_path, 0o600) as folder:
         monkeypatch.setattr(sources, "cache_folder", lambda: folder)

@@ -249,7 +249,7 @@ def test_bad_input_on_this_computer_and_without_floating_point_exceptions(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4-single", "cortex-a53"])
+@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4-single", "cortex-a53", "powerpc-e500mc"])
 def test_bad_input_on_a_target(name, place, tmp_path):
     emulator = next(item for item in EMULATED if item.target == name)
     if missing(emulator):
@@ -327,11 +327,12 @@ def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_identification_has_the_digits_of_the_host_on_a_bare_target(place, tmp_path):
-    host, bare = (
-        next(item for item in EMULATED if item.target == name) for name in ("host", "cortex-m7")
+@pytest.mark.parametrize("target", ["cortex-m7", "powerpc-e500mc"])
+def test_the_identification_has_the_digits_of_the_host(target, place, tmp_path):
+    host, other = (
+        next(item for item in EMULATED if item.target == name) for name in ("host", target)
     )
-    absent = missing(host) + missing(bare)
+    absent = missing(host) + missing(other)
     if absent:
         pytest.skip(f"not installed: {', '.join(absent)}")
     recording = read_recording(LOGS / "paper-open-1.blf")
@@ -339,11 +340,12 @@ def test_the_identification_has_the_digits_of_the_host_on_a_bare_target(place, t
     expected = identified(host, exported("host", place, len(ticks)), unit, ticks, tmp_path)
     assert expected.bits.startswith("0 ")
     assert expected.outcome.runs > 50.0
-    found = identified(bare, exported("cortex-m7", place, len(ticks)), unit, ticks, tmp_path)
+    found = identified(other, exported(target, place, len(ticks)), unit, ticks, tmp_path)
     assert found.bits == expected.bits
-    assert 0 < found.stack <= 4096
-    assert found.millions > 0
-    assert 0 < found.longest <= MOST_INSTRUCTIONS_OF_A_SLICE
+    assert 0 < found.stack <= 4608
+    if "-DCOUNTED" in other.options:
+        assert found.millions > 0
+        assert 0 < found.longest <= MOST_INSTRUCTIONS_OF_A_SLICE
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler here")

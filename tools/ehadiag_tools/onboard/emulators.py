@@ -54,6 +54,9 @@ EMULATED: tuple[Emulator, ...] = (
     Emulator("cortex-r5", "arm-none-eabi-gcc", BARE, ("qemu-arm", "-cpu", "max")),
     Emulator("cortex-a53", "aarch64-linux-gnu-gcc", ("-static",), ("qemu-aarch64",)),
     Emulator("riscv64", "riscv64-linux-gnu-gcc", ("-static",), ("qemu-riscv64",)),
+    Emulator(
+        "powerpc-e500mc", "powerpc-linux-gnu-gcc", ("-static",), ("qemu-ppc", "-cpu", "e500mc")
+    ),
 )
 
 
