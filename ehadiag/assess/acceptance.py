@@ -279,6 +279,8 @@ def objections_to_estimate(
             "the recording contradicts servovalve.clogging_exponent: with"
             f" {identification.better_exponent:g} far more of it is explained"
         )
+    if out and identification.exponent_doubted:
+        out.append("the recording does not bear out servovalve.clogging_exponent 0")
     hidden = [item.name for item in identification.estimates if not item.shown]
     if hidden:
         out.append(f"the test does not show {', '.join(hidden)}")

@@ -489,14 +489,17 @@ def _notes_on_discrepancy(
         return ()
     fit = identification.fit
     slow = identification.slip_speed
-    out = (
-        (
+    out: tuple[str, ...] = ()
+    if slow:
+        out += (
             f"the jack slips in steps below {slow * 1e3:.1f} mm/s, by the friction found: the"
             " pressure is left out where it is slower",
         )
-        if slow
-        else ()
-    )
+    if identification.exponent_doubted:
+        out += (
+            "the recording does not bear out servovalve.clogging_exponent 0: FSS is that of any"
+            " exponent",
+        )
     if verdict is Verdict.NOT_TESTED or not is_explained_by_discrepancy_alone(
         fit, actuator.calibration
     ):

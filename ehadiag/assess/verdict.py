@@ -68,36 +68,47 @@ def judge(identification: Identification, levels: Levels) -> tuple[Verdict, tupl
 
     By the interval rule FAULT goes before NOT TESTED (a severity of which the test says nothing:
     its interval reaches from below the advisory level to above the limit), and that before
-    DEGRADED.
+    DEGRADED. With a range of exponents of clogging friction makes a FAULT where it does with each
+    of them; where it does with at least half of them the verdict is NOT TESTED.
     """
     if levels.rule is VerdictRule.ESTIMATE:
         return _by_estimate(identification.estimates, levels)
-    open_ends = _limits_within_exponents(identification, levels)
-    verdict, reasons = _by_estimate(identification.estimates, levels, faults_only=True)
-    faults = {item.name for item in identification.estimates if _at_limit(item, levels)}
-    if open_ends and faults <= {FRICTION_NAME}:
-        return Verdict.NOT_TESTED, open_ends
+    share = _fault_share_of_exponents(identification, levels)
+    sure = [
+        item
+        for item in identification.estimates
+        if item.name != FRICTION_NAME or share in (0.0, 1.0)
+    ]
+    verdict, reasons = _by_estimate(sure, levels, faults_only=True)
     if reasons:
         return verdict, reasons
+    words = _words_of_exponents(identification) if identification.frictions else ()
+    if VERDICT.min_chance_fault <= share < 1.0:
+        return Verdict.NOT_TESTED, words
     blind = [
         f"{item.name} may be anything from {item.interval95[0]:.3f} to {item.interval95[1]:.3f}"
         for item in identification.estimates
         if item.interval95[0] < levels.advisory and item.interval95[1] > levels.limit
     ]
     if blind:
-        return Verdict.NOT_TESTED, tuple(blind)
-    return _by_chance(identification.estimates, levels)
+        return Verdict.NOT_TESTED, (*blind, *words)
+    verdict, reasons = _by_chance(identification.estimates, levels)
+    return verdict, (*(words if share > 0.0 else ()), *reasons)
 
 
-def _limits_within_exponents(identification: Identification, levels: Levels) -> tuple[str, ...]:
-    """Severities that are a fault with one exponent of clogging, and none with another."""
-    ends = identification.friction_range
-    if ends is None or not ends[0] < levels.limit <= ends[1]:
-        return ()
+def _fault_share_of_exponents(identification: Identification, levels: Levels) -> float:
+    """Share of the exponents of clogging with which the friction is a fault, 1."""
+    frictions = identification.frictions
+    return sum(value >= levels.limit for value in frictions) / max(len(frictions), 1)
+
+
+def _words_of_exponents(identification: Identification) -> tuple[str, ...]:
+    """Say what the friction may be by the exponents of clogging."""
     low, high = identification.named(FRICTION_NAME).interval95
+    remedy = "check" if identification.exponent_doubted else "state"
     return (
-        f"{FRICTION_NAME} may be anything from {low:.3f} to {high:.3f},"
-        " by the valve's exponent of clogging: state servovalve.clogging_exponent",
+        f"by the valve's exponent of clogging {FRICTION_NAME} may be {low:.3f} to {high:.3f}:"
+        f" {remedy} servovalve.clogging_exponent",
     )
 
 

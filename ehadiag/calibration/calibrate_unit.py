@@ -115,7 +115,9 @@ def _learn_chambers_as_new(session: CalibrationSession, best: LearnedModel) -> L
                 budget=SEARCHES.max_runs_one_start, turn=turn,
             )
         )  # fmt: skip
-        if _is_good_enough(found[-1], best):
+        # Another search cannot explain more than open loop, which is where the optimum is found.
+        most = SEARCHES.max_same_excess_ratio * best.estimated.excess
+        if found[-1].estimated.explained or found[-1].estimated.excess <= most:
             break
     return min(found, key=lambda item: item.criterion)
 

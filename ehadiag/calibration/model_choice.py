@@ -326,7 +326,15 @@ def _learn_chambers(session: CalibrationSession, first: UnitModel) -> list[Learn
         better = found.estimated.excess < SEARCHES.max_excess_share_moved * plain.estimated.excess
         if found.estimated.explained or (len(out) > 2 and better):
             break
+        if len(out) > 2 and _leaves_as_much(found, out[-2]):
+            models = models[-1:]
     return sorted(out, key=lambda item: item.criterion, reverse=True)
+
+
+def _leaves_as_much(found: LearnedModel, before: LearnedModel) -> bool:
+    """Whether a search leaves as much as the one before with the same model."""
+    least = before.estimated.excess / SEARCHES.max_same_excess_ratio
+    return found.model == before.model and found.estimated.excess > least
 
 
 def _rich_models(session: CalibrationSession, simple: Sequence[UnitModel]) -> list[LearnedModel]:

@@ -380,24 +380,37 @@ def _rms(refined: Refinement, row: int, cap: float = ESTIMATION.residual_cap) ->
     return float(np.sqrt(np.mean(np.minimum(residuals**2, cap)))) if residuals.size else np.nan
 
 
+EXPONENTS = 41
+"""Number of exponents of a range, its ends among them."""
+FIRST_STAGE_STD = 0.02
+"""Deviation of the clogging over the friction with the least exponent, 1, by the first stage's law
+that goes with an exponent: 0.018 to 0.032 on units of exponent 0 that were identified with 2."""
+
+
 def over_exponents(
-    found: Identification, constants: PlantConstants, exponents: tuple[float, float]
+    found: Identification,
+    constants: PlantConstants,
+    exponents: tuple[float, float],
+    *,
+    with_exponent: float,
 ) -> Identification:
     """Return an identification with the friction that any exponent of a range makes of it.
 
     The spool breaks away and creeps by the ratio of its friction and the first stage's pressure
     gain, GPF k^m (PHY-45). So a recording shows FSS / k^m, and hardly m: with each exponent there
-    is a friction that explains it as well. The estimate is the middle of these, its interval holds
-    them all.
+    is a friction that explains it as well. The interval holds that of each, the estimate is its
+    middle.
 
     Parameters
     ----------
     found : Identification
-        With the largest exponent.
+        With one exponent.
     constants : PlantConstants
-        Of the unit as new, the exponent in the middle of the range.
+        Of the unit as new.
     exponents : tuple[float, float]
         Least and largest exponent.
+    with_exponent : float
+        The one with which it was identified.
 
     Returns
     -------
@@ -410,12 +423,16 @@ def over_exponents(
     share = 1.0 + FAULT_LAWS["Kintas"].change * found.named("Kintas").value
     new = float(constants.FSS / (constants.FSS1 - constants.FSS))
     friction = found.named(FRICTION_NAME)
-    least = max(friction.value + new, 1e-9)
-    ends = [min(max(least * share ** (m - high) - new, 0.0), 1.0) for m in (high, low)]
-    value = sum(ends) / 2.0
-    ratio = (value + new) / least
-    std = ratio * friction.std + (ends[1] - ends[0]) / 2.0 / STANDARD_NORMAL.inv_cdf(0.975)
-    exponent = high + (math.log(ratio) / math.log(share) if share < 1.0 else 0.0)
+    shown = max(friction.value + new, 1e-9)
+    ratios = share ** (np.linspace(high, low, EXPONENTS) - with_exponent)
+    frictions = np.clip(shown * ratios - new, 0.0, 1.0).tolist()
+    half = STANDARD_NORMAL.inv_cdf(0.975) * friction.std * ratios
+    bottom = frictions[0] - float(half[0])
+    top = min(frictions[-1] + float(half[-1]), max(frictions[0] + float(half[0]), 1.0))
+    value = (bottom + top) / 2.0
+    std = (top - bottom) / 2.0 / STANDARD_NORMAL.inv_cdf(0.975)
+    power = math.log((value + new) / shown) / math.log(share) if share < 1.0 else 0.0
+    exponent = min(max(with_exponent + power, low), high)
     estimate = replace(
         friction,
         value=value,
@@ -423,18 +440,19 @@ def over_exponents(
         interval95=interval95(value, std),
         at_bound=not 0.0 < value < 1.0,
     )
-    place = [item.name for item in found.estimates].index(FRICTION_NAME)
-    covariance = found.covariance.copy()
-    covariance[place] *= std / friction.std
-    covariance[:, place] *= std / friction.std
-    nuisance = Nuisance(
-        exponent - (low + high) / 2.0, (high - low) / math.sqrt(12.0), at_bound=False
-    )
+    clogging = found.named("Kintas")
+    wider = math.hypot(clogging.std, FIRST_STAGE_STD * frictions[-1])
+    clogged = replace(clogging, std=wider, interval95=interval95(clogging.value, wider))
+    changed = {FRICTION_NAME: estimate, "Kintas": clogged}
+    ratio = np.array([changed.get(item.name, item).std / item.std for item in found.estimates])
+    covariance = found.covariance * np.outer(ratio, ratio)
+    std_of_exponent = (high - low) / math.sqrt(12.0)
+    nuisance = Nuisance(exponent - constants.CLE, std_of_exponent, at_bound=False)
     return replace(
         found,
-        estimates=tuple(estimate if item is friction else item for item in found.estimates),
+        estimates=tuple(changed.get(item.name, item) for item in found.estimates),
         nuisances={**found.nuisances, EXPONENT_NAME: nuisance},
         covariance=covariance,
-        friction_range=(ends[0], ends[1]),
-        response={FRICTION_NAME: friction.value, EXPONENT_NAME: (high - low) / 2.0},
+        frictions=tuple(frictions),
+        response={FRICTION_NAME: friction.value, EXPONENT_NAME: with_exponent - constants.CLE},
     )

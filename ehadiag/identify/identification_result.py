@@ -100,9 +100,11 @@ class Identification(msgspec.Struct, frozen=True, eq=False):
     """Speed of the jack, m/s, below which the pressure was left out; 0: none was."""
     better_exponent: float | None = None
     """Exponent of clogging, 1, that explains far more than the actuator file's; None: none does."""
-    friction_range: tuple[float, float] | None = None
-    """Least and largest `FSS` by the exponents of clogging that the actuator file allows; None
-    where it states one."""
+    exponent_doubted: bool = False
+    """Whether the file's exponent 0 is not borne out, so that `FSS` is that of all exponents."""
+    frictions: tuple[float, ...] = ()
+    """`FSS` with each of evenly spaced exponents of clogging that the actuator file allows, the
+    largest first; empty where it states one."""
     response: Mapping[str, float] = msgspec.field(default_factory=dict)
     """What the identified response has in place of estimates that are of a range, by name, SI."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.actuator import Actuator
+from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT, Actuator
 from ehadiag.core.criteria import FIT, LOSSES
 from ehadiag.identify import compact_ga
 from ehadiag.identify.estimates import (
@@ -65,6 +65,7 @@ from ehadiag.identify.staged_search import (
     stage_ready_at,
     staged_search,
 )
+from ehadiag.model.plant import PlantConstants
 from ehadiag.model.registry import FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
@@ -166,12 +167,16 @@ class IdentificationSession:
         return self._memory.recall(
             key,
             Identification,
-            lambda: over_exponents(
-                self._identify(experiments, callback),
-                experiments[0].constants,
-                self.prior.exponents,
+            lambda: self._over_exponents(
+                self._identify(experiments, callback), experiments[0].constants
             ),
         )
+
+    def _over_exponents(self, found: Identification, constants: PlantConstants) -> Identification:
+        """Return an identification with the friction of all exponents that may be."""
+        stated = self.prior.exponents
+        of_all = (0.0, MAX_CLOGGING_EXPONENT) if found.exponent_doubted else stated
+        return over_exponents(found, constants, of_all, with_exponent=stated[1])
 
     def _prepared(self, experiments: Sequence[Experiment]) -> list[Experiment]:
         """Experiments with offsets shared; of exponents of clogging with the largest one.
@@ -267,7 +272,10 @@ class IdentificationSession:
             timing=_timing(begin, searched_at, search_s),
         )
         return replace(
-            concluded, slip_speed=freed.slip_speed, better_exponent=freed.better_exponent
+            concluded,
+            slip_speed=freed.slip_speed,
+            better_exponent=freed.better_exponent,
+            exponent_doubted=freed.exponent_doubted,
         )
 
     def _discrepancy(self, refined: Refinement) -> Array:

@@ -89,6 +89,8 @@ class NuisanceEstimate(msgspec.Struct, frozen=True, eq=False):
     """Speed of the jack, m/s, below which the pressure was left out; 0: none was."""
     better_exponent: float | None = None
     """Exponent of clogging, 1, that explains far more than the actuator file's; None: none does."""
+    exponent_doubted: bool = False
+    """Whether the file says 0, and the recording does not bear it out."""
 
 
 def estimate_nuisances(
@@ -234,6 +236,11 @@ def would_effect_explain(effect: Parameter, found: NuisanceEstimate) -> bool:
     )
 
 
+def _explains_far_more(excess: float, before: float) -> bool:
+    """Whether an estimate leaves at most half of what another one leaves beside the noise."""
+    return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
+
+
 class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
@@ -263,19 +270,21 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         return self._loosened(experiments, found, hint) if calibrated else found
 
     def _loosened(
-        self,
-        experiments: Sequence[Experiment],
-        found: NuisanceEstimate,
+        self, experiments: Sequence[Experiment], found: NuisanceEstimate,
         hint: Mapping[str, float] | None,
-        budget: int = NUISANCE_RUN_BUDGET,
-    ) -> NuisanceEstimate:
+    ) -> NuisanceEstimate:  # fmt: skip
         """Estimate where effects may have changed since the calibration, if that explains more."""
+        loose = self._with_changed_effects(experiments, found, hint)
+        return loose if _explains_far_more(loose.excess, found.excess) else found
+
+    def _with_changed_effects(
+        self, experiments: Sequence[Experiment], found: NuisanceEstimate,
+        hint: Mapping[str, float] | None, budget: int = NUISANCE_RUN_BUDGET,
+    ) -> NuisanceEstimate:  # fmt: skip
+        """Estimate where effects may have changed; the same where what is left is of no change."""
         if found.explained or found.excess <= GIVE_UP.max_unchanged_excess:
             return found
-        loose = self._with(experiments, self.prior.loosened(), hint, budget=budget)
-        if loose.excess - 1.0 < GIVE_UP.max_changed_share * (found.excess - 1.0):
-            return loose
-        return found
+        return self._with(experiments, self.prior.loosened(), hint, budget=budget)
 
     def _of_oil(
         self, experiments: Sequence[Experiment], hint: Mapping[str, float] | None, before: float
@@ -289,37 +298,50 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         settings, considered = self._search(experiments, self.prior, hint, before, budget=1)
         staged = search_in_stages(experiments, settings)
         if staged.found.explained:
-            return estimate_about(experiments, settings, staged, considered)
+            found = estimate_about(experiments, settings, staged, considered)
+            better, doubted = self._other_exponent(experiments, found, found)
+            return replace(found, better_exponent=better, exponent_doubted=doubted)
         names = [item.name for item in staged.model.estimated]
         values = dict(zip(names, staged.found.density.x * staged.model.scale, strict=True))
         slow = max(item.slip_speed(min(max(values["FDJ"], 0.0), 1.0)) for item in experiments)
         sliding = [item.sliding(slow) for item in experiments]
         found = self._with(sliding, self.prior, values, before)
-        better = None if found.explained else self._better_exponent(sliding, found)
-        if better is None:
-            found = self._loosened(sliding, found, values, budget=1)
+        loose = self._with_changed_effects(sliding, found, values, budget=1)
+        better, doubted = self._other_exponent(sliding, found, loose)
+        if better is None and _explains_far_more(loose.excess, found.excess):
+            found = loose
         return replace(
             found,
             slip_speed=slow,
             better_exponent=better,
+            exponent_doubted=doubted,
             evaluations=staged.evaluations + found.evaluations,
             starts=staged.found.starts + found.starts,
         )
 
-    def _better_exponent(
-        self, experiments: Sequence[Experiment], found: NuisanceEstimate
-    ) -> float | None:
-        """Return the end of the exponents farther from the stated one, where it explains far more.
+    def _other_exponent(
+        self, experiments: Sequence[Experiment], found: NuisanceEstimate, loose: NuisanceEstimate
+    ) -> tuple[float | None, bool]:
+        """Return the end of the exponents farther from the stated one, where it explains far more
+        of the spool; and whether the stated one is 0, and is not borne out.
 
-        One start decides, by what is left of the spool.
-
-        A recording shows `FSS / k^m`, which any m explains: but not how a friction slows the spool,
-        by which a bridge behind a filter differs from the linear first stage (PHY-43).
+        One start with the other end decides. What was calibrated with the stated law is loosened,
+        since it stands in for what that law leaves out. Where neither end leaves half of what the
+        other one does, the recording shows `FSS / k^m` alone (PHY-45): 0 is not believed then,
+        which a file says that does not say anything. A unit that the model explains to the noise,
+        as new and now, is of the model's kind, with the file's exponent.
         """
         low, stated = self.prior.exponents
-        before = signal_excess_costs(found.refined.residuals)[SPOOL_ROW]
-        if low < stated or before <= FIT.max_explained_excess:
-            return None
+        before, own = (
+            float(signal_excess_costs(item.refined.residuals)[SPOOL_ROW]) for item in (found, loose)
+        )
+        shows = before > FIT.max_explained_excess
+        if stated == 0.0:
+            shows = shows or not self.prior.explains_unit_as_new
+        elif found.explained:
+            shows = False
+        if low < stated or not shows:
+            return None, False
         other = 0.0 if stated > MAX_CLOGGING_EXPONENT / 2.0 else MAX_CLOGGING_EXPONENT
         c, values = experiments[0].constants, found.refined.values
         bridge = self.prior.bridge if other > 0.0 else 0.0
@@ -331,9 +353,13 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         new = c.FSS / (c.FSS1 - c.FSS)
         friction = (values[FRICTION_NAME] + new) * share ** (other - stated) - new
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
-        settings, _ = self._search(others, self.prior, hint, budget=1)
-        left = signal_excess_costs(search_in_stages(others, settings).found.residuals)[SPOOL_ROW]
-        return other if left - 1.0 < GIVE_UP.max_changed_share * (before - 1.0) else None
+        settings, _ = self._search(others, self.prior.loosened(), hint, budget=1)
+        residuals = search_in_stages(others, settings).found.residuals
+        left = float(signal_excess_costs(residuals)[SPOOL_ROW])
+        least = min(own, before)
+        if least > FIT.max_explained_excess and _explains_far_more(left, least):
+            return other, False
+        return None, stated == 0.0 and not _explains_far_more(before, left)
 
     def _with_load(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate

@@ -37,7 +37,10 @@ def estimate(name, value, std):
 
 def verdict(*pairs, rule=VerdictRule.INTERVAL):
     estimates = [estimate(f"S{i}", *pair) for i, pair in enumerate(pairs)]
-    return judge(SimpleNamespace(estimates=estimates, friction_range=None), Levels(rule=rule))
+    return judge(
+        SimpleNamespace(estimates=estimates, frictions=(), exponent_doubted=False),
+        Levels(rule=rule),
+    )
 
 
 @pytest.mark.parametrize(

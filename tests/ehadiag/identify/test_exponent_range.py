@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Levels, Verdict, default_actuator
@@ -73,15 +74,24 @@ def identified(*values):
     )
 
 
+def over_any(found, constants, with_exponent=2.0):
+    """An identification with one exponent, by all of them."""
+    return over_exponents(found, constants, (0.0, 2.0), with_exponent=with_exponent)
+
+
 @given(kintas=st.floats(0.0, 1.0), friction=st.floats(0.0, 1.0), exponent=st.floats(0.0, 2.0))
 def test_the_interval_holds_the_friction_of_every_exponent(kintas, friction, exponent):
     constants = plant_constants(ANY)
     new = constants.FSS / (constants.FSS1 - constants.FSS)
     seen = (friction + new) * (1.0 - 0.8 * kintas) ** (2.0 - exponent) - new
-    found = over_exponents(identified(kintas, seen, 0.3), constants, (0.0, 2.0))
+    found = over_any(identified(kintas, seen, 0.3), constants)
     low, high = found.named("FSS").interval95
     assert low - 1e-9 <= friction <= high + 1e-9
-    assert found.named("Kintas") == identified(kintas, seen, 0.3).named("Kintas")
+    clogging = found.named("Kintas")
+    assert clogging.value == kintas
+    assert clogging.std == pytest.approx(np.hypot(STD, 0.02 * found.frictions[-1]))
+    assert found.covariance[0, 0] == pytest.approx(clogging.std**2)
+    assert found.covariance[2, 2] == pytest.approx(STD**2)
     assert found.covariance[1, 1] == pytest.approx(found.named("FSS").std ** 2)
     assert found.named("FSS").shown, "doubt about the exponent is none about the test"
 
@@ -90,7 +100,7 @@ def test_the_interval_holds_the_friction_of_every_exponent(kintas, friction, exp
 def test_estimate_and_exponent_are_what_was_identified(kintas, friction):
     """The response is that with the largest exponent, which was searched with."""
     constants = plant_constants(ANY)
-    found = over_exponents(identified(kintas, friction, 0.3), constants, (0.0, 2.0))
+    found = over_any(identified(kintas, friction, 0.3), constants)
     seen = found.constants(constants)
     assert seen.CLE == 2.0
     free = tuple(parameter(name) for name in ("Kintas", "FSS"))
@@ -101,32 +111,71 @@ def test_estimate_and_exponent_are_what_was_identified(kintas, friction):
     assert pytest.approx(force / gain, rel=1e-9) == seen.FSS / seen.GPF
 
 
+@given(kintas=st.floats(0.1, 0.9), friction=st.floats(0.0, 0.5))
+def test_a_doubted_zero_is_any_exponent(kintas, friction):
+    """What was identified with exponent 0 has the frictions of what was with 2."""
+    constants = plant_constants(with_exponent(0.0))
+    new = constants.FSS / (constants.FSS1 - constants.FSS)
+    papers = min((friction + new) * (1.0 - 0.8 * kintas) ** -2.0 - new, 1.0)
+    series = (papers + new) * (1.0 - 0.8 * kintas) ** 2.0 - new
+    found = over_any(identified(kintas, papers, 0.3), constants, with_exponent=0.0)
+    other = over_any(identified(kintas, series, 0.3), plant_constants(ANY))
+    assert found.frictions == pytest.approx(other.frictions, abs=1e-9)
+    assert found.constants(constants).CLE == 0.0, "the response is the one identified"
+    assert (
+        pytest.approx(constants.FSS + papers * (constants.FSS1 - constants.FSS))
+        == found.constants(constants).FSS
+    )
+
+
 def test_a_number_is_no_range():
     found = identified(0.5, 0.2, 0.3)
-    assert over_exponents(found, plant_constants(with_exponent(1.0)), (1.0, 1.0)) is found
+    constants = plant_constants(with_exponent(1.0))
+    assert over_exponents(found, constants, (1.0, 1.0), with_exponent=1.0) is found
 
 
 def test_the_verdict_covers_both_ends():
     constants = plant_constants(ANY)
-    verdict, reasons = judge(
-        over_exponents(identified(0.6, 0.3, 0.3), constants, (0.0, 2.0)), Levels()
-    )
-    assert verdict is Verdict.NOT_TESTED
-    assert "clogging_exponent" in reasons[0]
-    verdict, _ = judge(over_exponents(identified(0.8, 0.3, 0.3), constants, (0.0, 2.0)), Levels())
+    verdict, _ = judge(over_any(identified(0.8, 0.3, 0.3), constants), Levels())
     assert verdict is Verdict.FAULT, "the filter's clogging alone decides"
-    verdict, _ = judge(over_exponents(identified(0.1, 0.3, 0.3), constants, (0.0, 2.0)), Levels())
+    verdict, reasons = judge(over_any(identified(0.1, 0.3, 0.3), constants), Levels())
     assert verdict is Verdict.DEGRADED
+    assert not any("clogging_exponent" in reason for reason in reasons)
 
 
 @pytest.mark.parametrize(
-    ("friction", "expected"), [(0.6, Verdict.NOT_TESTED), (0.8, Verdict.FAULT)]
+    ("kintas", "friction", "expected"),
+    [
+        (0.6, 0.3, Verdict.DEGRADED),  # a fault with exponents up to 0.7
+        (0.6, 0.1, Verdict.DEGRADED),  # with none
+        (0.7, 0.2, Verdict.NOT_TESTED),  # up to 0.5, and below the advisory level with 2
+        (0.5, 0.6, Verdict.NOT_TESTED),  # up to 1.6
+        (0.5, 0.8, Verdict.FAULT),
+    ],
 )
-def test_a_clogged_filter_does_not_decide_what_the_exponent_leaves_open(friction, expected):
-    """The filter's own severity is at the advisory level, the middle of the friction a fault."""
-    found = over_exponents(identified(0.5, friction, 0.3), plant_constants(ANY), (0.0, 2.0))
-    assert found.named("FSS").value > Levels().limit
-    assert judge(found, Levels())[0] is expected
+def test_a_fault_with_some_exponents_alone_is_none(kintas, friction, expected):
+    found = over_any(identified(kintas, friction, 0.3), plant_constants(ANY))
+    verdict, reasons = judge(found, Levels())
+    assert verdict is expected
+    fault = [value >= Levels().limit for value in found.frictions]
+    named = any("servovalve.clogging_exponent" in reason for reason in reasons)
+    assert named is (any(fault) and not all(fault))
+
+
+@given(kintas=st.floats(0.0, 0.9), friction=st.floats(0.0, 1.0), std=st.floats(1e-3, 0.1))
+def test_the_interval_is_that_of_both_ends(kintas, friction, std):
+    """The one with the largest exponent, and that with the least, friction up to 1."""
+    constants = plant_constants(ANY)
+    one = identified(kintas, friction, 0.3)
+    given = tuple(
+        replace(item, std=std, interval95=interval95(item.value, std)) for item in one.estimates
+    )
+    low, high = over_any(replace(one, estimates=given), constants).named("FSS").interval95
+    assert low == pytest.approx(interval95(friction, std)[0], abs=1e-9)
+    new = constants.FSS / (constants.FSS1 - constants.FSS)
+    ratio = (1.0 - 0.8 * kintas) ** -2.0
+    least = (friction + new) * ratio - new
+    assert high == pytest.approx(interval95(min(least, 1.0), std * ratio)[1], abs=1e-9)
 
 
 def test_discrepancy_grows_with_wear_and_with_what_is_left():
@@ -161,7 +210,7 @@ def test_an_error_of_the_flow_gain_reaches_the_friction_where_the_filter_takes_p
 
 
 def test_judging_needs_no_effects():
-    assert judge(SimpleNamespace(estimates=(), friction_range=None), Levels())[0] is Verdict.HEALTHY
+    assert judge(SimpleNamespace(estimates=(), frictions=()), Levels())[0] is Verdict.HEALTHY
 
 
 def test_doubt_about_a_law_widens_the_interval_and_hides_nothing():

@@ -138,14 +138,14 @@ def test_a_second_stage_without_oil_leaves_nothing_out():
 
 
 def calibrated(actuator):
-    """A unit of which hysteresis was learned, and something left."""
+    """A unit of which hysteresis and null bias were learned, and something left."""
     calibration = Calibration(
         date="2026-01-02T03:04:05Z",
         start=actuator.name,
-        effects={"hysteresis": 0.02},
-        parameters=("hysteresis",),
-        std=(1e-4,),
-        root=((1.0,),),
+        effects={"hysteresis": 0.02, "null_bias": 0.0},
+        parameters=("hysteresis", "null_bias"),
+        std=(1e-4, 1e-7),
+        root=((1.0,), (0.0, 1.0)),
         fit=FitQuality(excess=1.5, outliers=0.01, spool_rms=1.0, pressure_rms=1.2),
         recordings=(CalibrationSource(name="a.blf", test="open"),),
     )
@@ -176,17 +176,37 @@ def test_a_worn_jack_that_slips_is_judged_where_it_is_fast():
     assert any("slips in steps below" in note for note in found.notes)
 
 
-@pytest.mark.slow
-def test_a_wrong_exponent_of_clogging_is_contradicted_by_the_recording():
-    test, actuator, worn = resolve_test("open"), with_volume(0.9e-4), Faults(0.3, 0.6, 0.2)
+def of_series_filter(worn, effects):
+    """A worn unit with m = 2, diagnosed with this exponent and with 0."""
+    test, actuator = resolve_test("open"), with_volume(0.9e-4)
     series = msgspec.structs.replace(actuator.servovalve, clogging_exponent=2.0)
     true = msgspec.structs.replace(actuator, servovalve=series)
-    effects = Effects(hysteresis=0.02)
     recording = simulate(true, test, worn, effects=effects, seed=3, step=1e-6).recording("unit")
-    stated = {
+    return {
         exponent: diagnose([recording], calibrated(unit), bundled_tests().values())
         for exponent, unit in ((0.0, actuator), (2.0, true))
     }
-    assert stated[2.0].verdict is Verdict.DEGRADED
+
+
+@pytest.mark.slow
+def test_a_wrong_exponent_of_clogging_is_contradicted_by_the_recording():
+    stated = of_series_filter(Faults(0.3, 0.9, 0.2), Effects(hysteresis=0.02))
+    assert stated[2.0].verdict is Verdict.FAULT
     assert stated[0.0].verdict is Verdict.NOT_TESTED
     assert any("contradicts servovalve.clogging_exponent: with 2" in r for r in stated[0.0].reasons)
+
+
+@pytest.mark.slow
+def test_an_exponent_of_zero_that_is_not_borne_out_is_any():
+    """The null bias has changed, which either exponent explains."""
+    truth = Faults(0.3, 0.2, 0.2)
+    stated = of_series_filter(truth, Effects(hysteresis=0.02, null_bias=1e-4))
+    found = {name: item.identification for name, item in stated.items()}
+    assert found[0.0] is not None
+    assert found[2.0] is not None
+    assert found[0.0].exponent_doubted
+    assert not found[2.0].exponent_doubted
+    low, high = found[0.0].named("FSS").interval95
+    assert low <= truth.FSS < found[0.0].frictions[-1] <= high
+    assert found[2.0].named("FSS").value == pytest.approx(truth.FSS, abs=0.01)
+    assert any("does not bear out servovalve.clogging_exponent" in n for n in stated[0.0].notes)

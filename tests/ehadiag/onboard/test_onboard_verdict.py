@@ -71,7 +71,8 @@ def judged(values, stds):
         for name, value, std in zip(NAMES, values, stds, strict=True)
     ]
     return verdict.judge(
-        SimpleNamespace(estimates=estimates, nuisances={}, friction_range=None), LEVELS
+        SimpleNamespace(estimates=estimates, nuisances={}, frictions=()),
+        LEVELS,
     )[0], estimates
 
 

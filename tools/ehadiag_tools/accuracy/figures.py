@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
-from ehadiag.assess.verdict import Verdict
+from ehadiag.assess.verdict import Levels, Verdict
 from ehadiag.identify.experiment import Experiment
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
@@ -57,6 +57,20 @@ def holds_truth(records: Sequence[Record]) -> NDArray[np.bool_]:
     low, high = _ends(records)
     truth = np.array([record["faults"] for record in records])
     return np.asarray((low <= truth + ROUNDING) & (truth - ROUNDING <= high))
+
+
+def is_wrong(record: Record, levels: Levels | None = None) -> bool:
+    """Whether a verdict is another than the truth's, and the intervals exclude the truth.
+
+    An interval that holds the truth on the other side of a level says that it may be so.
+    """
+    levels = levels or Levels()
+    worst = max(record["faults"])
+    true = Verdict.HEALTHY if worst < levels.advisory else Verdict.DEGRADED
+    true = Verdict.FAULT if worst >= levels.limit else true
+    if record["verdict"] in (None, Verdict.NOT_TESTED.name, true.name):
+        return False
+    return not bool(holds_truth([record]).all())
 
 
 def stated_of(records: Sequence[Record]) -> list[Record]:

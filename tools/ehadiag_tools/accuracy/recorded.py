@@ -6,6 +6,7 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import msgspec
@@ -14,11 +15,11 @@ import numpy as np
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.calibrate_unit import calibrate
-from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
+from ehadiag.core.actuator import Actuator, ExponentOrRange, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag_tools.accuracy.figures import cramer_rao, holds_truth, percent_errors
+from ehadiag_tools.accuracy.figures import cramer_rao, holds_truth, is_wrong, percent_errors
 from ehadiag_tools.simulator.compare_logs import read_rows
-from ehadiag_tools.study import Options, Record, Study, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError, EhadiagError
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.stored_test import bundled_tests
@@ -31,8 +32,8 @@ class RecordedUnit:
     folder: str
     unit: str
     new: int
-    exponent: float | tuple[float, float] | None = None
-    """Of the clogging, in place of the actuator file's."""
+    exponents: tuple[ExponentOrRange, ...] = ()
+    """Of the clogging, in place of the actuator file's; all with the same largest one."""
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -45,8 +46,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "--exponent",
         type=float,
         nargs="+",
+        action="append",
         metavar="M",
-        help="of the clogging, or the two ends of its range, in place of the file's",
+        help="of the clogging, or its range, in place of the file's; may be repeated",
     )
     add("--new", type=int, default=0, metavar="N", help="calibrate on the first N as new (all)")
 
@@ -59,43 +61,56 @@ def _cases(options: Options) -> list[RecordedUnit]:
         if name not in names:
             raise ConfigurationError(f"--unit {name}: no recording of it as new in truth.csv")
     folder = str(options.recordings)
-    given = options.exponent
-    exponent = None if given is None else given[0] if len(given) == 1 else (given[0], given[1])
-    return [RecordedUnit(folder, name, options.new, exponent) for name in wanted]
+    stated: dict[float, list[ExponentOrRange]] = {}
+    for given in options.exponent or ():
+        value = given[0] if len(given) == 1 else (given[0], given[1])
+        stated.setdefault(given[-1], []).append(value)
+    groups = [tuple(values) for values in stated.values()] or [()]
+    return [RecordedUnit(folder, name, options.new, group) for group in groups for name in wanted]
 
 
 def perform(case: RecordedUnit) -> Record:
-    """Calibrate a unit and diagnose its worn recordings; fractions of 1."""
+    """Calibrate a unit and diagnose its worn recordings; fractions of 1.
+
+    A range of exponents is calibrated with its largest: one calibration serves all of a case.
+    """
     folder = Path(case.folder)
     rows = [r for r in read_rows(folder / "truth.csv") if r["file"].startswith(f"{case.unit}-")]
     new = [read_recording(folder / row["file"]) for row in rows if "-new-" in row["file"]]
     begin = time.process_time()
     chosen = new[: case.new or None]
-    found = calibrate(chosen, _sheet(case), bundled_tests().values())
+    sheet = _sheet(case)
+    statements = case.exponents or (sheet.servovalve.clogging_exponent,)
+    stated = with_exponent(sheet, statements[0])
+    found = calibrate(chosen, stated, bundled_tests().values())
     spent = time.process_time() - begin
     record: Record = {"calibration_s": spent, "reasons": list(found.reasons), "worn": []}
     record["tried"] = [f"{item.words} {item.excess:.2f}" for item in found.tried]
     if found.actuator is not None and found.actuator.calibration is not None:
         calibration = found.actuator.calibration
         record["learned"] = f"{calibration.fit.excess:.2f}, {', '.join(calibration.effects)}"
-        for row in rows:
+        for said, row in product(statements, rows):
             if "-new-" not in row["file"]:
                 truth = [float(row[name]) for name in FAULT_NAMES]
-                record["worn"].append(_diagnosed(folder / row["file"], truth, found.actuator))
+                unit = with_exponent(found.actuator, said)
+                record["worn"].append({"m": said, **_diagnosed(folder / row["file"], truth, unit)})
     return record
 
 
 def _sheet(case: RecordedUnit) -> Actuator:
     """Data of the unit's type: `sheet-X.toml` beside its recordings, else the reference's."""
     path = Path(case.folder) / f"sheet-{case.unit}.toml"
-    sheet = load_actuator(path) if path.exists() else default_actuator()
-    if case.exponent is None:
-        return sheet
-    valve = msgspec.structs.replace(sheet.servovalve, clogging_exponent=case.exponent)
-    return msgspec.structs.replace(sheet, servovalve=valve)
+    return load_actuator(path) if path.exists() else default_actuator()
+
+
+def with_exponent(actuator: Actuator, exponent: ExponentOrRange) -> Actuator:
+    """Return data of an actuator with another statement of the clogging's exponent."""
+    valve = msgspec.structs.replace(actuator.servovalve, clogging_exponent=exponent)
+    return msgspec.structs.replace(actuator, servovalve=valve)
 
 
 def _diagnosed(path: Path, truth: list[float], unit: Actuator) -> Record:
+    begin = time.process_time()
     found = diagnose([read_recording(path)], unit, bundled_tests().values())
     if found.identification is None:
         raise EhadiagError(f"{path.name}: {'; '.join(found.reasons)}")
@@ -107,8 +122,9 @@ def _diagnosed(path: Path, truth: list[float], unit: Actuator) -> Record:
         "std": [item.std for item in estimates],
         "interval95": [list(item.interval95) for item in estimates],
         "bound": cramer_rao(found.experiments, truth).tolist(),
-        "verdict": found.verdict.name.replace("_", " "),
+        "verdict": found.verdict.name,
         "refused": list(found.reasons) if found.verdict is Verdict.NOT_TESTED else [],
+        "diagnosis_s": time.process_time() - begin,
     }
 
 
@@ -122,29 +138,30 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
             yield f"refused: {'; '.join(record['reasons'])}"
             continue
         yield f"learned: {record['learned']}\n"
-        worn = record["worn"]
-        if worn:
-            headings = ("recording", *FAULT_NAMES, "bounds", "covered", "verdict")
-            yield from markdown(headings, _rows(worn))
-            yield from _summary(worn)
+        if record["worn"]:
+            headings = ("m", "recording", *FAULT_NAMES, "bounds", "covered", "verdict")
+            yield from markdown(headings, _rows(record["worn"]))
+            for item in record["worn"]:
+                if item["refused"]:
+                    yield f"m {item['m']}, {item['recording']}: {'; '.join(item['refused'])}"
+    yield from _summary([item for record in records for item in record["worn"]])
 
 
 def _summary(worn: Sequence[Record]) -> Iterator[str]:
-    """What was answered: mean and worst error of each severity, coverage; why the rest was not."""
-    answered = [item for item in worn if not item["refused"]]
-    yield f"\nanswered: {len(answered)} of {len(worn)}"
-    if answered:
-        error = np.abs(percent_errors(answered))
-        means, worst = error.mean(axis=0), error.max(axis=0)
-        each = (
-            f"{name} mean {mean:.3f}, worst {most:.3f}"
-            for name, mean, most in zip(FAULT_NAMES, means, worst, strict=True)
-        )
-        held = 100.0 * holds_truth(answered).mean()
-        yield f"{'; '.join(each)}; coverage {held:.0f} %"
-    for item in worn:
-        if item["refused"]:
-            yield f"{item['recording']}: {'; '.join(item['refused'])}"
+    """What was answered: mean and worst error of each severity, coverage."""
+    for (said,), part in grouped(worn, "m").items():
+        answered = [item for item in part if not item["refused"]]
+        yield f"\nm {said}: answered {len(answered)} of {len(part)}"
+        if answered:
+            error = np.abs(percent_errors(answered))
+            means, worst = error.mean(axis=0), error.max(axis=0)
+            each = (
+                f"{name} mean {mean:.3f}, worst {most:.3f}"
+                for name, mean, most in zip(FAULT_NAMES, means, worst, strict=True)
+            )
+            held = holds_truth(answered)
+            wrong = sum(map(is_wrong, answered))
+            yield f"{'; '.join(each)}; {held.sum()} of {held.size} hold; sure and wrong: {wrong}"
 
 
 def _rows(worn: Sequence[Record]) -> Iterator[tuple[object, ...]]:
@@ -152,7 +169,8 @@ def _rows(worn: Sequence[Record]) -> Iterator[tuple[object, ...]]:
         cells = [f"{e:+.3f} ± {100.0 * s:.3f}" for e, s in zip(error, item["std"], strict=True)]
         bounds = " ".join(f"{100.0 * value:.3f}" for value in item["bound"])
         covered = "yes" if held.all() else "no"
-        yield item["recording"], *cells, bounds, covered, item["verdict"]
+        verdict = item["verdict"].replace("_", " ")
+        yield item["m"], item["recording"], *cells, bounds, covered, verdict
 
 
 RECORDED_UNITS = Study(

@@ -14,19 +14,20 @@ import msgspec
 import numpy as np
 
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.assess.verdict import Levels, Verdict
+from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag.calibration.unit_models import Calibrated
-from ehadiag.core.actuator import Actuator, Discrepancy, ExponentOrRange, default_actuator
+from ehadiag.core.actuator import Discrepancy, ExponentOrRange, default_actuator
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults, UnmodelledEffects
-from ehadiag_tools.accuracy.figures import holds_truth, percent_errors
+from ehadiag_tools.accuracy.figures import holds_truth, is_wrong, percent_errors
+from ehadiag_tools.accuracy.recorded import with_exponent
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, random_unit, record
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import bundled_tests
 
-__all__ = ["VALVES", "ValveCase", "is_wrong", "perform", "random_valve", "statements_of"]
+__all__ = ["VALVES", "ValveCase", "perform", "random_valve", "statements_of"]
 
 SERIES = 2.0
 """Exponent of a filter in series."""
@@ -96,11 +97,6 @@ def _switches(unit: Unit) -> list[str]:
     return [name for name, on in zip(SWITCHES, states, strict=True) if on]
 
 
-def _with_exponent(actuator: Actuator, exponent: ExponentOrRange) -> Actuator:
-    valve = msgspec.structs.replace(actuator.servovalve, clogging_exponent=exponent)
-    return msgspec.structs.replace(actuator, servovalve=valve)
-
-
 def perform(case: ValveCase) -> Record:
     """Calibrate a unit and diagnose it worn, with each statement; fractions of 1.
 
@@ -121,7 +117,7 @@ def perform(case: ValveCase) -> Record:
     for name, said in statements_of(unit).items():
         if name not in case.statements:
             continue
-        stated = _with_exponent(sheet, said)
+        stated = with_exponent(sheet, said)
         largest = stated.servovalve.clogging_range[1]
         if largest not in calibrated:
             if len(calibrated) == case.calibrations:
@@ -135,7 +131,7 @@ def perform(case: ValveCase) -> Record:
 def _answer(found: Calibrated, said: ExponentOrRange, worn: Recording) -> Record:
     if found.actuator is None:
         return {"refused": list(found.reasons), "verdict": None}
-    actuator = _with_exponent(found.actuator, said)
+    actuator = with_exponent(found.actuator, said)
     diagnosis = diagnose([worn], actuator, bundled_tests().values())
     estimates = diagnosis.identification.estimates if diagnosis.identification else ()
     tested = diagnosis.verdict is not Verdict.NOT_TESTED
@@ -148,20 +144,6 @@ def _answer(found: Calibrated, said: ExponentOrRange, worn: Recording) -> Record
         "std": [item.std for item in estimates],
         "interval95": [list(item.interval95) for item in estimates],
     }
-
-
-def is_wrong(record: Record, levels: Levels | None = None) -> bool:
-    """Whether a verdict is another than the truth's, and the intervals exclude the truth.
-
-    An interval that holds the truth on the other side of a level says that it may be so.
-    """
-    levels = levels or Levels()
-    worst = max(record["faults"])
-    true = Verdict.HEALTHY if worst < levels.advisory else Verdict.DEGRADED
-    true = Verdict.FAULT if worst >= levels.limit else true
-    if record["verdict"] in (None, Verdict.NOT_TESTED.name, true.name):
-        return False
-    return not bool(holds_truth([record]).all())
 
 
 def _cases(options: Options) -> list[ValveCase]:
