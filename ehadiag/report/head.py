@@ -150,12 +150,9 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
         sentences += tuple(remaining_sentences(prognosis, worn)[:1])
     serial = "unknown" if result.serial is None else str(result.serial)
     date = "date unknown" if result.date is None else _shown_date(result.date)
+    dated = "recorded" if untested and not result.identified else "tested"
     facts = (
-        *(
-            []
-            if untested and result.date is None
-            else [("recorded" if untested else "tested", date)]
-        ),
+        *([] if untested and result.date is None else [(dated, date)]),
         ("unit", serial),
         ("", stored_test_name(result.test)),
         ("actuator type", result.actuator),

@@ -125,8 +125,10 @@ def _draw_panel(axis: Axes, panel: Panel, dates: bool) -> None:
                 transform=axis.get_yaxis_transform(), color=style.colour,
             )  # fmt: skip
         elif line.label:
+            # At the last test the worst severity is high.
+            place, side = (0.01, "bottom") if line.role == "last test" else (1.0, "top")
             axis.text(
-                at, 1.0, f" {line.label}", rotation=90, va="top", fontsize=8,
+                at, place, f" {line.label}", rotation=90, va=side, fontsize=8,
                 transform=axis.get_xaxis_transform(), parse_math=False,
             )  # fmt: skip
     if panel.y_range is not None:

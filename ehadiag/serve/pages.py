@@ -121,7 +121,7 @@ class Pages:
         if place is None:
             none = "No history is kept: --history."
         _, head, rows, summary = self._fleet
-        lines = (levels_text(self._levels), "Worst unit first.") if rows else ()
+        lines = (f"{levels_text(self._levels)} Worst unit first.",) if rows else ()
         shown = rows[:MAX_PAGE_ROWS]
         return self._list("Fleet", "/", head, shown, none=none, lines=lines, summary=summary)
 

@@ -267,7 +267,7 @@ def test_names_in_an_actuator_file_are_text(name: str, run: Run, tmp_path: Path)
     (tmp_path / "a.toml").write_text(text)
     result = run("diagnose", "--actuator", "a.toml", HEALTHY)
     shown = name.replace("\x1b", "\\x1b").replace("\n", "\\x0a")
-    assert result.out.splitlines()[1].endswith(f", unit 1, test open, actuator {shown}")
+    assert result.out.splitlines()[1].endswith(f", unit 1, open-loop test, actuator type {shown}")
     (found,) = run("diagnose", "--json", "--actuator", "a.toml", HEALTHY).objects
     assert found["actuator"] == name
 
