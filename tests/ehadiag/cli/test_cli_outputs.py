@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ from cli_result import COMMAND, Run
 from places import LOGS
 
 from ehadiag.history.store import History
+from ehadiag.terminal.output import print_status
 from firmware_iface.files import Folder
 from firmware_iface.logs.reader import read_frames
 
@@ -380,3 +382,20 @@ def test_signals_in_a_folder_of_recordings_are_no_recordings(run: Run, tmp_path:
     found = run("diagnose", "--json", "o")
     assert len(found.objects) == 1
     assert "signals of a result are no recording: o/paper-open-1.signals.mf4" in found.err
+
+
+class Terminal(io.StringIO):
+    """Standard error that is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_breaks_no_file_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setattr("sys.stderr", screen := Terminal())
+    names = [f"a-folder/20261125T230028Z-closed.{kind}" for kind in ("json", "png")]
+    print_status(f"wrote {', '.join(names)}")
+    assert [line.strip(" ,") for line in screen.getvalue().splitlines()] == [
+        "ehadiag: wrote", *names,
+    ]  # fmt: skip
