@@ -8,10 +8,10 @@ import os
 import socket
 import threading
 from contextlib import contextmanager
-from dataclasses import replace
 
 import pytest
 from history_cases import an_entry
+from msgspec.structs import replace
 from page_sessions import fail, talk
 
 from ehadiag import ConfigurationError, Levels
