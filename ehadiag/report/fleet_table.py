@@ -9,7 +9,7 @@ import msgspec
 from markupsafe import Markup
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.report.head import plain_name
+from ehadiag.report.head import advised, percent, plain_name
 from firmware_iface.errors import printable
 
 if TYPE_CHECKING:
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from ehadiag.prognosis.units import Prognosis
 
 FLEET_HEAD = (
-    "unit", "verdict", "worst", "what to do", "time left", "trend", "last test", "actuator", "",
+    "unit", "verdict", "worst severity", "what to do", "time left", "trend", "last test",
+    "actuator type",
 )  # fmt: skip
 WORST_FIRST = ("FAULT", "DEGRADED", "NOT_TESTED", "HEALTHY")
 
@@ -48,9 +49,7 @@ class FleetUnit(msgspec.Struct, frozen=True):
     tested: str
     """Date of the newest test."""
     link: str
-    """Of the unit's page."""
-    report: str = ""
-    """Link of its report."""
+    """Of the unit's page or report."""
     prognosis: Prognosis | None = None
 
 
@@ -70,7 +69,16 @@ def fleet_table(
     ordered = sorted(units, key=lambda unit: (WORST_FIRST.index(unit.verdict), -_worst(unit)[1]))
     rows = [_row(unit, levels) for unit in ordered]
     filled = [n for n in range(len(FLEET_HEAD)) if any(row[n].text for row in rows)]
-    return tuple(FLEET_HEAD[n] for n in filled), [[row[n] for n in filled] for row in rows]
+    shown = [[row[n] if row[n].text else Cell("–") for n in filled] for row in rows]
+    return tuple(FLEET_HEAD[n] for n in filled), shown
+
+
+def levels_text(levels: Levels) -> str:
+    """Say what the severities are compared with."""
+    return (
+        "Severity in percent of full damage:"
+        f" advisory level {percent(levels.advisory)}, limit {percent(levels.limit)}."
+    )
 
 
 def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
@@ -86,7 +94,6 @@ def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
         Cell(_sparkline(unit.past, levels)),
         Cell(f"{unit.tested[:10]} {unit.tested[11:16]} UTC" if unit.tested else "unknown"),
         Cell(printable(unit.actuator)),
-        Cell("report", unit.report) if unit.report else Cell(""),
     ]
 
 
@@ -103,7 +110,7 @@ def _action(unit: FleetUnit, levels: Levels) -> str:
     advice = next((item.advice for item in unit.severities if item.name == name), "")
     if value < levels.advisory or not advice:
         return "Nothing" if unit.verdict == Verdict.HEALTHY.name else ""
-    return advice[0].upper() + advice[1:] if value >= levels.limit else f"Plan to {advice}"
+    return advised(advice, at_once=value >= levels.limit).rstrip(".")
 
 
 def _left(prognosis: Prognosis | None) -> str:
@@ -112,10 +119,13 @@ def _left(prognosis: Prognosis | None) -> str:
         return ""
     left = [item.remaining[-1].median for item in prognosis.forecasts]
     known = [value for value in left if value is not None]
-    if known and min(known) <= 0.0:
-        return "limit reached"
     unit = "h" if prognosis.unit == "hours" else prognosis.unit
-    return f"{float(f'{min(known):.2g}'):g} {unit}" if known else "not known yet"
+    if known and min(known) <= 0.0:
+        return f"0 {unit}, limit reached"
+    if known:
+        return f"{float(f'{min(known):.2g}'):g} {unit}"
+    few = all("needs" in item.remaining[-1].why for item in prognosis.forecasts)
+    return "too few diagnoses" if few else "no number"
 
 
 def _sparkline(values: Sequence[float], levels: Levels) -> str:

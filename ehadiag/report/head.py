@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -16,6 +16,8 @@ import msgspec
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import display_unit
+from firmware_iface.errors import EhadiagError
+from firmware_iface.stored_test import bundled_tests
 
 if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
@@ -73,7 +75,7 @@ class Head(msgspec.Struct, frozen=True):
     limit: float
     """Level from which it is FAULT."""
     facts: tuple[tuple[str, str], ...]
-    """Date of the test, unit, test, actuator: label and text."""
+    """Date of the test, unit, test, type of the actuator: label, which may be empty, and text."""
 
     @property
     def drawn(self) -> tuple[Bar, ...]:
@@ -81,12 +83,20 @@ class Head(msgspec.Struct, frozen=True):
         return self.bars if self.verdict != Verdict.NOT_TESTED.name else ()
 
     @property
+    def title(self) -> str:
+        """Unit, where it is known, and word: the first line of a page."""
+        serial = dict(self.facts)["unit"]
+        return self.word if serial == "unknown" else f"Unit {serial}: {self.word}"
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """What to do where there is no verdict."""
+        return tuple(dict.fromkeys(item.action for item in self.reasons if item.action))
+
+    @property
     def lines(self) -> tuple[str, ...]:
         """Sentences, then what to do where there is no verdict."""
-        return (
-            *self.sentences,
-            *dict.fromkeys(item.action for item in self.reasons if item.action),
-        )
+        return (*self.sentences, *self.actions)
 
 
 class _Explanation(msgspec.Struct, frozen=True):
@@ -103,6 +113,8 @@ CUT_OFF = ("The recording ends early", "The recording begins late")
 LEAST_WEAR = 0.005
 """Least severity that is worth a word, 1: it is rounded to a percent."""
 CUT_NOTE = re.compile(r"the (last|first) .* are missing")
+WIDE_RANGE = 10.0
+"""Ratio of the ends of an interval, 1, beyond which no time is given, only the earliest one."""
 
 
 @cache
@@ -134,14 +146,16 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
     reasons = _explained(result) if untested else ()
     sentences = tuple(item.cause for item in reasons) if untested else _found(result, bars, levels)
     if prognosis is not None and not untested:
-        sentences += tuple(remaining_sentences(prognosis)[:1])
+        worn = {bar.symbol for bar in bars if bar.state == "DEGRADED"}
+        sentences += tuple(remaining_sentences(prognosis, worn)[:1])
     serial = "unknown" if result.serial is None else str(result.serial)
     date = "date unknown" if result.date is None else _shown_date(result.date)
+    dated = "recorded" if untested and not result.identified else "tested"
     facts = (
-        *([] if untested and result.date is None else [("tested", date)]),
+        *([] if untested and result.date is None else [(dated, date)]),
         ("unit", serial),
-        ("test", result.test or "unknown"),
-        ("actuator", result.actuator),
+        ("", stored_test_name(result.test)),
+        ("actuator type", result.actuator),
     )
     return Head(
         verdict_word(result), result.verdict.name, sentences, reasons, tuple(bars),
@@ -149,20 +163,45 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
     )  # fmt: skip
 
 
-def remaining_sentences(prognosis: Prognosis) -> list[str]:
-    """Return when severities reach the limit, the soonest first; only those with a number."""
+def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = None) -> list[str]:
+    """Return when severities reach the limit, the soonest first; only those with a number.
+
+    prognosis: what the history says; names: of the severities; None: all. Returns sentences; one
+    whose interval is wide says only the earliest time.
+    """
     found = []
     for item in prognosis.forecasts:
         left = item.remaining[-1]
+        if names is not None and item.name not in names:
+            continue
         if left.median is None or left.low is None or left.high is None or left.high <= 0.0:
             continue
         unit = "h" if prognosis.unit == "hours" else prognosis.unit
-        text = (
-            f"{plain_name(item.name)} reaches its limit in about {_rounded(left.median)} {unit}"
-            f" (80 %: {_rounded(left.low)} to {_rounded(left.high)})."
-        )
+        low, high = _rounded(left.low), _rounded(left.high)
+        when = f"in about {_rounded(left.median)} {unit} (most likely {low} to {high} {unit})"
+        if left.high > WIDE_RANGE * left.low:
+            when = f"not before about {low} {unit}"
+        text = f"{plain_name(item.name)} reaches its limit {when}."
         found.append((left.median, text[0].upper() + text[1:]))
     return [text for _, text in sorted(found)]
+
+
+@cache
+def _loops() -> dict[str, str]:
+    """Loop of each stored test of the package, by the test's name."""
+    tests = bundled_tests().values()
+    return {item.name: "closed-loop" if item.closed_loop else "open-loop" for item in tests}
+
+
+def stored_test_name(name: str | None) -> str:
+    """Return what people call a stored test: by its loop, one that is not of the package by name.
+
+    name: several are joined by '+'; None: not known. Returns words such as `open-loop test`.
+    """
+    if name is None:
+        return "test unknown"
+    loops = [_loops().get(part, "") for part in name.split("+")]
+    return f"{' and '.join(loops)} test" if all(loops) else f'test "{name}"'
 
 
 def _rounded(value: float) -> str:
@@ -187,6 +226,34 @@ def plain_name(name: str) -> str:
         return parameter(name).short
     except KeyError:
         return name
+
+
+def full_name(name: str) -> str:
+    """Return plain name and symbol of a severity, such as `jack friction (FDJ)`."""
+    plain = plain_name(name)
+    return name if plain == name else f"{plain} ({name})"
+
+
+def kept_advice(line: str) -> dict[str, str]:
+    """Return what to do about each severity by its name.
+
+    line: JSON result that a history keeps; without one, as of a row that was imported, the advice
+    is that of any actuator.
+    """
+    from ehadiag.core.actuator import Advice  # noqa: PLC0415 - not for help texts
+    from ehadiag.result import Result  # noqa: PLC0415
+
+    try:
+        return {item.name: item.advice for item in Result.from_json(line).severities.values()}
+    except (EhadiagError, ValueError):
+        return msgspec.structs.asdict(Advice())
+
+
+def advised(advice: str, *, at_once: bool) -> str:
+    """Return what to do as a sentence, at once or planned; empty without an advice."""
+    if not advice:
+        return ""
+    return f"{advice[0].upper()}{advice[1:]}." if at_once else f"Plan to {advice}."
 
 
 def _shown_date(date: str) -> str:
@@ -224,10 +291,10 @@ def _found(result: Result, bars: Sequence[Bar], levels: Levels) -> tuple[str, ..
         size = f"{bar.name} is at {percent(bar.value, *both)}"
         if bar.state == "FAULT":
             text = f"{size}, its limit is {percent(levels.limit)}."
-            text += f" {advice[:1].upper()}{advice[1:]}." if advice else ""
+            text = f"{text} {advised(advice, at_once=True)}".rstrip()
         elif bar.state == "DEGRADED":
             text = f"{size}, above its advisory level of {percent(levels.advisory)}."
-            text += f" Plan to {advice}." if advice else ""
+            text = f"{text} {advised(advice, at_once=False)}".rstrip()
         elif any(reason.startswith(f"{bar.symbol} ") for reason in result.reasons):
             text = f"{size}, and may be above its advisory level of {percent(levels.advisory)}."
         else:
@@ -271,9 +338,9 @@ def _explained(result: Result) -> tuple[Reason, ...]:
     cut = [cause for cause in groups if cause.startswith(CUT_OFF)]
     if cut:  # what is missing is missing for this reason
         for cause in CONSEQUENCES & groups.keys():
-            groups[cut[0]][1].extend(groups.pop(cause)[1])
-        rank, evidence, _ = groups[cut[0]]
-        groups[cut[0]] = (rank, evidence[1:], "Record the test to its end, then diagnose again.")
+            del groups[cause]
+        rank = groups[cut[0]][0]
+        groups[cut[0]] = (rank, [cut[0]], "Record the test to its end, then diagnose again.")
     found = sorted(groups.items(), key=lambda pair: pair[1][0])
     return tuple(
         Reason(cause, () if [_sentence(item) for item in evidence] == [cause] else tuple(evidence),

@@ -74,7 +74,10 @@ def draw_picture(picture: Picture) -> NotebookFigure:
         ]  # fmt: skip
         _draw_column(list(axes), rows, column)
     # Names of others are no formulae.
-    figure.suptitle(picture.title, y=1.0 - 0.08 / height, fontsize=11, va="top", parse_math=False)
+    figure.suptitle(
+        picture.title, y=1.0 - 0.08 / height, fontsize=11, va="top", parse_math=False,
+        fontweight="bold" if picture.bold else "normal",
+    )  # fmt: skip
     return figure
 
 
@@ -122,8 +125,10 @@ def _draw_panel(axis: Axes, panel: Panel, dates: bool) -> None:
                 transform=axis.get_yaxis_transform(), color=style.colour,
             )  # fmt: skip
         elif line.label:
+            # At the last test the worst severity is high.
+            place, side = (0.01, "bottom") if line.role == "last test" else (1.0, "top")
             axis.text(
-                at, 1.0, f" {line.label}", rotation=90, va="top", fontsize=8,
+                at, place, f" {line.label}", rotation=90, va=side, fontsize=8,
                 transform=axis.get_xaxis_transform(), parse_math=False,
             )  # fmt: skip
     if panel.y_range is not None:
@@ -133,7 +138,7 @@ def _draw_panel(axis: Axes, panel: Panel, dates: bool) -> None:
     if len(panel.curves) > 1:
         # Rows in the order of the curves; matplotlib fills columns.
         found = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-        labels = [curve.label for curve in panel.curves]
+        labels = [item.label for item in panel.curves if not item.role.startswith("forecast")]
         columns = 5 if len(labels) <= 5 else (len(labels) + 1) // 2
         labels = [label for start in range(columns) for label in labels[start::columns]]
         axis.legend(

@@ -30,7 +30,8 @@ class CurveStyle(msgspec.Struct, frozen=True):
     hollow: bool = False
 
 
-# Darkened from Okabe and Ito's: colour-blind people tell them apart, and from white.
+# Darkened from Okabe and Ito's: colour-blind people tell them apart, and from white. Severities
+# have none of a traffic light.
 STYLES = {
     "measured": CurveStyle("#7b8794", marker="circle", size=2.0),
     "modelled": CurveStyle("#c2410c", "solid", 1.1),
@@ -43,14 +44,15 @@ STYLES = {
     "end stop": CurveStyle("#8a004f", marker="square", hollow=True),
     "re-anchoring": CurveStyle("#333333", marker="x"),
     "forecast 0": CurveStyle("#0072b2", "dotted", 1.4),
-    "forecast 1": CurveStyle("#b34e00", "dotted", 1.4),
-    "forecast 2": CurveStyle("#007a5a", "dotted", 1.4),
+    "forecast 1": CurveStyle("#7b2d8e", "dotted", 1.4),
+    "forecast 2": CurveStyle("#334155", "dotted", 1.4),
     "severity 0": CurveStyle("#0072b2", "solid", 1.2, "circle"),
-    "severity 1": CurveStyle("#b34e00", "dashed", 1.2, "square"),
-    "severity 2": CurveStyle("#007a5a", "dotdash", 1.2, "triangle"),
+    "severity 1": CurveStyle("#7b2d8e", "dashed", 1.2, "square"),
+    "severity 2": CurveStyle("#334155", "dotdash", 1.2, "triangle"),
     "advisory": CurveStyle("#8a5a00", "dashed"),
     "limit": CurveStyle("#b3001b", "solid"),
     "event": CurveStyle("#333333", "dotted"),
+    "last test": CurveStyle("#6b7280", "dotted"),
 }
 """Look of a curve or line by its role."""
 BAND_COLOURS = {
@@ -209,6 +211,8 @@ class Picture(msgspec.Struct, frozen=True, eq=False):
 
     title: str
     columns: tuple[PictureColumn, ...]
+    bold: bool = False
+    """Whether the title, which is a sentence, is bold."""
 
 
 def thin_to_extremes(curves: Sequence[CurveValues], most: int) -> NDArray[np.intp]:

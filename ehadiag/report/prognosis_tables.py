@@ -31,14 +31,14 @@ def print_prognosis(
     prognosis: what the history says; console: console to print to; before: the next inspection: as
     it was named, and hours, cycles or days until it.
     """
-    head = f"serial {prognosis.serial}, actuator {printable(prognosis.actuator or 'unknown')}"
+    head = f"unit {prognosis.serial}, actuator type {printable(prognosis.actuator or 'unknown')}"
     used = f"{prognosis.used} of {prognosis.diagnoses} diagnoses say {prognosis.unit}"
     console.print(f"{head}: {used}", soft_wrap=True)
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
     table.add_column("severity", no_wrap=True)
     table.add_column("now", justify="right", no_wrap=True)
     for name, level in named_levels(prognosis):
-        table.add_column(f"{prognosis.unit} to {name} {level:g}", overflow="fold")
+        table.add_column(f"{prognosis.unit} to {name} {level:g} (80 % interval)", overflow="fold")
     table.add_column("wear", overflow="fold")
     for item in prognosis.forecasts:
         cells = [remaining_text(left) for left in item.remaining]
@@ -63,7 +63,7 @@ def print_urgencies(
     cycles or days of each until the next inspection.
     """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
-    heads = ("serial", "actuator", "first", "to the limit", "about")
+    heads = ("serial", "actuator", "first", "to the limit (80 % interval)", "about")
     for name in (*heads, *(("chance before",) if before else ()), "alarms"):
         table.add_column(name, overflow="fold")
     for place, item in enumerate(found):
@@ -107,12 +107,12 @@ def _sentences(prognosis: Prognosis, before: tuple[str, float] | None) -> list[s
 
 
 def remaining_text(left: RemainingLife) -> str:
-    """Write hours, cycles or days to a level, or why there is no number."""
+    """Write hours, cycles or days to a level, 80 % interval in brackets, or why there are none."""
     if left.median is None or left.low is None or left.high is None:
         return f"no number: {left.why}"
     if left.high == 0.0:
         return "reached"
-    return f"{_rounded(left.median)} (80 %: {_rounded(left.low)} … {_rounded(left.high)})"
+    return f"{_rounded(left.median)} ({_rounded(left.low)} … {_rounded(left.high)})"
 
 
 def _rounded(value: float) -> str:

@@ -91,6 +91,7 @@ def index_html_page(
         FleetUnit,
         fleet_summary,
         fleet_table,
+        levels_text,
     )
     from ehadiag.report.head import verdict_word  # noqa: PLC0415
     from ehadiag.report.page_parts import templates_of  # noqa: PLC0415 - bokeh is slow
@@ -114,13 +115,14 @@ def index_html_page(
                 past=past,
                 tested=result.date or "",
                 link=link,
-                report=link,
                 prognosis=trend.prognosis if trend else None,
             )
         )
     template = templates_of("ehadiag.report").get_template("index.html.j2")
     head, rows = fleet_table(units, levels)
-    page_text = template.render(head=head, rows=rows, summary=fleet_summary(units))
+    page_text = template.render(
+        head=head, rows=rows, summary=fleet_summary(units), levels=levels_text(levels)
+    )
     return page_text.encode("utf-8", errors="backslashreplace")
 
 

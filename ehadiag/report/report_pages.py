@@ -17,7 +17,7 @@ from ehadiag.core.criteria import FIT
 from ehadiag.history.records import hash_of_file
 from ehadiag.model.registry import parameter
 from ehadiag.report.bokeh_plots import MAX_PAGE_VALUES, plot_column
-from ehadiag.report.head import head_of, percent
+from ehadiag.report.head import full_name, head_of, percent
 from ehadiag.report.page_parts import render_template
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
 from ehadiag.report.response_signals import calibration_columns, response_columns
@@ -66,7 +66,7 @@ def diagnosis_page(
     future = trend.prognosis if trend else None
     head = head_of(result, levels, future)
     faults = [_fault(bar) for bar in head.bars]
-    date = (result.date or "date unknown")[:16].replace("T", " ")
+    dated = [f"{label} {date}" for label, date in head.facts if label in ("tested", "recorded")]
     return render_template(
         "report.html.j2",
         plots,
@@ -75,9 +75,8 @@ def diagnosis_page(
         verdict=verdict,
         head=head,
         percent=percent,
-        running=f"{head.word}, unit {_or_unknown(result.serial)}, tested {date}",
-        reasons=result.reasons,
-        unit=f"{result.actuator}, unit {_or_unknown(result.serial)}",
+        running=", ".join([head.title, *dated]),
+        full_name=full_name,
         made=made,
         levels=levels,
         faults=faults,
@@ -124,8 +123,7 @@ def _draw_responses(
 
 def _fault(bar: Bar) -> dict[str, Any]:
     return {
-        "name": bar.symbol,
-        "meaning": bar.name,
+        "name": bar.name if bar.name == bar.symbol else f"{bar.name} ({bar.symbol})",
         "estimate": bar.value,
         "interval": None if bar.value is None else bar.interval,
         "standing": bar.standing,

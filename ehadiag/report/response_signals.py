@@ -25,6 +25,7 @@ from ehadiag.model.plant import PlantConstants
 from ehadiag.model.residual_models import model_response
 from ehadiag.model.sensors import SensorLaw, sensor_law
 from ehadiag.model.severities import FAULT_LAWS
+from ehadiag.report.head import stored_test_name
 from ehadiag.report.picture import (
     Band,
     Curve,
@@ -202,7 +203,7 @@ def _column(
                 small_unit=signal.small_unit,
             )
         )  # fmt: skip
-    details = "test unknown" if test is None else f"test {printable(test.name)!r}"
+    details = printable(stored_test_name(None if test is None else test.name))
     roles = {band.role for panel in panels for band in panel.bands}
     if "missing" in roles:
         details += ", grey: no samples"
@@ -309,8 +310,8 @@ def _title(result: Result, columns: int) -> list[str]:
         lines.append(",  ".join(effects))
     for reason in result.reasons[:3]:
         lines += textwrap.wrap(printable(reason), 110 * columns)[:3]
-    about = [f"actuator {printable(result.actuator)}"]
-    about += [] if result.serial is None else [f"serial {result.serial}"]
+    about = [] if result.serial is None else [f"unit {result.serial}"]
+    about += [f"actuator type {printable(result.actuator)}"]
     about += [] if result.date is None else [result.date]
     request = result.request
     about.append(f"DEGRADED from {request.advisory:g}, FAULT from {request.limit:g}")

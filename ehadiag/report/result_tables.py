@@ -10,7 +10,6 @@ import io
 import json
 import math
 import textwrap
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -21,13 +20,13 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.core.conventions import display_unit, to_precision
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
-from ehadiag.report.head import head_of, percent
+from ehadiag.report.head import CUT_NOTE, CUT_OFF, full_name, head_of, percent
 from firmware_iface.errors import printable, valid_text
 
 if TYPE_CHECKING:
     from ehadiag.calibration.unit_models import Calibrated, CalibratedValue
     from ehadiag.design.score import Bound, Score
-    from ehadiag.estimate import Effect, Severity
+    from ehadiag.estimate import Effect
     from ehadiag.report.head import Bar, Head
     from ehadiag.result import Onboard, Result
     from firmware_iface.stored_test import StoredTest
@@ -36,8 +35,10 @@ STATE_STYLES = {
     "HEALTHY": "bold green",
     "DEGRADED": "bold yellow",
     "FAULT": "bold red",
-    "NOT_TESTED": "bold magenta",
+    "NOT_TESTED": "bold",
 }
+NAMED_COLUMNS = 76
+"""Columns from which on the table of the severities has their plain names too."""
 TEXT_COLUMNS = 10_000
 """Columns of a text that no terminal bounds: nothing of ours is cut."""
 FLAG_REMARKS = {AT_BOUND: "at its bound", NOT_SHOWN: "not shown by the test"}
@@ -78,7 +79,7 @@ def print_result(result: Result, console: Console, *, verbose: bool = False) -> 
     for line in result.culprit.lines if result.culprit else ():
         _line(console, f"  {line}")
     if result.identified:
-        console.print(_severities([result.severities[bar.symbol] for bar in head.bars]), crop=False)
+        console.print(_severities(head, result, console), crop=False)
     if result.identified and verbose:
         for name in ("first", "search"):
             values = (f"{k} {_number(getattr(v, name), 4)}" for k, v in result.severities.items())
@@ -93,8 +94,10 @@ def print_result(result: Result, console: Console, *, verbose: bool = False) -> 
     if effects:
         _line(console, f"also estimated: {', '.join(map(_size, effects))}")
     _line(console, _quality_text(result))
+    cut_off = any(item.cause.startswith(CUT_OFF) for item in head.reasons)
     for note in result.notes:
-        _line(console, f"note: {note}")
+        if verbose or not (cut_off and CUT_NOTE.match(note)):  # the head says it
+            _line(console, f"note: {note}")
     if result.identified:
         _line(console, _effort_text(result))
 
@@ -106,21 +109,23 @@ def _print_head(head: Head, result: Result, console: Console) -> None:
     text = Text(head.word, style=STATE_STYLES[head.verdict])
     text.append(f"  {lines[0]}", style="not bold default")
     console.print(text, soft_wrap=True)
-    for sentence in ("\n".join(lines[1:]), *rest):
+    arrow = "→" if _unicode(console) else ">"
+    actions = [f"{arrow} {action}" for action in head.actions]
+    for sentence in ("\n".join(lines[1:]), *rest, *actions):
         for line in _wrapped(sentence, console, len(indent)) if sentence else ():
             console.print(indent + line, soft_wrap=True)
-    for reason in head.reasons:
-        for item in reason.evidence:
-            _line(console, f"- {item}")
-        if reason.action:
-            _line(console, f"→ {reason.action}" if _unicode(console) else f"> {reason.action}")
-    facts = ", ".join(f"{label} {printable(value)}" for label, value in head.facts)
+    facts = ", ".join(f"{label} {printable(value)}".lstrip() for label, value in head.facts)
     _line(console, facts)
     _line(console, f"recording {printable(result.source)}")
+    for item in (item for reason in head.reasons for item in reason.evidence):
+        _line(console, f"- {item}")
     if result.identified and head.drawn:
         for bar in head.drawn:
             console.print(_bar(bar, head, console), soft_wrap=True)
-        levels = f"marks at | advisory {percent(head.advisory)}, | limit {percent(head.limit)}"
+        advisory, limit = _marks(console)
+        levels = (
+            f"{advisory} advisory {percent(head.advisory)}, {limit} limit {percent(head.limit)}"
+        )
         start = max(min(27, console.width - len(levels)), 0)
         console.print(" " * start + levels, soft_wrap=True)
 
@@ -133,12 +138,17 @@ def _bar(bar: Bar, head: Head, console: Console) -> Text:
     value = bar.value or 0.0
     done = round(min(value, 1.0) * length)
     cells = [full] * done + [empty] * (length - done)
-    for level in (head.advisory, head.limit):
-        cells[min(round(level * length), length - 1)] = "|"
+    for level, mark in zip((head.advisory, head.limit), _marks(console), strict=True):
+        cells[min(round(level * length), length - 1)] = mark
     known = "unknown" if bar.value is None else percent(bar.value, head.advisory, head.limit)
     text = Text(f"  {bar.name:16}{known:>8} ")
-    text.append("".join(cells), style=STATE_STYLES.get(bar.state, "magenta"))
+    text.append("".join(cells), style=STATE_STYLES.get(bar.state, ""))
     return text
+
+
+def _marks(console: Console) -> tuple[str, str]:
+    """Marks of advisory level and limit."""
+    return ("┊", "┃") if _unicode(console) else (":", "|")
 
 
 def _unicode(console: Console) -> bool:
@@ -159,22 +169,28 @@ def _line(console: Console, text: str) -> None:
         console.print(f"{indent}{line}", soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
-def _severities(severities: Sequence[Severity]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 1))
+def _severities(head: Head, result: Result, console: Console) -> Table:
+    """Numbers of the severities, grey where there is no verdict."""
+    untested = not head.drawn
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 1), style="dim" if untested else "")
     table.add_column("severity", no_wrap=True)
     for name in ("estimate", "std", "95 % interval"):
         table.add_column(name, justify="right", no_wrap=True)
-    remarked = any(item.flags for item in severities)
-    if remarked:
+    severities = [result.severities[bar.symbol] for bar in head.bars]
+    remarks = [
+        ["no verdict"] if untested else [FLAG_REMARKS[flag] for flag in item.flags]
+        for item in severities
+    ]
+    if any(remarks):
         table.add_column("", no_wrap=True)
-    for item in severities:
+    for item, remark in zip(severities, remarks, strict=True):
         low, high = item.interval
         table.add_row(
-            item.name,
+            full_name(item.name) if console.width >= NAMED_COLUMNS else item.name,
             _number(item.estimate, 5),
             _number(item.std, 5),
             f"{low:.5f} … {high:.5f}",
-            *([", ".join(FLAG_REMARKS[flag] for flag in item.flags)] if remarked else []),
+            *([", ".join(remark)] if any(remarks) else []),
         )
     return table
 
@@ -321,7 +337,7 @@ def print_calibration(found: Calibrated, console: Console) -> None:
     calibration = unit.calibration if unit else None
     head = "CALIBRATED" if unit else "NOT CALIBRATED"
     names = " + ".join(printable(item.source) for item in found.recordings)
-    console.print(head, style="bold green" if unit else "bold magenta", end="")
+    console.print(head, style="bold green" if unit else "bold", end="")
     console.print(f"  {names}", soft_wrap=True, highlight=False, markup=False, emoji=False)
     serial = (
         ""

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
 from ehadiag.core.conversion import Conversion
 from ehadiag.history.records import Entry, MaintenanceEvent
-from ehadiag.report.head import percent, plain_name, remaining_sentences
+from ehadiag.report.head import advised, kept_advice, percent, plain_name, remaining_sentences
 from ehadiag.report.picture import (
     Area,
     Curve,
@@ -24,11 +25,13 @@ from ehadiag.report.picture import (
 from firmware_iface.errors import printable
 from firmware_iface.recording import CommandMode, Samples
 
-LEVEL_WORDS = (("advisory", "advisory level"), ("limit", "limit"))
-
 if TYPE_CHECKING:
     from ehadiag.prognosis.forecast import Forecast
     from ehadiag.prognosis.units import Prognosis
+
+LEVEL_WORDS = (("advisory", "advisory level"), ("limit", "limit"))
+X_LABELS = {"hours": "operating hours"}
+"""What the horizontal axis says of a unit of use, where that is more than its name."""
 
 
 def history_picture(
@@ -39,9 +42,27 @@ def history_picture(
     At least one of the entries has severities.
     """
     column = trend_column(entries, events, prognosis, numbered=False)
-    title = f"unit {entries[-1].serial}, actuator {printable(entries[-1].actuator)}"
-    first = remaining_sentences(prognosis)[:1]
-    return Picture("\n".join([title, *first]), (column,))
+    last = entries[-1]
+    column = replace(column, title=f"actuator type {printable(last.actuator)}")
+    texts = [f"Unit {last.serial}", *_first_to_the_limit(prognosis, kept_advice(last.result))]
+    return Picture(
+        ": ".join(texts[:2]) + "".join(f"\n{item}" for item in texts[2:]), (column,), True
+    )
+
+
+def _first_to_the_limit(prognosis: Prognosis, advice: Mapping[str, str]) -> list[str]:
+    """Say which severity reaches the limit first, and what to do where it is above the advisory."""
+    advisory, limit = prognosis.levels
+    if (found := prognosis.first()) is None:
+        return []
+    item, value = found[0], found[0].value or 0.0
+    said = remaining_sentences(prognosis)[:1]
+    if value >= limit:
+        size = percent(value, advisory, limit)
+        said = [f"{plain_name(item.name)} is at {size}, its limit is {percent(limit)}."]
+    said = [f"{text[0].upper()}{text[1:]}" for text in said]
+    action = advised(advice.get(item.name, ""), at_once=value >= limit)
+    return [*said, action] if said and action and value >= advisory else said
 
 
 def trend_column(
@@ -63,7 +84,7 @@ def trend_column(
     placed = [(at, item) for item in entries if (at := _abscissa(item, unit)) is not None]
     placed.sort(key=lambda pair: pair[0])
     names = dict.fromkeys(item.name for entry in entries for item in entry.severities)
-    curves, low, high = [], 0.0, max(0.05, *levels, 0.0)
+    curves, low, high = [], 0.0, 100.0 * max(0.05, *levels, 0.0)
     for index, name in enumerate(names):
         rows = [
             (at, item.estimate, *item.interval95)
@@ -74,10 +95,11 @@ def trend_column(
         if rows:
             rows += [(at, *3 * (math.nan,)) for at, _ in changes]
             x, y, lows, highs = np.array(sorted(rows, key=itemgetter(0)), dtype=np.float64).T
+            y, lows, highs = 100.0 * y, 100.0 * lows, 100.0 * highs
             curves.append(Curve(plain_name(name), f"severity {index % 3}", y, x, lows, highs))
             low, high = min(low, np.nanmin(lows)), max(high, np.nanmax(highs))
     lines = [
-        ReferenceLine(level, role, f"{words} {percent(level)}")
+        ReferenceLine(100.0 * level, role, f"{words} {percent(level)}")
         for level, (role, words) in zip(levels, LEVEL_WORDS, strict=True)
     ]
     numbers = {id(event): number for number, event in enumerate(events, start=1)}
@@ -88,17 +110,19 @@ def trend_column(
         )
         for at, event in changes
     ]  # fmt: skip
+    lines += [ReferenceLine(at, "last test", "last test", upright=True) for at, _ in placed[-1:]]
     fans = [_fan(item, f"forecast {list(names).index(item.name) % 3}")
             for item in prognosis.forecasts if unit is not None and item.name in names]  # fmt: skip
     areas = tuple(area for fan in fans for area in fan[0])
     curves += [curve for fan in fans for curve in fan[1]]
     panel = Panel(
-        "severity, 95 % interval", "", np.array([at for at, _ in placed]), tuple(curves),
+        "severity with 95 % interval", "%", np.array([at for at, _ in placed]), tuple(curves),
         lines=tuple(lines), areas=areas, y_range=(low - 0.02 * high, 1.05 * high),
     )  # fmt: skip
     until = None if unit is None else _until(prognosis, [at for at, _ in placed])
     x_range = None if until is None else (placed[0][0] - 0.02 * (until - placed[0][0]), until)
-    return PictureColumn("", (panel,), unit or "time", dates=unit is None, x_range=x_range)
+    x_label = "date" if unit is None else X_LABELS.get(unit, unit)
+    return PictureColumn("", (panel,), x_label, dates=unit is None, x_range=x_range)
 
 
 def _until(prognosis: Prognosis, known: Sequence[float]) -> float | None:
@@ -124,7 +148,7 @@ def _fan(item: Forecast, role: str) -> tuple[list[Area], list[Curve]]:
     if not ahead or item.at is None or item.value is None:
         return [], []
     medians, lows, highs, levels = np.array([(0.0, 0.0, 0.0, item.value), *ahead]).T
-    border = np.concatenate([lows, highs[::-1]])
+    border, levels = np.concatenate([lows, highs[::-1]]), 100.0 * levels
     area = Area(role, item.at + border, np.concatenate([levels, levels[::-1]]))
     return [area], [Curve(f"{plain_name(item.name)}, forecast", role, levels, item.at + medians)]
 

@@ -14,15 +14,21 @@ from markupsafe import Markup
 from msgspec import structs
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.core.actuator import Advice
 from ehadiag.core.conventions import MAX_RESULT_BYTES
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.prognosis.units import prognosis_of
 from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
-from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table
-from ehadiag.report.head import INCONCLUSIVE, percent, plain_name, verdict_word
+from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table, levels_text
+from ehadiag.report.head import (
+    INCONCLUSIVE,
+    full_name,
+    kept_advice,
+    percent,
+    plain_name,
+    verdict_word,
+)
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
 from ehadiag.report.trend_bus_pictures import trend_column
@@ -98,7 +104,7 @@ class Pages:
             here="/session",
             tests=self._tests,
             simulated=self._simulated,
-            faults=[(name, plain_name(name)) for name in FAULT_NAMES],
+            faults=[(name, plain_name(name), full_name(name)) for name in FAULT_NAMES],
             plots=[Markup(item) for item in elements.values()],
         )
 
@@ -115,7 +121,9 @@ class Pages:
         if place is None:
             none = "No history is kept: --history."
         _, head, rows, summary = self._fleet
-        return self._list("Fleet", "/", head, rows[:MAX_PAGE_ROWS], none=none, summary=summary)
+        lines = (f"{levels_text(self._levels)} Worst unit first.",) if rows else ()
+        shown = rows[:MAX_PAGE_ROWS]
+        return self._list("Fleet", "/", head, shown, none=none, lines=lines, summary=summary)
 
     def _units(self) -> list[FleetUnit]:
         entries, events = self._kept()
@@ -150,19 +158,9 @@ class Pages:
         """Severities with what to do about them, which only the whole result has."""
         assert self._history is not None
         with History(self._history) as history:
-            line = history.entry(entry.number).result
-        try:
-            known = Result.from_json(line).severities
-        except (EhadiagError, ValueError):  # a row of a table that was imported
-            known = {}
+            advice = kept_advice(history.entry(entry.number).result)
         return [
-            structs.replace(
-                item,
-                advice=known[item.name].advice
-                if item.name in known
-                else getattr(Advice(), item.name, ""),
-            )
-            for item in entry.severities
+            structs.replace(item, advice=advice.get(item.name, "")) for item in entry.severities
         ]
 
     def _unit_page(self, serial: int) -> Page:
@@ -172,7 +170,7 @@ class Pages:
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
         lines = [
-            f"{plain_name(item.name)}: {name} {percent(level)} in {future.unit}:"
+            f"{plain_name(item.name)}: {future.unit} to {name} {percent(level)} (80 % interval):"
             f" {remaining_text(left)}"
             for item in future.forecasts
             for (name, level), left in zip(named_levels(future), item.remaining, strict=True)
@@ -209,7 +207,7 @@ class Pages:
         return self._list(
             "Reports",
             "/reports",
-            ["report", "unit", "verdict", "worst", "written"],
+            ["report", "unit", "verdict", "worst severity", "written"],
             rows,
             none="No report is in the folder yet: each test that ends writes one.",
         )
@@ -269,7 +267,7 @@ class Pages:
 
 def _diagnosed(entry: Entry) -> list[Cell]:
     severities = ", ".join(
-        f"{item.name} {'none' if item.estimate is None else f'{item.estimate:.4f}'}"
+        f"{plain_name(item.name)} {'none' if item.estimate is None else percent(item.estimate)}"
         for item in entry.severities
     )
     return [

@@ -7,7 +7,9 @@ import io
 import itertools
 import json
 import os
+import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -57,9 +59,15 @@ PIPE_COLUMNS = 10_000
 
 
 def print_status(text: str) -> None:
-    """Print one line to standard error; a closed one is no error."""
+    """Print one line to standard error, on a terminal broken between words; it may be closed."""
+    line = f"ehadiag: {printable(text)}"
     try:
-        print(f"ehadiag: {printable(text)}", file=sys.stderr, flush=True)
+        if sys.stderr.isatty():
+            width = shutil.get_terminal_size().columns
+            line = textwrap.fill(
+                line, width, break_long_words=False, break_on_hyphens=False, subsequent_indent="  "
+            )
+        print(line, file=sys.stderr, flush=True)
     except OSError:
         discard_stream(sys.stderr)
 

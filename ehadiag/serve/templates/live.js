@@ -32,7 +32,7 @@ function show(snapshot) {
   if (snapshot === null) return;
   at("seen").hidden = at("share").hidden = false;
   const { bus, test, residuals, ending, signals } = snapshot;
-  at("unit").textContent = snapshot.actuator + ", unit " + text(snapshot.serial);
+  at("unit").textContent = "Unit " + text(snapshot.serial) + ", actuator type " + snapshot.actuator;
   at("verdict").textContent = ending ? ending.verdict.replace("_", " ") : "";
   at("verdict").className = "verdict " + (ending ? ending.verdict.replace(" ", "_") : "");
   list(at("reasons"), ending ? ending.reasons : []);
@@ -46,7 +46,7 @@ function show(snapshot) {
     ["dropped by this program", bus.dropped],
   ]);
   fill(at("severities"), snapshot.severities.map((item) =>
-    [item.name, number(item.estimate, 4), number(item.std, 4), item.source]));
+    [at("severities").dataset[item.name.toLowerCase()] ?? item.name, number(item.estimate, 4), number(item.std, 4), item.source]));
   fill(at("residuals"), residuals ? ["spool", "pressure"].map((name) =>
     [name, number(residuals[name], 2), number(residuals[name + "_above"], 2), number(residuals[name + "_below"], 2)]) : []);
   at("against").textContent = residuals && residuals.against ? "Compared with " + residuals.against : "";

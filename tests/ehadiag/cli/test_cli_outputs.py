@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ from cli_result import COMMAND, Run
 from places import LOGS
 
 from ehadiag.history.store import History
+from ehadiag.terminal.output import print_status
 from firmware_iface.files import Folder
 from firmware_iface.logs.reader import read_frames
 
@@ -267,7 +269,7 @@ def test_names_in_an_actuator_file_are_text(name: str, run: Run, tmp_path: Path)
     (tmp_path / "a.toml").write_text(text)
     result = run("diagnose", "--actuator", "a.toml", HEALTHY)
     shown = name.replace("\x1b", "\\x1b").replace("\n", "\\x0a")
-    assert result.out.splitlines()[1].endswith(f", unit 1, test open, actuator {shown}")
+    assert result.out.splitlines()[1].endswith(f", unit 1, open-loop test, actuator type {shown}")
     (found,) = run("diagnose", "--json", "--actuator", "a.toml", HEALTHY).objects
     assert found["actuator"] == name
 
@@ -380,3 +382,20 @@ def test_signals_in_a_folder_of_recordings_are_no_recordings(run: Run, tmp_path:
     found = run("diagnose", "--json", "o")
     assert len(found.objects) == 1
     assert "signals of a result are no recording: o/paper-open-1.signals.mf4" in found.err
+
+
+class Terminal(io.StringIO):
+    """Standard error that is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_breaks_no_file_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setattr("sys.stderr", screen := Terminal())
+    names = [f"a-folder/20261125T230028Z-closed.{kind}" for kind in ("json", "png")]
+    print_status(f"wrote {', '.join(names)}")
+    assert [line.strip(" ,") for line in screen.getvalue().splitlines()] == [
+        "ehadiag: wrote", *names,
+    ]  # fmt: skip

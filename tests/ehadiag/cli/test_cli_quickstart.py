@@ -34,7 +34,7 @@ def commands(page: str) -> list[tuple[str, str]]:
 
 def estimates(text: str) -> dict[str, float]:
     """Estimates in a printed table."""
-    rows = re.findall(r"^(Kintas|FSS|FDJ) +([\d.]+)", text, re.MULTILINE)
+    rows = re.findall(r"^[a-z ]+\((Kintas|FSS|FDJ)\) +([\d.]+)", text, re.MULTILINE)
     return {name: float(value) for name, value in rows}
 
 

@@ -45,6 +45,8 @@ def test_an_index_lists_the_results_worst_first_with_links(run: Run) -> None:
     assert 'href="o/paper-open-4.html"' in page
     assert "60 %" in page
     assert "Plan to" in page
+    assert "2 results, worst first: " in page
+    assert page.count('href="o/') == 2  # one link a row
     assert ">time left<" not in page  # without a history there is none
     twice = run("report", *names, "--index", "o/healthy-open.html")
     assert (twice.code, "name another file" in twice.message) == (2, True)

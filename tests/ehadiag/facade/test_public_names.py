@@ -169,7 +169,7 @@ def test_the_plot_leaves_pyplot_alone(result: ehadiag.Result) -> None:
 def test_a_notebook_shows_the_table(result: ehadiag.Result) -> None:
     html = result._repr_html_()
     text = unescape(re.sub(r"<style>.*?</style>|<[^>]*>", "", html, flags=re.DOTALL))
-    assert text.split()[0] == result.verdict.name
+    assert text.split()[:3] == ["Unit", f"{result.serial}:", result.verdict.name]
     for item in result.severities.values():
         assert item.meaning in text
         assert f"{item.value:.5f}" in text
@@ -180,7 +180,7 @@ def test_names_from_outside_are_text_only(recording: ehadiag.Recording) -> None:
     actuator = msgspec.structs.replace(ehadiag.default_actuator(), name=name)
     result = ehadiag.diagnose(replace(recording, source=name), actuator=actuator)
     assert f"  recording {name}" in str(result).splitlines()
-    assert f"actuator {name}" in str(result)
+    assert f"actuator type {name}" in str(result)
     html = result._repr_html_()
     assert "<script" not in html
     assert html.count("&lt;script&gt;alert(1)&lt;/script&gt;[/red][bold]:warning:&amp;amp;") == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -13,8 +14,9 @@ from rich.console import Console
 
 import ehadiag
 from ehadiag import Levels
-from ehadiag.report.head import head_of, percent
-from ehadiag.report.result_tables import diagnosis_html, print_result
+from ehadiag.prognosis.forecast import RemainingLife
+from ehadiag.report.head import head_of, percent, remaining_sentences, stored_test_name
+from ehadiag.report.result_tables import NAMED_COLUMNS, diagnosis_html, print_result
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,9 @@ def test_a_terminal_breaks_no_word_and_loses_no_digit(worn: ehadiag.Result, widt
     for item in worn.severities.values():
         for number in (item.value, *item.interval):
             assert f"{number:.5f}" in text
-    words = set(re.findall(r"\S+", "\n".join(printed(worn, 10_000)))) - {"|"}
+    words = set(re.findall(r"\S+", "\n".join(printed(worn, 10_000))))
+    if width < NAMED_COLUMNS:  # the table has no room for plain names
+        words -= {f"({name})" for name in worn.severities}
     bars = {word for word in words if "·" in word or "█" in word}
     assert words - bars <= set(re.findall(r"\S+", text))
 
@@ -85,8 +89,69 @@ def test_a_recording_that_was_cut_says_so_first(worn: ehadiag.Result) -> None:
     head = head_of(untested(worn, *reasons, quality=quality), Levels())
     assert head.word == "NOT TESTED"
     assert head.sentences == ("The recording ends early: 2.7 s are missing.",)
-    assert head.reasons[0].evidence == reasons
-    assert head.reasons[0].action
+    assert [len(item.evidence) for item in head.reasons] == [0]  # the gap is named once
+    assert head.actions == ("Record the test to its end, then diagnose again.",)
+    assert head.facts[0] == ("recorded", "2023-11-14 22:13 UTC")
+
+
+def test_what_to_do_stands_directly_below_the_cause(worn: ehadiag.Result) -> None:
+    reason = "the spool signal is frozen"
+    first, second, *rest = printed(untested(worn, reason), 120)
+    assert first.startswith("NOT TESTED  A sensor does not move")
+    assert second.strip() == "→ Check this sensor and its wiring."
+    assert f"  - {reason}" in rest
+
+
+def test_marks_of_the_levels_differ_on_every_code_page(worn: ehadiag.Result) -> None:
+    for encoding, marks in (("utf-8", "┊┃"), ("ascii", ":|")):
+        out = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="replace", newline="\n")
+        print_result(worn, Console(file=out, width=80, highlight=False))
+        out.seek(0)
+        text = out.read()
+        advisory, limit = marks
+        assert f"{advisory} advisory 25 %, {limit} limit 75 %" in text
+        (bar,) = (line for line in text.splitlines() if line.startswith("  jack friction"))
+        assert bar.index(advisory) < bar.index(limit)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("open", "open-loop test"), ("closed", "closed-loop test"), ("gentle", 'test "gentle"'),
+        ("open+closed", "open-loop and closed-loop test"), (None, "test unknown"),
+    ],
+)  # fmt: skip
+def test_a_test_is_called_by_its_loop_or_its_name(name: str | None, words: str) -> None:
+    assert stored_test_name(name) == words
+
+
+def forecast_of(*lives: tuple[str, float, float, float, float]) -> Any:
+    """A prognosis of severities: name, value now, low, median and high of the hours left."""
+    return SimpleNamespace(
+        unit="hours",
+        forecasts=[
+            SimpleNamespace(
+                name=name, value=now, remaining=[RemainingLife(0.75, low, median, high, "")]
+            )
+            for name, now, low, median, high in lives
+        ],
+    )
+
+
+def test_time_that_is_left_is_no_level_and_not_promised_where_it_is_wide() -> None:
+    sure, vague = ("FDJ", 0.6, 89.0, 130.0, 190.0), ("FSS", 0.3, 100.0, 500.0, 1400.0)
+    assert remaining_sentences(forecast_of(vague, sure)) == [
+        "Jack friction reaches its limit in about 130 h (most likely 89 to 190 h).",
+        "Spool friction reaches its limit not before about 100 h.",
+    ]
+
+
+def test_the_head_has_no_time_left_of_what_is_sound(worn: ehadiag.Result) -> None:
+    lives = (("FDJ", 0.6, 200.0, 300.0, 400.0), ("FSS", 0.6, 89.0, 130.0, 190.0))
+    said = head_of(worn, Levels(0.25, 0.75), forecast_of(*lives)).sentences[-1]
+    assert said.startswith("Spool friction reaches its limit in about 130 h")
+    sound = head_of(worn, Levels(0.7, 0.75), forecast_of(*lives)).sentences
+    assert not any("reaches its limit" in sentence for sentence in sound)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +191,8 @@ def test_an_unexplained_test_is_inconclusive_and_has_the_exit_code_of_not_tested
     assert result.exit_code == 30
     assert {bar.standing for bar in head.bars} == {"no verdict"}
     assert not any("█" in line for line in printed(result, 80))
+    assert sum(line.rstrip().endswith("no verdict") for line in printed(result, 80)) == 3
+    assert "learn its normal behaviour" in head.actions[0]
 
 
 def test_a_sound_unit_needs_nothing(worn: ehadiag.Result) -> None:
@@ -159,4 +226,6 @@ def test_a_notebook_shows_tables_and_texts_as_texts(worn: ehadiag.Result) -> Non
     assert "<script" not in html
     assert "<pre" not in html
     assert html.count("<table") == 2
+    assert "<h1>Unit 1: DEGRADED</h1>" in html
+    assert "jack friction (FDJ)" in html
     assert "DEGRADED" in html

@@ -93,7 +93,7 @@ def test_measured_beside_expected(log: str, tmp_path: Path) -> None:
     title = figure.get_suptitle()
     assert title.startswith("NOT TESTED: half$x^2$.blf\n")
     assert all(reason[:40] in title for reason in result.reasons[:3])
-    assert "serial 1,  2023-11-14T22:13:20" in title
+    assert "unit 1,  actuator type reference-31,  2023-11-14T22:13:20" in title
     assert "DEGRADED from 0.25, FAULT from 0.75" in title
     current, spool, pressure, position = signals(figure)
     assert len(spool.lines) == len(pressure.lines) == 2
@@ -158,14 +158,15 @@ def test_a_trend_has_levels_and_a_forecast_and_is_broken_at_an_event():
     column = trend_column(worn, [event], future(worn, [event]))
     (panel,) = column.panels
     assert [(line.at, line.label) for line in panel.lines] == [
-        (0.25, "advisory level 25 %"), (0.75, "limit 75 %"), (750.0, "1"),
+        (25.0, "advisory level 25 %"), (75.0, "limit 75 %"), (750.0, "1"), (1400.0, "last test"),
     ]  # fmt: skip
     kintas = panel.curves[0]
     assert np.isnan(kintas.y[np.asarray(kintas.x) == 750.0]).all()
     assert [area.role for area in panel.areas]
     ahead = [curve for curve in panel.curves if curve.role.startswith("forecast")]
     assert ahead
-    assert ahead[0].y[-1] == 0.75
+    assert ahead[0].y[-1] == 75.0
+    assert column.x_label == "operating hours"
 
 
 def test_a_slow_severity_does_not_squeeze_the_trend_of_a_fast_one():
@@ -178,9 +179,24 @@ def test_a_slow_severity_does_not_squeeze_the_trend_of_a_fast_one():
     left = {item.name: item.remaining[-1].median for item in found.forecasts}
     assert start <= 100.0
     assert 1200.0 + left["FSS"] < end < 1200.0 + left["Kintas"]
-    first, second = history_picture(worn, [], found).title.splitlines()
-    assert first == f"unit {worn[0].serial}, actuator {worn[0].actuator}"
-    assert second.startswith("Spool friction reaches its limit in about")
+    picture = history_picture(worn, [], found)
+    first, second = picture.title.splitlines()
+    assert first.startswith(f"Unit {worn[0].serial}: Spool friction reaches its limit in about")
+    assert second == "Plan to replace the servovalve."
+    assert picture.columns[0].title == f"actuator type {worn[0].actuator}"
+    (axes,) = draw_picture(picture).axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "filter clogging", "spool friction", "jack friction",
+    ]  # fmt: skip
+
+
+def test_a_severity_at_its_limit_is_the_title_of_the_trend():
+    worn = [an_entry(1, 100.0 * n, (0.01 * n, 0.06 * n, 0.01 * n)) for n in range(1, 14)]
+    assert history_picture(worn, [], future(worn)).title.splitlines() == [
+        "Unit 1: Spool friction is at 78 %, its limit is 75 %.", "Replace the servovalve.",
+    ]  # fmt: skip
 
 
 def test_picture(stated):
@@ -188,8 +204,10 @@ def test_picture(stated):
     assert len(axes.containers) == len(stated[0].severities)
     for bars in axes.containers:
         (lines,) = bars[2]
-        np.testing.assert_allclose([line[:, 1] for line in lines.get_segments()], [[LOW, HIGH]])
-    assert axes.get_ylim()[0] > -0.02
+        np.testing.assert_allclose(
+            [line[:, 1] for line in lines.get_segments()], [[LOW, 100 * HIGH]]
+        )
+    assert axes.get_ylim()[0] > -2.0
 
 
 def test_page(stated):
@@ -197,7 +215,7 @@ def test_page(stated):
     sources = [item.data for item in page.select({"type": ColumnDataSource}) if "low" in item.data]
     assert sources
     for item in sources:
-        np.testing.assert_allclose([item["low"], item["high"]], [[LOW], [HIGH]])
+        np.testing.assert_allclose([item["low"], item["high"]], [[LOW], [100 * HIGH]])
 
 
 def test_a_body_breaks_away_turns_and_meets_its_stop() -> None:

@@ -73,7 +73,7 @@ def a_trend(text: str = "filter changed") -> UnitTrend:
 def test_the_verdict_comes_first_and_in_words(worn: ehadiag.Result, plain: str) -> None:
     page = Page(plain)
     text = re.sub(r"\s+", " ", page.text).strip()
-    assert text.startswith("DEGRADED: reference-31, unit 1 DEGRADED Jack friction is at 60 %")
+    assert text.startswith("Unit 1: DEGRADED Unit 1: DEGRADED Jack friction is at 60 %")
     for name, fault in worn.faults.items():
         assert name in text
         assert f"{fault.value:.5f}" in text
@@ -179,7 +179,8 @@ def test_the_trend_shows_remaining_life_events_and_alarms(
     first, *others = trend.prognosis.forecasts
     alarmed = replace(trend.prognosis, forecasts=(replace(first, alarm="+0.4 at once"), *others))
     assert (
-        "Alarm: Kintas +0.4 at once" in Page(written(worn, replace(trend, prognosis=alarmed))).text
+        "Alarm: filter clogging (Kintas) +0.4 at once"
+        in Page(written(worn, replace(trend, prognosis=alarmed))).text
     )
 
 
@@ -263,6 +264,7 @@ def test_a_refused_calibration_has_a_page_that_says_why() -> None:
 def test_the_head_has_the_tests_date_and_says_what_to_do(plain: str) -> None:
     page = Page(plain)
     text = re.sub(r"\s+", " ", page.text)
-    assert "tested 2023-11-14 22:13 UTC, unit 1, test open" in text
+    assert "Unit 1: DEGRADED" in text
+    assert "tested 2023-11-14 22:13 UTC, open-loop test, actuator type reference-31" in text
     assert text.index("tested 2023-11-14") < text.index("Severities") < text.index(NOW)
     assert "Plan to overhaul the jack." in text

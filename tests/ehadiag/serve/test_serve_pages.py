@@ -8,10 +8,10 @@ import os
 import socket
 import threading
 from contextlib import contextmanager
-from dataclasses import replace
 
 import pytest
 from history_cases import an_entry
+from msgspec.structs import replace
 from page_sessions import fail, talk
 
 from ehadiag import ConfigurationError, Levels
@@ -226,6 +226,10 @@ def test_the_fleet_says_what_to_do_worst_unit_first(tmp_path):
     assert places == sorted(places)
     assert "Replace the servovalve" in page
     assert ">INCONCLUSIVE<" in page
+    assert "advisory level 25 %, limit 75 %. Worst unit first." in page
+    assert ">0 h, limit reached<" in page
+    assert ">too few diagnoses<" in page
+    assert ">trend<" not in page  # no unit has two diagnoses
 
 
 def test_only_reports_of_the_folder_are_served_and_as_strangers(tmp_path):
