@@ -23,7 +23,7 @@ from ehadiag.identify.experiment import Experiment, unknowns_of
 from ehadiag.identify.identification_result import Identification
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
-from firmware_iface.recording import Acquisition
+from firmware_iface.recording import Acquisition, Recording
 from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 
 __all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
@@ -53,14 +53,14 @@ class InstantRules(msgspec.Struct, frozen=True):
     """Largest residual that counts, in deviations of all."""
     fits: int = 6
     """Fits of one step, 1, each without the outliers of the one before."""
-    sufficient_rate: float = 5000.0
-    """Rate that suffices, Hz: `tools/study daq-recordings` is exact from there on."""
+    sufficient_share: float = 0.99
+    """Samples a tick that suffice, 1, but for the clocks: `tools/study daq-recordings`."""
     max_step_ticks: float = 0.6
     """Largest change of the instant, ticks: beyond it is another tick."""
-    parts: int = 4
+    parts: int = 8
     """Parts of a tick that the model runs through one by one, 1: within each it is a cubic, and
     behind a step of the current the flapper takes a fifth of a tick."""
-    instants: int = 3
+    instants: int = 2
     """Instants of each part, 1, at which samples may be: a cubic lies through four of them."""
 
 
@@ -331,15 +331,20 @@ def _placed(taken: _SampledTest, fit: _Fit, lines: _Lines) -> Experiment:
     )
 
 
-def why_sampled_seldom(experiments: Sequence[Experiment]) -> tuple[str, ...]:
-    """Name the rate of an acquisition that may be too slow for what is refused."""
-    rates = [item.acquired.rate for item in experiments if item.acquired is not None]
-    if min(rates, default=np.inf) >= (1.0 - 1e-3) * INSTANTS.sufficient_rate:
-        return ()
-    return (
-        f"the acquisition took {min(rates):.0f} samples a second, and the spool breaks away between"
-        f" them: {INSTANTS.sufficient_rate:.0f} Hz suffice",
-    )
+def why_sampled_seldom(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Name the rate of an acquisition that is too slow for a verdict."""
+    slow = [
+        (item.acquired.rate, 1e9 / item.period_ns)
+        for item in ((recording.as_measured or recording).samples for recording in recordings)
+        if item is not None and item.acquired is not None
+    ]
+    for rate, ticks in slow:
+        if rate < INSTANTS.sufficient_share * ticks:
+            return (
+                f"the acquisition took {rate:.0f} samples a second, and the computer makes"
+                f" {ticks:.0f} ticks: {ticks:.0f} Hz suffice",
+            )
+    return ()
 
 
 def widen_by_instants(found: Identification, variance: Array) -> Identification:
