@@ -404,9 +404,7 @@ class TickEncoder(Encoder):
             section: [item for item in writers if item.carries(section)]
             for section in SENT_SECTIONS
         }
-        self._raw = {
-            role.name: 0 for item in self._map.messages.values() for role in item.roles
-        }
+        self._raw = {role.name: 0 for item in self._map.messages.values() for role in item.roles}
         self._due: list[str] = []
 
     def frames(self, time_ns: int, counter: int | None = None) -> tuple[Frame, ...]:

@@ -181,7 +181,9 @@ class _Response:
         )
         # The end of the tick before, the same instants of each part of this one, its end.
         ends = runs.reshape(instants, 2, -1, parts)
-        grid = np.stack([ends[k, ..., parts - 1 - part] for part in range(parts) for k in range(instants)])
+        grid = np.stack(
+            [ends[k, ..., parts - 1 - part] for part in range(parts) for k in range(instants)]
+        )
         start = np.concatenate([grid[-1:, :, :1], grid[:1, :, :-1]], axis=2)
         self._grid = np.concatenate([grid, start])
 
@@ -218,9 +220,7 @@ class _Fit(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def of(cls, taken: _SampledTest, severities: Array, clock: _Clock) -> _Fit:
         samples = _sampled(taken, clock)
-        return cls(
-            severities, clock, samples, *_Response(taken, severities).at(samples.before)
-        )
+        return cls(severities, clock, samples, *_Response(taken, severities).at(samples.before))
 
     def cost(self, lines: _Lines) -> float:
         """Mean of Cauchy's cost of the residuals, offsets and what breaks away aside, 1."""

@@ -200,7 +200,8 @@ def build_experiment(
     spool, pressure = spool - spool_offset, pressure - pressure_offset
     rested = rest >= ESTIMATION.min_rest_samples
     # A motion to and fro leaves the sensor's offset.
-    centred = pressure - _mean_of_motion(pressure, test)
+    middle = _mean_of_motion(pressure, test)
+    centred = pressure - middle
     slips, held = (0, 0) if rested else _held_ticks(centred, test, channels.pressure)
     if held:
         # Friction keeps spool and jack where they came to rest, and the pressure with them.
@@ -219,6 +220,11 @@ def build_experiment(
         spool = np.where(ticks < (held if slides else slips), np.nan, spool)
     elif constants.OIL > 0.0 and test.closed_loop:
         unsettled = _ticks_before_motion(test)
+    elif not rested and test.closed_loop and middle:
+        if abs(_mean_at_start(centred)) > REST.settling_lsb * channels.pressure.lsb:
+            # A jack that sticks stands under any pressure, and each tick's noise moves the spool.
+            quiet = np.arange(len(pressure)) < _ticks_before_motion(test)
+            pressure = np.where(quiet, np.nan, pressure)
     if constants.OIL > 0.0:
         # The model begins at rest; oil that has begun to ring or to fill a chamber has not.
         pressure = np.where(np.arange(len(pressure)) < unsettled, np.nan, pressure)
