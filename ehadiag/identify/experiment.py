@@ -200,8 +200,7 @@ def build_experiment(
     spool, pressure = spool - spool_offset, pressure - pressure_offset
     rested = rest >= ESTIMATION.min_rest_samples
     # A motion to and fro leaves the sensor's offset.
-    middle = _mean_of_motion(pressure, test)
-    centred = pressure - middle
+    centred = pressure - _mean_of_motion(pressure, test)
     slips, held = (0, 0) if rested else _held_ticks(centred, test, channels.pressure)
     if held:
         # Friction keeps spool and jack where they came to rest, and the pressure with them.
@@ -220,14 +219,11 @@ def build_experiment(
         spool = np.where(ticks < (held if slides else slips), np.nan, spool)
     elif constants.OIL > 0.0 and test.closed_loop:
         unsettled = _ticks_before_motion(test)
-    elif not rested and test.closed_loop and middle:
-        if abs(_mean_at_start(centred)) > REST.settling_lsb * channels.pressure.lsb:
-            # A jack that sticks stands under any pressure, and each tick's noise moves the spool.
-            quiet = np.arange(len(pressure)) < _ticks_before_motion(test)
-            pressure = np.where(quiet, np.nan, pressure)
-    if constants.OIL > 0.0:
-        # The model begins at rest; oil that has begun to ring or to fill a chamber has not.
-        pressure = np.where(np.arange(len(pressure)) < unsettled, np.nan, pressure)
+    # The model begins at rest; oil that has begun to ring or to fill a chamber has not.
+    unsettled = unsettled if constants.OIL > 0.0 else 0
+    if not rested and not held:
+        unsettled = max(unsettled, _ticks_under_pressure(pressure, test, channels.pressure))
+    pressure = np.where(np.arange(len(pressure)) < unsettled, np.nan, pressure)
     origin = min(max(origin, -constants.XSM), constants.XSM)
     position_offset = _mean_at_start(position)
     # Before the sines only, where that suffices: the same while the test still runs.
@@ -352,6 +348,17 @@ def _held_ticks(pressure: Array, test: StoredTest, channel: Channel) -> tuple[in
         stands = end > quiet + round(REST.breakaway_s * test.rate)  # a sensor, not an actuator
         return (0, 0) if stands else (begin, end)
     return 0, 0
+
+
+def _ticks_under_pressure(pressure: Array, test: StoredTest, channel: Channel) -> int:
+    """Ticks before a closed loop's motion, if they begin under pressure; 0 if not.
+
+    A jack that sticks stands under any pressure, and the noise of each tick moves the spool.
+    """
+    middle = _mean_of_motion(pressure, test)
+    away = abs(_mean_at_start(pressure) - middle)
+    displaced = test.closed_loop and middle != 0.0 and away > REST.settling_lsb * channel.lsb
+    return _ticks_before_motion(test) if displaced else 0
 
 
 def _mean_of_motion(pressure: Array, test: StoredTest) -> float:
