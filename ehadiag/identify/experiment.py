@@ -192,7 +192,7 @@ def build_experiment(
     least, most = _rest_pressure_bounds(constants)
     pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
     origin = 0.0
-    if abs(pressure_offset) > REST.displaced_share * channels.pressure.full_scale:
+    if _is_displaced(pressure_offset, pressure, test, channels.pressure):
         # So much pressure is that of a spool that friction holds off the middle.
         origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
         origin = min(max(origin, -constants.XSM), constants.XSM)
@@ -348,6 +348,14 @@ def _held_ticks(pressure: Array, test: StoredTest, channel: Channel) -> tuple[in
         stands = end > quiet + round(REST.breakaway_s * test.rate)  # a sensor, not an actuator
         return (0, 0) if stands else (begin, end)
     return 0, 0
+
+
+def _is_displaced(offset: float, pressure: Array, test: StoredTest, channel: Channel) -> bool:
+    """Whether an offset of the pressure at rest is of the spool, not of the sensor: motion to and
+    fro about the same pressure says that it is the sensor's."""
+    most = REST.displaced_share * channel.full_scale
+    same = abs(offset - _mean_of_motion(pressure, test)) < 0.5 * most
+    return abs(offset) > most and not same
 
 
 def _ticks_under_pressure(pressure: Array, test: StoredTest, channel: Channel) -> int:
