@@ -232,7 +232,7 @@ class _Fit(msgspec.Struct, frozen=True, eq=False):
         return total
 
 
-class _Lines(NamedTuple):
+class _Lines(msgspec.Struct, frozen=True, eq=False):
     """The model about a fit, at the samples' instants."""
 
     slopes: Array
