@@ -63,8 +63,8 @@ class ClockFit(msgspec.Struct, frozen=True):
     """Places on a coarse grid, 1, from which the best one is sought."""
     search_steps: tuple[tuple[float, float], tuple[float, float]] = ((0.05, 25e-6), (1e-3, 0.5e-6))
     """First and least steps of phase (ticks) and rate of that search."""
-    grids: int = 2
-    """Grids of phase and rate, 1, each about what the one before left possible."""
+    grids: int = 10
+    """Largest number of grids of phase and rate, 1, each twice as wide as the one before."""
     grid: int = 17
     """Phases and rates of each, 1."""
 
@@ -227,19 +227,21 @@ def _by_test(begin: float, period: float, found: MatchedTest, away: Deviation) -
 
     starts = tried[np.argsort(misfits)[: CLOCK.starts]]
     best = min((_lowest_about(misfit, item) for item in starts), key=misfit)
-    axes = [value + np.linspace(-8.0, 8.0, CLOCK.grid) * step
-            for value, step in zip(best.tolist(), CLOCK.search_steps[1], strict=True)]  # fmt: skip
+    width = 8.0 * np.array(CLOCK.search_steps[1])
     for _ in range(CLOCK.grids):
-        tried = np.array(list(itertools.product(*axes)))
+        shares = np.linspace(-1.0, 1.0, CLOCK.grid)
+        tried = best + width * np.array(list(itertools.product(shares, repeat=2)))
         cost = np.array([misfit(item) for item in tried])
         alike = tried[cost <= cost.min() + CLOCK.alike]
-        steps = [float(axis[1] - axis[0]) for axis in axes]
-        axes = [
-            np.linspace(low - step, high + step, CLOCK.grid)
-            for low, high, step in zip(alike.min(axis=0), alike.max(axis=0), steps, strict=True)
-        ]
+        ends = np.stack([best - alike.min(axis=0), alike.max(axis=0) - best])
+        beyond = ends.max(axis=0) > 0.95 * width
+        if not beyond.any():
+            break
+        best, width = alike.mean(axis=0), np.where(beyond, 2.0 * width, width)
     phase, rate = (float(value) for value in alike.mean(axis=0))
-    std, rate_std = (float(value) for value in np.hypot(alike.std(axis=0), steps))
+    std, rate_std = (
+        float(value) for value in np.hypot(alike.std(axis=0), 2.0 * width / (CLOCK.grid - 1))
+    )
     middle = 0.5 * found.test.ticks
     return FittedClock(begin + period * (phase + middle), rate, std * period, rate_std, away.name)
 
