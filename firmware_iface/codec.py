@@ -256,6 +256,10 @@ def _at_stated_end(value: FloatArray, role: Role, stated: StatedConverter) -> Bo
     return (value <= low) | (value >= high)
 
 
+SENT_SECTIONS = ("channels", "command", "environment", "status")
+"""Sections of a mapping whose signals the computer sends."""
+
+
 class Encoder:
     """Builds frames and keeps the counter of each message.
 
@@ -278,7 +282,7 @@ class Encoder:
                 for item in self._map.messages.values()
                 for roles in _by_multiplexer(item, section)
             )
-            for section in ("channels", "command", "environment", "status", "request")
+            for section in (*SENT_SECTIONS, "request")
         }
         self._modes = {mode: number for number, mode in self._map.modes.items()}
         self._states = {state: number for number, state in self._map.states.items()}
@@ -302,7 +306,7 @@ class Encoder:
         raw = {
             key: self._codes[key][int(code)] for key, code in zip(CHANNEL_ROLES, codes, strict=True)
         }
-        return tuple(writer.frame(raw, time_ns, counter) for writer in self._writers["channels"])
+        return self._frames("channels", raw, time_ns, counter)
 
     def command(
         self,
@@ -372,7 +376,50 @@ class Encoder:
         writers = self._writers[section]
         if not writers:
             raise ConfigurationError(f"bus {self._map.name}: the mapping has no [{section}]")
-        return tuple(writer.frame(writer.raw(values), time_ns, counter) for writer in writers)
+        raw = {name: item for writer in writers for name, item in writer.raw(values).items()}
+        return self._frames(section, raw, time_ns, counter)
+
+    def _frames(
+        self, section: str, raw: Mapping[str, int], time_ns: int, counter: int | None
+    ) -> tuple[Frame, ...]:
+        """Frames of a group of signals, from bit patterns by role."""
+        return tuple(writer.frame(raw, time_ns, counter) for writer in self._writers[section])
+
+
+class TickEncoder(Encoder):
+    """Builds the frames of a tick: each message once, with all groups of signals that it carries.
+
+    The methods of `Encoder` take the values, which stay until the next ones, and return no frame:
+    `frames` does. A group without values yet is sent as zero.
+    """
+
+    def __init__(self, bus_map: BusMap | None = None, channels: Channels = CHANNELS) -> None:
+        super().__init__(bus_map, channels)
+        writers = [
+            _Writer(item, roles, self._counters)
+            for item in self._map.messages.values()
+            for roles in _by_multiplexer(item, *SENT_SECTIONS)
+        ]
+        self._sent = {
+            section: [item for item in writers if item.carries(section)]
+            for section in SENT_SECTIONS
+        }
+        self._raw = {role.name: 0 for item in self._map.messages.values() for role in item.roles}
+        self._due: list[str] = []
+
+    def frames(self, time_ns: int, counter: int | None = None) -> tuple[Frame, ...]:
+        """Frames of the groups that have new values; see `telemetry` for the arguments."""
+        due = dict.fromkeys(writer for section in self._due for writer in self._sent[section])
+        self._due.clear()
+        return tuple(writer.frame(self._raw, time_ns, counter) for writer in due)
+
+    def _frames(
+        self, section: str, raw: Mapping[str, int], time_ns: int, counter: int | None
+    ) -> tuple[Frame, ...]:
+        del time_ns, counter
+        self._raw.update(raw)
+        self._due.append(section)
+        return ()
 
 
 class _Codes(dict[int, int]):
@@ -414,6 +461,10 @@ class _Writer:
         """Bit patterns of SI values."""
         return {name: _to_raw(role, values[name]) for name, role in self._roles.items()}
 
+    def carries(self, section: str) -> bool:
+        """Whether it has a signal of a section of the mapping."""
+        return any(name.partition(".")[0] == section for name in self._roles)
+
     def frame(self, raw: Mapping[str, int], time_ns: int, counter: int | None) -> Frame:
         """One frame from bit patterns by role."""
         message = self._message
@@ -435,11 +486,11 @@ class _Writer:
         return Frame(time_ns, message.can_id, data, extended=message.extended, fd=message.fd)
 
 
-def _by_multiplexer(message: MessageMap, section: str) -> list[dict[str, Role]]:
-    """Roles of a section by the frame that carries them: one frame per multiplexer setting."""
+def _by_multiplexer(message: MessageMap, *sections: str) -> list[dict[str, Role]]:
+    """Roles of sections by the frame that carries them: one frame per multiplexer setting."""
     groups: dict[tuple[tuple[str, int], ...], dict[str, Role]] = {}
     for role in message.roles:
-        if role.name.startswith(section + "."):
+        if role.name.partition(".")[0] in sections:
             setting = tuple((item.name, min(values)) for item, values in role.signal.selectors)
             groups.setdefault(setting, {})[role.name] = role
     return list(groups.values())

@@ -42,9 +42,15 @@ def parse_xcp_ids(text: str) -> XcpIds:
         request, response = (int(part, 16) for part in text.split(":"))
     except ValueError:
         request = response = -1
+    return checked_xcp_ids(request, response, text)
+
+
+def checked_xcp_ids(request: int, response: int, text: str = "") -> XcpIds:
+    """Refuse a pair that no bus carries; text: as it was given."""
     if request == response or not all(0 <= item <= MAX_CAN_ID for item in (request, response)):
+        given = repr(text) if text else f"{request:#x}, {response:#x}"
         raise ConfigurationError(
-            f"XCP identifiers {text!r}: need two different ones in hexadecimal, such as 6F0:6F1"
+            f"XCP identifiers {given}: need two different ones in hexadecimal, such as 6F0:6F1"
         )
     return XcpIds(request, response)
 

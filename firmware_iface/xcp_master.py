@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import msgspec
 
 from firmware_iface.bus_map import BusMap
-from firmware_iface.codec import Encoder
+from firmware_iface.codec import TickEncoder
 from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.recording import CHANNEL_NAMES, Channels, CommandMode
 from firmware_iface.transport.base import Transport, TransportState
@@ -91,7 +91,7 @@ class XcpTransport(Transport):
             raise ConfigurationError("XCP: measures on command, and needs a bus that sends")
         refuse_taken_identifiers(ids, bus_map, uds=uds)
         self._bus, self._ids, self._mode = bus, ids, mode
-        self._encoder = Encoder(bus_map, channels)
+        self._encoder = TickEncoder(bus_map, channels)
         self._replaced = frozenset(_replaced_identifiers(bus_map))
         self._waiting: deque[Frame] = deque()
         measured = {item.name: item for item in measurements_of(channels)}
@@ -229,13 +229,13 @@ class XcpTransport(Transport):
         ):  # fmt: skip
             self._waiting += self._messages(values, frames[0].time_ns)
 
-    def _messages(self, values: dict[str, int], time_ns: int) -> Iterator[Frame]:
+    def _messages(self, values: dict[str, int], time_ns: int) -> tuple[Frame, ...]:
         tick = values["tick"]
         if values["command_mode"] == self._mode:
             value = values[self._command] * COMMAND_SCALE
-            yield from self._encoder.command(self._mode, value, values["test_id"], time_ns, tick)
-        codes = [values[name] for name in CHANNEL_NAMES]
-        yield from self._encoder.telemetry(codes, time_ns, tick)
+            self._encoder.command(self._mode, value, values["test_id"], time_ns)
+        self._encoder.telemetry([values[name] for name in CHANNEL_NAMES], time_ns)
+        return self._encoder.frames(time_ns, tick)
 
 
 def _odts(tick: Measurement, wanted: list[Measurement]) -> Iterator[list[_Entry]]:

@@ -188,7 +188,7 @@ def spool_steps(spool: Array, least: float) -> Array:
     Array
         Travel of each, of adjacent ticks together.
     """
-    change = np.nan_to_num(np.diff(spool))
+    change = np.diff(spool[np.isfinite(spool)])
     fast = np.concatenate([[0], np.abs(change) > least, [0]]).astype(int)
     edges = np.flatnonzero(np.diff(fast))
     sizes = [abs(change[a:b].sum()) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -188,7 +188,11 @@ class DiagnosisSession:
         found = self._finished(recordings, progress)
         if found.verdict is Verdict.NOT_TESTED and any(item.as_measured for item in recordings):
             measured = self._finished([item.as_measured or item for item in recordings], progress)
-            return found if measured.verdict is Verdict.NOT_TESTED else measured
+            if measured.verdict is not Verdict.NOT_TESTED or found.identification is None:
+                found = measured
+        if found.verdict is Verdict.NOT_TESTED:
+            why = (*found.reasons, *why_sampled_seldom(recordings))
+            return msgspec.structs.replace(found, reasons=why)
         return found
 
     def _finished(
@@ -284,7 +288,6 @@ class DiagnosisSession:
                 experiments, found, lambda item: self._session.finish(item, progress)
             )
         why = tuple(objections_to_estimate(found, self._actuator.calibration))
-        why += why_sampled_seldom(experiments) if why else ()
         if why and ordered and not late:
             reconstructed = self._reconstructed(recordings, experiments, progress)
             if reconstructed is not None:

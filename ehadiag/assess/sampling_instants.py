@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.identify.estimates import interval95
@@ -22,7 +23,7 @@ from ehadiag.identify.experiment import Experiment, unknowns_of
 from ehadiag.identify.identification_result import Identification
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
-from firmware_iface.recording import Acquisition
+from firmware_iface.recording import Acquisition, Recording
 from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
 
 __all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
@@ -37,8 +38,11 @@ class InstantRules(msgspec.Struct, frozen=True):
     """Largest number of Gauss-Newton steps, 1."""
     max_severity_step: float = 0.1
     """Largest change of a severity in one step, 1."""
-    severity_step: float = 2e-3
+    severity_step: float = 5e-4
     """Difference of a severity for its derivative, 1."""
+    most_bent: float = 0.5
+    """Most by which the model may leave a line within such differences, in deviations of the noise:
+    the tick of a break-away does."""
     shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1)
     """Shares of a step that are tried until one explains more, 1."""
     cauchy: float = 3.0
@@ -49,13 +53,15 @@ class InstantRules(msgspec.Struct, frozen=True):
     """Largest residual that counts, in deviations of all."""
     fits: int = 6
     """Fits of one step, 1, each without the outliers of the one before."""
-    sufficient_rate: float = 5000.0
-    """Rate that suffices, Hz: `tools/study daq-recordings` is exact from there on."""
+    sufficient_share: float = 0.99
+    """Samples a tick that suffice, 1, but for the clocks: `tools/study daq-recordings`."""
     max_step_ticks: float = 0.6
     """Largest change of the instant, ticks: beyond it is another tick."""
-    instants_per_tick: int = 6
-    """Instants of a tick at which the model is run, 1, besides the four of a cubic: it rings on the
-    oil at 80 Hz, a thirteenth of a turn a tick."""
+    parts: int = 8
+    """Parts of a tick that the model runs through one by one, 1: within each it is a cubic, and
+    behind a step of the current the flapper takes a fifth of a tick."""
+    instants: int = 2
+    """Instants of each part, 1, at which samples may be: a cubic lies through four of them."""
 
 
 INSTANTS = InstantRules()
@@ -87,13 +93,19 @@ class _SampledTest(msgspec.Struct, frozen=True, eq=False):
         ticks = self.experiment.ticks
         return np.asarray((np.arange(ticks) - 0.5 * ticks) * self.experiment.tick)
 
-    def response(self, severities: Array, before: float) -> Array:
-        """Spool and pressure so long before the ends of the ticks, in deviations of the noise."""
+    def response(self, severities: Array, before: float, parts: int = 1) -> Array:
+        """Spool and pressure so long before the ends of parts of ticks, in deviations of the noise.
+
+        Shape (2, n), n: ticks times parts.
+        """
         experiment = self.experiment
         constants = unknowns_of([experiment], FAULTS).constants(severities)
         constants = constants._replace(DLY=self.delay(before))
         model = model_response(
-            constants, experiment.trace.current, experiment.tick, origin=experiment.origin
+            constants,
+            np.repeat(experiment.trace.current, parts),
+            experiment.tick / parts,
+            origin=experiment.origin,
         )
         spool, pressure = experiment.noise[:2]
         return np.stack([model.spool / spool, model.pressure / pressure])
@@ -159,22 +171,25 @@ def _sampled(taken: _SampledTest, clock: _Clock) -> _Samples:
 
 
 class _Response:
-    """Response of the model at some instants of each tick, in deviations of the noise."""
+    """Response of the model within the ticks, in deviations of the noise."""
 
-    def __init__(self, taken: _SampledTest, severities: Array, before: Array) -> None:
-        low, high, tick = float(before.min()), float(before.max()), taken.experiment.tick
-        count = 4 + math.ceil(INSTANTS.instants_per_tick * (high - low) / tick)
-        high = max(high, low + 1e-3 * tick)
-        if high > tick:
-            low, high = tick - (high - low), tick
-        self._low, self._step = low, (high - low) / (count - 1)
-        self._grid = np.stack(
-            [taken.response(severities, low + k * self._step) for k in range(count)]
+    def __init__(self, taken: _SampledTest, severities: Array) -> None:
+        parts, instants = INSTANTS.parts, INSTANTS.instants
+        self._step = taken.experiment.tick / (parts * instants)
+        runs = np.stack(
+            [taken.response(severities, k * self._step, parts) for k in range(instants)]
         )
+        # The end of the tick before, the same instants of each part of this one, its end.
+        ends = runs.reshape(instants, 2, -1, parts)
+        grid = np.stack(
+            [ends[k, ..., parts - 1 - part] for part in range(parts) for k in range(instants)]
+        )
+        start = np.concatenate([grid[-1:, :, :1], grid[:1, :, :-1]], axis=2)
+        self._grid = np.concatenate([grid, start])
 
     def at(self, before: Array) -> tuple[Array, Array]:
         """Response so long before the ends of the ticks, s, and its derivative, 1/s; (2, n)."""
-        place = (before - self._low) / self._step
+        place = before / self._step
         first = np.clip(np.floor(place).astype(np.int64) - 1, 0, len(self._grid) - 4)
         part = place - first
         channel, tick = np.indices(before.shape)
@@ -201,19 +216,48 @@ class _Fit(msgspec.Struct, frozen=True, eq=False):
     """At the samples' instants, shape (2, n)."""
     slope: Array
     """Of the model with the time before the ends, 1/s, shape (2, n)."""
-    cost: float
-    """Mean of Cauchy's cost of the residuals, offsets aside, 1."""
 
     @classmethod
     def of(cls, taken: _SampledTest, severities: Array, clock: _Clock) -> _Fit:
         samples = _sampled(taken, clock)
-        model, slope = _Response(taken, severities, samples.before).at(samples.before)
-        cost = 0.0
-        for away in samples.value - model:
+        return cls(severities, clock, samples, *_Response(taken, severities).at(samples.before))
+
+    def cost(self, lines: _Lines) -> float:
+        """Mean of Cauchy's cost of the residuals, offsets and what breaks away aside, 1."""
+        total = 0.0
+        for away in np.where(lines.breaks, np.nan, self.samples.value - self.model):
             left = away[np.isfinite(away)]
             left = left - np.median(left) if left.size else np.full(1, np.inf)
-            cost += float(np.mean(np.log1p(left**2 / INSTANTS.cauchy**2)))
-        return cls(severities, clock, samples, model, slope, cost)
+            total += float(np.mean(np.log1p(left**2 / INSTANTS.cauchy**2)))
+        return total
+
+
+class _Lines(msgspec.Struct, frozen=True, eq=False):
+    """The model about a fit, at the samples' instants."""
+
+    slopes: Array
+    """Derivatives by the severities, shape (k, 2, n)."""
+    breaks: NDArray[np.bool_]
+    """Samples next to a break-away: at their instant, or at the one where they are wanted, the
+    model is no line in the severities; shape (2, n)."""
+
+    @classmethod
+    def about(cls, taken: _SampledTest, fit: _Fit) -> _Lines:
+        wanted, before = fit.clock.instant(taken), fit.samples.before
+        here = np.stack([fit.model, taken.response(fit.severities, wanted)])
+        slopes, bent = [], np.zeros(here.shape)
+        for index, value in enumerate(fit.severities.tolist()):
+            ends = np.clip(value + np.array([-1.0, 1.0]) * INSTANTS.severity_step, 0.0, 1.0)
+            points = np.repeat(fit.severities[None], 2, axis=0)
+            points[:, index] = ends
+            low, high = (
+                np.stack([_Response(taken, x).at(before)[0], taken.response(x, wanted)])
+                for x in points
+            )
+            slopes.append((high[0] - low[0]) / (ends[1] - ends[0]))
+            chord = low + (value - ends[0]) / (ends[1] - ends[0]) * (high - low)
+            bent = np.maximum(bent, np.abs(chord - here))
+        return cls(np.stack(slopes), bent.max(axis=0) > INSTANTS.most_bent)
 
 
 class _Step(msgspec.Struct, frozen=True):
@@ -247,30 +291,34 @@ def settle_instants(
 def _settled(taken: _SampledTest, start: Mapping[str, float]) -> tuple[Experiment, Array]:
     """One experiment at its own instants, and the variances that they add."""
     fit = _Fit.of(taken, np.array([start[name] for name in FAULT_NAMES]), _Clock())
-    step = _step(taken, fit)
+    lines = _Lines.about(taken, fit)
+    step = _step(taken, fit, lines)
     for _ in range(INSTANTS.steps):
+        cost = fit.cost(lines)
         for share in INSTANTS.shares:
             other = _Fit.of(
                 taken,
                 np.clip(fit.severities + share * step.severities, 0.0, 1.0),
                 _Clock(fit.clock.lead + share * step.lead, fit.clock.drift + share * step.drift),
             )
-            if other.cost < fit.cost:
+            left = other.cost(lines)
+            if left < cost:
                 break
         else:
             break
-        gain, fit = fit.cost - other.cost, other
-        step = _step(taken, fit)
-        if gain < INSTANTS.settled * fit.cost:
+        fit, lines = other, _Lines.about(taken, other)
+        step = _step(taken, fit, lines)
+        if cost - left < INSTANTS.settled * left:
             break
-    return _placed(taken, fit), step.variance
+    return _placed(taken, fit, lines), step.variance
 
 
-def _placed(taken: _SampledTest, fit: _Fit) -> Experiment:
-    """Samples at one instant of the ticks."""
+def _placed(taken: _SampledTest, fit: _Fit, lines: _Lines) -> Experiment:
+    """Samples at one instant of the ticks, without those next to a break-away."""
     experiment, wanted = taken.experiment, fit.clock.instant(taken)
     at = fit.clock.ends(taken) - wanted
-    spool, pressure = fit.samples.value - fit.model + taken.response(fit.severities, wanted)
+    moved = fit.samples.value - fit.model + taken.response(fit.severities, wanted)
+    spool, pressure = np.where(lines.breaks, np.nan, moved)
     position = values_at(taken.acquired.signals[2], at, experiment.tick)[0]
     return replace(
         experiment,
@@ -283,15 +331,20 @@ def _placed(taken: _SampledTest, fit: _Fit) -> Experiment:
     )
 
 
-def why_sampled_seldom(experiments: Sequence[Experiment]) -> tuple[str, ...]:
-    """Name the rate of an acquisition that may be too slow for what is refused."""
-    rates = [item.acquired.rate for item in experiments if item.acquired is not None]
-    if min(rates, default=np.inf) >= (1.0 - 1e-3) * INSTANTS.sufficient_rate:
-        return ()
-    return (
-        f"the acquisition took {min(rates):.0f} samples a second, and the spool breaks away between"
-        f" them: {INSTANTS.sufficient_rate:.0f} Hz suffice",
-    )
+def why_sampled_seldom(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Name the rate of an acquisition that is too slow for a verdict."""
+    slow = [
+        (item.acquired.rate, 1e9 / item.period_ns)
+        for item in ((recording.as_measured or recording).samples for recording in recordings)
+        if item is not None and item.acquired is not None
+    ]
+    for rate, ticks in slow:
+        if rate < INSTANTS.sufficient_share * ticks:
+            return (
+                f"the acquisition took {rate:.0f} samples a second, and the computer makes"
+                f" {ticks:.0f} ticks: {ticks:.0f} Hz suffice",
+            )
+    return ()
 
 
 def widen_by_instants(found: Identification, variance: Array) -> Identification:
@@ -307,25 +360,19 @@ def widen_by_instants(found: Identification, variance: Array) -> Identification:
     return replace(found, estimates=estimates, covariance=found.covariance + np.diag(variance))
 
 
-def _step(taken: _SampledTest, fit: _Fit) -> _Step:
+def _step(taken: _SampledTest, fit: _Fit, lines: _Lines) -> _Step:
     """Gauss-Newton step of severities, clock and offsets together."""
-    experiment, acquired, wanted = taken.experiment, taken.acquired, fit.clock.instant(taken)
-    here = taken.response(fit.severities, wanted)
-    columns: list[Array] = []
-    for index, value in enumerate(fit.severities.tolist()):
-        side = INSTANTS.severity_step if value < 0.5 else -INSTANTS.severity_step
-        other = np.asarray(fit.severities.copy())
-        other[index] += side
-        columns.append((taken.response(other, wanted) - here) / side)
+    experiment, acquired = taken.experiment, taken.acquired
     ones, none = np.ones(experiment.ticks), np.zeros(experiment.ticks)
-    columns += [
+    columns = [
+        *lines.slopes,
         fit.slope,
         fit.slope * taken.since_middle,
         np.stack([ones, none]),
         np.stack([none, ones]),
     ]
     table = np.stack([column.ravel() for column in columns], axis=1)
-    left = (fit.samples.value - fit.model).ravel()
+    left = np.where(lines.breaks, np.nan, fit.samples.value - fit.model).ravel()
     prior, about = np.zeros(table.shape[1]), np.zeros(table.shape[1])
     count = len(FAULT_NAMES)
     prior[:count] = 1.0

@@ -28,6 +28,7 @@ from ehadiag.session.bit_run import (
     BitSettings,
     BitTest,
     listen_for_tests,
+    measured_by_xcp,
     recording_path,
     refuse_untestable,
 )
@@ -274,26 +275,12 @@ def _connection(
                     for _ in range(2)
                 )
                 simulation.pace = stack.enter_context(emulator_in_thread(core, computer))
-        bus = stack.enter_context(_measured_by_xcp(arguments, setup, test, bus))
+        ids = options.xcp_ids(arguments)
+        if ids is not None:
+            bus = stack.enter_context(measured_by_xcp(bus, setup, test, ids, arguments.protocol))
         recorder = Recorder(path, channel=setup.bus_map.channel)
         print_status(f"test {test.name!r} on {bus.name}, recording to {path}")
         yield bus, recorder
-
-
-def _measured_by_xcp(
-    arguments: argparse.Namespace, setup: Setup, test: StoredTest, bus: Transport
-) -> Transport:
-    """Return the bus with command and channels as XCP measures them, where that is wanted."""
-    ids = options.xcp_ids(arguments)
-    if ids is None:
-        return bus
-    from ehadiag_sim.scales import scales_of  # noqa: PLC0415 - loads numpy
-    from firmware_iface.recording import CommandMode  # noqa: PLC0415
-    from firmware_iface.xcp_master import XcpTransport  # noqa: PLC0415 - loads cantools
-
-    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
-    channels = scales_of(setup.bus_map, setup.actuator).channels
-    return XcpTransport(bus, setup.bus_map, channels, mode, ids, uds=arguments.protocol == "uds")
 
 
 def _bit_monitor(

@@ -70,8 +70,10 @@ def define_serve(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="recordings, results and reports (default ehadiag-out)",
     )
+    options.add_xcp_option(parser, "tests measure command and channels by XCP, not by telemetry")
     options.add_request_options(parser, "actuator", *options.BUS)
     option_values.add_bus_options(parser)
+    option_values.add_protocol_option(parser)
     add_history_options(parser)
     options.add_request_options(parser, *options.LEVELS)
     show_usual(
@@ -95,6 +97,9 @@ def run_serve(arguments: argparse.Namespace) -> int:
     watched = option_values.has_bus(arguments)
     if arguments.simulate and not arguments.allow_tests:
         raise ConfigurationError("--simulate: nothing is simulated without --allow-tests")
+    if not arguments.allow_tests and (arguments.xcp or arguments.protocol != "native"):
+        named = "xcp" if arguments.xcp else "protocol"
+        raise ConfigurationError(f"--{named}: no test is requested without --allow-tests")
     if not watched and not arguments.simulate:
         option_values.require_one_bus(arguments)
     names = arguments.tests or ["open", "closed"]

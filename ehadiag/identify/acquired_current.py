@@ -85,8 +85,9 @@ def acquired_current(
                 code,
             )
             command = command if step == 0.0 else np.round(command / step) * step
-    away = seen - before
-    away = np.where(linear, away, np.nan)
+    away = np.where(linear, seen - before, np.nan)
+    if not np.isfinite(away).any():
+        return _as_measured(measured, command, offset, controller, deviation, step)
     middle = float(np.nanmedian(away))
     seen = np.where(linear, seen, before + middle)
     current = np.clip(controller.GAP * (command - seen), -limit, limit)

@@ -192,7 +192,7 @@ def build_experiment(
     least, most = _rest_pressure_bounds(constants)
     pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
     origin = 0.0
-    if abs(pressure_offset) > REST.displaced_share * channels.pressure.full_scale:
+    if _is_displaced(pressure_offset, pressure, test, channels.pressure):
         # So much pressure is that of a spool that friction holds off the middle.
         origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
         origin = min(max(origin, -constants.XSM), constants.XSM)
@@ -219,9 +219,11 @@ def build_experiment(
         spool = np.where(ticks < (held if slides else slips), np.nan, spool)
     elif constants.OIL > 0.0 and test.closed_loop:
         unsettled = _ticks_before_motion(test)
-    if constants.OIL > 0.0:
-        # The model begins at rest; oil that has begun to ring or to fill a chamber has not.
-        pressure = np.where(np.arange(len(pressure)) < unsettled, np.nan, pressure)
+    # The model begins at rest; oil that has begun to ring or to fill a chamber has not.
+    unsettled = unsettled if constants.OIL > 0.0 else 0
+    if not rested and not held:
+        unsettled = max(unsettled, _ticks_under_pressure(pressure, test, channels.pressure))
+    pressure = np.where(np.arange(len(pressure)) < unsettled, np.nan, pressure)
     origin = min(max(origin, -constants.XSM), constants.XSM)
     position_offset = _mean_at_start(position)
     # Before the sines only, where that suffices: the same while the test still runs.
@@ -346,6 +348,25 @@ def _held_ticks(pressure: Array, test: StoredTest, channel: Channel) -> tuple[in
         stands = end > quiet + round(REST.breakaway_s * test.rate)  # a sensor, not an actuator
         return (0, 0) if stands else (begin, end)
     return 0, 0
+
+
+def _is_displaced(offset: float, pressure: Array, test: StoredTest, channel: Channel) -> bool:
+    """Whether an offset of the pressure at rest is of the spool, not of the sensor: motion to and
+    fro about the same pressure says that it is the sensor's."""
+    most = REST.displaced_share * channel.full_scale
+    same = abs(offset - _mean_of_motion(pressure, test)) < 0.5 * most
+    return abs(offset) > most and not same
+
+
+def _ticks_under_pressure(pressure: Array, test: StoredTest, channel: Channel) -> int:
+    """Ticks before a closed loop's motion, if they begin under pressure; 0 if not.
+
+    A jack that sticks stands under any pressure, and the noise of each tick moves the spool.
+    """
+    middle = _mean_of_motion(pressure, test)
+    away = abs(_mean_at_start(pressure) - middle)
+    displaced = test.closed_loop and middle != 0.0 and away > REST.settling_lsb * channel.lsb
+    return _ticks_before_motion(test) if displaced else 0
 
 
 def _mean_of_motion(pressure: Array, test: StoredTest) -> float:

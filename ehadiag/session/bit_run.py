@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from firmware_iface.tester import BitProgress, RequestOutcome, RequestProtocol
     from firmware_iface.transport.base import Transport
     from firmware_iface.transport.frames import Frame
+    from firmware_iface.xcp import XcpIds
 
 STOPPED_REASON = "stopped by the user"
 STOPPED_TWICE_REASON = "stopped by the user; the abort was requested, its answer not waited for"
@@ -84,7 +85,10 @@ class BitTest:
         warm_up(setup.actuator, self.test)
         self._begin = time.perf_counter()
         self._session = setup.session([self.test])
-        self._view = BitView(setup.actuator, self.test, self._session, settings.bitrate, monitor)
+        self._view = BitView(
+            setup.actuator, self.test, self._session, settings.bitrate, monitor,
+            by_status=settings.protocol == "native",
+        )  # fmt: skip
         self._published = ExitStack()
         self._recording: Recording | None = None
         self._why = ""
@@ -252,6 +256,23 @@ def listen_for_tests(
         except BaseException:
             stop.set()
             raise
+
+
+def measured_by_xcp(
+    bus: Transport, setup: Setup, test: StoredTest, ids: XcpIds, protocol: RequestProtocol
+) -> Transport:
+    """Return a bus whose commands and channels are those that XCP measures.
+
+    bus: opened to send, it stays open; ids: identifiers of the computer's slave; protocol: by which
+    the test is requested. ConfigurationError, InputOutputError: see `XcpTransport`.
+    """
+    from ehadiag_sim.scales import scales_of  # noqa: PLC0415 - loads numpy
+    from firmware_iface.recording import CommandMode  # noqa: PLC0415
+    from firmware_iface.xcp_master import XcpTransport  # noqa: PLC0415 - loads cantools
+
+    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+    channels = scales_of(setup.bus_map, setup.actuator).channels
+    return XcpTransport(bus, setup.bus_map, channels, mode, ids, uds=protocol == "uds")
 
 
 def recording_path(folder: Path, test: StoredTest) -> Path:

@@ -18,7 +18,7 @@ from ehadiag.core.conventions import utc_text
 from ehadiag.estimate import Severity, finite
 from ehadiag.live import BusState, BusTraffic, Ending, RunningTest, SignalTrace, Snapshot
 from ehadiag.report.head import head_of
-from firmware_iface.recording import CommandMode, Recording
+from firmware_iface.recording import BitState, CommandMode, Recording
 from firmware_iface.stored_test import StoredTest
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class BitView:
 
     actuator: its data; test: the test; session: session that identifies while the test runs;
     bitrate: of the bus, bit/s; None: unknown; monitor: monitors the unit while the test runs; None:
-    there are no residuals.
+    there are no residuals; by_status: whether the bus's own messages say that the test runs.
     """
 
     def __init__(
@@ -123,9 +123,11 @@ class BitView:
         session: DiagnosisSession,
         bitrate: float | None,
         monitor: BitMonitor | None = None,
+        *,
+        by_status: bool = True,
     ) -> None:
         self._actuator, self._test, self._session = actuator, test, session
-        self._monitor = monitor
+        self._monitor, self._by_status = monitor, by_status
         self._traffic = BusTraffic(bitrate)
         self._trace = SignalTrace()
         self._mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
@@ -148,6 +150,14 @@ class BitView:
     def progress(self, progress: BitProgress) -> None:
         """Take the progress of the test."""
         self._progress = progress
+        if self._monitor is not None and not self._by_status:
+            from firmware_iface.live_decode import BitStatus  # noqa: PLC0415 - loads cantools
+
+            running = progress.phase.name == BitState.RUNNING.name
+            state = BitState.RUNNING if running else BitState.IDLE
+            self._monitor.take_status(
+                BitStatus(state, test_id=self._test.id, elapsed=progress.elapsed)
+            )
         sample = progress.sample
         if sample is not None:  # for a bus without a monitor; frames alone do not tell its command
             values = (sample.current, sample.spool, sample.pressure, sample.position)

@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
@@ -90,6 +90,7 @@ def run_test(
     limits: ChannelLimits | None = None,
     onboard_wait_s: float = ONBOARD_WAIT_S,
     protocol: RequestProtocol = "native",
+    xcp: tuple[int, int] | None = None,
     stop: threading.Event | None = None,
     progress: Progress | None = None,
     snapshots: Callable[[Snapshot], None] | None = None,
@@ -115,6 +116,9 @@ def run_test(
         Time after the test in which the computer's own result is awaited, s.
     protocol : RequestProtocol
         How the test is requested and watched: the bus's own messages, or "uds".
+    xcp : tuple[int, int] | None
+        Identifiers of XCP's commands and answers, as (0x6F0, 0x6F1), by which command and channels
+        are measured; None: by telemetry.
     stop : threading.Event | None
         When set, the abort is requested and its answer awaited; the result is NOT TESTED.
     progress : Progress | None
@@ -140,11 +144,18 @@ def run_test(
     KeyboardInterrupt
         Ctrl-C: the abort was requested, its answer not awaited; the recording is complete.
     """
-    from ehadiag.session.bit_run import BitSettings, BitTest, refuse_untestable  # noqa: PLC0415
+    from ehadiag.session.bit_run import (  # noqa: PLC0415
+        BitSettings,
+        BitTest,
+        measured_by_xcp,
+        refuse_untestable,
+    )
+    from firmware_iface.xcp import checked_xcp_ids  # noqa: PLC0415 - loads numpy
 
     setup = setup_for(request, {**options, "test": test})
     (stored,), channel = setup.named_tests, setup.bus_map.channel
     refuse_untestable(stored, setup.actuator, setup.bus_map, transmit=transmit, protocol=protocol)
+    ids = None if xcp is None else checked_xcp_ids(*xcp)
     log_if_compiling()
     settings = BitSettings(
         transmit=transmit, limits=limits, onboard_wait_s=onboard_wait_s, protocol=protocol
@@ -156,8 +167,11 @@ def run_test(
     def connection() -> Iterator[tuple[Transport, Recorder | None]]:
         from firmware_iface.logs.recorder import Recorder  # noqa: PLC0415 - loads python-can
 
-        with open_transport(bus, transmit=transmit) as transport:
-            yield transport, None if record is None else Recorder(source, channel=channel)
+        with ExitStack() as stack:
+            opened = stack.enter_context(open_transport(bus, transmit=transmit))
+            if ids is not None:
+                opened = stack.enter_context(measured_by_xcp(opened, setup, stored, ids, protocol))
+            yield opened, None if record is None else Recorder(source, channel=channel)
 
     with BitTest(setup, settings, progress=progress, snapshots=snapshots) as run:
         run.acquire(connection(), source, stop)

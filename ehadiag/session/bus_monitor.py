@@ -163,7 +163,7 @@ class BusMonitor:
         if key in self._status_ids:
             content = self._decoder.decode(frame)
             if isinstance(content, BitStatus):
-                self._take_status(content)
+                self.take_status(content)
         elif key in self._environment and not (frame.error or frame.remote):
             values = checked_values(self._environment[key], frame.data)
             if values is not None:
@@ -171,6 +171,19 @@ class BusMonitor:
         for tick in self._live.take(frame):
             self._push(tick, frame.time_ns)
         self._time_ns = frame.time_ns
+
+    def take_status(self, status: BitStatus) -> None:
+        """Take the state of the test: of the bus's own messages, or as another protocol says it."""
+        before, self._status = self._status, status
+        if status.serial is not None:
+            self.bus_serial = self.serial = status.serial
+        began = status.state is BitState.RUNNING
+        if (
+            self._monitor is not None
+            and began
+            and (before is None or before.state is not BitState.RUNNING)
+        ):
+            self._monitor.settle()
 
     def finish(self) -> None:
         """Take the ticks that wait for further frames, where there are some."""
@@ -227,18 +240,6 @@ class BusMonitor:
         self._environment_values |= values
         for name, value in values.items():
             self._averaged.setdefault(name, []).append(value)
-
-    def _take_status(self, status: BitStatus) -> None:
-        before, self._status = self._status, status
-        if status.serial is not None:
-            self.bus_serial = self.serial = status.serial
-        began = status.state is BitState.RUNNING
-        if (
-            self._monitor is not None
-            and began
-            and (before is None or before.state is not BitState.RUNNING)
-        ):
-            self._monitor.settle()
 
     def _push(self, tick: LiveTick, time_ns: int) -> None:
         self.ticks += 1

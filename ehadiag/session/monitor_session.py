@@ -21,6 +21,7 @@ from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S
 
 if TYPE_CHECKING:
+    from firmware_iface.live_decode import BitStatus
     from firmware_iface.transport.base import FrameSource
     from firmware_iface.transport.frames import Frame
 
@@ -369,6 +370,11 @@ class BitMonitor:
                 name="ehadiag-known",
                 daemon=True,
             ).start()
+
+    def take_status(self, status: BitStatus) -> None:
+        """Take the state of the test where the bus's own messages do not say it."""
+        if self._watcher is not None:
+            self._watcher.take_status(status)
 
     def _look_up(self, find: Callable[[int], UnitState | None], serial: int) -> None:
         try:

@@ -55,10 +55,18 @@ class ClockFit(msgspec.Struct, frozen=True):
     alike: float = 8.0
     """Logarithm of a likelihood below the largest one down to which phase and rate are possible:
     beyond it are 0.03 % of two normal variables."""
-    grids: int = 3
-    """Grids of phase and rate, 1, each about what the one before left possible."""
+    points: int = 16
+    """Points for each sample of a smoothed position, 1."""
+    reach: int = 5
+    """Samples on either side that a point is of, 1: five deviations."""
+    starts: int = 8
+    """Places on a coarse grid, 1, from which the best one is sought."""
+    search_steps: tuple[tuple[float, float], tuple[float, float]] = ((0.05, 25e-6), (1e-3, 0.5e-6))
+    """First and least steps of phase (ticks) and rate of that search."""
+    grids: int = 10
+    """Largest number of grids of phase and rate, 1, each twice as wide as the one before."""
     grid: int = 17
-    """Phases and rates of all but the first, 1."""
+    """Phases and rates of each, 1."""
 
 
 CLOCK = ClockFit()
@@ -202,32 +210,80 @@ def _explained(low: FloatArray, high: FloatArray, length: float) -> FloatArray:
 
 
 def _by_test(begin: float, period: float, found: MatchedTest, away: Deviation) -> FittedClock:
-    """Ticks on which the test explains what was recorded best."""
-    axes: tuple[FloatArray, ...] = np.arange(-1.5, 1.51, 0.1), np.arange(-300e-6, 301e-6, 50e-6)
-    noise = None
+    """Ticks on which the test explains what was recorded best.
+
+    A sample that comes to lie in the next tick misfits at once: the misfit has cliffs.
+    """
+    tried = np.array(list(itertools.product(
+        np.arange(-1.5, 1.51, 0.1), np.arange(-300e-6, 301e-6, 50e-6)
+    )))  # fmt: skip
+    left = [away.residuals(*item) for item in tried]
+    misfits = np.array([_capped_mean(item) for item in left])
+    noise = 1.4826 * float(np.median(np.abs(left[int(np.argmin(misfits))])))
+    noise += np.finfo(float).tiny
+
+    def misfit(item: FloatArray) -> float:
+        return float(np.log1p((away.residuals(*item.tolist()) / noise) ** 2).sum())
+
+    starts = tried[np.argsort(misfits)[: CLOCK.starts]]
+    best = min((_lowest_about(misfit, item) for item in starts), key=misfit)
+    width = 8.0 * np.array(CLOCK.search_steps[1])
     for _ in range(CLOCK.grids):
-        tried = np.array(list(itertools.product(*axes)))
-        left = [away.residuals(*item) for item in tried]
-        if noise is None:
-            best = int(np.argmin([_capped_mean(item) for item in left]))
-            noise = 1.4826 * float(np.median(np.abs(left[best]))) + np.finfo(float).tiny
-        cost = np.array([np.log1p((item / noise) ** 2).sum() for item in left])
+        shares = np.linspace(-1.0, 1.0, CLOCK.grid)
+        tried = best + width * np.array(list(itertools.product(shares, repeat=2)))
+        cost = np.array([misfit(item) for item in tried])
         alike = tried[cost <= cost.min() + CLOCK.alike]
-        steps = [float(axis[1] - axis[0]) for axis in axes]
-        axes = tuple(
-            np.linspace(low - step, high + step, CLOCK.grid)
-            for low, high, step in zip(alike.min(axis=0), alike.max(axis=0), steps, strict=True)
-        )
+        ends = np.stack([best - alike.min(axis=0), alike.max(axis=0) - best])
+        beyond = ends.max(axis=0) > 0.95 * width
+        if not beyond.any():
+            break
+        best, width = alike.mean(axis=0), np.where(beyond, 2.0 * width, width)
     phase, rate = (float(value) for value in alike.mean(axis=0))
-    std, rate_std = (float(value) for value in np.hypot(alike.std(axis=0), steps))
+    std, rate_std = (
+        float(value) for value in np.hypot(alike.std(axis=0), 2.0 * width / (CLOCK.grid - 1))
+    )
     middle = 0.5 * found.test.ticks
     return FittedClock(begin + period * (phase + middle), rate, std * period, rate_std, away.name)
+
+
+def _lowest_about(misfit: Callable[[FloatArray], float], start: FloatArray) -> FloatArray:
+    """Point of least misfit that steps to the eight neighbours lead to, halved where none is."""
+    around = np.array([item for item in itertools.product((-1.0, 0.0, 1.0), repeat=2) if any(item)])
+    here, least, step = start, misfit(start), np.array(CLOCK.search_steps[0])
+    while step[0] > CLOCK.search_steps[1][0]:
+        neighbours = here + step * around
+        costs = [misfit(item) for item in neighbours]
+        index = int(np.argmin(costs))
+        if costs[index] < least:
+            here, least = neighbours[index], costs[index]
+        else:
+            step = 0.5 * step
+    return here
 
 
 def _capped_mean(away: FloatArray) -> float:
     """Mean square of residuals, a few large ones aside."""
     away = np.abs(away)
     return float(np.mean(np.minimum(away, 6.0 * np.median(away) + np.finfo(float).tiny) ** 2))
+
+
+def _smoothed(signal: RecordedSignal) -> RecordedSignal:
+    """Signal with points between its samples, all of the same noise.
+
+    A line from sample to sample has half of the noise in their middle: of two phases that explain a
+    recording equally well the one that looks there would win. The weights of a Gaussian of one
+    sample's width leave the noise to 0.01 % the same.
+    """
+    points = CLOCK.points
+    samples = np.arange(len(signal.value))
+    reach = np.arange(-CLOCK.reach, CLOCK.reach + 1)
+    padded = np.pad(signal.value, CLOCK.reach, mode="edge")
+    fine = np.empty((len(samples), points))
+    for index in range(points):
+        weight = np.exp(-0.5 * (reach - index / points) ** 2)
+        fine[:, index] = np.correlate(padded, weight / weight.sum(), mode="valid")
+    between = np.arange(len(samples) * points) / points
+    return RecordedSignal(np.interp(between, samples, signal.time), fine.ravel())
 
 
 def _deviation(
@@ -249,6 +305,7 @@ def _deviation(
     if len(part.time) < CLOCK.min_samples:
         return None
     half = 0.5 * len(stored)
+    position = _smoothed(position)
 
     def residuals(phase: float, rate: float) -> FloatArray:
         # About the test's middle, where phase and rate say nothing of each other.

@@ -21,7 +21,7 @@ from ehadiag_sim.sensing import ChannelFault
 from ehadiag_sim.simulation import Plant
 from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.bus_map import BusMap, default_map
-from firmware_iface.codec import Encoder
+from firmware_iface.codec import TickEncoder
 from firmware_iface.errors import ConfigurationError, EhadiagError
 from firmware_iface.live_decode import BitRequest, BitStatus, LiveDecoder
 from firmware_iface.recording import CHANNEL_NAMES, BitReason, BitState, CommandMode
@@ -110,7 +110,7 @@ class FccCore:
         self._idle_telemetry = idle_telemetry
         bus_map = bus_map or default_map()
         self._scales = scales_of(bus_map, actuator)
-        self._encoder = Encoder(bus_map, self._scales.channels)
+        self._encoder = TickEncoder(bus_map, self._scales.channels)
         self._decoder = LiveDecoder(bus_map)
         self._rate = actuator.controller.rate
         self.period_ns = round(1e9 / self._rate)
@@ -213,11 +213,12 @@ class FccCore:
         frames: list[Frame] = []
         frames += self._status() if self._uds is None else answers
         if running or self._idle_telemetry:
-            frames += self._encoder.command(mode, command, test_id, 0)
-            frames += self._encoder.telemetry(codes.tolist(), 0)
+            self._encoder.command(mode, command, test_id, 0)
+            self._encoder.telemetry(codes.tolist(), 0)
         if (self._tick - 1) % round(self._rate / 10.0) == 0:
             supply, drain, degc = self._plant.probed
-            frames += self._encoder.environment(supply, drain, degc, 0)
+            self._encoder.environment(supply, drain, degc, 0)
+        frames += self._encoder.frames(0)
         if self._control is not None:
             frames = self._control.frames(frames)
         if self._slave is not None:
@@ -312,23 +313,23 @@ class FccCore:
         self._since = self._tick
 
     def _status(self) -> tuple[Frame, ...]:
-        """Status on change and at its rate; the answer to a second request in between."""
+        """Status on change and at its rate, given to the encoder; the answer to a second request
+        that comes in between, as frames."""
         frames: tuple[Frame, ...] = ()
         running = self._state in (BitState.ARMING, BitState.RUNNING)
         reason = BitReason.NONE
         if self._refused is not None:
             reason, wanted = self._refused
             if running:
-                frames += self._encoder.status(
-                    BitState.REFUSED, reason, wanted, 0.0, self._serial, 0
-                )
+                self._encoder.status(BitState.REFUSED, reason, wanted, 0.0, self._serial, 0)
+                frames = self._encoder.frames(0)
             if running or self._state is BitState.IDLE:
                 self._refused, reason = None, BitReason.NONE
         present = (self._state, self._since)
         due = (self._tick - 1) % round(self._rate / 50.0) == 0
         if due or present != self._sent_state or frames:
             self._sent_state = present
-            frames += self._encoder.status(
+            self._encoder.status(
                 self._state, reason, self._test_id, self._elapsed / self._rate, self._serial, 0
             )
         return frames

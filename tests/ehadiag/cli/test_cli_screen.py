@@ -184,6 +184,8 @@ def test_a_test_is_told_in_plain_lines_where_there_is_no_terminal(run: Run) -> N
     [
         ([], "no bus named"),
         (["--simulate"], "--allow-tests"),
+        (["-i", "virtual", "--protocol", "uds"], "--protocol: no test is requested without"),
+        (["-i", "virtual", "--xcp"], "--xcp: no test is requested without"),
         (["--simulate", "--allow-tests", "--http-port", "70000"], "need a port"),
         (["--simulate", "--allow-tests", "--test", "nothing"], "nothing"),
         (["--simulate", "--allow-tests", "--actuator", "missing.toml"], "missing.toml"),
@@ -208,11 +210,13 @@ def test_options_are_handed_on_as_they_were_given(tmp_path, monkeypatch):
     file = tmp_path / "own" / "ehadiag" / "ehadiag.toml"
     file.write_text("[bit]\nmax_position = 20.0\n[serve]\nadvisory = 0.3\n")
     given = ["-i", "socketcan", "-c", "can 0", "--fd", "--bus-kwargs", "a=1", "b=2", "--hours", "5"]
+    given += ["--protocol", "uds", "--xcp", "700:701"]
     arguments = parse_arguments(["serve", *given, "--mapping", "m.toml", "--http-port", "0"])
     test = bit_arguments(arguments, "closed")
     assert (test.interface, test.channel, test.fd) == ("socketcan", "can 0", True)
     assert (test.bus_kwargs, test.hours, test.mapping) == (["a=1", "b=2"], 5.0, ["m.toml"])
     assert (test.test, test.report, test.no_picture) == ("closed", True, True)
+    assert (test.protocol, test.xcp) == ("uds", "700:701")
     assert (test.max_position, test.advisory, test.limit) == (20.0, 0.3, 0.75)
     watch = monitor_arguments(arguments)
     assert (watch.interface, watch.bus_kwargs, watch.mapping) == (

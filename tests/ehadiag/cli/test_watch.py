@@ -81,6 +81,22 @@ def test_a_unit_of_which_nothing_is_known_is_compared_with_a_new_one() -> None:
     assert made.why == ""
 
 
+@pytest.mark.parametrize("by_status", [True, False])
+def test_where_no_message_has_the_state_of_the_test_its_progress_does(by_status: bool) -> None:
+    made, setup = BitMonitor(ACTUATOR, default_map(), [TEST]), Setup(Request(test="open"))
+    view = BitView(ACTUATOR, TEST, setup.session([TEST]), None, made, by_status=by_status)
+    view.progress(BitProgress(Phase.SETTLING, 0.0, 5.5, 0, None))
+    table = read_frames(LOGS / "paper-open-4.blf")
+    for row in np.flatnonzero(table.can_id != 0x201).tolist():
+        if row == 100:
+            view.progress(BitProgress(Phase.RUNNING, 0.0, 5.5, row, None))
+        data = table.data[row, : table.length[row]].tobytes()
+        view.take(Frame(int(table.time_ns[row]), can_id=int(table.can_id[row]), data=data))
+    seen = view.look(1)
+    assert {item.during for item in seen.alarms} == (set() if by_status else {"open"})
+    assert seen.residuals is not None
+
+
 def test_a_unit_that_is_as_its_history_says_raises_no_alarm() -> None:
     asked = []
 

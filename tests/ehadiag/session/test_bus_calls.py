@@ -24,6 +24,7 @@ from firmware_iface.recording import BitState
 from firmware_iface.stored_test import bundled_tests
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.frames import Frame
+from firmware_iface.xcp import XcpIds
 
 REQUEST_ID = 0x200
 TESTS = bundled_tests()
@@ -126,6 +127,22 @@ def test_a_test_is_requested_by_uds() -> None:
     assert not any("how the test ended" in note for note in result.notes)
     with pytest.raises(ehadiag.ConfigurationError, match="need one of native, uds"):
         ehadiag.run_test(bus, "open", transmit=True, protocol="xyz")  # type: ignore[arg-type]
+
+
+def test_a_test_is_measured_by_xcp() -> None:
+    core = emulated_computer(
+        default_actuator(), [TESTS["open"]], faults=Faults(FSS=0.5), xcp=XcpIds(0x700, 0x701)
+    )
+    with EmulatorTransport(core) as bus:
+        result = ehadiag.run_test(bus, "open", transmit=True, xcp=(0x700, 0x701))
+    assert result.faults["FSS"].value == pytest.approx(0.5, abs=0.02)
+    with pytest.raises(ehadiag.ConfigurationError, match="0x700, 0x700: need two different ones"):
+        ehadiag.run_test(bus, "open", transmit=True, xcp=(0x700, 0x700))
+    with (
+        EmulatorTransport(emulated_computer(default_actuator(), [TESTS["open"]])) as bus,
+        pytest.raises(ehadiag.InputOutputError, match="no XCP slave answers"),
+    ):
+        ehadiag.run_test(bus, "open", transmit=True, xcp=(0x700, 0x701))
 
 
 @pytest.mark.slow  # a whole test in real time

@@ -40,6 +40,8 @@ def read(this: DaqCase):
 @pytest.mark.parametrize(
     ("test", "rate", "most_us"),
     [
+        # By the control law: a line between two positions has less noise in its middle.
+        ("closed", 1000.0, 40.0),
         ("closed", 5000.0, 15.0),
         pytest.param("closed", 10_000.0, 8.0, marks=pytest.mark.slow),
         # The current changes from tick to tick in the sines alone: half a sampling interval.
@@ -50,6 +52,7 @@ def read(this: DaqCase):
 def test_the_ticks_are_found_between_samples(test, rate, most_us):
     this = case(test, rate)
     found = read(this)
+    found = found.as_measured or found
     assert found.test_id == bundled_tests()[test].id
     at = found.samples.host_ns * 1e-9
     true = SETTLING_S + this.lead_in_s + np.arange(len(at)) * 1e-3
@@ -75,13 +78,35 @@ def test_a_command_of_its_own_is_found_at_the_same_place():
     assert found.out_of_order == 0.0
 
 
+STUCK = case(
+    "closed", 5000.0, faults=(0.046, 0.047, 0.767), lead_in_s=0.687, phase=0.557,
+    drift_ppm=-78.959, seed=2041007357,
+)  # fmt: skip
+"""Begins under pressure of 0.5 MPa, which the jack's friction holds."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("test", ["open", "closed"])
-@pytest.mark.parametrize("bits", [12, 16])
-def test_a_verdict_that_holds_the_truth(test, bits):
-    this = case(test, 5000.0, bits=bits)
+@pytest.mark.parametrize(
+    "this",
+    [
+        case("open", 1000.0),
+        case("open", 10_000.0, bits=16),
+        case("closed", 1000.0),
+        case("closed", 5000.0, bits=16),
+        STUCK,
+    ],
+)
+def test_a_verdict_that_holds_the_truth(this):
     found = perform(this)
     assert found["verdict"] == "FAULT", found["why"]
-    for (low, high), truth in zip(found["interval95"], this.faults, strict=True):
-        assert low - 1e-3 <= truth <= high + 1e-3
-        assert high - low < 0.02
+    ends = zip(found["value"], found["interval95"], this.faults, strict=True)
+    for value, (low, high), truth in ends:
+        std = (high - low) / 3.92
+        assert abs(value - truth) < 3.5 * std
+        assert std < 0.003
+
+
+def test_a_refusal_names_a_rate_that_is_too_low():
+    found = perform(case("open", 500.0, bits=16))
+    assert found["verdict"] == "NOT_TESTED"
+    assert "took 500 samples a second, and the computer makes 1000 ticks" in found["why"]

@@ -13,9 +13,11 @@ from ehadiag_sim.conditions import Effects, Sensors
 from ehadiag_sim.emulator import FccCore
 from ehadiag_sim.plant_laws import PositionController
 from ehadiag_sim.simulation import simulate
-from firmware_iface.codec import Encoder
-from firmware_iface.recording import BitState
+from ehadiag_tools.rigs.buses import ForeignBus, Message, Signal
+from firmware_iface.codec import Encoder, decode
+from firmware_iface.recording import CHANNEL_ROLES, BitState
 from firmware_iface.tester import Assembler
+from firmware_iface.transport.frames import FrameTable
 
 LIMIT = default_actuator().controller.IM
 metres = st.floats(-0.06, 0.06)
@@ -104,3 +106,46 @@ def test_recording_is_that_of_the_bus(name):
         assert getattr(here.environment, probe) == pytest.approx(
             getattr(there.environment, probe), rel=1e-9
         )
+
+
+ALL_IN_ONE = ForeignBus(
+    "one",
+    "all in one message",
+    {
+        "All": Message(
+            0x410,
+            48,
+            (
+                Signal("command.position", 0, 32, 1e-9, "m"),
+                Signal("command.mode", 32, 8, 1, "", signed=False),
+                Signal("status.state", 40, 8, 1, "", signed=False),
+                Signal("status.test_id", 48, 8, 1, "", signed=False),
+                *(
+                    Signal(role, 64 + 32 * k, 32, 1e-6, ("mA", "mm", "MPa", "mm")[k])
+                    for k, role in enumerate(CHANNEL_ROLES)
+                ),
+                Signal("environment.supply_pressure", 192, 16, 0.01, "bar", signed=False),
+                Signal("environment.return_pressure", 208, 16, 0.01, "bar", signed=False),
+                Signal("environment.oil_temperature", 224, 16, 0.1, "K", signed=False),
+            ),
+            fd=True,
+        )
+    },
+)
+
+
+def test_a_message_of_all_groups_is_sent_once_a_tick_with_all_of_them():
+    bus_map = ALL_IN_ONE.bus_map()
+    core = FccCore(default_actuator(), TESTS.values(), bus_map=bus_map, seed=3)
+    core.start(TESTS["closed"].id)
+    sent = [core.step() for _ in range(900)]
+    assert {len(frames) for frames in sent} == {1}
+    table = decode(FrameTable.from_frames(frame for (frame,) in sent), bus_map).messages["All"]
+    assert set(table.values["environment.supply_pressure"].round(-3)) == {20.7e6}
+    running = table.values["status.state"] == BitState.RUNNING
+    assert not running[:100].any()
+    assert running[100:].all()
+    position, command = (table.values[f"{name}.position"] for name in ("channels", "command"))
+    assert np.ptp(command[running]) > 1e-3
+    np.testing.assert_allclose(position[running], command[running], atol=5e-3)
+    assert np.ptp(position[running]) > 0.5 * np.ptp(command[running])

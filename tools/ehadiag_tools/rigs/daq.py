@@ -1,6 +1,6 @@
 """Study of recordings by a data acquisition with converters and a clock of its own.
 
-The plant is sampled at 10 kHz, and read between two samples by a local cubic. The control computer
+The plant is sampled at 50 kHz, and read between two samples by a local cubic. The control computer
 reads it once a tick through its own converters and acts on what these say; the acquisition never
 sees their codes.
 """
@@ -32,7 +32,7 @@ from firmware_iface.errors import EhadiagError
 from firmware_iface.recording import CHANNELS, Channels, CommandMode
 from firmware_iface.stored_test import bundled_tests
 
-PLANT_RATE = 10_000.0
+PLANT_RATE = 50_000.0
 """Samples of the plant a second, Hz; a whole number of them makes a control tick."""
 SETTLING_S, AFTER_S = 0.2, 0.3
 """Rest before and after each test, s; the recording begins within the first."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag_tools.rigs.buses import ForeignBus
 from firmware_iface.bus_map import BusMap, default_map
-from firmware_iface.codec import Encoder
+from firmware_iface.codec import TickEncoder
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs.reader import choose_recording
 from firmware_iface.recording import CHANNELS, BitState, CommandMode, Recording, Samples
@@ -117,7 +117,7 @@ class _Encoder:
     """Payloads of each message in each tick."""
 
     def __init__(self, bus_map: BusMap, recording: Recording) -> None:
-        self._encoder = Encoder(bus_map)
+        self._encoder = TickEncoder(bus_map)
         self._map = bus_map
         self._recording = recording
         messages = bus_map.messages.values()
@@ -128,20 +128,19 @@ class _Encoder:
         }
 
     def tick(self, this: Played, tick: int) -> dict[str, bytes]:
-        """Payload of each message, the parts of one message put together."""
+        """Payload of each message."""
         inside = this.begin <= tick < this.end
         values = this.channels[:, tick]
-        frames: list[Frame] = []
         if not np.isnan(values).any():
             codes = [
                 int(channel.encode(value)) for channel, value in zip(CHANNELS, values, strict=True)
             ]
-            frames += self._encoder.telemetry(codes, 0)
+            self._encoder.telemetry(codes, 0)
         if self._has["command"]:
-            frames += self._encoder.command(this.mode, float(this.command[tick]), 0, 0)
+            self._encoder.command(this.mode, float(this.command[tick]), 0, 0)
         if self._has["environment"]:
             known = self._recording.environment
-            frames += self._encoder.environment(
+            self._encoder.environment(
                 known.supply_pressure or 0.0,
                 known.return_pressure or 0.0,
                 known.oil_temperature or 0.0,
@@ -155,12 +154,9 @@ class _Encoder:
                 state, number = BitState.COMPLETE, self._recording.test_id or 0
                 elapsed = (this.end - this.begin) * 1e-3
             serial = self._recording.serial or 0
-            frames += self._encoder.status(state, 0, number, elapsed, serial, 0)
-        out: dict[str, bytes] = {}
-        for frame in frames:
-            name = self._names[frame.can_id, frame.extended]
-            before = out.get(name, bytes(len(frame.data)))
-            out[name] = bytes(a | b for a, b in zip(before, frame.data, strict=True))
+            self._encoder.status(state, 0, number, elapsed, serial, 0)
+        frames = self._encoder.frames(0)
+        out = {self._names[frame.can_id, frame.extended]: frame.data for frame in frames}
         if np.isnan(values).any():
             # Lost: with a sample that shares its message a command is lost too.
             out = {
