@@ -18,7 +18,7 @@ from ehadiag.identify.experiment import Experiment, build_experiment
 from ehadiag.identify.identification_session import identify
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
-from ehadiag_sim.conditions import Faults, Sensors
+from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import simulate
 from ehadiag_tools.accuracy.figures import (
     SEVERITY_HEADINGS,
@@ -39,6 +39,10 @@ Severities = tuple[float, float, float]
 """Kintas, FSS, FDJ, each 0 … 1."""
 SURFACE_PERIOD = 4
 """Random cases for one on the surface of the cube, until each of its parts was visited."""
+OIL_RANGE = (-20.0, 100.0)
+"""Temperatures of the oil on a random day, degC."""
+OIL_BANDS = (-20.0, 0.0, 30.0, 65.0, 100.0)
+"""Limits of the bands in which coverage is counted, degC."""
 PLANTS = ("detailed", "monitoring")
 """The independent simulator; the monitoring model itself."""
 TESTS: Mapping[str, tuple[str, ...]] = {
@@ -101,8 +105,9 @@ def random_faults(count: int, seed: int) -> list[Severities]:
 class Case:
     """Settings of one identification; what it gives depends on nothing else but the code.
 
-    A test is one of `TESTS`, a plant of `PLANTS`; recordings, one log for each stored test, are
-    identified instead of a simulation.
+    A test is one of `TESTS`, a plant of `PLANTS`; oil (degC) and supply pressure (Pa) are the
+    simulator's own unless given; recordings, one log for each stored test, are identified instead
+    of a simulation.
     """
 
     test: str
@@ -111,6 +116,7 @@ class Case:
     search_seed: int = 0
     plant: str = "detailed"
     recordings: tuple[str, ...] = ()
+    conditions: tuple[float, float] | None = None
 
 
 def perform(case: Case) -> Record:
@@ -142,7 +148,7 @@ def experiments_of(case: Case) -> list[Experiment]:
         elif case.plant == "monitoring":
             samples, environment = _monitoring(name, case.faults, case.noise_seed)
         else:
-            samples, environment = _detailed(name, case.faults, case.noise_seed)
+            samples, environment = _detailed(name, case.faults, case.noise_seed, case.conditions)
         test = resolve_test(name)
         out.append(build_experiment(samples, environment, test, default_actuator()))
     return out
@@ -157,11 +163,17 @@ def _recorded(path: str) -> tuple[Samples, Environment]:
 
 
 @lru_cache(maxsize=8)
-def _detailed(test: str, faults: Severities, seed: int) -> tuple[Samples, Environment]:
+def _detailed(
+    test: str, faults: Severities, seed: int, conditions: tuple[float, float] | None = None
+) -> tuple[Samples, Environment]:
     # Open and closed loop of one seed must not have the same noise: a joint estimate has both.
     key = (seed, list(TESTS).index(test))
     noise = int(np.random.SeedSequence(key).generate_state(1)[0])
-    done = simulate(default_actuator(), resolve_test(test), Faults(*faults), seed=noise)
+    effects = None
+    if conditions is not None:
+        oil, supply = conditions
+        effects = Effects(oil_temperature=oil, supply_pressure=supply)
+    done = simulate(default_actuator(), resolve_test(test), Faults(*faults), effects, seed=noise)
     recording = done.recording("simulated")
     return done.samples, recording.environment
 
@@ -291,19 +303,30 @@ def _cube_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
     add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
+    add("--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%")
 
 
 def _cube_cases(options: Options) -> list[Case]:
+    days: list[tuple[float, float] | None] = [None] * options.cases
+    if options.conditions:
+        rng, supply = np.random.default_rng([options.seed, 1]), Effects().supply_pressure
+        low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
+        days = [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
     return [
-        Case(test, faults, noise_seed=index, plant=options.plant)
+        Case(test, faults, noise_seed=index, plant=options.plant, conditions=day)
         for test in options.test or ("open", "closed")
-        for index, faults in enumerate(random_faults(options.cases, options.seed))
+        for index, (faults, day) in enumerate(
+            zip(random_faults(options.cases, options.seed), days, strict=True)
+        )
     ]
 
 
 def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
     yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+    if options.conditions:
+        yield "\nIntervals that hold, by the temperature of the oil:\n"
+        yield from markdown(("test", "oil, degC", "cases", *FAULT_NAMES), _band_rows(records))
     for (test,), part in grouped(records, "test").items():
         yield f"\n{test}\n"
         yield from markdown(("figure", "value"), _summary_rows(part))
@@ -311,6 +334,14 @@ def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
         yield from markdown(
             ("noise seed", "truth", "errors", "stated deviations", "outliers, %"), _worst_rows(part)
         )
+
+
+def _band_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+    for (test,), part in grouped(records, "test").items():
+        for low, high in itertools.pairwise(OIL_BANDS):
+            mine = [item for item in part if low <= item["conditions"][0] < high]
+            held = holds_truth(mine).mean(axis=0) if mine else ()
+            yield test, f"{low:g} … {high:g}", len(mine), *(f"{100.0 * x:.0f} %" for x in held)
 
 
 def _summary_rows(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
