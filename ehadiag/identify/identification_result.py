@@ -103,6 +103,9 @@ class Identification(msgspec.Struct, frozen=True, eq=False):
     friction_range: tuple[float, float] | None = None
     """Least and largest `FSS` by the exponents of clogging that the actuator file allows; None
     where it states one."""
+    ambiguous: bool = False
+    """Whether the searches for effects in closed loop leave more than noise: another place, far
+    away, may explain it."""
     begun_from: str = ""
     """Earlier diagnosis that the refinement began from, in words; empty: the recordings' own
     search."""

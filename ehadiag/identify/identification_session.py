@@ -270,8 +270,12 @@ class IdentificationSession:
             attempts=freed.starts + (1 if best else 0),
             timing=_timing(begin, searched_at, search_s),
         )
+        closed = all(item.test.closed_loop for item in experiments)
         return replace(
-            concluded, slip_speed=freed.slip_speed, better_exponent=freed.better_exponent
+            concluded,
+            slip_speed=freed.slip_speed,
+            better_exponent=freed.better_exponent,
+            ambiguous=closed and self.prior.joint is None and not freed.explained,
         )
 
     def _from_earlier(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +16,12 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.identify.experiment import Experiment, build_experiment
-from ehadiag.identify.identification_session import identify
+from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.identification_session import (
+    EarlierEstimate,
+    IdentificationSession,
+    identify,
+)
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
 from ehadiag_sim.conditions import Effects, Faults, Sensors
@@ -107,7 +113,8 @@ class Case:
 
     A test is one of `TESTS`, a plant of `PLANTS`; oil (degC) and supply pressure (Pa) are the
     simulator's own unless given; recordings, one log for each stored test, are identified instead
-    of a simulation.
+    of a simulation. Wear: largest change of a severity since a diagnosis from which a second
+    identification begins.
     """
 
     test: str
@@ -117,13 +124,17 @@ class Case:
     plant: str = "detailed"
     recordings: tuple[str, ...] = ()
     conditions: tuple[float, float] | None = None
+    wear: float | None = None
 
 
 def perform(case: Case) -> Record:
     """Identify; plain numbers only, fractions of 1."""
     experiments = experiments_of(case)
+    begin = time.thread_time()
     result = identify(experiments, seed=case.search_seed)
+    spent = time.thread_time() - begin
     return {
+        **({} if case.wear is None else _from_earlier(case, experiments, result, spent)),
         "faults": case.faults,
         "first": [item.first for item in result.estimates],
         "search": [item.search for item in result.estimates],
@@ -136,6 +147,27 @@ def perform(case: Case) -> Record:
         "converged": result.converged,
         "rescued": result.rescued,
         "bound": [float(value) for value in cramer_rao(experiments, case.faults)],
+    }
+
+
+def _from_earlier(
+    case: Case, experiments: Sequence[Experiment], found: Identification, spent: float
+) -> Record:
+    """Identify from an earlier diagnosis: whether it began there, how far from that of a search.
+
+    In deviations; time as a share of that of the search.
+    """
+    rng = np.random.default_rng(case.noise_seed)
+    change = (case.wear or 0.0) * rng.uniform(-1.0, 1.0, len(FAULT_NAMES))
+    values = np.clip(np.array([item.value for item in found.estimates]) + change, 0.0, 1.0)
+    earlier = EarlierEstimate(dict(zip(FAULT_NAMES, values.tolist(), strict=True)), "earlier")
+    begin = time.thread_time()
+    other = IdentificationSession(seed=case.search_seed, earlier=earlier).finish(experiments)
+    pairs = zip(other.estimates, found.estimates, strict=True)
+    return {
+        "begun": bool(other.begun_from),
+        "time_share": (time.thread_time() - begin) / spent,
+        "apart": max(abs(new.value - old.value) / old.std for new, old in pairs),
     }
 
 
@@ -304,6 +336,13 @@ def _cube_options(parser: argparse.ArgumentParser) -> None:
     add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
     add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
     add("--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%")
+    add(
+        "--wear",
+        action="append",
+        type=float,
+        metavar="K",
+        help="also begin from a diagnosis with severities that differ by so much; may be repeated",
+    )
 
 
 def _cube_cases(options: Options) -> list[Case]:
@@ -313,11 +352,12 @@ def _cube_cases(options: Options) -> list[Case]:
         low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
         days = [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
     return [
-        Case(test, faults, noise_seed=index, plant=options.plant, conditions=day)
+        Case(test, faults, noise_seed=index, plant=options.plant, conditions=day, wear=wear)
         for test in options.test or ("open", "closed")
         for index, (faults, day) in enumerate(
             zip(random_faults(options.cases, options.seed), days, strict=True)
         )
+        for wear in options.wear or (None,)
     ]
 
 
@@ -327,6 +367,9 @@ def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     if options.conditions:
         yield "\nIntervals that hold, by the temperature of the oil:\n"
         yield from markdown(("test", "oil, degC", "cases", *FAULT_NAMES), _band_rows(records))
+    if options.wear:
+        yield "\nFrom an earlier diagnosis, beside a search:\n"
+        yield from markdown(WEAR_HEADINGS, _wear_rows(records))
     for (test,), part in grouped(records, "test").items():
         yield f"\n{test}\n"
         yield from markdown(("figure", "value"), _summary_rows(part))
@@ -334,6 +377,24 @@ def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
         yield from markdown(
             ("noise seed", "truth", "errors", "stated deviations", "outliers, %"), _worst_rows(part)
         )
+
+
+WEAR_HEADINGS = (
+    "test", "wear", "cases", "begun there", "apart, median", "95 %", "most", "time, median",
+)  # fmt: skip
+
+
+def _wear_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+    """How far both estimates are apart, in deviations, and the time, of those that began there."""
+    for (test, wear), part in grouped(records, "test", "wear").items():
+        begun = [item for item in part if item["begun"]] or [
+            {"apart": np.nan, "time_share": np.nan}
+        ]
+        apart = [item["apart"] for item in begun]
+        cells = [f"{np.quantile(apart, share):.3f}" for share in (0.5, 0.95, 1.0)]
+        time_share = float(np.median([item["time_share"] for item in begun]))
+        share = f"{np.mean([item['begun'] for item in part]):.0%}"
+        yield test, f"{wear:g}", len(part), share, *cells, f"{time_share:.2f}"
 
 
 def _band_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
