@@ -283,11 +283,35 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
+        if not found.explained and any(item.origin_read for item in experiments):
+            found = self._from_origin(experiments, found, hint, before)
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
             return self._with_load(experiments, found)
         return self._loosened(experiments, found, hint) if calibrated else found
+
+    def _from_origin(
+        self,
+        experiments: Sequence[Experiment],
+        found: NuisanceEstimate,
+        hint: Mapping[str, float] | None,
+        before: float,
+    ) -> NuisanceEstimate:
+        """Estimate with the spool's origin less the offset that was found, if that explains more.
+
+        Where friction holds the spool the first break-away comes at another tick otherwise, and
+        hysteresis stands in for friction.
+        """
+        offset = found.refined.values["spool_offset"]
+        moved = [item.with_origin(offset) for item in experiments]
+        other = self._with(moved, self.prior, hint, before)
+        best = other if other.explained or other.excess < found.excess else found
+        return replace(
+            best,
+            evaluations=found.evaluations + other.evaluations,
+            starts=found.starts + other.starts,
+        )
 
     def _loosened(
         self,
