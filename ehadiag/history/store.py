@@ -287,7 +287,9 @@ class History:
 
         Parameters
         ----------
-        serial, actuator : int, str
+        serial : int
+            Of the unit.
+        actuator : str
             Of the unit.
         other_than : Collection[str]
             Hashes of the samples of the new recordings.
