@@ -115,12 +115,13 @@ def refine_first_part(
     at_start: StartResiduals | None = None,
     spread: Array | float = SEARCH_OPTIMUM_STD,
     schedule: SearchSchedule = FEW_UNKNOWNS_SCHEDULE,
+    judgements: int = ESTIMATION.max_noise_judgements,
 ) -> FirstPart:
     """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
     `start`: severities by name. `between`: called between rounds; what it raises ends the search.
     `at_start`: of `start_residuals` there, if they are known. `spread`, `schedule`: see
-    `refine_severities`.
+    `refine_severities`. `judgements`: of the noise after that of the start, at most.
     """
     spans = first_part_spans(experiments, until)
     at_start = at_start or start_residuals(experiments, until, start)
@@ -129,7 +130,7 @@ def refine_first_part(
     levels = anchored_model(experiments, spans).levels
     best = _refined_spans(experiments, spans, start, levels, spread, between, schedule)
     evaluations = 1 + best.evaluations
-    for _ in range(ESTIMATION.max_noise_judgements):
+    for _ in range(judgements):
         before = [item.noise for item in experiments]
         judged = _with_judged_noise(experiments, until, best.residuals)
         after = [item.noise for item in judged]

@@ -67,9 +67,8 @@ the window."""
 
 
 FROM_PRIOR_SCHEDULE = replace(FEW_UNKNOWNS_SCHEDULE, most_rounds=4)
-MOST_RUNS_FROM_PRIOR = 1 + FROM_PRIOR_SCHEDULE.most_rounds * (1 + 2 * len(FAULTS))
-"""Runs of the model from an earlier diagnosis, 1: what takes more rounds stood between break-aways,
-up to 55 deviations off."""
+"""Schedule from an earlier diagnosis: what takes more rounds stood between break-aways, up to 55
+deviations off."""
 
 
 class SeverityAttempt(msgspec.Struct, frozen=True, eq=False):
@@ -130,10 +129,10 @@ def attempt_from_prior(
     look = start_residuals(experiments, ends, prior)
     if look.outlier_share > FIT.max_fit_outliers:
         return None
-    whole = refine_first_part(
-        experiments, ends, prior, between, look, ESTIMATION.refined_std, FROM_PRIOR_SCHEDULE
-    )
-    if not whole.refined.converged or whole.evaluations > MOST_RUNS_FROM_PRIOR:
+    spread, schedule = ESTIMATION.refined_std, FROM_PRIOR_SCHEDULE
+    # So near the optimum the start's residuals show the noise.
+    whole = refine_first_part(experiments, ends, prior, between, look, spread, schedule, 0)
+    if not whole.refined.converged:
         return None
     refined, judged = _finished(experiments, whole)
     point = np.full(len(FAULTS), np.nan)
