@@ -93,8 +93,7 @@ class InterimEstimate(msgspec.Struct, frozen=True):
     """Their standard deviations by name; None before a refinement."""
 
 
-@dataclass(frozen=True, slots=True)
-class EarlierEstimate:
+class EarlierEstimate(msgspec.Struct, frozen=True):
     """What an earlier diagnosis of the unit found; a refinement may begin there."""
 
     severities: Mapping[str, float]
