@@ -282,6 +282,7 @@ class Options(TypedDict, total=False):
     solver: Solver | str
     nuisances: str
     seed: int
+    prior: Result | PathLike | None
     advisory: float
     limit: float
     rule: str
@@ -309,7 +310,7 @@ def diagnose(
         Called with the stage and its share done, 0 … 1.
     **options : Unpack[Options]
         Fields of the request, by name; they go before those of `request`. `actuator`, `test`,
-        `mapping`, `columns` and `solver` may be objects.
+        `mapping`, `columns`, `solver` and `prior` may be objects.
 
     Returns
     -------
@@ -407,7 +408,7 @@ def setup_for(request: Request | None, options: Mapping[str, Any]) -> Setup:
         )
         if any(isinstance(item, StoredTest) for item in tests):
             objects["test"] = tests
-    for name in ("actuator", "mapping", "columns", "solver"):
+    for name in ("actuator", "mapping", "columns", "solver", "prior"):
         value = given.get(name)
         plain = value is None or isinstance(value, str | os.PathLike | list | tuple)
         if not plain:

@@ -247,6 +247,7 @@ def _search(request: Request, sources: Sources, found: Identification | None) ->
         evaluations=found.evaluations,
         generations=found.generations,
         converged=bool(found.converged),
+        begun_from=valid_text(found.begun_from) or None,
     )
 
 

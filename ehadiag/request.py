@@ -196,6 +196,16 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
             project=True,
         ),
     ] = 0  # fmt: skip
+    prior: Annotated[
+        str | None,
+        _option(
+            "--prior",
+            "JSON result of the unit's last diagnosis: the estimate begins there if that explains"
+            " the recording (default: the last one in the health history)",
+            "FILE",
+            file=True,
+        ),
+    ] = None
     advisory: Annotated[
         float,
         _option(

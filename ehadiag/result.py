@@ -13,10 +13,11 @@ import msgspec
 from msgspec import Meta, field
 
 from ehadiag.assess.verdict import Verdict
+from ehadiag.core.conventions import MAX_RESULT_BYTES
 from ehadiag.estimate import Culprit, Effect, Severity
 from ehadiag.request import MOST_SEED, Request
 from firmware_iface.errors import ConfigurationError, NotTestedError
-from firmware_iface.files import write_file
+from firmware_iface.files import read_small_file, write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,6 +91,8 @@ class Search(msgspec.Struct, frozen=True, kw_only=True):
     """Runs of the model in all stages."""
     generations: int = 0
     converged: bool | None = None
+    begun_from: str | None = None
+    """Earlier diagnosis that the refinement began from; None: the search of this recording."""
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
@@ -484,6 +487,15 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         from ehadiag.report.result_tables import diagnosis_html  # noqa: PLC0415
 
         return diagnosis_html(self)
+
+
+def load_result(path: Path) -> Result:
+    """Read a result's JSON file; ConfigurationError: it is none, InputOutputError: unreadable."""
+    line = read_small_file(path, MAX_RESULT_BYTES, "result")
+    try:
+        return Result.from_json(line)
+    except ValueError:
+        raise ConfigurationError(f"result {path}: is none of ehadiag's JSON results") from None
 
 
 def result_schema() -> dict[str, Any]:

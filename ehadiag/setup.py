@@ -22,18 +22,21 @@ from ehadiag.api import (
     resolve_stored_test,
     stored_tests_with,
 )
+from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, with_tolerance
 from ehadiag.core.conventions import date_text, fingerprint
 from ehadiag.core.interruption import COMPUTING_THREAD_NAME
 from ehadiag.records import failed_result, result_of
 from ehadiag.request import Request
-from ehadiag.result import Log, Mapped, Result, Sources
+from ehadiag.result import Log, Mapped, Result, Sources, load_result
 from firmware_iface.errors import EhadiagError, NotTestedError, valid_text
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.stored_test import StoredTest
 
 if TYPE_CHECKING:
     from ehadiag.assess.diagnosis import Diagnosis, DiagnosisSession
+    from ehadiag.history.store import HistorySnapshot
+    from ehadiag.identify.identification_session import EarlierEstimate
     from ehadiag.identify.solvers import Solver
     from firmware_iface.bus_map import BusMap
     from firmware_iface.logs.log_files import Budget
@@ -161,7 +164,9 @@ class Setup:
     """What is asked for."""
     objects: Mapping[str, Any] = field(default_factory=dict)
     """Given as objects, not by name, by the fields of the request: `actuator`, `test`, `mapping`,
-    `columns`, `solver`; and `candidates`, tests to look for."""
+    `columns`, `solver`, `prior`; and `candidates`, tests to look for."""
+    history: HistorySnapshot | None = None
+    """Health history whose last diagnosis of a unit a new one may begin from."""
     label: str = ""
     """Tells its results from those of other actuators on the same bus; empty of the only one."""
 
@@ -269,10 +274,46 @@ class Setup:
             solver=self.solver.name if "solver" in self.objects else None,
         )
 
-    def session(self, tests: Sequence[StoredTest] | None = None) -> DiagnosisSession:
+    @cached_property
+    def prior(self) -> Result | None:
+        """Result that was named to begin from."""
+        if "prior" in self.objects or self.request.prior is None:
+            found: Result | None = self.objects.get("prior")
+            return found
+        return load_result(Path(self.request.prior))
+
+    def earlier(self, recordings: Sequence[Recording]) -> EarlierEstimate | None:
+        """Return what the last diagnosis of the recordings' unit found; None where none is known.
+
+        The result that was named, else the last one in the history: of the same serial number, by
+        the same actuator data, and not of these recordings.
+        """
+        serial = next((item.serial for item in recordings if item.serial is not None), None)
+        found, words = self.prior, f"result {self.request.prior or 'given'}"
+        if found is None and self.history is not None and serial is not None:
+            found, words = self.history.last_result(serial, self.actuator.name, recordings)
+        if (
+            found is None
+            or not found.identified
+            or found.verdict is Verdict.NOT_TESTED
+            or found.actuator_sha256 != fingerprint(self.actuator)
+            or found.serial != serial
+        ):
+            return None
+        from ehadiag.identify.identification_session import EarlierEstimate  # noqa: PLC0415 - loads kernels
+
+        values = {name: item.value for name, item in found.severities.items()}
+        return EarlierEstimate(values, words)
+
+    def session(
+        self,
+        tests: Sequence[StoredTest] | None = None,
+        earlier: EarlierEstimate | None = None,
+    ) -> DiagnosisSession:
         """Begin a diagnosis that can be fed a running test.
 
-        tests: that a recording may be of; None: all. Returns for `diagnose`.
+        tests: that a recording may be of; None: all; earlier: see `DiagnosisSession`. Returns for
+        `diagnose`.
         """
         from ehadiag.assess.diagnosis import DiagnosisSession  # noqa: PLC0415 - loads kernels
         from ehadiag.identify.identification_session import NuisanceMode  # noqa: PLC0415
@@ -285,6 +326,7 @@ class Setup:
             solver=self.solver,
             seed=self.request.seed,
             nuisances=NuisanceMode(self.request.nuisances),
+            earlier=earlier,
         )
 
     def open(self, *files: PathLike, progress: Progress | None = None) -> Iterator[Recording]:
@@ -348,7 +390,7 @@ class Setup:
         if deadline is None and limit is not None:
             deadline = Deadline(limit)
         try:
-            session = session or self.session()
+            session = session or self.session(earlier=self.earlier(recordings))
             work = partial(session.finish, recordings)
             found = work(report) if deadline is None else deadline.run(work, report)
         except NotTestedError as error:

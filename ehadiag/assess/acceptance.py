@@ -274,6 +274,11 @@ def objections_to_estimate(
             f"{rms:.2f} (limit {most_rms:.3g}): other actuator data, or an effect that the three "
             "faults leave out"
         )
+    if identification.ambiguous and not out:
+        out.append(
+            "searches with all effects of the unit leave more than noise in closed loop, where"
+            " friction and hysteresis look alike: record the open-loop test, too"
+        )
     if identification.better_exponent is not None:
         out.append(
             "the recording contradicts servovalve.clogging_exponent: with"

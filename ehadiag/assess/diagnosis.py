@@ -61,6 +61,7 @@ from ehadiag.estimate import Culprit, Effect
 from ehadiag.identify.experiment import Experiment, build_experiment, noise_is_judged_early
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.identification_session import (
+    EarlierEstimate,
     IdentificationSession,
     InterimEstimate,
     NuisanceMode,
@@ -123,7 +124,8 @@ class DiagnosisSession:
     number; default: test of recordings whose bus does not carry a number; levels: advisory level
     and limit; solver: global search; the compact genetic algorithm unless given; seed: the same
     seed gives the same answer on the same machine; nuisances: which effects of the installation are
-    estimated with the faults.
+    estimated with the faults; earlier: what the unit's last diagnosis found, see
+    `IdentificationSession`.
     """
 
     def __init__(
@@ -136,12 +138,15 @@ class DiagnosisSession:
         solver: Solver | None = None,
         seed: int = 0,
         nuisances: NuisanceMode = NuisanceMode.AUTO,
+        earlier: EarlierEstimate | None = None,
     ) -> None:
         self._actuator = actuator
         self._tests = tuple(tests)
         self._default = default
         self._levels = levels or Levels()
-        self._session = IdentificationSession(solver, seed, nuisances, unit_prior(actuator))
+        self._session = IdentificationSession(
+            solver, seed, nuisances, unit_prior(actuator), earlier
+        )
 
     @property
     def reused(self) -> int:

@@ -152,8 +152,8 @@ class SuspectSearch(msgspec.Struct, frozen=True):
 
     difference: float = 0.2
     """Width of the differences, in units of the parameters' scales."""
-    step_shares: tuple[float, ...] = (0.0, 0.4, 1.0)
-    """Shares of the Gauss-Newton step that are tried, 1."""
+    step_shares: tuple[float, ...] = (0.4, 1.0)
+    """Shares of the Gauss-Newton step that are tried besides none, 1."""
     range_shares: tuple[float, ...] = (0.25, 0.6)
     """Shares of a parameter's bounds that are tried on a unit as new, 1."""
     severity_as_new: float = 0.1
@@ -225,7 +225,7 @@ def _suspects(model: SimdModel, x: Array, base: Array, estimated: set[str]) -> t
     first = np.argsort(costs)[: SUSPECTS.refined]
     points, costs = points[first], costs[first]
     for _ in range(SUSPECTS.steps):
-        points, costs = _improved(model, points, [[*own, tried[place]] for place in first])
+        points, costs = _improved(model, points, costs, [[*own, tried[place]] for place in first])
     before = float(_cost(base).sum())
     order = np.argsort(costs)
     out = (
@@ -243,7 +243,8 @@ def _stepped(
     sides = _sides(model, x)
     slopes = _slopes(model.residuals(x + np.diag(sides))[0], base, sides)
     steps = np.array([_step(slopes, base, [*own, k]) for k in tried])
-    return _best_share(model, np.repeat(x[None, :], len(tried), axis=0), steps)
+    points = np.repeat(x[None, :], len(tried), axis=0)
+    return _best_share(model, points, np.full(len(tried), _cost(base).sum()), steps)
 
 
 def _range_points(
@@ -272,8 +273,10 @@ def _range_points(
     return points[places, best], costs[places, best]
 
 
-def _improved(model: SimdModel, points: Array, chosen: Sequence[list[int]]) -> tuple[Array, Array]:
-    """One Gauss-Newton step of each point, in its chosen coordinates."""
+def _improved(
+    model: SimdModel, points: Array, costs: Array, chosen: Sequence[list[int]]
+) -> tuple[Array, Array]:
+    """One Gauss-Newton step of each point with its cost, in its chosen coordinates."""
     sides = [_sides(model, point) for point in points]
     wanted = [
         np.vstack([point, point + np.diag(side)[pick]])
@@ -285,7 +288,7 @@ def _improved(model: SimdModel, points: Array, chosen: Sequence[list[int]]) -> t
     for place, (run, side, pick) in enumerate(zip(runs, sides, chosen, strict=True)):
         slopes = _slopes(run[1:], run[0], side[pick])
         steps[place, pick] = _step(slopes, run[0], list(range(len(pick))))
-    return _best_share(model, points, steps)
+    return _best_share(model, points, costs, steps)
 
 
 def _sides(model: SimdModel, x: Array) -> Array:
@@ -319,17 +322,19 @@ def _step(slopes: Array, base: Array, chosen: list[int]) -> Array:
     return out
 
 
-def _best_share(model: SimdModel, points: Array, steps: Array) -> tuple[Array, Array]:
-    """Best of some shares of each step, and its cost."""
+def _best_share(
+    model: SimdModel, points: Array, before: Array, steps: Array
+) -> tuple[Array, Array]:
+    """Best of some shares of each step and none, and its cost; before: costs of the points."""
     scale = np.array([item.scale for item in model.unknowns.free])
     lower, upper = model.unknowns.lower, model.unknowns.upper
     there = np.stack(
         [np.clip(points + s * steps * scale, lower, upper) for s in SUSPECTS.step_shares]
     )
     costs = _cost(model.residuals(there.reshape(-1, points.shape[1]))[0]).sum(axis=(1, 2))
-    costs = costs.reshape(len(SUSPECTS.step_shares), -1)
+    costs = np.vstack([before, costs.reshape(len(SUSPECTS.step_shares), -1)])
     best, places = costs.argmin(axis=0), np.arange(len(points))
-    return there[best, places], costs[best, places]
+    return np.concatenate([points[None], there])[best, places], costs[best, places]
 
 
 def _suspect(item: Parameter, value: float, share: float) -> Suspect:

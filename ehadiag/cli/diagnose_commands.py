@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,14 +30,14 @@ from ehadiag.cli.result_output import (
     refuse_unwritable,
     reserved_stems,
 )
-from ehadiag.core.conventions import MAX_RESULT_BYTES, fingerprint
+from ehadiag.core.conventions import fingerprint
 from ehadiag.core.interruption import defer_signals
 from ehadiag.report.rendering import (
     diagnosis_html_page,
     index_html_page,
 )
 from ehadiag.request import Request, request_options
-from ehadiag.result import Result
+from ehadiag.result import Result, load_result
 from ehadiag.setup import Setup
 from ehadiag.terminal.output import (
     counting_bar,
@@ -47,7 +48,7 @@ from ehadiag.terminal.output import (
     worst_exit_code,
 )
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
-from firmware_iface.files import read_small_file, write_file
+from firmware_iface.files import write_file
 from firmware_iface.logs.log_files import FRAME_READERS
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
     add_actuators_options(parser)
     options.add_request_options(parser, "columns", "merge", *options.READING, *options.SEARCH)
     options.add_json_option(parser)
+    options.add_request_options(parser, "prior")
     add_history_options(parser)
     options.add_result_options(parser)
     options.add_report_option(parser)
@@ -123,6 +125,7 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     results = ResultWriter(
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
+    setups = [replace(setup, history=results.snapshot()) for setup in setups]
     print_compiling_notice()
     if arguments.merge:
         codes = {_diagnose_merged(setup, results, inputs) for setup in setups}
@@ -168,7 +171,7 @@ def _output_files(arguments: argparse.Namespace) -> list[OutputFile]:
 def _loaded(unit: ActuatorArguments) -> Setup:
     """Return what the command line names for one actuator; what is wrong with it is said here."""
     setup = options.setup_of(unit.arguments, unit.label)
-    _ = setup.sources, setup.actuator
+    _ = setup.sources, setup.actuator, setup.prior
     return setup
 
 
@@ -302,11 +305,7 @@ def run_report(arguments: argparse.Namespace) -> int:
 
 def _write_report(arguments: argparse.Namespace, path: Path, levels: Levels) -> Result:
     """Write the page of a stored result; return the result."""
-    line = read_small_file(path, MAX_RESULT_BYTES, "result")
-    try:
-        result = Result.from_json(line)
-    except ValueError:
-        raise ConfigurationError(f"result {path}: is none of ehadiag's JSON results") from None
+    result = load_result(path)
     try:
         result = _redrawn(arguments, path, result)
     except EhadiagError as error:

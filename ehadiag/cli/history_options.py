@@ -13,7 +13,7 @@ from firmware_iface.errors import ConfigurationError, InputOutputError
 
 if TYPE_CHECKING:
     from ehadiag.history.records import Usage
-    from ehadiag.history.store import History
+    from ehadiag.history.store import History, HistorySnapshot
     from ehadiag.result import Result
 
 HISTORY_VARIABLE = "EHADIAG_HISTORY"
@@ -138,6 +138,15 @@ class HistoryWriter:
                 history.append(entry)
         except ConfigurationError as error:  # exchanged since the call began
             raise InputOutputError(str(error)) from None
+
+    def snapshot(self) -> HistorySnapshot | None:
+        """Return the history as it is now; None where there is none."""
+        if self.place is None or not self.place.exists():
+            return None
+        from ehadiag.history.store import HistorySnapshot  # noqa: PLC0415
+
+        with self._open() as history:
+            return HistorySnapshot(self.place, history.last_number)
 
     def has(self, result: Result) -> bool:
         """Whether a result need not be appended: it was, or there is no history."""

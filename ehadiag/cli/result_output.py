@@ -12,6 +12,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -33,7 +34,10 @@ from ehadiag.terminal.output import (
 from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name, reason_of
 from firmware_iface.files import RESULT_MODE, Folder, write_errors
 
-INPUT_FILE_OPTIONS = ("actuator", "mapping", "dbc", "test")
+if TYPE_CHECKING:
+    from ehadiag.history.store import HistorySnapshot
+
+INPUT_FILE_OPTIONS = ("actuator", "mapping", "dbc", "test", "prior")
 """Options, of any command, that name files to be read."""
 SQLITE_SUFFIXES = ("", "-wal", "-shm", "-journal")
 """What SQLite appends to the name of a database for its own files."""
@@ -194,6 +198,10 @@ class ResultWriter:
     def history(self) -> Path | None:
         """Health history that the results are kept in; None: in none."""
         return self._keeper.place
+
+    def snapshot(self) -> HistorySnapshot | None:
+        """Return the history as it is now; None where there is none."""
+        return self._keeper.snapshot()
 
     def load(self) -> None:
         """Load what printing needs: a verdict must not wait for it."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import msgspec
 
@@ -26,12 +26,18 @@ from ehadiag.history.records import (
     MaintenanceEvent,
     SourceRecord,
     Usage,
+    hash_of_samples,
 )
 from ehadiag.history.schema import MIGRATION_STEPS, migrate, refuse_foreign_schema, schema_version
-from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
+from ehadiag.result import Result
+from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError, reason_of
+
+if TYPE_CHECKING:
+    from firmware_iface.recording import Recording
 
 __all__ = [
     "History",
+    "HistorySnapshot",
 ]
 
 
@@ -274,6 +280,48 @@ class History:
             )
         return found[0]
 
+    def last_identified(
+        self, serial: int, actuator: str, other_than: Collection[str], until: int
+    ) -> Entry | None:
+        """Return the last diagnosis of a unit that a new one may begin from.
+
+        Parameters
+        ----------
+        serial : int
+            Of the unit.
+        actuator : str
+            Of the unit.
+        other_than : Collection[str]
+            Hashes of the samples of the new recordings.
+        until : int
+            Largest number of a diagnosis that counts.
+
+        Returns
+        -------
+        Entry | None
+            With a verdict, and no maintenance of the unit since; None where there is none.
+        """
+        with self._one_line_errors():
+            rows = self._rows(
+                "SELECT id FROM diagnosis WHERE serial = ? AND actuator = ? AND id <= ?"
+                " AND verdict <> 'NOT_TESTED' ORDER BY id DESC LIMIT 10",
+                (serial, actuator, until),
+            )
+        for row in rows:
+            entry = self.entry(row["id"])
+            if entry.withdrawn or any(item.samples in other_than for item in entry.sources):
+                continue
+            events = self.events(serial)
+            return None if any(event.when >= entry.when for event in events) else entry
+        return None
+
+    @property
+    def last_number(self) -> int:
+        """Number of the last diagnosis; 0 where there is none."""
+        with self._one_line_errors():
+            (row,) = self._rows("SELECT MAX(id) AS number FROM diagnosis")
+        return int(row["number"] or 0)
+
     def units(self, serial: int | None = None) -> list[tuple[str, int]]:
         """Return actuator and serial number of each unit, or of those with a serial number."""
         where = "serial NOT NULL" if serial is None else "serial = ?"
@@ -505,6 +553,32 @@ class History:
             why = SQLITE_ERROR_TEXTS["SQLITE_CORRUPT"]
             raise InputOutputError(f"history {self.path}: {why}") from None
         return made
+
+
+class HistorySnapshot(NamedTuple):
+    """A history file as it was at some time; it can be sent to workers."""
+
+    path: Path
+    until: int
+    """Number of the last diagnosis that counts: digits of a call's results are then independent of
+    their order."""
+
+    def last_result(
+        self, serial: int, actuator: str, recordings: Sequence[Recording]
+    ) -> tuple[Result | None, str]:
+        """Return what a new diagnosis of a unit may begin from, and what it is, in words.
+
+        recordings: the new ones. None where there is nothing, or the file cannot be read.
+        """
+        hashes = {hash_of_samples(item) or "" for item in recordings}
+        try:
+            with History(self.path) as history:
+                entry = history.last_identified(serial, actuator, hashes, self.until)
+            result = None if entry is None else Result.from_json(entry.result)
+        except (EhadiagError, ValueError):
+            return None, ""
+        words = "" if entry is None else f"diagnosis {entry.number} of history {self.path}"
+        return result, words
 
 
 def _severity(row: sqlite3.Row) -> Severity:

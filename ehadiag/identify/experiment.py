@@ -112,6 +112,8 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
     """Spool position before the test by the pressure at rest, m."""
     channels: Channels
     """Converters that the samples went through."""
+    origin_read: bool = False
+    """Whether the origin was read from the spool's sensor, and has its offset."""
     viscosity_std: float = 0.0
     """Relative standard deviation of the oil's viscosity by the bus's steps of temperature."""
     supply_std: float = 0.0
@@ -158,6 +160,12 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         slow = slow_ticks(self.position, self.channels.position, slip_speed * self.tick)
         return replace(self, pressure=np.where(slow, np.nan, self.pressure))
 
+    def with_origin(self, offset: float) -> Experiment:
+        """Return the same with the offset of the spool's sensor taken off an origin read by it."""
+        if not self.origin_read:
+            return self
+        return replace(self, origin=self.origin - offset, origin_read=False)
+
     def with_noise(self, noise: tuple[float, ...]) -> Experiment:
         """Return the same with other standard deviations, see `noise`."""
         spool, pressure, position = noise
@@ -191,7 +199,7 @@ def build_experiment(
     # What the jack's load or displaced lands ask for is no offset.
     least, most = _rest_pressure_bounds(constants)
     pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
-    origin = 0.0
+    origin, origin_read = 0.0, False
     if _is_displaced(pressure_offset, pressure, test, channels.pressure):
         # So much pressure is that of a spool that friction holds off the middle.
         origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
@@ -211,7 +219,7 @@ def build_experiment(
         if slides and abs(seen - origin) > far:
             # A spool that still slips began a tick's way before its first sample.
             start = float(2.0 * spool[0] - spool[1])
-            origin = start if abs(start - seen) > far else seen
+            origin, origin_read = (start if abs(start - seen) > far else seen), True
         # 0.1 MPa are an offset of the sensor, or 0.07 µm of the spool; where the jack slides the
         # offset of the spool's sensor is in its origin: unknown until it moves.
         ticks = np.arange(len(pressure))
@@ -244,6 +252,7 @@ def build_experiment(
         position_offset=position_offset,
         rested=rested,
         origin=origin,
+        origin_read=origin_read,
         channels=channels,
         viscosity_std=_viscosity_std(environment),
         supply_std=environment.supply_std,
@@ -429,7 +438,7 @@ def share_offsets(experiments: Sequence[Experiment]) -> list[Experiment]:
             pressure=item.pressure - pressure,
             spool_offset=spool,
             pressure_offset=pressure,
-        )
+        ).with_origin(spool)
         for item in experiments
     ]
 

@@ -18,9 +18,9 @@ class Estimate(msgspec.Struct, frozen=True):
 
     name: str
     first: float
-    """After the first approximation."""
+    """After the first approximation; NaN where a refinement began from an earlier diagnosis."""
     search: float
-    """After the genetic search."""
+    """After the genetic search; NaN as above."""
     value: float
     """After the refinement: the estimate."""
     std: float
@@ -105,6 +105,12 @@ class Identification(msgspec.Struct, frozen=True, eq=False):
     frictions: tuple[float, ...] = ()
     """`FSS` with each of evenly spaced exponents of clogging that the actuator file allows, the
     largest first; empty where it states one."""
+    ambiguous: bool = False
+    """Whether the searches for effects in closed loop leave more than noise: another place, far
+    away, may explain it."""
+    begun_from: str = ""
+    """Earlier diagnosis that the refinement began from, in words; empty: the recordings' own
+    search."""
     response: Mapping[str, float] = msgspec.field(default_factory=dict)
     """What the identified response has in place of estimates that are of a range, by name, SI."""
 

@@ -43,6 +43,7 @@ from ehadiag.identify.posterior import no_interruption
 from ehadiag.identify.prior import EXACT_UNIT_PRIOR, UnitPrior, basic_nuisances_of
 from ehadiag.identify.severity_estimate import (
     SeverityAttempt,
+    attempt_from_prior,
     best_further_attempt,
     explains_recording,
     first_part_ticks,
@@ -93,13 +94,23 @@ class InterimEstimate(msgspec.Struct, frozen=True):
     """Their standard deviations by name; None before a refinement."""
 
 
+class EarlierEstimate(msgspec.Struct, frozen=True):
+    """What an earlier diagnosis of the unit found; a refinement may begin there."""
+
+    severities: Mapping[str, float]
+    """By name."""
+    source: str
+    """Which diagnosis it was, in words."""
+
+
 class IdentificationSession:
     """An identification that takes recordings while they grow, and is finished with complete ones.
 
     What was computed from the beginning of a test is used again where the samples are the same to
     the last bit, so the answer is that of the recording alone, only sooner. One thread at a time.
     solver: global search, the compact genetic algorithm unless given; prior: of the unit, whose
-    inexact data are always estimated, too.
+    inexact data are always estimated, too; earlier: where a refinement begins if that explains the
+    recordings. It has no weight in the estimate.
     """
 
     def __init__(
@@ -108,7 +119,9 @@ class IdentificationSession:
         seed: int = 0,
         nuisances: NuisanceMode = NuisanceMode.AUTO,
         prior: UnitPrior = EXACT_UNIT_PRIOR,
+        earlier: EarlierEstimate | None = None,
     ) -> None:
+        self.earlier = earlier
         self.solver = solver or CompactGa()
         self.seed = seed
         self.nuisances = nuisances
@@ -160,9 +173,8 @@ class IdentificationSession:
         """Estimate the severities from one or more complete recordings of one actuator."""
         windows = [repr(item.test.windows) for item in experiments]
         arrays = [array for item in experiments for array in experiment_arrays(item)]
-        key = inputs_digest(
-            f"identify {self.seed} {self.solver!r} {self.nuisances} {windows}", arrays
-        )
+        settings = f"{self.seed} {self.solver!r} {self.nuisances} {self.earlier}"
+        key = inputs_digest(f"identify {settings} {windows}", arrays)
         callback = progress or (lambda _stage, _share: None)
         return self._memory.recall(
             key,
@@ -194,8 +206,12 @@ class IdentificationSession:
         self, experiments: Sequence[Experiment], progress: StageProgress
     ) -> Identification:
         begin = time.perf_counter()
-        progress("first approximation", 0.0)
         experiments, self._latest_digest = self._prepared(experiments), ((), b"")
+        if self.earlier is not None:
+            found_before = self._from_earlier(experiments, self.earlier, begin, progress)
+            if found_before is not None:
+                return found_before
+        progress("first approximation", 0.0)
         first, start = self._first(experiments)
         searched_at = time.perf_counter()
         found = staged_search(
@@ -224,13 +240,6 @@ class IdentificationSession:
                 partial(progress, "nuisances"),
             )
             freed = freeing.estimated(experiments, hint if near else None, alone_left)
-        conclude = partial(
-            identification_result,
-            solver=self.solver.name,
-            seed=self.seed,
-            about=self.prior.about,
-            discrepancy=self.prior.discrepancy,
-        )
         if best is not None and (freed is None or _nuisances_explain_no_more(freed, best)):
             if (
                 near
@@ -241,24 +250,18 @@ class IdentificationSession:
                     experiments, best, self._first_part, self.solver, self.seed, progress,
                     time.perf_counter,
                 )  # fmt: skip
-            return conclude(
+            return self._concluded_by_severities(
                 first,
-                best.found,
-                best.refined,
-                estimate_covariance(best.refined) + _guessed_covariance(best.refined),
-                best.experiments,
-                doubt=self._discrepancy(best.refined),
-                evaluations=first.evaluations
-                + best.evaluations
-                + (freed.evaluations if freed else 0),
-                attempts=best.count + (freed.starts if freed else 0),
-                timing=_timing(begin, searched_at, search_s + best.search_s),
+                best,
+                first.evaluations + (freed.evaluations if freed else 0),
+                freed.starts if freed else 0,
+                _timing(begin, searched_at, search_s + best.search_s),
             )
         assert freed is not None
         values = freed.refined.values
         severities = np.array([values[item.name] for item in FAULTS])
         before = best.evaluations if best else found.evaluations
-        concluded = conclude(
+        concluded = self._concluded(
             first,
             replace(found, best=severities, cost=freed.refined.cost),
             freed.refined,
@@ -271,11 +274,67 @@ class IdentificationSession:
             attempts=freed.starts + (1 if best else 0),
             timing=_timing(begin, searched_at, search_s),
         )
+        closed = all(item.test.closed_loop for item in experiments)
         return replace(
             concluded,
             slip_speed=freed.slip_speed,
             better_exponent=freed.better_exponent,
             exponent_doubted=freed.exponent_doubted,
+            ambiguous=closed and self.prior.joint is None and not freed.explained,
+        )
+
+    def _from_earlier(
+        self,
+        experiments: Sequence[Experiment],
+        earlier: EarlierEstimate,
+        begin: float,
+        progress: StageProgress,
+    ) -> Identification | None:
+        """Estimate about an earlier one; None where that does not explain the recordings, or where
+        more than the severities is to be estimated."""
+        if self.nuisances is NuisanceMode.ALL or self.prior.has_inexact_data:
+            return None
+        progress("refinement", 0.0)
+        best = attempt_from_prior(
+            experiments, earlier.severities, partial(progress, "refinement", 0.0)
+        )
+        if best is None or not _severities_suffice(best.refined):
+            return None
+        first = FirstApproximation({item.name: np.nan for item in FAULTS}, 0)
+        timing = _timing(begin, begin, 0.0)
+        found = self._concluded_by_severities(first, best, 0, 0, timing)
+        return replace(found, begun_from=earlier.source)
+
+    def _concluded_by_severities(
+        self,
+        first: FirstApproximation,
+        best: SeverityAttempt,
+        evaluations: int,
+        attempts: int,
+        timing: IdentificationTiming,
+    ) -> Identification:
+        """Result by the severities alone; evaluations, attempts: others than those of `best`."""
+        return self._concluded(
+            first,
+            best.found,
+            best.refined,
+            estimate_covariance(best.refined) + _guessed_covariance(best.refined),
+            best.experiments,
+            doubt=self._discrepancy(best.refined),
+            evaluations=best.evaluations + evaluations,
+            attempts=best.count + attempts,
+            timing=timing,
+        )
+
+    @property
+    def _concluded(self) -> Callable[..., Identification]:
+        """What puts a result together, see `identification_result`."""
+        return partial(
+            identification_result,
+            solver=self.solver.name,
+            seed=self.seed,
+            about=self.prior.about,
+            discrepancy=self.prior.discrepancy,
         )
 
     def _discrepancy(self, refined: Refinement) -> Array:

@@ -14,6 +14,7 @@ from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
 from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.criteria import FIT, GIVE_UP
 from ehadiag.identify.estimates import (
+    estimate_covariance,
     excess_cost,
     independent_covariance,
     is_pressure_misfit,
@@ -63,6 +64,9 @@ FINAL_SPREAD_RATIO = 3.0
 """Spread of the last look, with the noise as judged, in spreads of the search's end."""
 HYSTERESIS_NAME = "hysteresis"
 AMBIGUOUS_STDS = {name: law.ambiguous_std for name, law in FAULT_LAWS.items()}
+PROFILE_REACH = 15
+"""Deviations to either side in which the likelihood along a valley is looked at, 1: with the middle
+two blocks of runs."""
 LinearisationMethod = Callable[[Derivatives, ParameterDensity], LinearModel]
 
 
@@ -146,17 +150,40 @@ def estimate_about(
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=at_first[1]
     )
+    profile = _profile_covariance(fine, refined) if settings.require_agreement else 0.0
     refined = refined_with_day(fine, refined, linear)
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
-        covariance=optima_covariance(found, model.scale) + _ambiguity_covariance(refined, judged),
+        covariance=optima_covariance(found, model.scale)
+        + _ambiguity_covariance(refined, judged)
+        + profile,
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
         starts=found.starts,
         evaluations=staged.evaluations + fine.evaluations,
     )
+
+
+def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
+    """Covariance of a valley in which the spool's friction and hysteresis trade, beyond that of the
+    curvature at its floor, SI, shape (k, k).
+
+    Break-aways make the floor uneven, and flatter than its curvature. The likelihood of points
+    along it, each parameter as the curvature has it by the friction, gives the second moment.
+    """
+    covariance = estimate_covariance(refined) / np.outer(refined.scale, refined.scale)
+    place = [item.name for item in refined.parameters].index(FRICTION_NAME)
+    along = covariance[place] / np.sqrt(covariance[place, place])
+    shifts = np.arange(-PROFILE_REACH, PROFILE_REACH + 1.0)
+    points = np.clip(refined.x + shifts[:, None] * along, model.lower, model.upper)
+    costs = cauchy_cost(model.many(points))
+    unit = max(excess_cost(refined.residuals), 1.0)
+    weights = np.exp(-0.5 * (costs - costs.min()) / unit)
+    moment = float(weights @ shifts**2 / weights.sum())
+    extra = max(moment - 1.0, 0.0) * np.outer(along, along)
+    return np.asarray(extra * np.outer(refined.scale, refined.scale))
 
 
 def _ambiguity_covariance(refined: Refinement, experiments: Sequence[Experiment]) -> Array:
@@ -263,11 +290,35 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
+        if not found.explained and any(item.origin_read for item in experiments):
+            found = self._from_origin(experiments, found, hint, before)
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
             return self._with_load(experiments, found)
         return self._loosened(experiments, found, hint) if calibrated else found
+
+    def _from_origin(
+        self,
+        experiments: Sequence[Experiment],
+        found: NuisanceEstimate,
+        hint: Mapping[str, float] | None,
+        before: float,
+    ) -> NuisanceEstimate:
+        """Estimate with the spool's origin less the offset that was found, if that explains more.
+
+        Where friction holds the spool the first break-away comes at another tick otherwise, and
+        hysteresis stands in for friction.
+        """
+        offset = found.refined.values["spool_offset"]
+        moved = [item.with_origin(offset) for item in experiments]
+        other = self._with(moved, self.prior, hint, before)
+        best = other if other.explained or other.excess < found.excess else found
+        return replace(
+            best,
+            evaluations=found.evaluations + other.evaluations,
+            starts=found.starts + other.starts,
+        )
 
     def _loosened(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,

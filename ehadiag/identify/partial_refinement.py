@@ -38,7 +38,12 @@ from ehadiag.identify.linearisation import (
     ParameterDensity,
     ResidualSlope,
 )
-from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE, bounded_step, no_interruption
+from ehadiag.identify.posterior import (
+    FEW_UNKNOWNS_SCHEDULE,
+    SearchSchedule,
+    bounded_step,
+    no_interruption,
+)
 from ehadiag.identify.staged_search import RUN_IN_S
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
@@ -108,20 +113,24 @@ def refine_first_part(
     start: Mapping[str, float],
     between: Callable[[], None] = no_interruption,
     at_start: StartResiduals | None = None,
+    spread: Array | float = SEARCH_OPTIMUM_STD,
+    schedule: SearchSchedule = FEW_UNKNOWNS_SCHEDULE,
+    judgements: int = ESTIMATION.max_noise_judgements,
 ) -> FirstPart:
     """Refine on the first `until` ticks of each test, weighing by the noise that residuals show.
 
     `start`: severities by name. `between`: called between rounds; what it raises ends the search.
-    `at_start`: of `look_at` there, if there was one.
+    `at_start`: of `start_residuals` there, if they are known. `spread`, `schedule`: see
+    `refine_severities`. `judgements`: of the noise after that of the start, at most.
     """
     spans = first_part_spans(experiments, until)
     at_start = at_start or start_residuals(experiments, until, start)
     start = {**start, **at_start.offsets}
     experiments = _with_judged_noise(experiments, until, at_start.residuals)
     levels = anchored_model(experiments, spans).levels
-    best = _refined_spans(experiments, spans, start, levels, SEARCH_OPTIMUM_STD, between)
+    best = _refined_spans(experiments, spans, start, levels, spread, between, schedule)
     evaluations = 1 + best.evaluations
-    for _ in range(ESTIMATION.max_noise_judgements):
+    for _ in range(judgements):
         before = [item.noise for item in experiments]
         judged = _with_judged_noise(experiments, until, best.residuals)
         after = [item.noise for item in judged]
@@ -129,7 +138,7 @@ def refine_first_part(
             break
         experiments = judged
         best = _refined_spans(
-            experiments, spans, best.values, levels, ESTIMATION.refined_std, between
+            experiments, spans, best.values, levels, ESTIMATION.refined_std, between, schedule
         )
         evaluations += best.evaluations
     noise = tuple(item.noise for item in experiments)
@@ -153,11 +162,13 @@ def _refined_spans(
     levels: NDArray[np.int64],
     spread: Array | float,
     between: Callable[[], None],
+    schedule: SearchSchedule,
 ) -> Refinement:
     batch = lay_out_spans(experiments, spans, anchor_lsb=ANCHOR_THRESHOLDS_LSB)
     # What is considered is worked out with the last part.
     model = SimdModel(batch, unknowns_of(experiments), levels=levels)
-    return refine_severities(Derivatives(model, experiments[0].noise), start, spread, between)
+    derivatives = Derivatives(model, experiments[0].noise)
+    return refine_severities(derivatives, start, spread, between, schedule)
 
 
 def anchored_derivatives(

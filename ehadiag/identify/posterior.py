@@ -28,10 +28,12 @@ def bounded_step(x: Array, normal: Array, gradient: Array, lower: Array, upper: 
     bounds, which may be infinite. Each coordinate at a bound is pushed out of it and all others are
     free (Karush, Kuhn, Tucker); an active set finds the one such point.
     """
+    out = x - np.linalg.solve(normal, gradient)
+    if np.all((out >= lower) & (out <= upper)):
+        return out
     allowed = MIN_GRADIENT_SHARE * float(np.abs(gradient).max(initial=0.0))
     held = np.zeros(len(x), dtype=np.bool_)
     ends = x.copy()
-    out = x
     for _ in range(4 * len(x) + 4):
         step = np.where(held, ends - x, 0.0)
         pull = gradient[~held] + normal[np.ix_(~held, held)] @ step[held]

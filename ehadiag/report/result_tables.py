@@ -272,10 +272,11 @@ def _effort_text(result: Result) -> str:
     took = f"{timing.total - timing.read:.2f} s"
     if timing.after_test is not None:
         took = f"{timing.after_test:.2f} s after the test"
+    begun = f"; begun from {search.begun_from}" if search.begun_from else ""
     return (
         f"residual rms spool {_known(fit.spool_rms):.2f}, pressure {_known(fit.pressure_rms):.2f} "
         f"of the noise, {_known(fit.outliers):.2%} outliers; solver {search.name}, "
-        f"seed {search.seed}, {search.evaluations} model runs, {took}"
+        f"seed {search.seed}, {search.evaluations} model runs, {took}{begun}"
     )
 
 

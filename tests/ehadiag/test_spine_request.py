@@ -29,6 +29,7 @@ OTHER: dict[str, Any] = {
     "log_channel": 2,
     "solver": "pygad",
     "nuisances": "all",
+    "prior": "yesterday.json",
     "rule": "estimate",
     "time_limit_s": 5.0,
 }
@@ -84,7 +85,7 @@ def test_each_field_says_what_it_is_and_what_it_takes() -> None:
 def test_a_projects_file_may_set_what_the_fields_say() -> None:
     assert {"actuator", "log_channel", "seed", "rule"} <= PROJECT_KEYS
     assert not {"time_limit", "max_frames", "all", "tolerance"} & PROJECT_KEYS
-    assert {"actuator", "mapping", "dbc", "test"} == FILE_KEYS
+    assert {"actuator", "mapping", "dbc", "test", "prior"} == FILE_KEYS
 
 
 @pytest.mark.parametrize(

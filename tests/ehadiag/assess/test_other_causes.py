@@ -63,9 +63,9 @@ def test_the_default_limits(name, value, beyond):
     assert bool(reasons) is beyond
 
 
-def objections(fit, better_exponent=None):
+def objections(fit, better_exponent=None, ambiguous=False):
     return objections_to_estimate(
-        SimpleNamespace(fit=fit, estimates=(), better_exponent=better_exponent)
+        SimpleNamespace(fit=fit, estimates=(), better_exponent=better_exponent, ambiguous=ambiguous)
     )
 
 
@@ -76,6 +76,14 @@ def test_no_limit_is_judged_where_only_a_wrong_law_of_a_fault_explains_the_recor
     assert item.limit == 0.1
     assert objections(doubtful) == []
     (reason,) = objections(replace(doubtful, unexplained_outliers=0.15))
+    assert "15.0% of the residuals" in reason
+
+
+def test_searches_that_leave_more_than_noise_in_closed_loop_are_an_objection():
+    (reason,) = objections(NOISE, ambiguous=True)
+    assert "record the open-loop test" in reason
+    # What is far from explained has its own reason.
+    (reason,) = objections(replace(NOISE, unexplained_outliers=0.15), ambiguous=True)
     assert "15.0% of the residuals" in reason
 
 

@@ -216,3 +216,35 @@ def test_wrong_usage_is_one_line(
     found: Result = run(*arguments)
     assert said in found.message
     assert found.code == code
+
+
+def test_a_diagnosis_begins_from_the_units_last_one(run: Run) -> None:
+    history = ("--history", "h.sqlite", "--json")
+
+    def begun_from(*words: object) -> str | None:
+        (found,) = run("diagnose", *words).objects
+        source: str | None = found["solver"]["begun_from"]
+        return source
+
+    assert begun_from(HEALTHY, *history) is None
+    assert begun_from(HEALTHY, *history) is None  # not from itself
+    closed = HEALTHY.with_name("healthy-closed.blf")
+    assert begun_from(closed, *history) == "diagnosis 2 of history h.sqlite"
+    assert "begun from diagnosis 3" in run("diagnose", HEALTHY, "--history", "h.sqlite").out
+    assert begun_from(WORN, *history) is None  # it does not explain another wear
+    run("history", "event", "--unit", 1, "filter changed", "--history", "h.sqlite")
+    assert begun_from(closed, *history) is None
+
+
+def test_a_diagnosis_begins_from_a_named_result(run: Run) -> None:
+    run("diagnose", HEALTHY, "--out", ".")
+    closed = HEALTHY.with_name("healthy-closed.blf")
+    (found,) = run("diagnose", closed, "--prior", "healthy-open.json", "--json").objects
+    assert found["solver"]["begun_from"] == "result healthy-open.json"
+    assert found["request"]["prior"] == "healthy-open.json"
+    said = run("diagnose", closed, "--prior", "nowhere.json")
+    assert said.code == 3
+    assert "nowhere.json" in said.message
+    said = run("diagnose", closed, "--prior", closed)
+    assert said.code == 2
+    assert "is none of ehadiag's JSON results" in said.message

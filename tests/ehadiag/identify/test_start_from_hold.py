@@ -6,11 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import ehadiag
-from ehadiag.identify.experiment import build_experiment
+from ehadiag.identify.experiment import build_experiment, share_offsets
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import Plant, SimulatedRun, bus_command, simulate
+from ehadiag_tools.accuracy.units import UnitCase, draw_unit
+from ehadiag_tools.simulator.units import COARSE_STEP, Unit, record
 from firmware_iface.recording import CommandMode, Environment, Recording
 
 CLOSED = next(test for test in ehadiag.bundled_tests().values() if test.closed_loop)
@@ -89,3 +92,40 @@ def test_a_sensor_that_reads_beside_zero_is_no_hold() -> None:
     begun = build_experiment(done.samples, ENVIRONMENT, CLOSED, ehadiag.default_actuator())
     assert begun.origin == 0.0
     assert np.isfinite(begun.pressure).all()
+
+
+@pytest.fixture(scope="module")
+def biased() -> tuple[Unit, list[float], Recording]:
+    """A null bias moves the spool from the first tick on; its sensor reads beside zero."""
+    unit, faults = draw_unit(UnitCase("closed", 228, seed=8200))
+    return unit, faults, record(unit, CLOSED, Faults(*faults), seed=5, step=COARSE_STEP)
+
+
+def test_an_origin_that_the_sensor_read_has_its_offset(
+    biased: tuple[Unit, list[float], Recording],
+) -> None:
+    unit, _, recording = biased
+    samples = recording.samples
+    assert samples is not None
+    begun = build_experiment(samples, ENVIRONMENT, CLOSED, ehadiag.default_actuator())
+    offset = unit.sensors.offsets_lsb[1] * begun.channels.spool.lsb
+    assert begun.origin_read
+    assert begun.origin == pytest.approx(offset, abs=1e-6)
+    mended = begun.with_origin(offset)
+    assert mended.origin == pytest.approx(0.0, abs=1e-6)
+    assert mended.with_origin(offset) is mended
+    resting = replace(begun, rested=True, spool_offset=offset, pressure_offset=0.0)
+    assert share_offsets([resting, begun])[1].origin == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_friction_and_hysteresis_do_not_trade_by_a_wrong_origin(
+    biased: tuple[Unit, list[float], Recording],
+) -> None:
+    """The spool's friction was 11 % off once, and sure."""
+    _, faults, recording = biased
+    result = ehadiag.diagnose(recording)
+    assert result.verdict is not ehadiag.Verdict.NOT_TESTED, result.reasons
+    found = result.severities["FSS"]
+    assert found.std is not None
+    assert abs(found.value - faults[1]) < 4.0 * found.std < 0.03

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,10 +16,15 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.identify.experiment import Experiment, build_experiment
-from ehadiag.identify.identification_session import identify
+from ehadiag.identify.identification_result import Identification
+from ehadiag.identify.identification_session import (
+    EarlierEstimate,
+    IdentificationSession,
+    identify,
+)
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
-from ehadiag_sim.conditions import Faults, Sensors
+from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import simulate
 from ehadiag_tools.accuracy.figures import (
     SEVERITY_HEADINGS,
@@ -39,6 +45,10 @@ Severities = tuple[float, float, float]
 """Kintas, FSS, FDJ, each 0 … 1."""
 SURFACE_PERIOD = 4
 """Random cases for one on the surface of the cube, until each of its parts was visited."""
+OIL_RANGE = (-20.0, 100.0)
+"""Temperatures of the oil on a random day, degC."""
+OIL_BANDS = (-20.0, 0.0, 30.0, 65.0, 100.0)
+"""Limits of the bands in which coverage is counted, degC."""
 PLANTS = ("detailed", "monitoring")
 """The independent simulator; the monitoring model itself."""
 TESTS: Mapping[str, tuple[str, ...]] = {
@@ -101,8 +111,10 @@ def random_faults(count: int, seed: int) -> list[Severities]:
 class Case:
     """Settings of one identification; what it gives depends on nothing else but the code.
 
-    A test is one of `TESTS`, a plant of `PLANTS`; recordings, one log for each stored test, are
-    identified instead of a simulation.
+    A test is one of `TESTS`, a plant of `PLANTS`; oil (degC) and supply pressure (Pa) are the
+    simulator's own unless given; recordings, one log for each stored test, are identified instead
+    of a simulation. Wear: largest change of a severity since a diagnosis from which a second
+    identification begins.
     """
 
     test: str
@@ -111,13 +123,18 @@ class Case:
     search_seed: int = 0
     plant: str = "detailed"
     recordings: tuple[str, ...] = ()
+    conditions: tuple[float, float] | None = None
+    wear: float | None = None
 
 
 def perform(case: Case) -> Record:
     """Identify; plain numbers only, fractions of 1."""
     experiments = experiments_of(case)
+    begin = time.thread_time()
     result = identify(experiments, seed=case.search_seed)
+    spent = time.thread_time() - begin
     return {
+        **({} if case.wear is None else _from_earlier(case, experiments, result, spent)),
         "faults": case.faults,
         "first": [item.first for item in result.estimates],
         "search": [item.search for item in result.estimates],
@@ -133,6 +150,27 @@ def perform(case: Case) -> Record:
     }
 
 
+def _from_earlier(
+    case: Case, experiments: Sequence[Experiment], found: Identification, spent: float
+) -> Record:
+    """Identify from an earlier diagnosis: whether it began there, how far from that of a search.
+
+    In deviations; time as a share of that of the search.
+    """
+    rng = np.random.default_rng(case.noise_seed)
+    change = (case.wear or 0.0) * rng.uniform(-1.0, 1.0, len(FAULT_NAMES))
+    values = np.clip(np.array([item.value for item in found.estimates]) + change, 0.0, 1.0)
+    earlier = EarlierEstimate(dict(zip(FAULT_NAMES, values.tolist(), strict=True)), "earlier")
+    begin = time.thread_time()
+    other = IdentificationSession(seed=case.search_seed, earlier=earlier).finish(experiments)
+    pairs = zip(other.estimates, found.estimates, strict=True)
+    return {
+        "begun": bool(other.begun_from),
+        "time_share": (time.thread_time() - begin) / spent,
+        "apart": max(abs(new.value - old.value) / old.std for new, old in pairs),
+    }
+
+
 def experiments_of(case: Case) -> list[Experiment]:
     """Experiments of a case, one for each stored test."""
     out = []
@@ -142,7 +180,7 @@ def experiments_of(case: Case) -> list[Experiment]:
         elif case.plant == "monitoring":
             samples, environment = _monitoring(name, case.faults, case.noise_seed)
         else:
-            samples, environment = _detailed(name, case.faults, case.noise_seed)
+            samples, environment = _detailed(name, case.faults, case.noise_seed, case.conditions)
         test = resolve_test(name)
         out.append(build_experiment(samples, environment, test, default_actuator()))
     return out
@@ -157,11 +195,17 @@ def _recorded(path: str) -> tuple[Samples, Environment]:
 
 
 @lru_cache(maxsize=8)
-def _detailed(test: str, faults: Severities, seed: int) -> tuple[Samples, Environment]:
+def _detailed(
+    test: str, faults: Severities, seed: int, conditions: tuple[float, float] | None = None
+) -> tuple[Samples, Environment]:
     # Open and closed loop of one seed must not have the same noise: a joint estimate has both.
     key = (seed, list(TESTS).index(test))
     noise = int(np.random.SeedSequence(key).generate_state(1)[0])
-    done = simulate(default_actuator(), resolve_test(test), Faults(*faults), seed=noise)
+    effects = None
+    if conditions is not None:
+        oil, supply = conditions
+        effects = Effects(oil_temperature=oil, supply_pressure=supply)
+    done = simulate(default_actuator(), resolve_test(test), Faults(*faults), effects, seed=noise)
     recording = done.recording("simulated")
     return done.samples, recording.environment
 
@@ -291,19 +335,41 @@ def _cube_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
     add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
+    add("--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%")
+    add(
+        "--wear",
+        action="append",
+        type=float,
+        metavar="K",
+        help="also begin from a diagnosis with severities that differ by so much; may be repeated",
+    )
 
 
 def _cube_cases(options: Options) -> list[Case]:
+    days: list[tuple[float, float] | None] = [None] * options.cases
+    if options.conditions:
+        rng, supply = np.random.default_rng([options.seed, 1]), Effects().supply_pressure
+        low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
+        days = [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
     return [
-        Case(test, faults, noise_seed=index, plant=options.plant)
+        Case(test, faults, noise_seed=index, plant=options.plant, conditions=day, wear=wear)
         for test in options.test or ("open", "closed")
-        for index, faults in enumerate(random_faults(options.cases, options.seed))
+        for index, (faults, day) in enumerate(
+            zip(random_faults(options.cases, options.seed), days, strict=True)
+        )
+        for wear in options.wear or (None,)
     ]
 
 
 def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
     yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+    if options.conditions:
+        yield "\nIntervals that hold, by the temperature of the oil:\n"
+        yield from markdown(("test", "oil, degC", "cases", *FAULT_NAMES), _band_rows(records))
+    if options.wear:
+        yield "\nFrom an earlier diagnosis, beside a search:\n"
+        yield from markdown(WEAR_HEADINGS, _wear_rows(records))
     for (test,), part in grouped(records, "test").items():
         yield f"\n{test}\n"
         yield from markdown(("figure", "value"), _summary_rows(part))
@@ -311,6 +377,32 @@ def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
         yield from markdown(
             ("noise seed", "truth", "errors", "stated deviations", "outliers, %"), _worst_rows(part)
         )
+
+
+WEAR_HEADINGS = (
+    "test", "wear", "cases", "begun there", "apart, median", "95 %", "most", "time, median",
+)  # fmt: skip
+
+
+def _wear_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+    """How far both estimates are apart, in deviations, and the time, of those that began there."""
+    for (test, wear), part in grouped(records, "test", "wear").items():
+        begun = [item for item in part if item["begun"]] or [
+            {"apart": np.nan, "time_share": np.nan}
+        ]
+        apart = [item["apart"] for item in begun]
+        cells = [f"{np.quantile(apart, share):.3f}" for share in (0.5, 0.95, 1.0)]
+        time_share = float(np.median([item["time_share"] for item in begun]))
+        share = f"{np.mean([item['begun'] for item in part]):.0%}"
+        yield test, f"{wear:g}", len(part), share, *cells, f"{time_share:.2f}"
+
+
+def _band_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
+    for (test,), part in grouped(records, "test").items():
+        for low, high in itertools.pairwise(OIL_BANDS):
+            mine = [item for item in part if low <= item["conditions"][0] < high]
+            held = holds_truth(mine).mean(axis=0) if mine else ()
+            yield test, f"{low:g} … {high:g}", len(mine), *(f"{100.0 * x:.0f} %" for x in held)
 
 
 def _summary_rows(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
