@@ -97,8 +97,9 @@ class BlockScore(msgspec.Struct, frozen=True, eq=False):
     information: Array2
     """Shape (k, k)."""
     gain: Array2
-    """Squares of residuals that a step up or down explains, beyond what any parameter within what
-    is no change does; each square of limited size. Shape (2, k)."""
+    """Squares of residuals that a step up or down explains beyond what is no change; each square of
+    limited size. Shape (2, k)."""
+    ticks: int
 
 
 class ScoreBank:
@@ -223,25 +224,28 @@ class ScoreBank:
         flowing, current = flowing[fine], current[fine]
         change = np.stack((np.ones_like(flowing), flowing)) * self.steps[MODELLED:, None] / noise
         _add(score, information, slice(MODELLED, None), (current - flowing) / noise, change, 1.0)
+        gain = self._gain(found, score, information)
         part = np.linalg.inv(np.eye(len(BANK)) + information * (PASSING / self.steps) ** 2)
-        return BlockScore(part @ score, part @ information, self._gain(found))
+        return BlockScore(part @ score, part @ information, gain, len(rows))
 
-    def _gain(self, found: Array2) -> Array2:
-        """What a step of each parameter explains of a block, see `BlockScore`."""
+    def _gain(self, found: Array2, score: Array, information: Array2) -> Array2:
+        """What a step of each parameter explains of a block, see `BlockScore`.
+
+        Both with the step and without it all parameters take their likeliest values of what is no
+        change.
+        """
         residual, change = found[0], found[0] - found[1:]
-        before = np.minimum(residual**2, MAX_SQUARE)
-
-        def explained(off: Array) -> Array:
-            after = np.minimum((residual - off) ** 2, MAX_SQUARE)
-            return np.asarray((before - after).sum(axis=-1))
-
-        within = change * self.steady[:MODELLED, None]
-        least = max(
-            0.0, *(float(explained(share * within).max()) for share in (-1.0, -0.3, 0.3, 1.0))
-        )
+        count, modelled = len(change), slice(0, MODELLED)
+        allowed = np.hypot(self.steady, PASSING / self.steps)[modelled]
+        inner = information[modelled, modelled]
+        fit = np.linalg.inv(inner + np.diag(1.0 / np.maximum(allowed, 1e-9) ** 2))
+        steps = np.concatenate((np.zeros((1, count)), np.eye(count), -np.eye(count)))
+        taken = (score[modelled] - steps @ inner) @ fit
+        left = residual - (steps + taken) @ change
+        cost = np.minimum(left**2, MAX_SQUARE).sum(axis=1) + ((taken / allowed) ** 2).sum(axis=1)
         out = np.zeros((2, len(BANK)))
         shown = (change**2).sum(axis=-1) > 1.0
-        out[:, :MODELLED] = np.where(shown, explained(np.stack((change, -change))) - least, 0.0)
+        out[:, modelled] = np.where(shown, (cost[0] - cost[1:]).reshape(2, count), 0.0)
         return out
 
     def gains(
