@@ -50,8 +50,9 @@ CENTRING_A_M, CENTRING_S = 0.1, 0.5
 """Gain, A/m, and time constant, s, of what keeps the jack from walking off in current mode."""
 OIL = (-20.0, 100.0)
 """Range of the oil's temperature, degC."""
-STEP = 8e-6
-"""Integration step, s: thirty-two times the default's; the monitor's scores are those of 1 µs."""
+STEP = 2e-6
+"""Integration step, s: eight times the default's. With 8 µs two of 32 healthy pieces alarmed by the
+steps' own error, with 2 µs neither."""
 ENVIRONMENT_TICKS = 50
 """Ticks between two changes of oil and supply, 1."""
 REPORT_TICKS = 100
