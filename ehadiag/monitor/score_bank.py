@@ -195,7 +195,10 @@ class ScoreBank:
 
     def settle(self, rows: Array2) -> None:
         """Push a block of ticks, and put the modelled spool where it is seen."""
-        errors = self._monitors[0].push_block(rows)[len(rows) // 2 :, 3]
+        self._put_where_seen(self._monitors[0].push_block(rows))
+
+    def _put_where_seen(self, modelled: Array2) -> None:
+        errors = modelled[len(modelled) // 2 :, 3]
         errors = errors[np.isfinite(errors)]
         if len(errors):
             self._monitors[0].nudge(float(errors.mean()) * self._noise[0])
@@ -213,6 +216,10 @@ class ScoreBank:
             self._monitors[1 + index].nudge(-float(self.steps[index]) * place)
         modelled = np.stack([item.push_block(rows) for item in self._monitors])
         found = self._residuals(rows, modelled, self._gains)
+        # A spool that holds in one and not in the other counts once, not in each block of the hold.
+        grain, seen = self._channels.spool.grain, rows[np.isfinite(rows[:, 2]), 2]
+        if len(seen) and seen.std() < grain and np.ptp(modelled[0, :, 0]) < grain:
+            self._put_where_seen(modelled[0])
         residual, change = found[0], found[0] - found[1:]
         score, information = np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK)))
         steps = np.maximum(np.abs(change).max(axis=0), MAX_STEP_DEVIATIONS)
