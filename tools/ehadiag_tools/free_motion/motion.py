@@ -230,7 +230,7 @@ def changed(motion: Motion, change: str, size: float, after: float) -> Motion:
 
 SEVERITY_ERROR = 0.003
 """Standard deviation of the severities that the monitor has from the true ones, 1."""
-CHANGED_PIECE_S = 180.0
+CHANGED_PIECE_S = 150.0
 CHANGE_S = 60.0
 """Length of a piece with a change, and time of the change, s."""
 CHANGES = (
