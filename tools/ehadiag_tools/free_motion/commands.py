@@ -98,7 +98,7 @@ def _multisine(
     phase = rng.uniform(0.0, 2.0 * math.pi, (8, 1))
     size = rng.uniform(0.05, 0.5) * largest / (1.0 + hertz / CORNER_HZ)
     waves = size * np.sin(2.0 * math.pi * hertz * np.arange(count) / rate + phase)
-    wave = waves.sum(axis=0)
+    wave: NDArray[np.float64] = waves.sum(axis=0)
     return last + wave - wave[0]
 
 
