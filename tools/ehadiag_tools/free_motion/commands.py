@@ -106,9 +106,8 @@ def _binary(
     rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
 ) -> NDArray[np.float64]:
     """Two values in turn, random in length."""
-    turns = rng.exponential(rng.uniform(0.03, 0.5) * rate, count).cumsum().searchsorted(
-        np.arange(count)
-    ) % 2  # fmt: skip
+    ends = rng.exponential(rng.uniform(0.03, 0.5) * rate, count).cumsum()
+    turns = (ends.searchsorted(np.arange(count)) % 2).astype(np.float64)
     return last + rng.uniform(-0.4, 0.4) * largest * turns
 
 
