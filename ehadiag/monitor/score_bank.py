@@ -150,7 +150,7 @@ class ScoreBank:
             )  # fmt: skip
 
         named = zip(BANK_NAMES, self.steps[:MODELLED].tolist(), strict=False)
-        self._make = monitor
+        self._make, self._held = monitor, False
         self._monitors = [monitor("", 0.0), *(monitor(*item) for item in named)]
         self._gains = np.array([1.0 + item.constants.GXJ for item in self._monitors])
         self.tune(Environment())
@@ -192,6 +192,7 @@ class ScoreBank:
     def reset(self, spool: float) -> None:
         """Restart from rest with the spool measured there (m)."""
         self._monitors[0].reset(spool - self._offset)
+        self._held = False
 
     def settle(self, rows: Array2) -> None:
         """Push a block of ticks, and put the modelled spool where it is seen."""
@@ -216,9 +217,11 @@ class ScoreBank:
             self._monitors[1 + index].nudge(-float(self.steps[index]) * place)
         modelled = np.stack([item.push_block(rows) for item in self._monitors])
         found = self._residuals(rows, modelled, self._gains)
-        # A spool that holds in one and not in the other counts once, not in each block of the hold.
+        # What holds in one and not in the other counts once, not in each block of the hold.
         grain, seen = self._channels.spool.grain, rows[np.isfinite(rows[:, 2]), 2]
-        if len(seen) and seen.std() < grain and np.ptp(modelled[0, :, 0]) < grain:
+        rested, held = self._held, len(seen) and seen.std() < grain
+        self._held = bool(held and np.ptp(modelled[0, :, 0]) < grain)
+        if self._held:
             self._put_where_seen(modelled[0])
         residual, change = found[0], found[0] - found[1:]
         score, information = np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK)))
@@ -231,7 +234,10 @@ class ScoreBank:
         flowing, current = flowing[fine], current[fine]
         change = np.stack((np.ones_like(flowing), flowing)) * self.steps[MODELLED:, None] / noise
         _add(score, information, slice(MODELLED, None), (current - flowing) / noise, change, 1.0)
-        gain = self._gain(found, score, information)
+        if rested and self._held:
+            gain = np.zeros((2, len(BANK)))
+        else:
+            gain = self._gain(found, score, information)
         part = np.linalg.inv(np.eye(len(BANK)) + information * (PASSING / self.steps) ** 2)
         return BlockScore(part @ score, part @ information, gain, len(rows))
 
