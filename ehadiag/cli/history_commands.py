@@ -227,7 +227,7 @@ def _import(arguments: argparse.Namespace) -> None:
 
 def _plot(arguments: argparse.Namespace) -> None:
     from ehadiag.history.records import counted_entries  # noqa: PLC0415
-    from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415 - loads scipy
+    from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415 - slow
     from ehadiag.report.rendering import isolated_png  # noqa: PLC0415
     from ehadiag.report.trend_bus_pictures import history_picture  # noqa: PLC0415
 

@@ -75,7 +75,7 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
 
 def run_rul(arguments: argparse.Namespace) -> int:
     """Print the forecasts; 0 also where there is no number."""
-    from ehadiag.prognosis.units import all_prognoses, forecast  # noqa: PLC0415 - scipy
+    from ehadiag.prognosis.units import all_prognoses, forecast  # noqa: PLC0415 - numpy
     from ehadiag.report.prognosis_tables import (  # noqa: PLC0415
         print_prognosis,
         print_urgencies,

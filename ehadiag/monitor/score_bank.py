@@ -97,8 +97,9 @@ class BlockScore(msgspec.Struct, frozen=True, eq=False):
     information: Array2
     """Shape (k, k)."""
     gain: Array2
-    """Squares of residuals that a step up or down explains, beyond what any parameter within what
-    is no change does; each square of limited size. Shape (2, k)."""
+    """Squares of residuals that a step up or down explains beyond what is no change; each square of
+    limited size. Shape (2, k)."""
+    ticks: int
 
 
 class ScoreBank:
@@ -149,7 +150,7 @@ class ScoreBank:
             )  # fmt: skip
 
         named = zip(BANK_NAMES, self.steps[:MODELLED].tolist(), strict=False)
-        self._make = monitor
+        self._make, self._held = monitor, False
         self._monitors = [monitor("", 0.0), *(monitor(*item) for item in named)]
         self._gains = np.array([1.0 + item.constants.GXJ for item in self._monitors])
         self.tune(Environment())
@@ -191,10 +192,14 @@ class ScoreBank:
     def reset(self, spool: float) -> None:
         """Restart from rest with the spool measured there (m)."""
         self._monitors[0].reset(spool - self._offset)
+        self._held = False
 
     def settle(self, rows: Array2) -> None:
         """Push a block of ticks, and put the modelled spool where it is seen."""
-        errors = self._monitors[0].push_block(rows)[len(rows) // 2 :, 3]
+        self._put_where_seen(self._monitors[0].push_block(rows))
+
+    def _put_where_seen(self, modelled: Array2) -> None:
+        errors = modelled[len(modelled) // 2 :, 3]
         errors = errors[np.isfinite(errors)]
         if len(errors):
             self._monitors[0].nudge(float(errors.mean()) * self._noise[0])
@@ -212,6 +217,12 @@ class ScoreBank:
             self._monitors[1 + index].nudge(-float(self.steps[index]) * place)
         modelled = np.stack([item.push_block(rows) for item in self._monitors])
         found = self._residuals(rows, modelled, self._gains)
+        # What holds in one and not in the other counts once, not in each block of the hold.
+        grain, seen = self._channels.spool.grain, rows[np.isfinite(rows[:, 2]), 2]
+        rested, held = self._held, len(seen) and seen.std() < grain
+        self._held = bool(held and np.ptp(modelled[0, :, 0]) < grain)
+        if self._held:
+            self._put_where_seen(modelled[0])
         residual, change = found[0], found[0] - found[1:]
         score, information = np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK)))
         steps = np.maximum(np.abs(change).max(axis=0), MAX_STEP_DEVIATIONS)
@@ -223,25 +234,31 @@ class ScoreBank:
         flowing, current = flowing[fine], current[fine]
         change = np.stack((np.ones_like(flowing), flowing)) * self.steps[MODELLED:, None] / noise
         _add(score, information, slice(MODELLED, None), (current - flowing) / noise, change, 1.0)
+        if rested and self._held:
+            gain = np.zeros((2, len(BANK)))
+        else:
+            gain = self._gain(found, score, information)
         part = np.linalg.inv(np.eye(len(BANK)) + information * (PASSING / self.steps) ** 2)
-        return BlockScore(part @ score, part @ information, self._gain(found))
+        return BlockScore(part @ score, part @ information, gain, len(rows))
 
-    def _gain(self, found: Array2) -> Array2:
-        """What a step of each parameter explains of a block, see `BlockScore`."""
+    def _gain(self, found: Array2, score: Array, information: Array2) -> Array2:
+        """What a step of each parameter explains of a block, see `BlockScore`.
+
+        Both with the step and without it all parameters take their likeliest values of what is no
+        change.
+        """
         residual, change = found[0], found[0] - found[1:]
-        before = np.minimum(residual**2, MAX_SQUARE)
-
-        def explained(off: Array) -> Array:
-            after = np.minimum((residual - off) ** 2, MAX_SQUARE)
-            return np.asarray((before - after).sum(axis=-1))
-
-        within = change * self.steady[:MODELLED, None]
-        least = max(
-            0.0, *(float(explained(share * within).max()) for share in (-1.0, -0.3, 0.3, 1.0))
-        )
+        count, modelled = len(change), slice(0, MODELLED)
+        allowed = np.hypot(self.steady, PASSING / self.steps)[modelled]
+        inner = information[modelled, modelled]
+        fit = np.linalg.inv(inner + np.diag(1.0 / np.maximum(allowed, 1e-9) ** 2))
+        steps = np.concatenate((np.zeros((1, count)), np.eye(count), -np.eye(count)))
+        taken = (score[modelled] - steps @ inner) @ fit
+        left = residual - (steps + taken) @ change
+        cost = np.minimum(left**2, MAX_SQUARE).sum(axis=1) + ((taken / allowed) ** 2).sum(axis=1)
         out = np.zeros((2, len(BANK)))
         shown = (change**2).sum(axis=-1) > 1.0
-        out[:, :MODELLED] = np.where(shown, explained(np.stack((change, -change))) - least, 0.0)
+        out[:, modelled] = np.where(shown, (cost[0] - cost[1:]).reshape(2, count), 0.0)
         return out
 
     def gains(

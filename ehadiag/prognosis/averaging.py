@@ -8,6 +8,7 @@ weighted answer was off widens or moves the interval (conformal calibration).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -15,7 +16,6 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from scipy.special import logsumexp, ndtr, ndtri
 
 from ehadiag.prognosis.lives import Life
 from ehadiag.prognosis.wear import (
@@ -32,7 +32,9 @@ __all__ = [
     "LIBRARY_NAMES",
     "POOL_NAME",
     "Fleet",
+    "OwnLife",
     "Passage",
+    "filter_own",
     "learn_fleet",
     "passage_of",
     "surprises",
@@ -119,6 +121,20 @@ class Passage(msgspec.Struct, frozen=True):
 
 
 CHANCES = np.linspace(0.01, 0.99, 99)
+SCORE_STEP, LEAST_SCORE = 0.005, -37.0
+SCORES = np.arange(LEAST_SCORE, 8.0, SCORE_STEP)
+"""Normal deviates, 1, at which their chance is tabulated."""
+SCORE_CHANCES = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in SCORES])
+
+
+def _normal_chance(score: NDArray[np.floating]) -> Array:
+    """Chance of a normal deviate below these, to half a step of `SCORES`."""
+    place = np.rint((score - LEAST_SCORE) * (1.0 / SCORE_STEP)).astype(np.int32)
+    return np.asarray(SCORE_CHANCES[np.clip(place, 0, len(SCORES) - 1, out=place)])
+
+
+def _normal_score(chance: Array) -> Array:
+    return np.interp(chance, SCORE_CHANCES, SCORES)
 
 
 def learn_fleet(lives: Sequence[Life], scale: float, seed: int = 0) -> Fleet:
@@ -217,12 +233,20 @@ class _Questions(msgspec.Struct, frozen=True):
     """Time from the diagnosis to the level; NaN where it is not known yet."""
 
 
-def passage_of(life: Life, fleet: Fleet, level: float, seed: int) -> Passage:
+class OwnLife(msgspec.Struct, frozen=True, eq=False):
+    """A life whose passage is asked for."""
+
+    life: Life
+    filtered: Filtered
+    """About the rates of the fleet, else about its own first ones."""
+
+
+def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     """Predict the time from a life's last diagnosis to a level.
 
     Parameters
     ----------
-    life : Life
+    own : OwnLife
         Of at least two diagnoses, the last one below the level.
     fleet : Fleet
         What other lives say.
@@ -237,11 +261,10 @@ def passage_of(life: Life, fleet: Fleet, level: float, seed: int) -> Passage:
         Its distribution, calibrated.
     """
     rng, rules = np.random.default_rng(seed), AVERAGING_RULES
-    life = _thinned(life)
-    own = _filter_own(life, fleet)
+    life, filtered = own.life, own.filtered
     lives = (*fleet.seen, life)
     asked = _questions(lives, level)
-    drawn, likely, names = _draw(asked, lives, fleet, own, rng)
+    drawn, likely, names = _draw(asked, lives, fleet, filtered, rng)
     past = ~np.isnan(asked.answer)
     counted = _counts(asked, past)
     truth = np.log(asked.answer[past] / asked.age[past])
@@ -260,9 +283,9 @@ def passage_of(life: Life, fleet: Fleet, level: float, seed: int) -> Passage:
     return Passage(quantiles * float(life.age[-1]), found, float(counted[past].sum()))
 
 
-def _filter_own(life: Life, fleet: Fleet) -> Filtered:
-    """Filter the life itself with the rates of the fleet, else about its own first ones."""
-    laws = fleet.laws
+def filter_own(life: Life, fleet: Fleet) -> OwnLife:
+    """Filter a life of at least two diagnoses."""
+    laws, life = fleet.laws, _thinned(life)
     if len(fleet.seen) >= AVERAGING_RULES.min_lives:
         usual, deviation = _pooled_rate(fleet.rates.mean(axis=0), fleet.rates.var(axis=0),
                                         len(fleet.seen))  # fmt: skip
@@ -270,7 +293,7 @@ def _filter_own(life: Life, fleet: Fleet) -> Filtered:
         first = min(max(2, len(life.age) // 3), len(life.age) - 1)
         usual = np.maximum(np.abs(mean_rates(laws, life, first, fleet.scale)), 1e-9)
         deviation = usual
-    return filter_lives(laws, [life], fleet.scale, usual[None], deviation[None])
+    return OwnLife(life, filter_lives(laws, [life], fleet.scale, usual[None], deviation[None]))
 
 
 def _questions(lives: Sequence[Life], level: float) -> _Questions:
@@ -351,8 +374,9 @@ def _draw(
     even = (np.arange(rules.draws) + 0.5) / rules.draws
     for group in groups:
         part = logs[:, group]
-        evidence.append(logsumexp(part, axis=1) - np.log(len(group)))
-        weight = np.cumsum(np.exp(part - part.max(axis=1, keepdims=True)), axis=1)
+        best = part.max(axis=1, keepdims=True)
+        weight = np.cumsum(np.exp(part - best), axis=1)
+        evidence.append(best[:, 0] + np.log(weight[:, -1] / len(group)))
         weight /= weight[:, -1:]
         picked = group[np.sum(weight[:, None, :-1] < even[:, None], axis=2)]
         row = np.arange(count)[:, None]
@@ -475,7 +499,7 @@ def _middle(drawn: Array, weights: Array) -> tuple[Array, Array, Array]:
 def _calibrated(miss: Array, counted: Array) -> Array:
     """Quantiles of the misses at `CHANCES`, in half intervals, beside those that were stated."""
     rules = AVERAGING_RULES
-    stated = ndtri((np.arange(99) + 0.5) / 99) / ndtri(0.9)
+    stated = _normal_score((np.arange(99) + 0.5) / 99) / _normal_score(np.array(0.9))
     stated = np.where(stated < 0.0, rules.early * stated, stated)
     every = np.r_[miss, stated]
     weight = np.r_[counted, np.full(99, rules.even_misses / 99)]
@@ -488,12 +512,12 @@ def _calibrated(miss: Array, counted: Array) -> Array:
     return np.interp(chances, at / total, every[order])
 
 
-def surprises(life: Life, fleet: Fleet) -> tuple[Array, Array]:
+def surprises(own: OwnLife, fleet: Fleet) -> tuple[Array, Array]:
     """Return how unexpected each diagnosis of a life was, and each one of the fleet.
 
     Parameters
     ----------
-    life : Life
+    own : OwnLife
         Of at least two diagnoses.
     fleet : Fleet
         What other lives say.
@@ -503,8 +527,7 @@ def surprises(life: Life, fleet: Fleet) -> tuple[Array, Array]:
     tuple[Array, Array]
         In deviations of the prediction before it, signed; of the life from its second diagnosis.
     """
-    own = _filter_own(_thinned(life), fleet)
-    mine = _weighted_surprise(own, np.zeros((1, len(fleet.laws.law))), fleet)[:, 0]
+    mine = _weighted_surprise(own.filtered, np.zeros((1, len(fleet.laws.law))), fleet)[:, 0]
     if fleet.filtered is None:
         return mine, np.empty(0)
     theirs = _weighted_surprise(fleet.filtered, fleet.shares, fleet)
@@ -520,8 +543,6 @@ def _weighted_surprise(filtered: Filtered, own: Array, fleet: Fleet) -> Array:
     logs = prior + rules.evidence_power * filtered.score[:-1]
     weight = np.exp(logs - logs.max(axis=2, keepdims=True))
     weight /= weight.sum(axis=2, keepdims=True)
-    below, above = (
-        np.sum(weight * ndtr(side * filtered.surprise[1:]), axis=2) for side in (1.0, -1.0)
-    )
-    tail = -ndtri(np.maximum(np.minimum(below, above), 1e-300))
-    return np.asarray(np.where(below < above, -tail, tail), dtype=np.float64)
+    side = np.where(np.sum(weight * filtered.surprise[1:], axis=2) < 0.0, 1.0, -1.0)
+    chance = np.sum(weight * _normal_chance(side[..., None] * filtered.surprise[1:]), axis=2)
+    return np.asarray(side * _normal_score(chance))

@@ -10,7 +10,15 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ehadiag.prognosis.averaging import CHANCES, Fleet, learn_fleet, passage_of, surprises
+from ehadiag.prognosis.averaging import (
+    CHANCES,
+    Fleet,
+    OwnLife,
+    filter_own,
+    learn_fleet,
+    passage_of,
+    surprises,
+)
 from ehadiag.prognosis.lives import Life
 
 __all__ = ["Forecast", "RemainingLife", "forecast", "learn_fleet"]
@@ -141,12 +149,12 @@ def forecast(
         return replace(found, remaining=_no_numbers(life, levels, why))
     if fall := _fall(life, unit):
         return replace(found, alarm=fall, remaining=_no_numbers(life, levels, "see the alarm"))
-    remaining, weights = [], {}
+    remaining, weights, own = [], {}, filter_own(life, fleet)
     for level in levels:
         if life.value[-1] >= level:
             remaining.append(RemainingLife(level, 0.0, 0.0, 0.0, ""))
             continue
-        passage = passage_of(life, fleet, level, seed)
+        passage = passage_of(own, fleet, level, seed)
         weights = passage.weights
         remaining.append(_remaining(passage.quantiles, level, elapsed, unit))
     return replace(
@@ -155,7 +163,7 @@ def forecast(
         weights=weights,
         remaining=tuple(remaining),
         note=_extrapolation(life, fleet, levels),
-        alarm=_surprise(life, fleet, unit),
+        alarm=_surprise(own, fleet, unit),
     )
 
 
@@ -222,18 +230,18 @@ def _fall(life: Life, unit: str) -> str:
     return f"{-fallen:+.3f} between {begin:g} and {end:g} {unit}: {NOTE_NO_WEAR}"
 
 
-def _surprise(life: Life, fleet: Fleet, unit: str) -> str:
+def _surprise(own: OwnLife, fleet: Fleet, unit: str) -> str:
     """Name the change that was expected least, if sound wear makes such a one too rarely."""
-    own, others = surprises(life, fleet)
-    worst = int(np.argmax(np.abs(own)))
-    rest = np.abs(np.r_[np.delete(own, worst), others])
+    life, (mine, others) = own.life, surprises(own, fleet)
+    worst = int(np.argmax(np.abs(mine)))
+    rest = np.abs(np.r_[np.delete(mine, worst), others])
     if len(rest) < RULES.min_surprises:
         normal = np.abs(np.random.default_rng(0).standard_normal(RULES.min_surprises - len(rest)))
         rest = np.r_[rest, normal]
     begin = float(np.quantile(rest, 1.0 - RULES.tail_chance))
     excess = float(np.mean(rest[rest >= begin] - begin))
     bound = begin + max(excess, 0.2 * begin) * math.log(RULES.tail_chance / RULES.alarm_rate)
-    if abs(own[worst]) <= bound:
+    if abs(mine[worst]) <= bound:
         return ""
     low, high = worst, worst + 1
     change = float(life.value[high] - life.value[low])
@@ -241,6 +249,6 @@ def _surprise(life: Life, fleet: Fleet, unit: str) -> str:
     if change < 0.0:
         return f"{what} {unit}: {NOTE_NO_WEAR}"
     return (
-        f"{what} {unit}: {abs(own[worst]):.0f} deviations from what was expected, sound wear stays"
+        f"{what} {unit}: {abs(mine[worst]):.0f} deviations from what was expected, sound wear stays"
         f" within {bound:.0f} in {1.0 - RULES.alarm_rate:.1%} of diagnoses"
     )

@@ -156,7 +156,7 @@ def prognosis_of(
         present = mine[-1] if mine else Life(serial, none, none, none, 0.0)
         others = [*mine[:-1], *(life for several in lives.values() for life in several)]
         ages = [life.age[-1] for life in (present, *others) if len(life.age)]
-        fleet = learn_fleet(others, float(np.median(ages)) if ages else 1.0, seed)
+        fleet = learn_fleet(others, float(np.quantile(ages, 0.5)) if ages else 1.0, seed)
         elapsed = 0.0
         if at is not None and len(present.age):
             elapsed = max(at - present.born - float(present.age[-1]), 0.0)

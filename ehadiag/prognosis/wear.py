@@ -8,11 +8,11 @@ from the filtered state. Equations and literature: docs/explanation/remaining-li
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainc, ndtr
 
 from ehadiag.prognosis.lives import Life
 
@@ -30,8 +30,8 @@ MAX_CLOCK = 1e6
 """Clock, scales of age, beyond which a passage counts as none."""
 WALK_STEPS = 48
 """Number of steps of a simulated path with a walking rate."""
-BISECTIONS = 15
-"""Number of halvings of the logarithm for a passage: to 1e-3 or better."""
+BISECTIONS = 11
+"""Number of halvings for a passage: to 1e-3 of its time."""
 
 LAW_NAMES = (
     "Wiener", "gamma", "inverse Gaussian", "power", "Paris", "logistic", "two phases",
@@ -63,6 +63,7 @@ class Laws(msgspec.Struct, frozen=True):
     """Scale at `SEVERITY_GRID`, shape (grid, sets)."""
 
 
+@cache
 def draw_laws() -> Laws:
     """Return the parameter sets: an even cover of what each law may be, always the same."""
     count = SETS_PER_LAW
@@ -211,10 +212,10 @@ def filter_lives(
             ahead + a / total * off, rate + b / total * off, a - a * a / total, b - a * b / total,
             c - b * b / total, score + density, off / np.sqrt(total),
         ]  # fmt: skip
-        olds = [level, rate, pzz, pza, paa, score, surprise]
-        level, rate, pzz, pza, paa, score, surprise = (
-            np.where(there, new, old) for new, old in zip(news, olds, strict=True)
-        )
+        if not there.all():
+            olds = [level, rate, pzz, pza, paa, score, surprise]
+            news = [np.where(there, new, old) for new, old in zip(news, olds, strict=True)]
+        level, rate, pzz, pza, paa, score, surprise = news
         kept[:, at] = level, rate, pzz, pza, paa, score, surprise
     return Filtered(kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], kept[6], usual)
 
@@ -269,9 +270,9 @@ def draw_passages(
     monotone = ((name == "gamma") | (name == "inverse Gaussian")) & (speed > 0.0)
     plain = ~walking & ~monotone
     passed[plain] = _wiener_passage(far[plain], speed[plain], diffusion[plain], rng)
-    for kind in ("gamma", "inverse Gaussian"):
+    for kind, draw in (("gamma", _gamma_passage), ("inverse Gaussian", _inverse_gaussian_passage)):
         mine = monotone & (name == kind)
-        passed[mine] = _monotone_passage(kind, far[mine], speed[mine], diffusion[mine], rng)
+        passed[mine] = draw(far[mine], speed[mine], diffusion[mine], rng)
     passed[walking] = _walking_passage(
         far[walking], speed[walking], diffusion[walking], walk[walking], usual[walking], rng
     )
@@ -293,28 +294,35 @@ def _wiener_passage(
     return out
 
 
-def _monotone_passage(
-    kind: str, far: Array, speed: Array, diffusion: Array, rng: np.random.Generator
+def _gamma_passage(far: Array, speed: Array, diffusion: Array, rng: np.random.Generator) -> Array:
+    """First passage of a gamma process: its path between two instants is halved by beta draws."""
+    shape, size = speed**2 / diffusion, diffusion / speed
+    step = 2.0 * far / speed + diffusion / speed**2
+    begin, low = np.zeros((2, *far.shape))
+    high = rng.gamma(shape * step, size)
+    while np.any(short := high < far):
+        begin, low = np.where(short, begin + step, begin), np.where(short, high, low)
+        high = np.where(short, high + rng.gamma(shape * step, size), high)
+    for _ in range(BISECTIONS):
+        step = 0.5 * step
+        middle = low + (high - low) * rng.beta(shape * step, shape * step)
+        above = middle >= far
+        begin = np.where(above, begin, begin + step)
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return begin + 0.5 * step
+
+
+def _inverse_gaussian_passage(
+    far: Array, speed: Array, diffusion: Array, rng: np.random.Generator
 ) -> Array:
-    """Passage of a process that never falls: where its distribution at an instant says so."""
-    chance = rng.random(far.shape)
-    usual = far / speed
-    low, high = np.log(1e-3 * usual), np.log(60.0 * (usual + diffusion / speed**2))
-    with np.errstate(all="ignore"):
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            clock = np.exp(middle)
-            if kind == "gamma":
-                beyond = 1.0 - gammainc(clock * speed**2 / diffusion, far * speed / diffusion)
-            else:
-                shape = clock**2 * speed**3 / diffusion
-                root, mean = np.sqrt(shape / far), speed * clock
-                tail = ndtr(-root * (far / mean + 1.0))
-                second = np.exp(np.minimum(2.0 * shape / mean, 600.0)) * tail
-                beyond = 1.0 - ndtr(root * (far / mean - 1.0)) - second
-            below = beyond < chance
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.exp(0.5 * (low + high))
+    """First passage of an inverse Gaussian process: that of a Wiener process by its level.
+
+    So it is the maximum of a Wiener process over the severity in place of time.
+    """
+    variance = far * diffusion / speed**3
+    end = far / speed + np.sqrt(variance) * rng.standard_normal(far.shape)
+    root = np.sqrt(end * end - 2.0 * variance * np.log1p(-rng.random(far.shape)))
+    return np.asarray(0.5 * (end + root))
 
 
 def _walking_passage(
@@ -323,14 +331,16 @@ def _walking_passage(
 ) -> Array:  # fmt: skip
     """First passage of simulated paths whose rate is a random walk, held between 0 and a bound."""
     pace = np.maximum(np.maximum(speed, 0.2 * np.abs(usual)), 1e-12)
-    step, at = far / pace / 16.0, np.zeros_like(far)
-    grown, out = np.zeros_like(far), np.full(far.shape, np.inf)
+    step, out = far / pace / 16.0, np.full(far.shape, np.inf)
+    path = np.array([far, speed, diffusion, walk, step, np.zeros_like(far), np.zeros_like(far)])
+    left = np.arange(len(far))
     for _ in range(WALK_STEPS):
-        noise = rng.standard_normal((2, len(far)))
+        far, speed, diffusion, walk, step, at, grown = path
+        noise = rng.standard_normal((2, len(left)))
         speed = np.abs(speed + walk * np.sqrt(step) * noise[0])
         growth = speed * step + np.sqrt(diffusion * step) * noise[1]
-        over = np.isinf(out) & (grown + growth >= far)
-        share = (far - grown) / np.where(growth > 0.0, growth, 1.0)
-        out = np.where(over, at + np.clip(share, 0.0, 1.0) * step, out)
-        grown, at, step = grown + growth, at + step, step * 1.07
+        over = grown + growth >= far
+        out[left[over]] = (at + step * (far - grown) / growth)[over]
+        path[1], path[4], path[5], path[6] = speed, step * 1.07, at + step, grown + growth
+        path, left = path[:, ~over], left[~over]
     return out

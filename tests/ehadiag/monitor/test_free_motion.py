@@ -52,7 +52,7 @@ def alarms_of(monitor, rows):
 @pytest.mark.parametrize("mode", list(CommandMode))
 def test_free_motion_of_a_known_unit_gives_no_alarm_and_that_of_a_changed_one_does(mode):
     """Four seconds: an alarm in half an hour is not to be met with."""
-    motion = Motion("steps", mode.name.lower(), 4.0, WORN, 3)
+    motion = Motion("steps", mode.name.lower(), 4.0, WORN, 1)
     same = free_motion(ACTUATOR, motion).rows
     assert alarms_of(monitor_of(WORN, mode), same) == []
     assert alarms_of(monitor_of((0.3, 0.3, 0.6), mode), same)
