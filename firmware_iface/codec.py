@@ -413,6 +413,10 @@ class TickEncoder(Encoder):
         self._due.clear()
         return tuple(writer.frame(self._raw, time_ns, counter) for writer in due)
 
+    def clear(self, section: str) -> None:
+        """Let a group of signals be sent as zero again, in messages that it shares."""
+        self._raw.update({name: 0 for name in self._raw if name.startswith(f"{section}.")})
+
     def _frames(
         self, section: str, raw: Mapping[str, int], time_ns: int, counter: int | None
     ) -> tuple[Frame, ...]:

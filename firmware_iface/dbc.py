@@ -225,7 +225,8 @@ def cached_dbc(text: bytes, name: str) -> Mapping[str, DbcMessage]:
     with folder:
         parser = find_spec("cantools")
         # Another version of cantools is another file; what it is called takes 15 ms to find out.
-        stamp = os.stat(parser.origin).st_mtime_ns if parser and parser.origin else 0
+        path = (parser and parser.origin) or __file__
+        stamp = path, os.stat(path).st_mtime_ns, os.stat(path).st_size
         key = hashlib.sha256(f"{CACHE_FORMAT} {stamp} ".encode() + text).hexdigest()
         kept = _read_cache(folder, f"{key}.json")
         if kept is None:

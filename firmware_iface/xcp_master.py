@@ -234,6 +234,8 @@ class XcpTransport(Transport):
         if values["command_mode"] == self._mode:
             value = values[self._command] * COMMAND_SCALE
             self._encoder.command(self._mode, value, values["test_id"], time_ns)
+        else:
+            self._encoder.clear("command")
         self._encoder.telemetry([values[name] for name in CHANNEL_NAMES], time_ns)
         return self._encoder.frames(time_ns, tick)
 

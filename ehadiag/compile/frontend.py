@@ -123,12 +123,14 @@ def _only_translate() -> None:
 _only_translate()
 
 
+_write_array = cpu.CPUContext.make_constant_array
+
+
 def order_bytes(order: str) -> None:
     """Give constant arrays the byte order of the target, < or >; numba takes this computer's."""
-    write = cpu.CPUContext.make_constant_array
 
     def in_order(context: Any, builder: Any, kind: Any, values: Any) -> Any:
-        return write(context, builder, kind, values.astype(values.dtype.newbyteorder(order)))
+        return _write_array(context, builder, kind, values.astype(values.dtype.newbyteorder(order)))
 
     cpu.CPUContext.make_constant_array = in_order
 

@@ -178,7 +178,10 @@ def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
     along = covariance[place] / np.sqrt(covariance[place, place])
     shifts = np.arange(-PROFILE_REACH, PROFILE_REACH + 1.0)
     points = np.clip(refined.x + shifts[:, None] * along, model.lower, model.upper)
-    costs = cauchy_cost(model.many(points))
+    # At a bound of the friction the points go no farther.
+    reached = (points[:, place] - refined.x[place]) / along[place]
+    shifts, kept = np.unique(reached, return_index=True)
+    costs = cauchy_cost(model.many(points[kept]))
     unit = max(excess_cost(refined.residuals), 1.0)
     weights = np.exp(-0.5 * (costs - costs.min()) / unit)
     moment = float(weights @ shifts**2 / weights.sum())

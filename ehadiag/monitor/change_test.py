@@ -298,7 +298,8 @@ class ChangeTest:
         sides = np.where(sizes < 0.0, -1.0, 1.0)
         ordered = try_sizes(
             [(place, float(sides[place] * size)) for place in range(len(CAUSES))
-             for size in TRIAL_STEPS if least[place] <= size <= MAX_SIZES[place]]
+             for size in (TRIAL_STEPS if least[place] <= TRIAL_STEPS[-1] else (least[place],))
+             if least[place] <= size <= MAX_SIZES[place]]
         )[:REFINED_CAUSES]  # fmt: skip
         for factors in TRIAL_FACTORS:
             ordered = try_sizes(

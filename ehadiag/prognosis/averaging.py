@@ -129,8 +129,8 @@ SCORE_CHANCES = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in SCORES])
 
 def _normal_chance(score: NDArray[np.floating]) -> Array:
     """Chance of a normal deviate below these, to half a step of `SCORES`."""
-    place = np.rint((score - LEAST_SCORE) * (1.0 / SCORE_STEP)).astype(np.int32)
-    return np.asarray(SCORE_CHANCES[np.clip(place, 0, len(SCORES) - 1, out=place)])
+    place = np.clip((score - LEAST_SCORE) * (1.0 / SCORE_STEP), 0.0, len(SCORES) - 1.0)
+    return np.asarray(SCORE_CHANCES[np.rint(place).astype(np.int32)])
 
 
 def _normal_score(chance: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -55,8 +56,9 @@ class FleetUnit(msgspec.Struct, frozen=True):
 
 def fleet_summary(units: Sequence[FleetUnit]) -> str:
     """Say how many units have which verdict, worst first."""
-    counts = [(word, sum(unit.verdict == word for unit in units)) for word in WORST_FIRST]
-    return ", ".join(f"{n} {word.replace('_', ' ')}" for word, n in counts if n)
+    ordered = sorted(units, key=lambda unit: WORST_FIRST.index(unit.verdict))
+    counts = Counter(unit.word for unit in ordered)
+    return ", ".join(f"{n} {word}" for word, n in counts.items())
 
 
 def fleet_table(
@@ -110,7 +112,8 @@ def _action(unit: FleetUnit, levels: Levels) -> str:
     advice = next((item.advice for item in unit.severities if item.name == name), "")
     if value < levels.advisory or not advice:
         return "Nothing" if unit.verdict == Verdict.HEALTHY.name else ""
-    return advised(advice, at_once=value >= levels.limit).rstrip(".")
+    fault = unit.verdict == Verdict.FAULT.name or value >= levels.limit
+    return advised(advice, at_once=fault).rstrip(".")
 
 
 def _left(prognosis: Prognosis | None) -> str:

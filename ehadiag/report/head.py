@@ -201,7 +201,11 @@ def stored_test_name(name: str | None) -> str:
     if name is None:
         return "test unknown"
     loops = [_loops().get(part, "") for part in name.split("+")]
-    return f"{' and '.join(loops)} test" if all(loops) else f'test "{name}"'
+    if not all(loops):
+        return f'test "{name}"'
+    several = [loop if loops.count(loop) == 1 else f"{loops.count(loop)} {loop}"
+               for loop in dict.fromkeys(loops)]  # fmt: skip
+    return f"{' and '.join(several)} test{'s' * (len(loops) > 1)}"
 
 
 def _rounded(value: float) -> str:

@@ -131,7 +131,8 @@ def _until(prognosis: Prognosis, known: Sequence[float]) -> float | None:
     ahead = [max(value, 0.0) for value in medians if value is not None]
     if not ahead or len(known) < 2:
         return None
-    return known[-1] + max(1.5 * min(ahead), 0.5 * (known[-1] - known[0]))
+    until = known[-1] + max(1.5 * min(ahead), 0.5 * (known[-1] - known[0]))
+    return until if until > known[0] else None
 
 
 def _fan(item: Forecast, role: str) -> tuple[list[Area], list[Curve]]:

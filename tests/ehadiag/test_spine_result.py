@@ -59,7 +59,7 @@ def result() -> Result:
 @pytest.fixture(scope="module")
 def everything(result: Result) -> Result:
     """The same as if every parameter of the registry had been estimated."""
-    from dataclasses import replace
+    from msgspec.structs import replace
 
     from ehadiag.assess.other_causes import effects_of
 
@@ -317,7 +317,7 @@ def test_result_and_history_are_watched_with_the_same_model(
 
 def test_a_former_result_in_a_history_is_watched_with_all_its_effects(tmp_path: Path) -> None:
     """The object has only those with a limit, the rows beside it all."""
-    from dataclasses import replace
+    from msgspec.structs import replace
 
     read = Result.from_json(LINES[1])
     entry = replace(

@@ -65,7 +65,13 @@ def test_the_default_limits(name, value, beyond):
 
 def objections(fit, better_exponent=None, ambiguous=False):
     return objections_to_estimate(
-        SimpleNamespace(fit=fit, estimates=(), better_exponent=better_exponent, ambiguous=ambiguous)
+        SimpleNamespace(
+            fit=fit,
+            estimates=(),
+            better_exponent=better_exponent,
+            exponent_doubted=False,
+            ambiguous=ambiguous,
+        )
     )
 
 

@@ -149,7 +149,7 @@ def block(text: str, word: str) -> str:
 
 def assert_worn(result: Result, truth: tuple[float, ...] = WORN) -> None:
     assert result.code == 10, result.err
-    rows = dict(re.findall(r"^(Kintas|FSS|FDJ) +([\d.]+)", result.out, re.MULTILINE))
+    rows = dict(re.findall(r"\((Kintas|FSS|FDJ)\) +([\d.]+)", result.out, re.MULTILINE))
     found = [float(rows[name]) for name in ("Kintas", "FSS", "FDJ")]
     assert found == pytest.approx(truth, abs=2e-3)
 

@@ -88,8 +88,8 @@ def test_a_pipe_does_not_cut_the_table(run: Run, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("COLUMNS", "30")
     result = run("diagnose", WORN)
     assert f"  recording {WORN}" in result.out.splitlines()
-    row = next(line for line in result.out.splitlines() if line.startswith("Kintas"))
-    assert len(row.split()) == 6
+    row = next(line for line in result.out.splitlines() if "(Kintas)" in line)
+    assert len(row.split()) == 8
     assert any(line.startswith("  filter clogging ") for line in result.out.splitlines())
     assert result.err == ""
 

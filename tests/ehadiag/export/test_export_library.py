@@ -6,11 +6,11 @@ import platform
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from exported import Loaded, exported, object_of
-from msgspec.structs import replace
 from places import LOGS, ROOT
 
 from ehadiag import ConfigurationError, Monitor, default_actuator

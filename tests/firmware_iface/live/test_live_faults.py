@@ -5,6 +5,7 @@ From a damaged harness, or a damaged log, to the verdict: the stated outcome, ne
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import tracemalloc
 from pathlib import Path
@@ -182,10 +183,10 @@ def test_the_comparison_of_verdicts_sees_what_is_wrong(sound: Judged) -> None:
     assert objection(case, clean, clean) == ""
     assert "instead of" in objection(case, clean, replace(clean, verdict=Verdict.HEALTHY))
     assert "instead of" in objection(case, clean, replace(clean, verdict=Verdict.NOT_TESTED))
-    assert "was stated" in objection(replace(case, unfit="x"), clean, clean)
+    assert "was stated" in objection(dataclasses.replace(case, unfit="x"), clean, clean)
     untested = replace(clean, verdict=Verdict.NOT_TESTED, reasons=("because",))
-    assert objection(replace(case, unfit="because"), clean, untested) == ""
-    assert "other reasons" in objection(replace(case, why="lost"), clean, untested)
+    assert objection(dataclasses.replace(case, unfit="because"), clean, untested) == ""
+    assert "other reasons" in objection(dataclasses.replace(case, why="lost"), clean, untested)
     assert clean.identification is not None
     moved = tuple(
         replace(item, value=item.value + 4.0 * item.std) for item in clean.identification.estimates
