@@ -29,7 +29,7 @@ from ehadiag.core.interruption import COMPUTING_THREAD_NAME
 from ehadiag.records import failed_result, result_of
 from ehadiag.request import Request
 from ehadiag.result import Log, Mapped, Result, Sources, load_result
-from firmware_iface.errors import EhadiagError, NotTestedError, valid_text
+from firmware_iface.errors import ConfigurationError, EhadiagError, NotTestedError, valid_text
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.stored_test import StoredTest
 
@@ -276,11 +276,20 @@ class Setup:
 
     @cached_property
     def prior(self) -> Result | None:
-        """Result that was named to begin from."""
-        if "prior" in self.objects or self.request.prior is None:
-            found: Result | None = self.objects.get("prior")
-            return found
-        return load_result(Path(self.request.prior))
+        """Result that was named to begin from.
+
+        ConfigurationError: nothing can begin from it.
+        """
+        found: Result | None = self.objects.get("prior")
+        if found is None and self.request.prior is not None:
+            found = load_result(Path(self.request.prior))
+        if found is not None:
+            where = f"prior {self.request.prior or 'result'}"
+            if not found.identified or found.verdict is Verdict.NOT_TESTED:
+                raise ConfigurationError(f"{where}: NOT TESTED, name a result with a verdict")
+            if found.actuator_sha256 != fingerprint(self.actuator):
+                raise ConfigurationError(f"{where}: by other actuator data than this diagnosis")
+        return found
 
     def earlier(self, recordings: Sequence[Recording]) -> EarlierEstimate | None:
         """Return what the last diagnosis of the recordings' unit found; None where none is known.

@@ -188,8 +188,9 @@ def spool_steps(spool: Array, least: float) -> Array:
     Array
         Travel of each, of adjacent ticks together.
     """
-    change = np.diff(spool[np.isfinite(spool)])
-    fast = np.concatenate([[0], np.abs(change) > least, [0]]).astype(int)
+    known = np.flatnonzero(np.isfinite(spool))
+    change = np.diff(spool[known])
+    fast = np.concatenate([[0], np.abs(change) > least * np.diff(known), [0]]).astype(int)
     edges = np.flatnonzero(np.diff(fast))
     sizes = [abs(change[a:b].sum()) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return np.array(sizes)

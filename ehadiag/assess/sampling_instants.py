@@ -100,15 +100,17 @@ class _SampledTest(msgspec.Struct, frozen=True, eq=False):
         """
         experiment = self.experiment
         constants = unknowns_of([experiment], FAULTS).constants(severities)
-        constants = constants._replace(DLY=self.delay(before))
+        part = experiment.tick / parts
+        # The model has delays of up to a step of its own.
+        steps = max(int(self.delay(before) // part), 0)
+        constants = constants._replace(DLY=self.delay(before) - steps * part)
         model = model_response(
-            constants,
-            np.repeat(experiment.trace.current, parts),
-            experiment.tick / parts,
-            origin=experiment.origin,
+            constants, np.repeat(experiment.trace.current, parts), part, origin=experiment.origin
         )
         spool, pressure = experiment.noise[:2]
-        return np.stack([model.spool / spool, model.pressure / pressure])
+        found = np.stack([model.spool / spool, model.pressure / pressure])
+        first = np.repeat(found[:, :1], steps, axis=1)
+        return np.concatenate([first, found[:, : found.shape[1] - steps]], axis=1)
 
     def delay(self, before: float) -> float:
         """Delay of samples so long before the ends of the ticks, s."""
@@ -247,16 +249,18 @@ class _Lines(msgspec.Struct, frozen=True, eq=False):
         here = np.stack([fit.model, taken.response(fit.severities, wanted)])
         slopes, bent = [], np.zeros(here.shape)
         for index, value in enumerate(fit.severities.tolist()):
-            ends = np.clip(value + np.array([-1.0, 1.0]) * INSTANTS.severity_step, 0.0, 1.0)
-            points = np.repeat(fit.severities[None], 2, axis=0)
-            points[:, index] = ends
-            low, high = (
-                np.stack([_Response(taken, x).at(before)[0], taken.response(x, wanted)])
+            step = INSTANTS.severity_step
+            middle = min(max(value, step), 1.0 - step)
+            points = np.repeat(fit.severities[None], 3, axis=0)
+            points[:, index] = middle - step, middle, middle + step
+            low, between, high = (
+                here
+                if x[index] == value
+                else np.stack([_Response(taken, x).at(before)[0], taken.response(x, wanted)])
                 for x in points
             )
-            slopes.append((high[0] - low[0]) / (ends[1] - ends[0]))
-            chord = low + (value - ends[0]) / (ends[1] - ends[0]) * (high - low)
-            bent = np.maximum(bent, np.abs(chord - here))
+            slopes.append((high[0] - low[0]) / (2.0 * step))
+            bent = np.maximum(bent, np.abs(0.5 * (low + high) - between))
         return cls(np.stack(slopes), bent.max(axis=0) > INSTANTS.most_bent)
 
 

@@ -125,7 +125,9 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     results = ResultWriter(
         arguments, folder, reserved_stems(folder.path, outputs) if folder else ()
     )
-    setups = [replace(setup, history=results.snapshot()) for setup in setups]
+    history = results.snapshot()
+    if history is not None:  # a copy loads its files anew
+        setups = [replace(setup, history=history) for setup in setups]
     print_compiling_notice()
     if arguments.merge:
         codes = {_diagnose_merged(setup, results, inputs) for setup in setups}
