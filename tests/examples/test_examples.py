@@ -72,7 +72,7 @@ def test_the_notebook_runs_and_shows_table_picture_and_frames(tmp_path: Path) ->
     assert "FSS" in table["text/html"]
     assert len(picture["image/png"]) > 10_000
     assert "interval" not in faults["text/plain"]
-    assert re.search(r"^spool friction \(FSS\) +0\.(30|29)\d+ ", faults["text/plain"], re.MULTILINE)
+    assert re.search(r"^FSS +0\.(30|29)\d+ ", faults["text/plain"], re.MULTILINE)
     assert re.findall(r"HEALTHY|DEGRADED|FAULT", study["text/plain"]) == [
         "HEALTHY",
         "DEGRADED",
