@@ -118,7 +118,7 @@ def test_marks_of_the_levels_differ_on_every_code_page(worn: ehadiag.Result) -> 
     ("name", "words"),
     [
         ("open", "open-loop test"), ("closed", "closed-loop test"), ("gentle", 'test "gentle"'),
-        ("open+closed", "open-loop and closed-loop test"), (None, "test unknown"),
+        ("open+closed", "open-loop and closed-loop tests"), (None, "test unknown"),
     ],
 )  # fmt: skip
 def test_a_test_is_called_by_its_loop_or_its_name(name: str | None, words: str) -> None:

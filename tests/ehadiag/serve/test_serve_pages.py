@@ -221,7 +221,7 @@ def test_the_fleet_says_what_to_do_worst_unit_first(tmp_path):
                             replace(worn[1], verdict="FAULT"), shut])  # fmt: skip
     with site(tmp_path, place, watch=None) as (port, _):
         _, page, _ = request(port, "/")
-    assert "<h1>Fleet: 1 FAULT, 1 NOT TESTED, 1 HEALTHY</h1>" in page
+    assert "<h1>Fleet: 1 FAULT, 1 INCONCLUSIVE, 1 HEALTHY</h1>" in page
     places = [page.index(f'href="/history/{serial}"') for serial in (9, 5, 3)]
     assert places == sorted(places)
     assert "Replace the servovalve" in page
