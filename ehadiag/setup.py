@@ -284,12 +284,18 @@ class Setup:
         if found is None and self.request.prior is not None:
             found = load_result(Path(self.request.prior))
         if found is not None:
-            where = f"prior {self.request.prior or 'result'}"
-            if not found.identified or found.verdict is Verdict.NOT_TESTED:
-                raise ConfigurationError(f"{where}: NOT TESTED, name a result with a verdict")
-            if found.actuator_sha256 != fingerprint(self.actuator):
-                raise ConfigurationError(f"{where}: by other actuator data than this diagnosis")
+            reason = self._objection_to_prior(found)
+            if reason:
+                raise ConfigurationError(f"prior {self.request.prior or 'result'}: {reason}")
         return found
+
+    def _objection_to_prior(self, found: Result) -> str:
+        """Why nothing can begin from a result; empty if it can."""
+        if not found.identified or found.verdict is Verdict.NOT_TESTED:
+            return "NOT TESTED, name a result with a verdict"
+        if found.actuator_sha256 != fingerprint(self.actuator):
+            return "by other actuator data than this diagnosis"
+        return ""
 
     def earlier(self, recordings: Sequence[Recording]) -> EarlierEstimate | None:
         """Return what the last diagnosis of the recordings' unit found; None where none is known.
@@ -301,13 +307,7 @@ class Setup:
         found, words = self.prior, f"result {self.request.prior or 'given'}"
         if found is None and self.history is not None and serial is not None:
             found, words = self.history.last_result(serial, self.actuator.name, recordings)
-        if (
-            found is None
-            or not found.identified
-            or found.verdict is Verdict.NOT_TESTED
-            or found.actuator_sha256 != fingerprint(self.actuator)
-            or found.serial != serial
-        ):
+        if found is None or found.serial != serial or self._objection_to_prior(found):
             return None
         from ehadiag.identify.identification_session import EarlierEstimate  # noqa: PLC0415 - loads kernels
 

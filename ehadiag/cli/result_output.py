@@ -270,7 +270,8 @@ class ResultWriter:
         else:
             from ehadiag.report.head import verdict_word  # noqa: PLC0415
 
-            print_text(f"{verdict_word(result)}  {result.source}  (found by an earlier call)")
+            word = verdict_word(result.verdict.name, identified=result.identified)
+            print_text(f"{word}  {result.source}  (found by an earlier call)")
 
     def has(self, result: Result, name: str) -> bool:
         """Whether all that this call is to write of a result is there from an earlier one.

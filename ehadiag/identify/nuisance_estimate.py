@@ -64,9 +64,8 @@ FINAL_SPREAD_RATIO = 3.0
 """Spread of the last look, with the noise as judged, in spreads of the search's end."""
 HYSTERESIS_NAME = "hysteresis"
 AMBIGUOUS_STDS = {name: law.ambiguous_std for name, law in FAULT_LAWS.items()}
-PROFILE_REACH = 15
-"""Deviations to either side in which the likelihood along a valley is looked at, 1: with the middle
-two blocks of runs."""
+PROFILE_HALF_WIDTH = 15
+"""Half width of the likelihood profile along a valley, deviations: two blocks of runs."""
 LinearisationMethod = Callable[[Derivatives, ParameterDensity], LinearModel]
 
 
@@ -176,7 +175,7 @@ def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
     covariance = estimate_covariance(refined) / np.outer(refined.scale, refined.scale)
     place = [item.name for item in refined.parameters].index(FRICTION_NAME)
     along = covariance[place] / np.sqrt(covariance[place, place])
-    shifts = np.arange(-PROFILE_REACH, PROFILE_REACH + 1.0)
+    shifts = np.arange(-PROFILE_HALF_WIDTH, PROFILE_HALF_WIDTH + 1.0)
     points = np.clip(refined.x + shifts[:, None] * along, model.lower, model.upper)
     # At a bound of the friction the points go no farther.
     reached = (points[:, place] - refined.x[place]) / along[place]
@@ -266,6 +265,16 @@ def would_effect_explain(effect: Parameter, found: NuisanceEstimate) -> bool:
     )
 
 
+def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEstimate:
+    """The further estimate if it explains more of the recordings, with the effort of both."""
+    best = further if further.explained or further.excess < found.excess else found
+    return replace(
+        best,
+        evaluations=found.evaluations + further.evaluations,
+        starts=found.starts + further.starts,
+    )
+
+
 def _explains_far_more(excess: float, before: float) -> bool:
     """Whether an estimate leaves at most half of what another one leaves beside the noise."""
     return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
@@ -316,12 +325,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         offset = found.refined.values["spool_offset"]
         moved = [item.with_origin(offset) for item in experiments]
         other = self._with(moved, self.prior, hint, before)
-        best = other if other.explained or other.excess < found.excess else found
-        return replace(
-            best,
-            evaluations=found.evaluations + other.evaluations,
-            starts=found.starts + other.starts,
-        )
+        return _better_of(found, other)
 
     def _loosened(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,
@@ -428,12 +432,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             return found
         values = found.refined.values
         more = self._with(experiments, self.prior, values, found.excess, (load,))
-        best = more if more.explained or more.excess < found.excess else found
-        return replace(
-            best,
-            evaluations=found.evaluations + more.evaluations,
-            starts=found.starts + more.starts,
-        )
+        return _better_of(found, more)
 
     def _with(
         self,

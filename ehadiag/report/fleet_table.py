@@ -10,7 +10,7 @@ import msgspec
 from markupsafe import Markup
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.report.head import advised, percent, plain_name
+from ehadiag.report.head import advised, percent, plain_name, two_digits
 from firmware_iface.errors import printable
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _left(prognosis: Prognosis | None) -> str:
     if known and min(known) <= 0.0:
         return f"0 {unit}, limit reached"
     if known:
-        return f"{float(f'{min(known):.2g}'):g} {unit}"
+        return f"{two_digits(min(known))} {unit}"
     few = all("needs" in item.remaining[-1].why for item in prognosis.forecasts)
     return "too few diagnoses" if few else "no number"
 

@@ -124,15 +124,15 @@ def _explanations() -> tuple[_Explanation, ...]:
     return tuple(_Explanation(*row) for row in tomllib.loads(text)["explanations"])
 
 
-def verdict_word(result: Result) -> str:
+def verdict_word(verdict: str, *, identified: bool) -> str:
     """Return the word for a verdict that people see; NOT TESTED has two.
 
-    result: what was found. Returns INCONCLUSIVE: the test ran and was identified, but cannot be
-    explained.
+    verdict: its name; identified: whether there are estimates. Returns INCONCLUSIVE: the test ran
+    and was identified, but cannot be explained.
     """
-    if result.verdict is Verdict.NOT_TESTED and result.identified:
+    if verdict == Verdict.NOT_TESTED.name and identified:
         return INCONCLUSIVE
-    return result.verdict.name.replace("_", " ")
+    return verdict.replace("_", " ")
 
 
 def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) -> Head:
@@ -158,8 +158,8 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
         ("actuator type", result.actuator),
     )
     return Head(
-        verdict_word(result), result.verdict.name, sentences, reasons, tuple(bars),
-        levels.advisory, levels.limit, facts,
+        verdict_word(result.verdict.name, identified=result.identified), result.verdict.name,
+        sentences, reasons, tuple(bars), levels.advisory, levels.limit, facts,
     )  # fmt: skip
 
 
@@ -177,8 +177,8 @@ def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = No
         if left.median is None or left.low is None or left.high is None or left.high <= 0.0:
             continue
         unit = "h" if prognosis.unit == "hours" else prognosis.unit
-        low, high = _rounded(left.low), _rounded(left.high)
-        when = f"in about {_rounded(left.median)} {unit} (most likely {low} to {high} {unit})"
+        low, high = two_digits(left.low), two_digits(left.high)
+        when = f"in about {two_digits(left.median)} {unit} (most likely {low} to {high} {unit})"
         if left.high > WIDE_RANGE * left.low:
             when = f"not before about {low} {unit}"
         text = f"{plain_name(item.name)} reaches its limit {when}."
@@ -208,7 +208,7 @@ def stored_test_name(name: str | None) -> str:
     return f"{' and '.join(several)} test{'s' * (len(loops) > 1)}"
 
 
-def _rounded(value: float) -> str:
+def two_digits(value: float) -> str:
     """Write a number with two digits that count."""
     return f"{float(f'{value:.2g}'):g}"
 

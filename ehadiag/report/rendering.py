@@ -110,7 +110,7 @@ def index_html_page(
                 serial=result.serial,
                 actuator=result.actuator,
                 verdict=result.verdict.name,
-                word=verdict_word(result),
+                word=verdict_word(result.verdict.name, identified=result.identified),
                 severities=tuple(result.severities.values()),
                 past=past,
                 tested=result.date or "",

@@ -22,7 +22,6 @@ from ehadiag.prognosis.units import prognosis_of
 from ehadiag.report.bokeh_plots import plot_column, plot_live_signals
 from ehadiag.report.fleet_table import Cell, FleetUnit, fleet_summary, fleet_table, levels_text
 from ehadiag.report.head import (
-    INCONCLUSIVE,
     full_name,
     kept_advice,
     percent,
@@ -278,9 +277,8 @@ def _diagnosed(entry: Entry) -> list[Cell]:
 
 
 def _word(entry: Entry) -> str:
-    """Word for a verdict that people see, as `verdict_word`."""
-    inconclusive = entry.verdict == Verdict.NOT_TESTED.name and entry.severities
-    return INCONCLUSIVE if inconclusive else entry.verdict.replace("_", " ")
+    """Word for the verdict of a history's row."""
+    return verdict_word(entry.verdict, identified=bool(entry.severities))
 
 
 def _worst_value(entry: Entry) -> float:
@@ -299,7 +297,10 @@ def _reported(path: Path) -> list[Cell]:
     worst = max(known, key=lambda item: item.value, default=None)
     return [
         Cell("unknown" if result.serial is None else str(result.serial)),
-        Cell(verdict_word(result), kind=result.verdict.name),
+        Cell(
+            verdict_word(result.verdict.name, identified=result.identified),
+            kind=result.verdict.name,
+        ),
         Cell("" if worst is None else f"{plain_name(worst.name)} {percent(worst.value)}"),
     ]
 

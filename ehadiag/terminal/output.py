@@ -7,9 +7,7 @@ import io
 import itertools
 import json
 import os
-import shutil
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -63,6 +61,9 @@ def print_status(text: str) -> None:
     line = f"ehadiag: {printable(text)}"
     try:
         if sys.stderr.isatty():
+            import shutil  # noqa: PLC0415 - loads compression
+            import textwrap  # noqa: PLC0415
+
             width = shutil.get_terminal_size().columns
             line = textwrap.fill(
                 line, width, break_long_words=False, break_on_hyphens=False, subsequent_indent="  "
