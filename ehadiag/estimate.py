@@ -123,6 +123,12 @@ class Suspect(msgspec.Struct, frozen=True, kw_only=True):
     """Of what is unexplained that it would explain, 0 … 1."""
 
 
+NO_SINGLE_CAUSE = (
+    "no single effect or datum explains most of it: broken hardware, another actuator, or a unit"
+    " whose data differ in several places"
+)
+
+
 class Culprit(msgspec.Struct, frozen=True, kw_only=True):
     """Where the model fails, and what may be the cause."""
 
@@ -137,7 +143,7 @@ class Culprit(msgspec.Struct, frozen=True, kw_only=True):
     suspects: tuple[Suspect, ...]
     """What would explain most comes first; may be empty."""
     advice: str
-    """What to look at next."""
+    """What to check first; empty: nothing alone explains most."""
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -151,4 +157,4 @@ class Culprit(msgspec.Struct, frozen=True, kw_only=True):
             f"({item.name}) would explain {item.share:.0%} of it"
             for item in self.suspects
         )
-        return (where, *would, f"to look at: {self.advice}")
+        return (where, *would) if self.advice else (where, *would, NO_SINGLE_CAUSE)

@@ -416,10 +416,7 @@ def _frozen_since(measured: Array, model: Array, lsb: float, least: int) -> int 
 
 def _advice(suspects: Sequence[Suspect], environment: Environment) -> str:
     if not suspects or suspects[0].share < FIT.min_advice_share:
-        return (
-            "no single effect or datum explains most of it: broken hardware, another actuator, or "
-            "a unit whose data differ in several places: if it is known to be sound, calibrate it"
-        )
+        return ""
     first = suspects[0]
     item = next(entry for entry in REGISTRY if entry.name == first.name)
     if first.name == "oil_viscosity":

@@ -330,7 +330,8 @@ class _BatchRun:
                 self._fail(result)
                 return
             draw = None if picture is None else lambda content=picture: content
-            code = self._results.deliver(result, setup.name(task.item.name, result), draw)
+            name = setup.name(task.item.name, result)
+            code = self._results.deliver(result, name, draw, alone=False)
             self._take(result, unit=task.unit)
             self._summary.codes.add(code)
         self._came += 1

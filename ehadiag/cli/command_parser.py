@@ -21,7 +21,7 @@ class CommandParser(argparse.ArgumentParser):
     usual: Sequence[str] = ()
     """Options, or positional arguments, that the short help shows; none: it shows all."""
     examples: Sequence[str] = ()
-    """Command lines at the end of the short help."""
+    """Command lines at the end of the help."""
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2 and one line."""
@@ -43,8 +43,9 @@ class CommandParser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         """Return the help: of the usual options only, where the command names them."""
+        examples = "".join(f"  {line}\n" for line in self.examples)
         if not self.usual:
-            return super().format_help()
+            return super().format_help() + (f"\nexamples:\n{examples}" if examples else "")
         formatter = self._get_formatter()
         named = {
             name: item for item in self._actions for name in item.option_strings or [item.dest]
@@ -58,7 +59,6 @@ class CommandParser(argparse.ArgumentParser):
         formatter.end_section()
         rest = sum(item.help is not argparse.SUPPRESS for item in self._actions) - len(chosen)
         text = formatter.format_help().replace(f"[options] {self.prog}", "[options]", 1)
-        examples = "".join(f"  {line}\n" for line in self.examples)
         more = f"\n{self.prog} --help-all shows {rest} more options.\n"
         return f"{text}\nexamples:\n{examples}{more}"
 
@@ -84,6 +84,12 @@ class FullHelpAction(argparse.Action):
         assert isinstance(parser, CommandParser)
         print(parser.format_full_help(), end="")
         parser.exit()
+
+
+def show_examples(parser: argparse.ArgumentParser, *examples: str) -> None:
+    """Let `--help` of a command that has few options end with examples."""
+    assert isinstance(parser, CommandParser)
+    parser.examples = examples
 
 
 def show_usual(parser: argparse.ArgumentParser, usual: str, *, examples: Sequence[str]) -> None:

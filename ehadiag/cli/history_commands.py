@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
+from ehadiag.cli.command_parser import show_examples
 from ehadiag.cli.history_options import (
     add_history_option,
     add_usage_options,
@@ -61,6 +62,11 @@ def define_history(parser: argparse.ArgumentParser) -> None:
         " file by `bit` and `diagnose`, and never changed."
     )
     add_history_option(parser)
+    show_examples(
+        parser,
+        "ehadiag history init --history fleet.sqlite",
+        "ehadiag history list --history fleet.sqlite --unit 7",
+    )
     verbs = parser.add_subparsers(metavar="VERB", required=True, dest="verb")
 
     def verb(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Verdict
 from ehadiag.cli.defaults import DEFAULTS_FILE_NAME, user_defaults_file
 from ehadiag.cli.history_options import HistoryWriter, history_path
 from ehadiag.core.conventions import MAX_RESULT_BYTES, SIGNAL_FILE_SUFFIXES
@@ -31,11 +31,18 @@ from ehadiag.terminal.output import (
     worst_exit_code,
     write_output,
 )
-from firmware_iface.errors import ConfigurationError, InputOutputError, plain_name, reason_of
+from firmware_iface.errors import (
+    ConfigurationError,
+    EhadiagError,
+    InputOutputError,
+    plain_name,
+    reason_of,
+)
 from firmware_iface.files import RESULT_MODE, Folder, write_errors
 
 if TYPE_CHECKING:
     from ehadiag.history.store import HistorySnapshot
+    from ehadiag.prognosis.units import Prognosis
 
 INPUT_FILE_OPTIONS = ("actuator", "mapping", "dbc", "test", "prior")
 """Options, of any command, that name files to be read."""
@@ -212,7 +219,9 @@ class ResultWriter:
         if self._arguments.report:
             import ehadiag.report.report_pages  # noqa: F401, PLC0415
 
-    def deliver(self, result: Result, name: str, draw: Callable[[], bytes] | None) -> int:
+    def deliver(
+        self, result: Result, name: str, draw: Callable[[], bytes] | None, *, alone: bool = True
+    ) -> int:
         """Write and print one result; return its exit code.
 
         That is the verdict's, or 3 where something could not be written and that is worse (see
@@ -220,7 +229,7 @@ class ResultWriter:
         the second what is not out yet.
 
         name: of the files, without suffix; made safe, and numbered where it is taken. draw: makes
-        the picture; None: there is none.
+        the picture; None: there is none. alone: whether the time of a forecast is worth it.
         """
         came = defer_signals()
         codes = [result.exit_code]
@@ -234,7 +243,7 @@ class ResultWriter:
             if stem is not None:
                 written.append(f"{stem}.json")
             with report_failure(codes):
-                self._print(result)
+                self._print(result, self._prognosis(result) if alone else None)
             if stem is not None and draw is not None and self.pictures and not came.is_set():
                 with report_failure(codes):
                     self._draw(draw, f"{stem}.png")
@@ -302,7 +311,19 @@ class ResultWriter:
         """Whether pictures are wanted."""
         return self._folder is not None and not self._arguments.no_picture
 
-    def _print(self, result: Result) -> None:
+    def _prognosis(self, result: Result) -> Prognosis | None:
+        """Forecast the unit of a result that needs one, from the history."""
+        place, worn = self.history, (Verdict.DEGRADED, Verdict.FAULT)
+        if place is None or result.serial is None or result.verdict not in worn:
+            return None
+        from ehadiag.prognosis.units import forecast  # noqa: PLC0415 - loads numpy
+
+        request = result.request
+        with contextlib.suppress(EhadiagError):  # said when the diagnosis was to be kept
+            return forecast(place, result.serial, advisory=request.advisory, limit=request.limit)
+        return None
+
+    def _print(self, result: Result, prognosis: Prognosis | None) -> None:
         if self._arguments.json:
             write_output(result.to_json() + "\n")
             return
@@ -311,7 +332,7 @@ class ResultWriter:
         verbose = self._arguments.verbose
         write_output(
             render_for_terminal(
-                lambda console: print_result(result, console, verbose=verbose), least=0
+                lambda console: print_result(result, console, prognosis, verbose=verbose), least=0
             )
         )
 

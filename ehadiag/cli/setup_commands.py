@@ -12,7 +12,7 @@ from importlib import resources
 from pathlib import Path
 
 from ehadiag.cli import options
-from ehadiag.cli.command_parser import show_usual
+from ehadiag.cli.command_parser import show_examples, show_usual
 from ehadiag.cli.result_output import OutputFile, open_output_folder, refuse_overwriting
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
@@ -60,6 +60,7 @@ def define_init(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "folder", nargs="?", default=".", metavar="DIR", help="where (default: the working folder)"
     )
+    show_examples(parser, "ehadiag init actuator", "ehadiag init mapping my-bus")
     parser.set_defaults(run=run_init)
 
 
@@ -93,6 +94,7 @@ def define_tests(parser: argparse.ArgumentParser) -> None:
     """Add description and options of the command."""
     parser.description = "List the stored tests; --csv prints time and command of one."
     parser.add_argument("--csv", metavar=TEST, help="test to print as CSV")
+    show_examples(parser, "ehadiag tests", "ehadiag tests --csv closed")
     parser.set_defaults(run=run_tests)
 
 
@@ -258,6 +260,7 @@ def define_warmup(parser: argparse.ArgumentParser) -> None:
         "Compile the model's kernels into the cache folder (EHADIAG_CACHE_DIR, else"
         " the user's cache), so that the first diagnosis does not wait for it."
     )
+    show_examples(parser, "ehadiag warmup", "ehadiag warmup --verbose")
     parser.set_defaults(run=run_warmup)
 
 
@@ -294,6 +297,7 @@ def define_completion(parser: argparse.ArgumentParser) -> None:
         " ~/.local/share/bash-completion/completions/ehadiag."
     )
     parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which shell")
+    show_examples(parser, "ehadiag completion bash", "ehadiag completion zsh")
     parser.set_defaults(run=run_completion)
 
 

@@ -98,6 +98,11 @@ class Forecast(msgspec.Struct, frozen=True):
     alarm: str
     """A change that no wear explains; empty where there is none."""
 
+    @property
+    def too_few(self) -> bool:
+        """Whether a number needs more diagnoses."""
+        return self.diagnoses < _needed(self.fleet)
+
 
 def forecast(
     name: str,
@@ -195,10 +200,15 @@ def _no_numbers(life: Life, levels: Sequence[float], why: str) -> tuple[Remainin
     )
 
 
+def _needed(lives: int) -> int:
+    """Number of diagnoses that a number needs beside a fleet of so many lives."""
+    return RULES.min_diagnoses - (lives >= RULES.min_lives)
+
+
 def _objection_to_data(life: Life, fleet: Fleet, unit: str) -> str:
     """Why the data cannot carry a number; empty if they may."""
     number = len(life.age)
-    needed = RULES.min_diagnoses - (fleet.lives >= RULES.min_lives)
+    needed = _needed(fleet.lives)
     since = f"since {life.born:g} {unit}" if life.born else "of the unit"
     if number < needed:
         return f"{number or 'no'} diagnos{'is' if number == 1 else 'es'} {since}, needs {needed}"

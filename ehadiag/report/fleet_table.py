@@ -10,7 +10,7 @@ import msgspec
 from markupsafe import Markup
 
 from ehadiag.assess.verdict import Verdict
-from ehadiag.report.head import advised, percent, plain_name, two_digits
+from ehadiag.report.head import advised, percent, plain_name, shown_date, two_digits
 from firmware_iface.errors import printable
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def _row(unit: FleetUnit, levels: Levels) -> list[Cell]:
         Cell(_action(unit, levels)),
         Cell(_left(unit.prognosis)),
         Cell(_sparkline(unit.past, levels)),
-        Cell(f"{unit.tested[:10]} {unit.tested[11:16]} UTC" if unit.tested else "unknown"),
+        Cell(shown_date(unit.tested) if unit.tested else "unknown"),
         Cell(printable(unit.actuator)),
     ]
 
@@ -127,7 +127,7 @@ def _left(prognosis: Prognosis | None) -> str:
         return f"0 {unit}, limit reached"
     if known:
         return f"{two_digits(min(known))} {unit}"
-    few = all("needs" in item.remaining[-1].why for item in prognosis.forecasts)
+    few = all(item.too_few for item in prognosis.forecasts)
     return "too few diagnoses" if few else "no number"
 
 

@@ -1,4 +1,4 @@
-"""The head of a result: what is wrong, how bad, what to do. Every surface lays out the same.
+"""The head of a result: what is wrong, how bad, what to do by when. Every surface shows the same.
 
 Terminal, report, page of `serve` and notebook show a `Head`; none of them words a verdict itself.
 """
@@ -65,7 +65,7 @@ class Head(msgspec.Struct, frozen=True):
     verdict: str
     """Name of the verdict, which gives colour and exit code."""
     sentences: tuple[str, ...]
-    """What is wrong and what to do, worst first; the first one stands beside the word."""
+    """What is wrong, what to do and by when, worst first; the first one stands beside the word."""
     reasons: tuple[Reason, ...]
     """Why there is no verdict, the plain cause first; none where there is one."""
     bars: tuple[Bar, ...]
@@ -113,6 +113,9 @@ CUT_OFF = ("The recording ends early", "The recording begins late")
 LEAST_WEAR = 0.005
 """Least severity that is worth a word, 1: it is rounded to a percent."""
 CUT_NOTE = re.compile(r"the (last|first) .* are missing")
+NO_TIME = "By when: one test does not tell; ehadiag rul does, from the unit's health history."
+UNEXPLAINED = "does not explain the recording"
+"""Words of the reason for which a culprit is looked for."""
 WIDE_RANGE = 10.0
 """Ratio of the ends of an interval, 1, beyond which no time is given, only the earliest one."""
 
@@ -145,11 +148,9 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
     )
     reasons = _explained(result) if untested else ()
     sentences = tuple(item.cause for item in reasons) if untested else _found(result, bars, levels)
-    if prognosis is not None and not untested:
-        worn = {bar.symbol for bar in bars if bar.state == "DEGRADED"}
-        sentences += tuple(remaining_sentences(prognosis, worn)[:1])
+    sentences += _by_when(bars, prognosis)
     serial = "unknown" if result.serial is None else str(result.serial)
-    date = "date unknown" if result.date is None else _shown_date(result.date)
+    date = "date unknown" if result.date is None else shown_date(result.date)
     dated = "recorded" if untested and not result.identified else "tested"
     facts = (
         *([] if untested and result.date is None else [(dated, date)]),
@@ -161,6 +162,17 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
         verdict_word(result.verdict.name, identified=result.identified), result.verdict.name,
         sentences, reasons, tuple(bars), levels.advisory, levels.limit, facts,
     )  # fmt: skip
+
+
+def _by_when(bars: Sequence[Bar], prognosis: Prognosis | None) -> tuple[str, ...]:
+    """Say by when to act on the severities between the levels, worst first."""
+    worn = [bar.symbol for bar in bars if bar.state == "DEGRADED"]
+    known = remaining_sentences(prognosis, worn)[:1] if prognosis else []
+    if known or not worn or any(bar.state == "FAULT" for bar in bars):
+        return tuple(known)
+    futures = prognosis.forecasts if prognosis else ()
+    why = [item.remaining[-1].why for item in futures if item.name == worn[0]]
+    return (f"By when is not known yet: {why[0]}." if why else NO_TIME,)
 
 
 def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = None) -> list[str]:
@@ -257,10 +269,11 @@ def advised(advice: str, *, at_once: bool) -> str:
     """Return what to do as a sentence, at once or planned; empty without an advice."""
     if not advice:
         return ""
-    return f"{advice[0].upper()}{advice[1:]}." if at_once else f"Plan to {advice}."
+    return f"Act now: {advice}." if at_once else f"Plan to {advice}."
 
 
-def _shown_date(date: str) -> str:
+def shown_date(date: str) -> str:
+    """Return a date of a result, UTC and ISO 8601, as people read it."""
     return f"{date[:10]} {date[11:16]} UTC"
 
 
@@ -338,18 +351,22 @@ def _explained(result: Result) -> tuple[Reason, ...]:
                 cause = item.cause.format(short, evidence=text)
                 rank, action = place, item.action
                 break
-        groups.setdefault(cause, (rank, [], action))[1].append(text)
+        found = [text]
+        if UNEXPLAINED in text and (culprit := result.culprit) is not None:
+            found += culprit.lines
+            action = f"Check this first: {culprit.advice}." if culprit.advice else action
+        groups.setdefault(cause, (rank, [], action))[1].extend(found)
     cut = [cause for cause in groups if cause.startswith(CUT_OFF)]
     if cut:  # what is missing is missing for this reason
         for cause in CONSEQUENCES & groups.keys():
             del groups[cause]
         rank = groups[cut[0]][0]
         groups[cut[0]] = (rank, [cut[0]], "Record the test to its end, then diagnose again.")
-    found = sorted(groups.items(), key=lambda pair: pair[1][0])
+    ordered = sorted(groups.items(), key=lambda pair: pair[1][0])
     return tuple(
         Reason(cause, () if [_sentence(item) for item in evidence] == [cause] else tuple(evidence),
                action)
-        for cause, (_, evidence, action) in found
+        for cause, (_, evidence, action) in ordered
     )  # fmt: skip
 
 

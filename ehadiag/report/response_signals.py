@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.assess.diagnosis import Diagnosis
+from ehadiag.assess.verdict import Levels
 from ehadiag.calibration.unit_models import Calibrated
 from ehadiag.core.actuator import Actuator
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, build_experiment
@@ -25,7 +26,7 @@ from ehadiag.model.plant import PlantConstants
 from ehadiag.model.residual_models import model_response
 from ehadiag.model.sensors import SensorLaw, sensor_law
 from ehadiag.model.severities import FAULT_LAWS
-from ehadiag.report.head import stored_test_name
+from ehadiag.report.head import head_of, plain_name, stored_test_name
 from ehadiag.report.picture import (
     Band,
     Curve,
@@ -294,10 +295,15 @@ def result_picture(result: Result) -> Picture:
 
 
 def _title(result: Result, columns: int) -> list[str]:
-    lines = [f"{result.verdict.name.replace('_', ' ')}: {_names(result.origins)}"]
+    request = result.request
+    head = head_of(result, Levels(request.advisory, request.limit))
+    lines = [head.title]
+    for text in head.lines:
+        lines += textwrap.wrap(printable(text), 110 * columns)
     if result.identified:
         faults = (
-            f"{item.name} {item.value:.5f} ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
+            f"{plain_name(item.name)} {item.value:.5f}"
+            f" ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
             for item in result.severities.values()
         )
         lines.append(",  ".join(faults))
@@ -308,14 +314,8 @@ def _title(result: Result, columns: int) -> list[str]:
             for item in result.other
         )
         lines.append(",  ".join(effects))
-    for reason in result.reasons[:3]:
-        lines += textwrap.wrap(printable(reason), 110 * columns)[:3]
-    about = [] if result.serial is None else [f"unit {result.serial}"]
-    about += [f"actuator type {printable(result.actuator)}"]
-    about += [] if result.date is None else [result.date]
-    request = result.request
-    about.append(f"DEGRADED from {request.advisory:g}, FAULT from {request.limit:g}")
-    return [*lines, ",  ".join(about)]
+    facts = ", ".join(f"{label} {printable(value)}".lstrip() for label, value in head.facts)
+    return [*lines, *textwrap.wrap(f"{facts}, {_names(result.origins)}", 110 * columns)]
 
 
 def _names(recordings: Sequence[Recording | Origin]) -> str:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ehadiag.calibration.unit_models import Calibrated, CalibratedValue
     from ehadiag.design.score import Bound, Score
     from ehadiag.estimate import Effect
+    from ehadiag.prognosis.units import Prognosis
     from ehadiag.report.head import Bar, Head
     from ehadiag.result import Onboard, Result
     from firmware_iface.stored_test import StoredTest
@@ -64,20 +65,20 @@ def diagnosis_html(result: Result) -> str:
     return template.render(head=head, severities=severities, percent=percent)
 
 
-def print_result(result: Result, console: Console, *, verbose: bool = False) -> None:
+def print_result(
+    result: Result, console: Console, prognosis: Prognosis | None = None, *, verbose: bool = False
+) -> None:
     """Print a result: its head, then the numbers.
 
-    result: what was found; console: console to print to; verbose: the course of the search, reasons
-    in terms of the field, and every effect that was estimated, not only those that are not 0 beyond
-    doubt.
+    result: what was found; console: console to print to; prognosis: of its unit; verbose: the
+    course of the search, reasons in terms of the field, and every effect that was estimated, not
+    only those that are not 0 beyond doubt.
     """
-    head = head_of(result, Levels(result.request.advisory, result.request.limit))
+    head = head_of(result, Levels(result.request.advisory, result.request.limit), prognosis)
     _print_head(head, result, console)
     if verbose:
         for reason in result.reasons:
             _line(console, f"- {reason}")
-    for line in result.culprit.lines if result.culprit else ():
-        _line(console, f"  {line}")
     if result.identified:
         console.print(_severities(head, result, console), crop=False)
     if result.identified and verbose:

@@ -44,13 +44,13 @@ def history_picture(
     column = trend_column(entries, events, prognosis, numbered=False)
     last = entries[-1]
     column = replace(column, title=f"actuator type {printable(last.actuator)}")
-    texts = [f"Unit {last.serial}", *_first_to_the_limit(prognosis, kept_advice(last.result))]
+    texts = [f"Unit {last.serial}", *first_to_the_limit(prognosis, kept_advice(last.result))]
     return Picture(
         ": ".join(texts[:2]) + "".join(f"\n{item}" for item in texts[2:]), (column,), True
     )
 
 
-def _first_to_the_limit(prognosis: Prognosis, advice: Mapping[str, str]) -> list[str]:
+def first_to_the_limit(prognosis: Prognosis, advice: Mapping[str, str]) -> list[str]:
     """Say which severity reaches the limit first, and what to do where it is above the advisory."""
     advisory, limit = prognosis.levels
     if (found := prognosis.first()) is None:
@@ -117,7 +117,7 @@ def trend_column(
     curves += [curve for fan in fans for curve in fan[1]]
     panel = Panel(
         "severity with 95 % interval", "%", np.array([at for at, _ in placed]), tuple(curves),
-        lines=tuple(lines), areas=areas, y_range=(low - 0.02 * high, 1.05 * high),
+        lines=tuple(lines), areas=areas, y_range=(low - 0.02 * high, 1.12 * high),
     )  # fmt: skip
     until = None if unit is None else _until(prognosis, [at for at, _ in placed])
     x_range = None if until is None else (placed[0][0] - 0.02 * (until - placed[0][0]), until)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -26,11 +27,12 @@ from ehadiag.report.head import (
     kept_advice,
     percent,
     plain_name,
+    shown_date,
     verdict_word,
 )
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
-from ehadiag.report.trend_bus_pictures import trend_column
+from ehadiag.report.trend_bus_pictures import first_to_the_limit, trend_column
 from ehadiag.result import Result
 from ehadiag.serve.server import Page
 from firmware_iface.errors import EhadiagError, printable
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from ehadiag.assess.verdict import Levels
     from ehadiag.estimate import Severity
     from ehadiag.history.records import Entry, MaintenanceEvent
+    from ehadiag.prognosis.units import Prognosis
 
 MAX_PAGE_ROWS = 500
 """Of a list, newest first."""
@@ -155,9 +158,7 @@ class Pages:
 
     def _advised(self, entry: Entry) -> list[Severity]:
         """Severities with what to do about them, which only the whole result has."""
-        assert self._history is not None
-        with History(self._history) as history:
-            advice = kept_advice(history.entry(entry.number).result)
+        advice = kept_advice(self._newest_result([entry]))
         return [
             structs.replace(item, advice=advice.get(item.name, "")) for item in entry.severities
         ]
@@ -168,18 +169,14 @@ class Pages:
         mine = [entry for entry in entries if entry.serial == serial]
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
-        lines = [
-            f"{plain_name(item.name)}: {future.unit} to {name} {percent(level)} (80 % interval):"
-            f" {remaining_text(left)}"
-            for item in future.forecasts
-            for (name, level), left in zip(named_levels(future), item.remaining, strict=True)
-        ]
+        used = counted_entries(mine)
+        first = first_to_the_limit(future, kept_advice(self._newest_result(used)))
+        lines = [" ".join(first)] if first else []
         lines += [
             f"{plain_name(item.name)} {item.alarm}" for item in future.forecasts if item.alarm
         ]
         own = [item for item in events if item.serial == serial]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
-        used = counted_entries(mine)
         plots = {}
         if any(entry.severities for entry in used):
             plots["trend"] = plot_column(trend_column(used, own, future))
@@ -191,7 +188,17 @@ class Pages:
             none="No diagnosis of this unit is kept.",
             lines=lines,
             plots=plots,
+            summary=_word(used[-1]) if used else "",
+            kind=used[-1].verdict if used else "",
+            left=_left_to_the_levels(future),
         )
+
+    def _newest_result(self, entries: Sequence[Entry]) -> str:
+        """Whole result of the newest of one unit's diagnoses; empty without any."""
+        if self._history is None or not entries:
+            return ""
+        with History(self._history) as history:
+            return history.entry(entries[-1].number).result
 
     def _reports_page(self) -> Page:
         """Return the list of the reports in the folder."""
@@ -247,6 +254,8 @@ class Pages:
         lines: Sequence[str] = (),
         plots: dict[str, Any] | None = None,
         summary: str = "",
+        kind: str = "",
+        left: Sequence[Sequence[Cell]] = (),
     ) -> Page:
         scripts, elements = embed_plots(plots or {})
         return _page(
@@ -254,14 +263,32 @@ class Pages:
             scripts,
             title=title,
             summary=summary,
+            kind=kind,
             here=here,
             head=head,
             rows=rows,
             empty_text=none,
             lines=lines,
+            left=left,
             simulated=self._simulated,
             plot=next((Markup(item) for item in elements.values()), None),
         )
+
+
+def _left_to_the_levels(future: Prognosis) -> list[list[Cell]]:
+    """Lines of the table of a unit's remaining life, the soonest at its limit first; the head."""
+    levels = [f"{name} {percent(level)}" for name, level in named_levels(future)]
+    head = ["fault", "now", *(f"{future.unit} to {level}" for level in levels)]
+    ordered = sorted(
+        future.forecasts,
+        key=lambda item: math.inf if (left := item.remaining[-1].median) is None else left,
+    )
+    rows = [
+        [full_name(item.name), "none" if item.value is None else percent(item.value),
+         *map(remaining_text, item.remaining)]
+        for item in ordered
+    ]  # fmt: skip
+    return [[Cell(text) for text in row] for row in (head, *rows)] if rows else []
 
 
 def _diagnosed(entry: Entry) -> list[Cell]:
@@ -270,7 +297,7 @@ def _diagnosed(entry: Entry) -> list[Cell]:
         for item in entry.severities
     )
     return [
-        Cell(printable(entry.tested or entry.appended)),
+        Cell(shown_date(printable(entry.tested or entry.appended))),
         Cell(_word(entry), kind=entry.verdict),
         Cell(severities or "none"),
     ]

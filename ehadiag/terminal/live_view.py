@@ -20,13 +20,7 @@ MIN_WIDE_COLUMNS = 140
 SPARK_BLOCKS = " ▁▂▃▄▅▆▇█"
 ASCII_SPARK_BLOCKS = " .:-=+*#%@"
 BUS_STATE_STYLES = {"open": "green", "silent": "yellow", "degraded": "yellow", "failed": "bold red"}
-ENDING_STYLES = {
-    "HEALTHY": "bold green",
-    "NO ALARM": "bold green",
-    "DEGRADED": "bold yellow",
-    "FAULT": "bold red",
-    "ALARM": "bold red",
-}
+ENDING_STYLES = {"NO ALARM": "bold green", "ALARM": "bold red"}
 BAR_COLUMNS = 20
 FULL_BAR = 1.0
 
@@ -42,9 +36,13 @@ def draw_snapshot(snapshot: Snapshot, width: int, *, unicode: bool = True) -> Re
     parts = [_signals(snapshot.signals, inner, unicode=unicode)]
     if monitored:
         parts.append(_residuals(snapshot.residuals, inner, unicode=unicode))
-    none = "severities: none" if snapshot.ending else "severities: none yet"
-    severities = _severities(snapshot.severities, unicode=unicode)
-    beside: list[RenderableType] = [severities if snapshot.severities else _line(none, "dim")]
+    # The result of a test is printed below its last view.
+    ending = snapshot.ending if snapshot.command == "monitor" else None
+    beside: list[RenderableType] = []
+    if snapshot.ending is None or ending is not None:
+        none = "severities: none" if ending else "severities: none yet"
+        severities = _severities(snapshot.severities, unicode=unicode)
+        beside.append(severities if snapshot.severities else _line(none, "dim"))
     if monitored:
         beside.append(_alarms(snapshot))
     body: RenderableType
@@ -56,10 +54,9 @@ def draw_snapshot(snapshot: Snapshot, width: int, *, unicode: bool = True) -> Re
     if snapshot.ending is None and snapshot.working:
         rows.append(_line(snapshot.working, "dim"))
     rows += [_line(note, "yellow") for note in snapshot.notes]
-    if snapshot.ending is not None:
-        style = ENDING_STYLES.get(snapshot.ending.verdict, "bold")
-        rows.append(_line(snapshot.ending.verdict, style))
-        rows += [Padding(Text(printable(item)), (0, 0, 0, 2)) for item in snapshot.ending.reasons]
+    if ending is not None:
+        rows.append(_line(ending.verdict, ENDING_STYLES.get(ending.verdict, "bold")))
+        rows += [Padding(Text(printable(item)), (0, 0, 0, 2)) for item in ending.reasons]
     return Panel(Group(*rows), width=width, padding=(0, 1))
 
 

@@ -63,6 +63,12 @@ def test_the_users_own_history_is_kept_once_it_was_begun(run: Run) -> None:
     assert "was there already" in run("history", "init").out
 
 
+def test_the_verdict_says_by_when_from_the_history(run: Run) -> None:
+    assert "By when: one test does not tell" in run("diagnose", WORN).out
+    found = run("diagnose", "--history", "h.sqlite", "--hours", 100, WORN)
+    assert "By when is not known yet: 1 diagnosis of the unit, needs 3." in found.out
+
+
 def test_a_simulated_unit_goes_into_a_named_history_only(run: Run) -> None:
     bit = ("bit", "--simulate", "--fast", "--json", "--no-picture", "--test", "open", "--unit", 9)
     run("history", "init")

@@ -101,6 +101,16 @@ def test_it_fits_and_shows_what_others_wrote_as_text(width: int, text: str) -> N
     assert text is not HOSTILE or "[bold red]x[/] \\x1b[2J\\u202e:bomb:" in whole
 
 
+def test_the_result_of_a_test_stands_once() -> None:
+    """It is printed below the last view."""
+    ending = Ending(verdict="DEGRADED", reasons=("Plan to replace the servovalve.",))
+    whole = "\n".join(printed(snapshot(command="bit", ending=ending), 80))
+    assert "DEGRADED" not in whole
+    assert "servovalve" not in whole
+    assert "FSS" not in whole
+    assert "pressure" in whole
+
+
 def test_all_that_is_known_is_there() -> None:
     whole = "\n".join(printed(snapshot(), 80))
     for item in ("open", "2070 frames/s", "load 23%", "lost 1", "3.5 s left",

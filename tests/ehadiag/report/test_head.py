@@ -14,6 +14,7 @@ from rich.console import Console
 
 import ehadiag
 from ehadiag import Levels
+from ehadiag.estimate import Culprit
 from ehadiag.prognosis.forecast import RemainingLife
 from ehadiag.report.head import head_of, percent, remaining_sentences, stored_test_name
 from ehadiag.report.result_tables import NAMED_COLUMNS, diagnosis_html, print_result
@@ -75,7 +76,7 @@ def test_the_worst_comes_first_with_what_to_do(worn: ehadiag.Result) -> None:
     assert re.match(
         r"(Spool friction|Filter clogging) is at 60 %, its limit is 50 %\.", head.sentences[0]
     )
-    assert "Replace the servovalve." in " ".join(head.sentences)
+    assert "Act now: replace the servovalve." in " ".join(head.sentences)
     assert head.sentences[-1].endswith("Plan to overhaul the jack.")
     assert dict(head.facts)["tested"] == "2023-11-14 22:13 UTC"
 
@@ -152,6 +153,40 @@ def test_the_head_has_no_time_left_of_what_is_sound(worn: ehadiag.Result) -> Non
     assert said.startswith("Spool friction reaches its limit in about 130 h")
     sound = head_of(worn, Levels(0.7, 0.75), forecast_of(*lives)).sentences
     assert not any("reaches its limit" in sentence for sentence in sound)
+
+
+def test_the_head_says_by_when_or_why_that_is_not_known(worn: ehadiag.Result) -> None:
+    assert head_of(worn, Levels(0.25, 0.75)).sentences[-1].startswith("By when: one test does not")
+    few = forecast_of(("FDJ", 0.6, 0.0, 0.0, 0.0), ("FSS", 0.6, 0.0, 0.0, 0.0))
+    for item in few.forecasts:
+        item.remaining = [RemainingLife(0.75, None, None, None, "2 diagnoses, needs 3")]
+    said = head_of(worn, Levels(0.25, 0.75), few).sentences[-1]
+    assert said == "By when is not known yet: 2 diagnoses, needs 3."
+    sentences = head_of(worn, Levels(0.25, 0.5)).sentences
+    assert sentences[0].split(". ")[1].startswith("Act now: ")
+    assert not any(sentence.startswith("By when") for sentence in sentences)
+
+
+@pytest.mark.parametrize(
+    ("advice", "action", "evidence"),
+    [
+        ("supply pressure looks -2 MPa off its probes", "Check this first: supply pressure", ""),
+        ("", "Check sensors, oil and supply.", "no single effect or datum explains most of it"),
+    ],
+)
+def test_what_to_check_is_said_once(
+    worn: ehadiag.Result, advice: str, action: str, evidence: str
+) -> None:
+    reason = "the model does not explain the recording: 9.0% of the residuals beyond three times"
+    culprit = Culprit(signal="spool", test="closed", start=1.0, end=2.0, suspects=(), advice=advice)
+    result = untested(worn, reason, fit=worn.fit, culprit=culprit)
+    lines = printed(result, 200)
+    assert lines[1].strip().startswith(f"→ {action}")
+    text = "\n".join(lines)
+    assert text.count("calibrate") == (not advice)
+    assert text.count(advice or "Check sensors") == 1
+    assert text.count("most is unexplained on the spool signal") == 1
+    assert evidence in text
 
 
 @pytest.mark.parametrize(

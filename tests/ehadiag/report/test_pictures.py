@@ -91,10 +91,11 @@ def test_measured_beside_expected(log: str, tmp_path: Path) -> None:
     assert result.verdict.name == "NOT_TESTED"
     figure = result.plot()
     title = figure.get_suptitle()
-    assert title.startswith("NOT TESTED: half$x^2$.blf\n")
-    assert all(reason[:40] in title for reason in result.reasons[:3])
-    assert "unit 1,  actuator type reference-31,  2023-11-14T22:13:20" in title
-    assert "DEGRADED from 0.25, FAULT from 0.75" in title
+    words = " ".join(title.split())
+    assert title.startswith("Unit 1: NOT TESTED\nThe recording ends early: ")
+    assert "Record the test to its end, then diagnose again." in words
+    assert "recorded 2023-11-14 22:13 UTC, unit 1, " in words
+    assert words.endswith("actuator type reference-31, half$x^2$.blf")
     current, spool, pressure, position = signals(figure)
     assert len(spool.lines) == len(pressure.lines) == 2
     assert len((position if "closed" in log else current).lines) == 2
@@ -195,7 +196,7 @@ def test_a_slow_severity_does_not_squeeze_the_trend_of_a_fast_one():
 def test_a_severity_at_its_limit_is_the_title_of_the_trend():
     worn = [an_entry(1, 100.0 * n, (0.01 * n, 0.06 * n, 0.01 * n)) for n in range(1, 14)]
     assert history_picture(worn, [], future(worn)).title.splitlines() == [
-        "Unit 1: Spool friction is at 78 %, its limit is 75 %.", "Replace the servovalve.",
+        "Unit 1: Spool friction is at 78 %, its limit is 75 %.", "Act now: replace the servovalve.",
     ]  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import socket
 import threading
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from history_cases import an_entry
 from msgspec.structs import replace
@@ -18,6 +19,10 @@ from ehadiag import ConfigurationError, Levels
 from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, Usage
 from ehadiag.history.store import History
+from ehadiag.prognosis.forecast import RemainingLife, forecast, learn_fleet
+from ehadiag.prognosis.lives import Life
+from ehadiag.prognosis.units import Prognosis
+from ehadiag.report.fleet_table import FleetUnit, fleet_table
 from ehadiag.serve.pages import Pages
 from ehadiag.serve.server import LOOPBACK_ADDRESS, Site, serve
 from ehadiag.serve.sessions import Session, SessionRunner
@@ -224,12 +229,49 @@ def test_the_fleet_says_what_to_do_worst_unit_first(tmp_path):
     assert "<h1>Fleet: 1 FAULT, 1 INCONCLUSIVE, 1 HEALTHY</h1>" in page
     places = [page.index(f'href="/history/{serial}"') for serial in (9, 5, 3)]
     assert places == sorted(places)
-    assert "Replace the servovalve" in page
+    assert "Act now: replace the servovalve" in page
     assert ">INCONCLUSIVE<" in page
     assert "advisory level 25 %, limit 75 %. Worst unit first." in page
     assert ">0 h, limit reached<" in page
     assert ">too few diagnoses<" in page
     assert ">trend<" not in page  # no unit has two diagnoses
+
+
+def test_a_units_page_says_first_what_to_do_by_when(tmp_path):
+    place = tmp_path / "history.db"
+    with History(place, create=True) as history:
+        for step in range(4):
+            wear = 0.2 + 0.1 * step
+            history.append(an_entry(9, 100.0 * step, (wear, 0.1, wear / 2), verdict="DEGRADED"))
+    with site(tmp_path, place, watch=None) as (port, _):
+        _, page, _ = request(port, "/history/9")
+    assert '<h1 class="DEGRADED">Unit 9: DEGRADED</h1>' in page
+    first = page.partition('<p class="text first">')[2].partition("</p>")[0]
+    assert first.startswith("Filter clogging reaches its limit in about ")
+    assert " Plan to clean or replace the filter of the servovalve" in first
+    life = page.partition('aria-label="Remaining life"')[2].partition("</table>")[0]
+    places = [life.index(f"<td>{name}") for name in ("filter clogging", "jack f", "spool f")]
+    assert places == sorted(places)
+    assert "needs" in life or "no growth" in life  # of the spool friction, which did not change
+    assert "(80 % interval)" not in page
+
+
+def test_too_few_diagnoses_are_counted_and_not_read_from_a_reason():
+    def left(diagnoses):
+        why = "no wear: the unit needs nothing"
+        future = forecast(
+            "FSS", "hours", Life(1, *3 * (np.ones(0),), 0.0), learn_fleet([], 1.0), []
+        )
+        future = replace(
+            future, diagnoses=diagnoses, remaining=(RemainingLife(0.75, None, None, None, why),)
+        )
+        known = Prognosis(1, "x", "hours", 0, 0, (0.25, 0.75), (future,), 0, None, "")
+        unit = FleetUnit(1, "x", "HEALTHY", "HEALTHY", (), (), "", "", known)
+        head, (cells,) = fleet_table([unit], Levels())
+        return cells[head.index("time left")].text
+
+    assert left(2) == "too few diagnoses"
+    assert left(3) == "no number"
 
 
 def test_only_reports_of_the_folder_are_served_and_as_strangers(tmp_path):
