@@ -64,14 +64,19 @@ def adapt(_app: Sphinx, page: str, source: list[str]) -> None:
 
 
 EXAMPLES = HERE.parent / "examples" / "README.md"
-SCRIPT = re.compile(r"^```sh\npython (examples/\w+\.py)", re.MULTILINE)
+PICTURE = re.compile(r"^!\[(.*?)\]\((.*?)\)$", re.MULTILINE)
+SCRIPT = re.compile(r"^```sh\npython (examples/\w+\.py).*?```\n```\n.*?```\n\n", re.M | re.S)
 
 
 def gallery() -> str:
-    """Return the examples with their output, which tests compare, each below its source."""
+    """Return the examples with their output, which tests compare, each above its folded source."""
     text = EXAMPLES.read_text("utf-8").partition("\n\n")[2].replace("](../docs/", "](")
     text = text.replace("](diagnose.ipynb)", "](path:../examples/diagnose.ipynb)")
-    return SCRIPT.sub(r"```{literalinclude} ../\1\n:language: python\n```\n\n\g<0>", text)
+    return SCRIPT.sub(
+        r"\g<0><details><summary>Source</summary>\n\n"
+        r"```{literalinclude} ../\1\n:language: python\n```\n\n</details>\n\n",
+        PICTURE.sub(r"```{image} \2\n:alt: \1\n:height: 24em\n```", text),
+    )
 
 
 TABLE = re.compile(r"^<!-- (.*) -->$", re.MULTILINE)

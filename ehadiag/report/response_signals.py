@@ -26,7 +26,7 @@ from ehadiag.model.plant import PlantConstants
 from ehadiag.model.residual_models import model_response
 from ehadiag.model.sensors import SensorLaw, sensor_law
 from ehadiag.model.severities import FAULT_LAWS
-from ehadiag.report.head import head_of, plain_name, stored_test_name
+from ehadiag.report.head import head_of, stored_test_name
 from ehadiag.report.picture import (
     Band,
     Curve,
@@ -302,8 +302,7 @@ def _title(result: Result, columns: int) -> list[str]:
         lines += textwrap.wrap(printable(text), 110 * columns)
     if result.identified:
         faults = (
-            f"{plain_name(item.name)} {item.value:.5f}"
-            f" ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
+            f"{item.name} {item.value:.5f} ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
             for item in result.severities.values()
         )
         lines.append(",  ".join(faults))

@@ -1,8 +1,9 @@
-"""Pictures of the documentation: what faults do, why they are found, intervals."""
+"""Pictures of the documentation: what faults do, why they are found, intervals, the live view."""
 
 from __future__ import annotations
 
 import argparse
+import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,11 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from rich.console import Console
 
 import ehadiag
 from ehadiag.identify.experiment import Experiment
+from ehadiag.live import Snapshot
 from ehadiag.model.registry import FAULTS, Unknowns
 from ehadiag.report.response_signals import sensed_response
+from ehadiag.terminal.live_view import draw_snapshot
 from ehadiag_sim.conditions import Faults
 from ehadiag_tools.study import Options, Record, Study
 
@@ -156,10 +160,35 @@ def _intervals(figure: Figure) -> None:
     axes[0].set_ylabel("estimate less truth, % of full damage")
 
 
+def _exponent(figure: Figure) -> None:
+    """What a file with m = 0 makes of the friction of a valve with m = 2."""
+    axis, clogging = figure.subplots(), np.linspace(0.0, 1.0, 201)
+    for truth, colour, dash in zip((0.1, 0.2, 0.4), COLOURS, DASHES, strict=True):
+        read = np.minimum(truth / (1.0 - 0.8 * clogging) ** 2, 1.0)
+        axis.plot(clogging, read, color=colour, ls=dash, label=f"{truth:g}")
+        axis.fill_between(clogging, truth, read, color=colour, alpha=0.1)
+    axis.set(xlabel="Kintas", ylabel="FSS as read", title="valve with m = 2, file says 0")
+    axis.legend(title="true FSS", loc="lower right")
+
+
+def _monitor(figure: Figure) -> None:
+    """Live view of a monitor at the end of a log of a worn unit, as a terminal shows it."""
+    seen: list[Snapshot] = []
+    ehadiag.watch("tests/data/logs/paper-open-1.blf", snapshots=seen.append)
+    console = Console(file=io.StringIO(), record=True, width=100, color_system=None)
+    console.print(draw_snapshot(seen[-1], 100))
+    figure.set_size_inches(9.0, 4.4)
+    figure.patch.set_facecolor("#111417")
+    text = console.export_text().rstrip()
+    figure.text(0.01, 0.98, text, family="monospace", color="#e8eaed", va="top", size=9)
+
+
 METHOD_PICTURES: dict[str, Callable[[Figure], None]] = {
     **{name: partial(_effects, name=name) for name in EFFECTS},
     "searches": _searches,
     "intervals": _intervals,
+    "exponent": _exponent,
+    "monitor": _monitor,
 }
 """By name."""
 
@@ -182,6 +211,6 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
 
 PICTURES = Study(
     "pictures",
-    "Draws the pictures of docs/explanation/method.md: what faults do, why they are found.",
+    "Draws pictures of the documentation: what faults do, why they are found, the live view.",
     _cases, draw_method, _report, _options, count=None, measures_time=True,
 )  # fmt: skip
