@@ -185,7 +185,7 @@ def _remaining(
         why = "the wear that was seen need not ever reach this level"
         return RemainingLife(level, None, None, None, why)
     if high > RULES.max_interval_ratio * max(low, 1e-9):
-        why = f"anything from {low:.2g} to {high:.2g} {unit}: too wide"
+        why = f"anything from {low:.0f} to {high:.0f} {unit}: too wide"
         return RemainingLife(level, None, None, None, why)
     return RemainingLife(level, low, median, high, "", tuple(quantiles.tolist()))
 

@@ -36,6 +36,8 @@ function show(snapshot) {
   at("verdict").textContent = ending ? ending.verdict.replace("_", " ") : "";
   at("verdict").className = "verdict " + (ending ? ending.verdict.replace(" ", "_") : "");
   list(at("reasons"), ending ? ending.reasons : []);
+  at("trend").hidden = !ending || snapshot.serial === null;
+  at("trend").href = "/history/" + snapshot.serial;
   const left = test && test.left_s !== null ? ", " + test.left_s.toFixed(1) + " s left" : "";
   at("phase").textContent = (test ? "Test " + test.name + ": " + test.phase + left : "No test") +
     (snapshot.working ? "; " + snapshot.working : "") + (snapshot.mode ? "; commands are a " + snapshot.mode : "");
