@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -33,3 +34,14 @@ def test_the_site_is_built_without_a_warning_and_has_every_public_name(tmp_path:
     assert 'role="heading" aria-level="2"' in first
     assert 'role="heading">' not in first
     assert "<pre>" not in first
+
+
+def test_each_tutorial_and_how_to_shows_a_small_picture_and_none_is_unused() -> None:
+    docs, examples, shown = REPOSITORY / "docs", REPOSITORY / "examples" / "README.md", set()
+    for page in (*docs.rglob("*.md"), REPOSITORY / "README.md", examples):
+        names = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text("utf-8"))
+        pictures = [page.parent / name for name in names]
+        assert pictures or page.parent.name not in ("tutorials", "how-to"), page
+        shown |= {path.resolve() for path in pictures}
+    assert {path for path in shown if path.stat().st_size > 150_000} == set()
+    assert set((docs / "img").iterdir()) == {path for path in shown if path.parent.name == "img"}
