@@ -306,26 +306,27 @@ def _unmapped(messages: Mapping[str, Decoded], frames: int) -> tuple[str, ...]:
 
 
 def render_bus_report(report: BusReport) -> str:
-    """Text of a report, lines of at most some 100 characters."""
+    """Text of a report; the tables take 80 columns where names of messages are short."""
+    width = max((len(item.name) for item in report.messages), default=7)
     lines = [
         f"{report.frames} frames in {report.duration:.2f} s, {report.errors} error frames",
         "",
-        f"{'message':<24}{'id':>11}{'frames':>8}{'1/s':>9}{'pause ms':>10}"
-        f"{'lost':>6}{'conf':>6}{'crc':>5}{'len':>5}{'range':>6}",
+        f"{'message':<{width}} {'id':>10} {'frames':>7} {'1/s':>7} {'pause ms':>8}"
+        f" {'lost':>5} {'conf':>4} {'crc':>4} {'len':>4} {'range':>5}",
     ]
     for item in report.messages:
         lost = "-" if item.lost is None else str(item.lost)
         check = str(item.crc_errors) if item.crc else "-"
         lines.append(
-            f"{item.name:<24}{item.can_id:>#11x}{item.received:>8}{item.rate:>9.1f}"
-            f"{1e3 * item.longest_pause:>10.2f}{lost:>6}{item.conflicts:>6}{check:>5}"
-            f"{item.length_errors:>5}{item.range_errors:>6}"
+            f"{item.name:<{width}} {item.can_id:>#10x} {item.received:>7} {item.rate:>7.1f}"
+            f" {1e3 * item.longest_pause:>8.2f} {lost:>5} {item.conflicts:>4} {check:>4}"
+            f" {item.length_errors:>4} {item.range_errors:>5}"
         )
     if report.ranges:
         lines += [
             "",
-            f"{'channel':<12}{'codes seen':>16}{'of':>8}{'use':>7}{'at end':>8}"
-            f"{'now':>11}{'least':>11}{'most':>11}",
+            f"{'channel':<8} {'codes seen':>13} {'of':>5} {'use':>5} {'at end':>6}"
+            f" {'now':>10} {'least':>10} {'most':>10}",
         ]
     for use in report.ranges:
         seen, of, share = "-", "-", "-"
@@ -334,8 +335,8 @@ def render_bus_report(report: BusReport) -> str:
             share = f"{100 * (use.highest_code - use.lowest_code + 1) / use.codes:.0f} %"
         channel: Channel = getattr(CHANNELS, use.channel)
         unit, per_unit = channel.unit, channel.per_unit
-        values = (f"{item / per_unit:>11.4g}" for item in (use.now, use.lowest, use.highest))
-        codes = f"{use.channel:<12}{seen:>16}{of:>8}{share:>7}{use.saturated:>8}"
+        values = (f" {item / per_unit:>10.4g}" for item in (use.now, use.lowest, use.highest))
+        codes = f"{use.channel:<8} {seen:>13} {of:>5} {share:>5} {use.saturated:>6}"
         lines.append(f"{codes}{''.join(values)} {unit}")
     if report.state:
         lines += ["", report.state]

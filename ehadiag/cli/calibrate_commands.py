@@ -22,6 +22,7 @@ from ehadiag.report.rendering import (
     isolated_png,
 )
 from ehadiag.terminal.output import (
+    TABLE_COLUMNS,
     print_compiling_notice,
     print_status,
     print_text,
@@ -111,7 +112,8 @@ def _print_calibrated(found: Calibrated, *, as_json: bool) -> None:
     if as_json:
         write_output(calibration_json(found) + "\n")
     else:
-        write_output(render_for_terminal(lambda console: print_calibration(found, console)))
+        draw = partial(print_calibration, found)
+        write_output(render_for_terminal(draw, least=TABLE_COLUMNS))
 
 
 def _write_outputs(
@@ -420,7 +422,8 @@ def _print_scores(
 
     if not arguments.json:
         for test, scored in found:
-            write_output(render_for_terminal(partial(print_score, test, scored)))
+            draw = partial(print_score, test, scored)
+            write_output(render_for_terminal(draw, least=TABLE_COLUMNS))
         return
     out = {"schema": DESIGN_SCHEMA, "actuator": arguments.actuator, "scored": score_tree(*found[0])}
     if arguments.out:

@@ -22,6 +22,7 @@ from ehadiag.cli.history_options import (
 from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.history.records import DIAGNOSIS_TABLE, EVENT_TABLE
+from ehadiag.report.head import shown_date
 from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
 from firmware_iface.errors import (
     ConfigurationError,
@@ -315,7 +316,7 @@ def _entry_row(entry: Entry) -> tuple[str, ...]:
     )
     return (
         str(entry.number),
-        entry.when,
+        shown_date(entry.when),
         _cell(entry.serial),
         _cell(entry.usage.hours),
         _cell(entry.usage.cycles),
@@ -329,7 +330,7 @@ def _event_row(event: MaintenanceEvent) -> tuple[str, ...]:
     resets = f" (begins anew: {', '.join(event.resets)})" if event.resets else ""
     usage = (_cell(event.usage.hours), _cell(event.usage.cycles))
     kind = f"event {event.number}{_withdrawn(event)}"
-    return ("", event.when, str(event.serial), *usage, "", kind, event.text + resets)
+    return ("", shown_date(event.when), str(event.serial), *usage, "", kind, event.text + resets)
 
 
 def _withdrawn(item: Entry | MaintenanceEvent) -> str:

@@ -332,7 +332,7 @@ class ResultWriter:
         verbose = self._arguments.verbose
         write_output(
             render_for_terminal(
-                lambda console: print_result(result, console, prognosis, verbose=verbose), least=0
+                lambda console: print_result(result, console, prognosis, verbose=verbose)
             )
         )
 

@@ -33,7 +33,9 @@ def print_prognosis(
     """
     head = f"unit {prognosis.serial}, actuator type {printable(prognosis.actuator or 'unknown')}"
     used = f"{prognosis.used} of {prognosis.diagnoses} diagnoses say {prognosis.unit}"
-    console.print(f"{head}: {used}", soft_wrap=True)
+    console.print(f"{head}: {used}")
+    for line in _sentences(prognosis, before):
+        console.print(f"  {line}")
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
     table.add_column("severity", no_wrap=True)
     table.add_column("now", justify="right", no_wrap=True)
@@ -45,13 +47,11 @@ def print_prognosis(
         now = "-" if item.value is None else f"{item.value:.4f}"
         table.add_row(item.name, now, *cells, _wear_text(item))
     console.print(table, crop=False)
-    for line in _sentences(prognosis, before):
-        console.print(f"  {line}", soft_wrap=True)
     for item in prognosis.forecasts:
         if item.note:
-            console.print(f"  {item.name}: {item.note}", soft_wrap=True)
+            console.print(f"  {item.name}: {item.note}")
         if item.alarm:
-            console.print(f"  ALARM: {item.name} {item.alarm}", soft_wrap=True)
+            console.print(f"  ALARM: {item.name} {item.alarm}")
 
 
 def print_urgencies(
@@ -65,7 +65,7 @@ def print_urgencies(
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
     heads = ("serial", "actuator", "first", "to the limit (80 % interval)", "about")
     for name in (*heads, *(("chance before",) if before else ()), "alarms"):
-        table.add_column(name, overflow="fold")
+        table.add_column(name, overflow="fold", no_wrap=name == "actuator")
     for place, item in enumerate(found):
         first = item.first()
         alarms = ", ".join(part.name for part in item.forecasts if part.alarm)

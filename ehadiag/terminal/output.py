@@ -124,7 +124,7 @@ class _EncodedText(io.StringIO):
     encoding = "utf-8"
 
 
-def render_for_terminal(draw: Callable[[Console], None], *, least: int = TABLE_COLUMNS) -> str:
+def render_for_terminal(draw: Callable[[Console], None], *, least: int = 0) -> str:
     """Return what is drawn on a console like standard output's, for `write_output`.
 
     Not written by the console itself, which ends the program where a pipe is closed.
@@ -278,7 +278,9 @@ def print_test_list(source: str, tests: Iterable[ListedTest], *, as_json: bool) 
         return
     from rich.table import Table  # noqa: PLC0415 - only who prints tables needs it
 
-    table = Table(*TEST_LIST_COLUMNS, box=None, pad_edge=False, title=None)
+    table = Table(box=None, pad_edge=False)
+    for name in TEST_LIST_COLUMNS:
+        table.add_column(name, overflow="fold")
     for test in tests:
         shown = (*astuple(test)[:-1], "; ".join(test.remarks))
         table.add_row(*("-" if cell in (None, "") else printable(str(cell)) for cell in shown))

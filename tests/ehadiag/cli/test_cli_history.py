@@ -6,6 +6,7 @@ import csv
 import gzip
 import io
 import json
+import re
 import shutil
 import time
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 from cli_result import Result, Run
-from places import LOGS
+from places import LOGS, ROOT
 
 from ehadiag.history.records import MAX_DATE_ROUNDING_S
 
@@ -67,6 +68,22 @@ def test_the_verdict_says_by_when_from_the_history(run: Run) -> None:
     assert "By when: one test does not tell" in run("diagnose", WORN).out
     found = run("diagnose", "--history", "h.sqlite", "--hours", 100, WORN)
     assert "By when is not known yet: 1 diagnosis of the unit, needs 3." in found.out
+
+
+def test_tables_are_broken_between_words_on_a_narrow_terminal(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("history", "init", "--history", "h.sqlite")
+    run("history", "import", ROOT / "docs" / "examples" / "fleet.csv", "--history", "h.sqlite")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    for words, kept in (
+        (("history", "list"), r"2026-08-20 08:00 .*FAULT"), (("rul", "--all"), "reference-31 "),
+        (("rul", "--unit", "1"), r"710\s+to 2500 with 80 %\."),
+    ):  # fmt: skip
+        out = re.sub(r"\x1b\[[\d;]*m", "", run(*words, "--history", "h.sqlite").out)
+        assert max(map(len, out.splitlines())) <= 80
+        assert re.search(kept, out), out
 
 
 def test_a_simulated_unit_goes_into_a_named_history_only(run: Run) -> None:

@@ -187,7 +187,7 @@ def test_reference_recording(bus_map, logs):
     text = render_bus_report(report)
     assert "everything that a diagnosis needs is there" in text
     assert "0.130 ms" in text
-    assert max(map(len, text.splitlines())) <= 100
+    assert max(map(len, text.splitlines())) <= 80
 
 
 def test_lossy_recording(bus_map, logs):
