@@ -2,7 +2,7 @@
 """Fuzz C code in its own process: `python tools/fuzz/native.py fcc|onboard FOLDER [RUNS [SEED]]`.
 
 fcc: the firmware side of the bus; onboard: a library of `ehadiag export` for this computer. New
-inputs go to the folder; tests/data/fuzz is read too. docs/maintainers/fuzz.md says what a finding is.
+inputs go to the folder; tests/data/fuzz is read too. A finding: docs/maintainers/fuzz.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Fuzz one target with atheris: `python tools/fuzz/run.py TARGET [FOLDER...] [-option...]`.
 
-Options are libFuzzer's; docs/maintainers/fuzz.md says how to start it and what to do with a finding.
+Options are libFuzzer's; docs/maintainers/fuzz.md says how to start it and what a finding is.
 """
 
 from __future__ import annotations
