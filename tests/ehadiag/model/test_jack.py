@@ -22,7 +22,7 @@ from ehadiag.model.second_stage import jack_piece
 from ehadiag.model.sensors import JackState, PathPiece, PressureProbe
 from ehadiag.model.simd_jack import driven_jack_costs
 from ehadiag_sim.conditions import Effects
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.simulator.units import damaged_unit
 from firmware_iface.recording import POSITION_CHANNEL, Environment
 
 SPAN = 1e-3

@@ -20,7 +20,7 @@ from ehadiag.model.batch import Anchor
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.residual_models import model_response
 from ehadiag.model.simd_jack import driven_jack_costs
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.simulator.units import damaged_unit
 from firmware_iface.recording import POSITION_CHANNEL, PRESSURE_CHANNEL, SPOOL_CHANNEL
 
 TICK = 1e-3

@@ -23,7 +23,7 @@ from ehadiag.model.batch import NO_ANCHOR, Anchor, Batch
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, parameter
 from ehadiag.model.residual_models import ScalarModel, SimdModel, model_response
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.simulator.units import damaged_unit
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
 from firmware_iface.stored_test import resolve_test

@@ -26,7 +26,7 @@ from ehadiag import CommandMode, ConfigurationError, Monitor, Tick, default_actu
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.model.batch import NO_ANCHOR, Anchor
 from ehadiag.model.residual_models import model_response
-from ehadiag_tools.damaged import damaged, damaged_unit
+from ehadiag_tools.simulator.units import damaged, damaged_unit
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
 from firmware_iface.stored_test import resolve_test
