@@ -18,14 +18,13 @@ from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import RESPONSE
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, RESPONSE
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
 from ehadiag.model.batch import NO_ANCHOR
 from ehadiag.model.residual_models import ModelResponse, model_response
-from firmware_iface.recording import SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 
 def identified_response(experiment: Experiment, identification: Identification) -> ModelResponse:
@@ -257,7 +256,7 @@ def fit_position(
         rms=float(np.sqrt(np.mean(most))),
         outliers=float(np.mean(smoothed > RESPONSE.min_travel_outlier)),
         most_drift=RESPONSE.max_position_drift_m_per_s
-        * (channels.spool.full_scale / SPOOL_CHANNEL.full_scale),
+        * (channels.spool.full_scale / CHANNELS.spool.full_scale),
     )
 
 

@@ -148,7 +148,7 @@ EXPECTED = {
 }
 SLOW = {
     "alarms": "--cases 1 --recordings 2",
-    "bench": "--repeats 1 --seconds 0.1 --frames 2000 --only process --only kernels --only push"
+    "bench": "--repeats 1 --seconds 0.1 --frames 2000 --only kernels --only push"
     " --only decode --only batch --only history --recordings 2 --diagnoses 400 --folder {folder}",
 }
 

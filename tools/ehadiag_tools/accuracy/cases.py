@@ -32,7 +32,7 @@ from ehadiag_tools.simulator.units import damaged_unit
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL, Environment, Samples
+from firmware_iface.recording import CHANNELS, Environment, Samples
 from firmware_iface.stored_test import resolve_test
 
 Severities = tuple[float, float, float]
@@ -219,7 +219,7 @@ def _monitoring(test: str, faults: Severities, seed: int) -> tuple[Samples, Envi
     rng = np.random.default_rng(np.random.SeedSequence((seed, 7)))
     noise = Sensors().noise_lsb
     measured = []
-    for channel, clean in ((SPOOL_CHANNEL, truth.spool), (PRESSURE_CHANNEL, truth.pressure)):
+    for channel, clean in ((CHANNELS.spool, truth.spool), (CHANNELS.pressure, truth.pressure)):
         volts = clean + noise * channel.lsb * rng.standard_normal(len(clean))
         measured.append(channel.decode(channel.encode(volts)))
     return replace(samples, spool=measured[0], pressure=measured[1]), environment

@@ -16,7 +16,7 @@ from ehadiag_sim.conditions import Sensors
 from ehadiag_tools.simulator.units import damaged
 from ehadiag_tools.study import Record, grouped, markdown
 from firmware_iface.errors import EhadiagError
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 Array = NDArray[np.float64]
 NOT_TESTED = Verdict.NOT_TESTED.name
@@ -164,7 +164,7 @@ def _information(experiment: Experiment, faults: Sequence[float]) -> Array:
 def _derivatives(experiment: Experiment, truth: Array, step: float) -> Array:
     """Derivatives of spool and pressure in units of their noise, shape (k, 2, n)."""
     noise = np.sqrt(Sensors().noise_lsb ** 2 + 1.0 / 12.0) * np.array(
-        [SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb]
+        [CHANNELS.spool.lsb, CHANNELS.pressure.lsb]
     )
     out = np.empty((len(FAULTS), len(noise), experiment.ticks))
     for j in range(len(FAULTS)):

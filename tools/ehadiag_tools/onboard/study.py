@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator, load_actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.export.library import (
     MANIFEST_FILE,
     SHARED_LIBRARY_FILE,
     STATIC_LIBRARY_FILE,
     export_library,
+    exported_unit,
+    library_plan,
 )
-from ehadiag.export.plan import exported_unit, library_plan
 from ehadiag.export.targets import find_target
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.identification_session import NuisanceMode, identify
@@ -247,8 +249,6 @@ ONBOARD = Study(
 
 UNTESTED = 30.0
 """Verdict of an identification that carries none."""
-NORMAL_95 = 1.96
-"""Half-width of the normal law's 95 % interval, deviations."""
 GOES_ON = 1
 """What a slice returns before the last one."""
 FAR_OFF = 5.0
@@ -318,7 +318,10 @@ def perform_random(case: OnboardUnit) -> Record:
     found = _library().identified(surrounded(recording), ticks[: round(case.share * len(ticks))])
     spent = time.process_time() - begin
     std = [found.std_Kintas, found.std_FSS, found.std_FDJ]
-    ends = [(v - NORMAL_95 * s, v + NORMAL_95 * s) for v, s in zip(found[:3], std, strict=True)]
+    ends = [
+        (v - NORMAL_HALF_WIDTH_95 * s, v + NORMAL_HALF_WIDTH_95 * s)
+        for v, s in zip(found[:3], std, strict=True)
+    ]
     out = {
         "faults": severities, "processor_s": spent, "value": found[:3], "std": std,
         "interval95": ends, "runs": found.runs, "outliers": found.outliers,

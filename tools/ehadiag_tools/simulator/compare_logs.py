@@ -29,14 +29,7 @@ from ehadiag_tools.simulator.units import Unit
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import (
-    CHANNELS,
-    CURRENT_CHANNEL,
-    POSITION_CHANNEL,
-    CommandMode,
-    Environment,
-    Samples,
-)
+from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
 from firmware_iface.stored_test import resolve_test
 
 EFFECTS = "truth-effects.csv"
@@ -191,17 +184,17 @@ def replay(
 
 def _missing(law: PositionController, command: float, current: float, simulated: float) -> float:
     """Jack position that the converter may have shown, m."""
-    nearest = round(simulated / POSITION_CHANNEL.lsb)
+    nearest = round(simulated / CHANNELS.position.lsb)
     if math.isnan(current):
-        return nearest * POSITION_CHANNEL.lsb
+        return nearest * CHANNELS.position.lsb
 
     def misfit(code: int) -> tuple[int, int]:
-        trial = copy.copy(law).current(command, CommandMode.POSITION, code * POSITION_CHANNEL.lsb)
+        trial = copy.copy(law).current(command, CommandMode.POSITION, code * CHANNELS.position.lsb)
         # In saturation many codes give one current: take the nearest position then.
-        return round(abs(trial - current) / CURRENT_CHANNEL.lsb), abs(code - nearest)
+        return round(abs(trial - current) / CHANNELS.current.lsb), abs(code - nearest)
 
     codes = range(nearest - NEIGHBOURS, nearest + NEIGHBOURS + 1)
-    return min(codes, key=misfit) * POSITION_CHANNEL.lsb
+    return min(codes, key=misfit) * CHANNELS.position.lsb
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
