@@ -158,7 +158,7 @@ def delay_note(delays: Sequence[Delay], tick: float) -> str:
 
 
 def _advanced(values: Array, ticks: float) -> Array:
-    """Values that many ticks later; NaN where one of two neighbours is missing."""
+    """Values a number of ticks later; NaN where one of two neighbours is missing."""
     near = abs(ticks - round(ticks)) < DELAYS.rounding_ticks
     whole = round(ticks) if near else math.floor(ticks)
     part = 0.0 if near else ticks - whole
@@ -306,7 +306,7 @@ def objections_to_position(
 
 
 def _robust_fit(columns: Array, values: Array) -> tuple[Array, Array]:
-    """Least squares reweighted by Cauchy's weights; the solution, and what is left."""
+    """Least squares reweighted by Cauchy's weights: solution and residuals."""
     weight = np.ones_like(values)
     for _ in range(DELAYS.fit_iterations):
         weighed = columns * weight[:, None]

@@ -35,7 +35,7 @@ class Kind(IntEnum):
 
 
 class Flag(IntFlag):
-    """What a section is, in the memory of a process."""
+    """Flags of a section: whether a process has it in memory, and may write to it."""
 
     WRITABLE = 1
     ALLOCATED = 2
