@@ -3,8 +3,8 @@
 Each has a quantity, a unit and how it was set: by the statistics of noise, by a bound, by a source,
 or by a study whose command shows it. Those that no study is named for are bounds of judgement.
 Recorded units: `tools/study recorded-units`; random units: `tools/study units`; broken hardware:
-`tools/study hardware`; buses with losses: `tools/study foreign-buses`. The last part are the numbers
-that the identification on the host and the one on board share.
+`tools/study hardware`; buses with losses: `tools/study foreign-buses`. Last come the numbers that
+the identification on the host and the one on board share.
 """
 
 from __future__ import annotations
