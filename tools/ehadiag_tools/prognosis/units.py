@@ -147,6 +147,8 @@ SHARES = (0.3, 0.5, 0.7, 0.9)
 SETS = {"tuned": tuple(TUNED), "held-out": tuple(HELD_OUT), "all": tuple(LAWS)}
 UNITS_PER_FLEET = 4
 """Number of units of a law that are forecast beside the same fleet."""
+CENSORED_SHARE = (0.3, 0.8)
+"""Shares of its last life at which a unit of a censored fleet is taken out, 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +159,7 @@ class LifeCase:
     law: str
     fleet: int
     group: int
+    censored: bool
     seed: int
 
 
@@ -167,7 +170,7 @@ def perform(case: LifeCase) -> Record:
     alarm, and the quantiles of the forecast; None where there is no number.
     """
     unit = simulate_unit(case.law, case.unit, read_noise(), case.seed)
-    lives, fleet = _fleet(case.law, case.fleet, case.group, case.seed)
+    lives, fleet = _fleet(case.law, case.fleet, case.group, case.censored, case.seed)
     length = unit.end - unit.born
     asked = []
     for share in SHARES:
@@ -185,12 +188,13 @@ def perform(case: LifeCase) -> Record:
 
 
 @lru_cache(maxsize=1)
-def _fleet(law: str, size: int, group: int, seed: int) -> tuple[list[Life], Fleet]:
+def _fleet(law: str, size: int, group: int, censored: bool, seed: int) -> tuple[list[Life], Fleet]:
     """Lives of further units of a law, and what is learned from them."""
     noise, lives = read_noise(), []
     for number in range(10_000 * (group + 1), 10_000 * (group + 1) + size):
         unit = simulate_unit(law, number, noise, seed)
-        life, earlier = _lives_until(unit, 1.0)
+        share = np.random.default_rng((seed, number)).uniform(*CENSORED_SHARE) if censored else 1.0
+        life, earlier = _lives_until(unit, float(share))
         lives += [item for item in (*earlier, life) if len(item.age) > 1]
     scale = float(np.median([life.age[-1] for life in lives])) if lives else 1000.0
     return lives, learn_fleet(lives, scale, seed)
@@ -210,7 +214,9 @@ def _cases(options: Options) -> list[LifeCase]:
     laws = SETS[options.laws]
     each = -(-options.cases // len(laws))
     return [
-        LifeCase(place, law, options.fleet, place // UNITS_PER_FLEET, options.seed)
+        LifeCase(
+            place, law, options.fleet, place // UNITS_PER_FLEET, options.censored, options.seed
+        )
         for law in laws
         for place in range(each)
     ]
@@ -219,10 +225,11 @@ def _cases(options: Options) -> list[LifeCase]:
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--laws", choices=SETS, default="all", help="(%(default)s)")
     parser.add_argument("--fleet", type=int, default=20, help="units of the fleet (%(default)d)")
+    parser.add_argument("--censored", action="store_true", help="taken out before the limit")
 
 
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
-    fleet = f"fleet of {options.fleet}"
+    fleet = f"fleet of {options.fleet}{' taken out early' if options.censored else ''}"
     yield f"{len(records)} units, laws {options.laws}, seed {options.seed}, {fleet}\n"
     rows: list[tuple[str, ...]] = [("all", *_cells(records))]
     for law in SETS[options.laws]:

@@ -49,10 +49,11 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class RecordedCase:
-    """Folder and file of a recording."""
+    """Folder and file of a recording, and whether commands are exact."""
 
     folder: str
     file: str
+    exact_command: bool
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -61,13 +62,19 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="recordings, truth.csv and, for units with effects, truth-effects.csv",
     )
+    parser.add_argument(
+        "--exact-command",
+        action="store_true",
+        help="do not round the command to the bus's resolution",
+    )
 
 
 def _cases(options: Options) -> list[RecordedCase]:
     rows = read_truth(options.folder / "truth.csv")
     units = _units(options.folder)
     folder = str(options.folder)
-    return [RecordedCase(folder, row.file) for row in rows if row.unit in units]
+    exact = options.exact_command
+    return [RecordedCase(folder, row.file, exact) for row in rows if row.unit in units]
 
 
 def _units(folder: Path) -> dict[str, Unit]:
@@ -84,7 +91,7 @@ def perform(case: RecordedCase) -> Record:
     if recording.samples is None:
         raise InputOutputError(f"log {row.file}: no telemetry of a test in it")
     test, unit = resolve_test(row.test), _units(folder)[row.unit]
-    command = bus_command(test)
+    command = test.command() if case.exact_command else bus_command(test)
     if recording.samples.ticks != test.ticks:
         raise InputOutputError(f"log {row.file}: not as long as test {test.name!r}")
     effects = effects_of(recording.environment, unit.effects)
