@@ -1,4 +1,7 @@
-"""The detailed actuator simulator: plant, sensors and control law, tick by tick or a whole test."""
+"""The detailed actuator simulator: plant, sensors and control law, tick by tick or a whole test.
+
+Also how finely, and how far, the computer behind a mapping sees its actuator.
+"""
 
 from __future__ import annotations
 
