@@ -153,18 +153,18 @@ def _as_float(pattern: NDArray[np.uint64], length: int) -> FloatArray:
 MAX_DBC_BYTES = 2 << 20
 MAX_CACHED_BYTES = 32 << 20
 MAX_CACHED_FILES = 16
-"""Files in the cache; the oldest goes."""
+"""Largest number of files in the cache; the oldest goes."""
 MAX_SIGNALS = 10_000
 MAX_MESSAGE_SIGNALS = 1000
-"""Of all messages, and of one."""
+"""Largest number of signals of all messages, and of one."""
 MAX_SIGNAL_BITS = 8 * 1785
-"""Bits of a message, and from its start to a signal's, at most: J1939's longest message."""
+"""Largest length of a message, and offset of a signal in it, bits: J1939's longest message."""
 MAX_LAYOUT_WORK = MAX_SIGNALS * 512**2
 """Sum of the squares of bits that the parser goes through for each signal; 512 are those of FD."""
 MAX_MULTIPLEXED_VALUES = 100_000
-"""Of all ranges of a multiplexer, which the parser writes out."""
+"""Largest number of values in the ranges of all multiplexers, 1: the parser lists each value."""
 SKIPPED_PATTERN = re.compile(r'//.*?\n|"(?:\\"|[^"])*?"')
-"""Comments and texts, as the parser skips them."""
+"""Comments and quoted texts, in which nothing is counted."""
 LAYOUT_PATTERN = re.compile(
     r"(?:BO_\s*([-+]?\d++)\s*(\w+)\s*)?:\s*([-+]?\d++)\s*(?=[A-Za-z_])"
     r"|(?:SG_\s+(\w+)(?:\s+\w+)?\s*)?:\s*([-+]?\d++)\s*\|\s*([-+]?\d++)"
@@ -173,12 +173,12 @@ LAYOUT_PATTERN = re.compile(
 RANGES_PATTERN = re.compile(r"SG_MUL_VAL_([^;]*)")
 RANGE_PATTERN = re.compile(r"(?<!\d)(\d++)\s*-\s*(\d++)")
 MAX_DIGITS = 12
-"""Digits of a number that is converted: an identifier has ten."""
+"""Largest number of digits that are converted, 1: an identifier has ten."""
 UNASSIGNED_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"
 """Message of signals that are of no message; the parser passes it over."""
 DBC_ERROR_PLACE = re.compile(r"at line (\d+), column (\d+)")
 CACHE_FORMAT = 2
-"""Raised with each change of what is kept."""
+"""Version of the cache's content, 1; another version is not read."""
 
 
 class DbcSignal(msgspec.Struct, frozen=True):
@@ -263,7 +263,7 @@ def parse_dbc(text: bytes, name: str) -> Dbc:
 
 
 def _check_budget(content: str, name: str) -> None:
-    """Refuse what would take its parser longer than anybody waits, and what is there twice.
+    """Refuse a DBC that would keep the parser busy for minutes, or that names an identifier twice.
 
     Multiplexed signals cost the square of their number in a message, each signal that of its bits.
     """
@@ -323,12 +323,12 @@ def _check_ranges(plain: str, name: str) -> None:
 
 
 def _small(digits: str) -> int:
-    """Return a number; one of more digits than any identifier has is as large as none."""
+    """Number of digits; a longer one than any identifier counts as the largest."""
     return int(digits) if len(digits) <= MAX_DIGITS else 10**MAX_DIGITS
 
 
 def _reason(error: Exception) -> str:
-    """Why a DBC is none, without quoting a line of it: a link may lead to any file."""
+    """Why a file is no valid DBC, without quoting a line of it: a link may lead to any file."""
     text = str(error)
     if place := DBC_ERROR_PLACE.search(text):
         return f": invalid syntax at line {place[1]}, column {place[2]}"

@@ -113,7 +113,7 @@ MIN_CONTRADICTIONS = 2
 
 
 class Phase(Enum):
-    """Where the handshake is."""
+    """Step that the handshake has reached."""
 
     SETTLING = "settling"
     WAITING = "waiting"
@@ -127,7 +127,7 @@ class Phase(Enum):
 
 
 class HandshakeAction(Enum):
-    """What the machine wants sent."""
+    """Message that the handshake sends next."""
 
     START = "start"
     ABORT = "abort"
@@ -175,7 +175,7 @@ class HandshakeResult(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Handshake:
-    """The machine; times in ns on the clock of the frames.
+    """State machine of the handshake; times in ns on the clock of the frames.
 
     Each input returns the actions to carry out now, in order. `verdict` is set once `phase` is
     DONE. `test_id` None: listen only, whatever test someone else starts.

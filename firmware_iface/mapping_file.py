@@ -185,7 +185,7 @@ class UdsIdentifiers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Protection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How one message is guarded."""
+    """Counter and check sum by which a lost, repeated or damaged message is noticed."""
 
     counter: MappingName | None = None
     counts: Literal["frames", "ticks"] = "frames"

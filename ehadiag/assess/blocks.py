@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.least_squares import Refinement
 from ehadiag.identify.prior import FAULT_OF_DATUM, severity_of_datum
@@ -20,10 +20,6 @@ from ehadiag.model.residual_models import ModelResponse
 
 BLOCKS = ("torque", "spool", "pressure", "jack")
 """Torque motor and first stage; spool with its friction; second stage; jack."""
-
-
-SIGNS = {"GQF": -1.0}
-"""Sign of the severity that does what more of a datum does, where it is not +1."""
 
 
 class BlockRules(msgspec.Struct, frozen=True):
@@ -137,7 +133,8 @@ def pulls_of_blocks(
         step = -inverse @ (refined.jacobian[:, used] @ refined.residuals[used]) * refined.scale
         out[block] = {
             FAULT_OF_DATUM[symbol]: float(
-                step[names.index(f"datum_{symbol}")] * share * SIGNS.get(symbol, 1.0)
+                # Friction of the spool that grows does what a smaller flow gain of it does.
+                step[names.index(f"datum_{symbol}")] * share * (-1.0 if symbol == "GQF" else 1.0)
             )
             for symbol, share in shares.items()
             if f"datum_{symbol}" in names

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import LOSSES
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, LOSSES
 from ehadiag.identify.estimates import interval95
 from ehadiag.identify.experiment import (
     ANCHOR_THRESHOLDS_LSB,

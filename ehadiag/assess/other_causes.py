@@ -22,8 +22,7 @@ from ehadiag.assess.verdict import Verdict
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.criteria import FIT, VERDICT
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, FIT, NORMAL_HALF_WIDTH_95, VERDICT
 from ehadiag.estimate import Culprit, Effect, Suspect, finite
 from ehadiag.identify.experiment import (
     Experiment,
@@ -41,8 +40,6 @@ from ehadiag.model.registry import REGISTRY, parameter
 from ehadiag.model.residual_models import SimdModel
 from firmware_iface.recording import Environment
 
-QUANTILE_TWO_SIDED_95 = NormalDist().inv_cdf(0.975)
-
 
 def effects_of(identification: Identification | None, actuator: Actuator) -> tuple[Effect, ...]:
     """Return every effect that was estimated, in the order of the identification.
@@ -58,7 +55,7 @@ def effects_of(identification: Identification | None, actuator: Actuator) -> tup
     out = []
     for name, found in identification.nuisances.items():
         item = scaled_to_channels(parameter(name), channels)
-        half, limit = QUANTILE_TWO_SIDED_95 * found.std, item.limit_of(actuator)
+        half, limit = NORMAL_HALF_WIDTH_95 * found.std, item.limit_of(actuator)
         known = math.isfinite(found.value) and math.isfinite(found.std)
         chance = None
         if limit is not None and known and not doubtful:

@@ -18,14 +18,13 @@ from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import RESPONSE
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, RESPONSE
 from ehadiag.identify.experiment import ANCHOR_THRESHOLDS_LSB, Experiment, slow_ticks
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.prior import has_further_effects
 from ehadiag.model.batch import NO_ANCHOR
 from ehadiag.model.residual_models import ModelResponse, model_response
-from firmware_iface.recording import SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 
 def identified_response(experiment: Experiment, identification: Identification) -> ModelResponse:
@@ -159,7 +158,7 @@ def delay_note(delays: Sequence[Delay], tick: float) -> str:
 
 
 def _advanced(values: Array, ticks: float) -> Array:
-    """Values that many ticks later; NaN where one of two neighbours is missing."""
+    """Values a number of ticks later; NaN where one of two neighbours is missing."""
     near = abs(ticks - round(ticks)) < DELAYS.rounding_ticks
     whole = round(ticks) if near else math.floor(ticks)
     part = 0.0 if near else ticks - whole
@@ -257,7 +256,7 @@ def fit_position(
         rms=float(np.sqrt(np.mean(most))),
         outliers=float(np.mean(smoothed > RESPONSE.min_travel_outlier)),
         most_drift=RESPONSE.max_position_drift_m_per_s
-        * (channels.spool.full_scale / SPOOL_CHANNEL.full_scale),
+        * (channels.spool.full_scale / CHANNELS.spool.full_scale),
     )
 
 
@@ -307,7 +306,7 @@ def objections_to_position(
 
 
 def _robust_fit(columns: Array, values: Array) -> tuple[Array, Array]:
-    """Least squares reweighted by Cauchy's weights; the solution, and what is left."""
+    """Least squares reweighted by Cauchy's weights: solution and residuals."""
     weight = np.ones_like(values)
     for _ in range(DELAYS.fit_iterations):
         weighed = columns * weight[:, None]

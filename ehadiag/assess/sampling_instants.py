@@ -23,8 +23,7 @@ from ehadiag.identify.experiment import Experiment, unknowns_of
 from ehadiag.identify.identification_result import Identification
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
-from firmware_iface.recording import Acquisition, Recording
-from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
+from firmware_iface.recording import SAMPLING, Acquisition, Recording, sampling_interval, values_at
 
 __all__ = ["INSTANTS", "settle_instants", "why_sampled_seldom", "widen_by_instants"]
 

@@ -30,8 +30,7 @@ from ehadiag.calibration.unit_models import (
     simple_models,
 )
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.criteria import FIT
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.identify.estimates import estimate_covariance, is_pressure_misfit, signal_excess_costs
 from ehadiag.identify.experiment import lay_out_spans, share_offsets, unknowns_of
 from ehadiag.identify.ring import SPOOL_PARAMETERS, find_ring, is_same_ring, ring_prior

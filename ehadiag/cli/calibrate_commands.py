@@ -39,8 +39,7 @@ from firmware_iface.stored_test import RATE_TOLERANCE, StoredTest, encode_test, 
 if TYPE_CHECKING:
     from ehadiag.calibration.unit_models import Calibrated
     from ehadiag.core.actuator import Actuator, CalibrationSource
-    from ehadiag.design.propose import MotionLimits, Proposal
-    from ehadiag.design.score import Score
+    from ehadiag.design.score import MotionLimits, Proposal, Score
     from ehadiag.setup import Setup
     from firmware_iface.recording import Recording
 
@@ -345,7 +344,7 @@ def run_design(arguments: argparse.Namespace) -> int:
 def _propose(
     arguments: argparse.Namespace, test: StoredTest, actuator: Actuator, scored: Score
 ) -> Proposal | None:
-    from ehadiag.design.propose import propose  # noqa: PLC0415
+    from ehadiag.design.score import propose  # noqa: PLC0415
 
     with progress_bar() as show:
         return propose(
@@ -362,8 +361,8 @@ def _design_limits(
     arguments: argparse.Namespace, test: StoredTest, actuator: Actuator, scored: Score
 ) -> MotionLimits:
     """Limits that were given, else what the test does; as new the actuator goes farthest."""
-    from ehadiag.design.propose import MotionLimits  # noqa: PLC0415
     from ehadiag.design.score import (  # noqa: PLC0415
+        MotionLimits,
         play_stored_test,
         typical_effects,
     )

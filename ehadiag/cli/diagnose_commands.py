@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.batch.test_list import list_tests
+from ehadiag.batch.journal import list_tests
 from ehadiag.batch.workers import LogInput, expand_logs
 from ehadiag.cli import options
 from ehadiag.cli.batch_run import add_batch_options, diagnose_all, diagnose_and_deliver

@@ -69,7 +69,7 @@ def exponential_less_one(x: float) -> float:
 LN2 = 0.6931471805599453
 LOGARITHM_TERMS = 14
 """Of the series of the logarithm: the next is below 1e-20."""
-TWO_PI = 6.283185307179586
+TWO_PI = math.tau
 
 TWO_POWER_52 = 4503599627370496.0
 """2^52: a number from there on is whole, and so is one that it was added to."""

@@ -9,16 +9,36 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
 PAGE = 0x10000
 """Alignment of segments, bytes: the largest page of AArch64."""
 HEADER, PROGRAM, SECTION, SYMBOL = "<16sHHIQQQIHHHHHH", "<IIQQQQQQ", "<IIQQQQIIQQ", "<IBBHQQ"
-X86_64, AARCH64 = 62, 183
-MACHINES = (X86_64, AARCH64)
-ALLOCATED, WRITABLE, NO_BITS, RELOCATIONS, SYMBOL_TABLE = 2, 1, 8, 4, 2
 FIXED_TAGS = {"hash": 4, "strings": 5, "symbols": 6, "string_bytes": 10, "symbol_bytes": 11}
 """Entries of the dynamic section (DT_HASH, DT_STRTAB, DT_SYMTAB, DT_STRSZ, DT_SYMENT)."""
+
+
+class Machine(IntEnum):
+    """Processors, as the header of a file numbers them."""
+
+    X86_64 = 62
+    AARCH64 = 183
+
+
+class Kind(IntEnum):
+    """Kinds of sections."""
+
+    SYMBOL_TABLE = 2
+    RELOCATIONS = 4
+    NO_BITS = 8
+
+
+class Flag(IntFlag):
+    """Flags of a section: whether a process has it in memory, and may write to it."""
+
+    WRITABLE = 1
+    ALLOCATED = 2
 
 
 class Section(NamedTuple):
@@ -45,14 +65,18 @@ def shared_library(code: bytes, names: Sequence[str]) -> bytes:
     """
     head = struct.unpack_from(HEADER, code)
     machine, table, size, count = head[2], head[6], head[11], head[12]
-    if not code.startswith(b"\x7fELF\x02\x01") or machine not in MACHINES:
+    if not code.startswith(b"\x7fELF\x02\x01") or machine not in list(Machine):
         raise ValueError("no object file of ELF-64 for x86-64 or AArch64")
     sections = [Section(*struct.unpack_from(SECTION, code, table + i * size)) for i in range(count)]
     symbols, strings = _symbols(code, sections)
     places, end = {}, PAGE
     for index, item in enumerate(sections):
-        if item.flags & ALLOCATED and item.size and not _is_frame(code, sections, head[13], item):
-            if item.flags & WRITABLE or item.kind == NO_BITS:
+        if (
+            item.flags & Flag.ALLOCATED
+            and item.size
+            and not _is_frame(code, sections, head[13], item)
+        ):
+            if item.flags & Flag.WRITABLE or item.kind == Kind.NO_BITS:
                 raise ValueError("data that change")
             end = -(-end // max(item.alignment, 16)) * max(item.alignment, 16)
             places[index] = end
@@ -66,7 +90,7 @@ def shared_library(code: bytes, names: Sequence[str]) -> bytes:
         if section in places:
             found[_text(strings, name)] = places[section] + value
     for item in sections:
-        if item.kind == RELOCATIONS and item.info in places:
+        if item.kind == Kind.RELOCATIONS and item.info in places:
             for at in range(item.offset, item.offset + item.size, 24):
                 where, info, addend = struct.unpack_from("<QQq", code, at)
                 name, _, _, section, value, _ = symbols[info >> 32]
@@ -81,7 +105,7 @@ def shared_library(code: bytes, names: Sequence[str]) -> bytes:
 def _symbols(
     code: bytes, sections: Sequence[Section]
 ) -> tuple[list[tuple[int, int, int, int, int, int]], bytes]:
-    table = next(item for item in sections if item.kind == SYMBOL_TABLE)
+    table = next(item for item in sections if item.kind == Kind.SYMBOL_TABLE)
     names = sections[table.link]
     found = struct.iter_unpack(SYMBOL, code[table.offset : table.offset + table.size])
     return [*found], code[names.offset : names.offset + names.size]
@@ -100,7 +124,7 @@ def _text(strings: bytes, place: int) -> str:
 
 def _relocate(image: bytearray, machine: int, kind: int, place: int, target: int) -> None:
     """Write a reference as the ABI's supplement for the processor has it."""
-    if machine == X86_64:
+    if machine == Machine.X86_64:
         if kind not in (2, 4):  # R_X86_64_PC32, R_X86_64_PLT32
             raise ValueError(f"relocation {kind} of x86-64")
         struct.pack_into("<i", image, place, target - place)

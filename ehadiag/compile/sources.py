@@ -26,7 +26,7 @@ MAX_LIBRARY_BYTES = 64 << 20
 """Size of a file in the folder, bytes, at most; the largest library has half a megabyte."""
 SOURCE_DIGESTS_FILE = "sources.json"
 """Digests of source files by the hash of their bytes: parsing all of them takes 0.3 s."""
-PREBUILT = Path(__file__).parents[1] / "_kernels"
+PREBUILT = Path(__file__).parent.parent / "_kernels"
 """Folder of the libraries that came with the package."""
 
 

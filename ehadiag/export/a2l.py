@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import __version__
-from ehadiag_sim.scales import scales_of
+from ehadiag_sim.simulation import scales_of
 from firmware_iface.bus_map import BusMap
 from firmware_iface.xcp import (
     IDENTITY,

@@ -50,7 +50,7 @@ def _member(name: str, content: bytes) -> bytes:
 
 ELF_32_LITTLE = b"\x7fELF\x01\x01"
 ARM_ATTRIBUTES_SECTION_TYPE = 0x70000003
-"""Type of the section."""
+"""Type of the section with attributes of Arm code (SHT_ARM_ATTRIBUTES)."""
 HALF_FLOAT_TAG = b"\x26\x01"
 """Tag_ABI_FP_16bit_format = IEEE: no such numbers are in the code, so that its place is free."""
 EITHER_CONVENTION_TAG = b"\x1c\x03"

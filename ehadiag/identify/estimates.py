@@ -17,8 +17,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_NOISE_EXCESS, WEAR_EXCESS_FACTOR, FitQuality
 from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
-from ehadiag.core.criteria import FIT, GIVE_UP
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.identification_result import (
     Estimate,

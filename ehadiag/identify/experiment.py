@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels, conversion_of
-from ehadiag.core.criteria import RECORDING
-from ehadiag.core.estimation_rules import ANCHORING, ESTIMATION
-from ehadiag.identify.acquired_current import acquired_current
+from ehadiag.core.criteria import ANCHORING, ESTIMATION, RECORDING
 from ehadiag.identify.signals import (
     QUIET_BLOCK_TICKS,
     CurrentTrace,
+    acquired_current,
     commanded_current,
     noise_of_signal,
     relative_noise,
@@ -29,7 +28,7 @@ from ehadiag.model.parameter import Parameter, scaled_to_channels
 from ehadiag.model.plant import PlantConstants, relative_viscosity
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, unit_constants
 from firmware_iface.recording import (
-    PRESSURE_CHANNEL,
+    CHANNELS,
     Acquisition,
     Channel,
     Channels,
@@ -42,7 +41,7 @@ from firmware_iface.stored_test import StoredTest, TimeWindow
 class RestRules(msgspec.Struct, frozen=True):
     """Rest of an actuator before its test."""
 
-    displaced_share: float = 0.3e6 / PRESSURE_CHANNEL.full_scale
+    displaced_share: float = 0.3e6 / CHANNELS.pressure.full_scale
     """Pressure at rest from which it is no offset of the sensor, over the converter's half range,
     1: 0.3 MPa of the default range."""
     settling_lsb: float = 5.0

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION
 from ehadiag.identify.linearisation import (
     CoordinateCross,
     Derivatives,

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.registry import ResidualModel
 

@@ -14,8 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import GIVE_UP
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, GIVE_UP
 from ehadiag.identify.experiment import (
     ANCHOR_THRESHOLDS_LSB,
     Experiment,

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.identify.linearisation import Derivatives, LinearModel, ParameterDensity
 
 MIN_GRADIENT_SHARE = 1e-9

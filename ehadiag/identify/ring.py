@@ -1,6 +1,6 @@
-"""Ring of the pressure on its oil: which stiffness of the oil explains its phase.
+"""Finds the oil's stiffness from the ring, the oscillation of the jack's mass on the chambers' oil.
 
-The chambers' oil and the jack's mass ring hardly damped, for dozens of periods. Half a percent of
+Hardly damped, the ring shows in the pressure for dozens of periods. Half a percent of
 frequency is a wrong phase, so the cost of the pressure has a valley for each period by which model
 and unit may differ, and a search that begins 2 % off ends in a wrong one. Here the stiffness is
 scanned where nothing but the ring moves; a search then begins in the right valley.
@@ -23,7 +23,7 @@ from ehadiag.model.residual_models import SimdModel
 
 
 class RingScan(msgspec.Struct, frozen=True):
-    """Scan of the oil's stiffness."""
+    """Range, step and criteria of the scan of the oil's stiffness."""
 
     least: float = -0.6
     """Least relative change of the stiffness, 1: beyond half of it, a total volume in the file."""

@@ -14,8 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.compile.jit import Array
-from ehadiag.core.criteria import FIT
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.identify.estimates import refinement_outlier_share
 from ehadiag.identify.experiment import Experiment, lay_out_spans, unknowns_of
 from ehadiag.identify.least_squares import Refinement, median_offsets

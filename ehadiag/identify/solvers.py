@@ -49,8 +49,6 @@ EvaluationProgress = Callable[[int, int], None]
 """Called with evaluations done and budget."""
 MIN_GENERATIONS = 3
 """Generations of the usual size below which a search makes smaller ones."""
-PYGAD_PARENTS, PYGAD_ELITE, PYGAD_MUTATION_PROBABILITY = 3, 1, 0.8
-"""Of pygad: parents of a generation, individuals kept, probability that a gene mutates."""
 
 
 class SearchResult(msgspec.Struct, frozen=True, eq=False):
@@ -193,7 +191,7 @@ class PygadGa(msgspec.Struct, frozen=True):
         def fitness(_: Any, solutions: Array, __: Any) -> Array:
             return -objective(np.clip(solutions, lower, upper))
 
-        generations = max(1, (self.budget - self.population) // (self.population - PYGAD_ELITE))
+        generations = max(1, (self.budget - self.population) // (self.population - 1))
 
         def after(ga: Any) -> None:
             share = ga.generations_completed / generations
@@ -207,17 +205,17 @@ class PygadGa(msgspec.Struct, frozen=True):
             warnings.simplefilter("ignore")
             ga = pygad.GA(
                 num_generations=generations,
-                num_parents_mating=PYGAD_PARENTS,
+                num_parents_mating=3,
                 initial_population=first,
                 fitness_func=fitness,
                 fitness_batch_size=self.population,
                 # No gene_space: with one, a mutated gene is drawn from all of it.
                 parent_selection_type="sss",
-                keep_elitism=PYGAD_ELITE,
+                keep_elitism=1,
                 crossover_type="uniform",
                 mutation_type="random",
                 mutation_by_replacement=False,
-                mutation_probability=PYGAD_MUTATION_PROBABILITY,
+                mutation_probability=0.8,
                 random_mutation_min_val=-widest,
                 random_mutation_max_val=widest,
                 random_seed=seed,

@@ -42,10 +42,10 @@ class Anchor(msgspec.Struct, frozen=True):
 NO_ANCHOR = Anchor(0.0, np.inf, np.inf)
 
 
-SPOOL_ROW, PRESSURE_ROW, POSITION_ROW = 0, 1, 2
 SIGNAL_ROWS = 3
 """Rows of weights and residuals: the signals that a candidate has to explain. Weights without the
 last row leave the jack's position out, and residuals are then without it too."""
+SPOOL_ROW, PRESSURE_ROW, POSITION_ROW = range(SIGNAL_ROWS)
 
 
 class Batch(NamedTuple):

@@ -24,7 +24,7 @@ ConstantChanges = Mapping[str, ConstantValue]
 
 
 class ParameterKind(Enum):
-    """What a parameter is to the diagnosis. The order is that in which they are applied."""
+    """Kind of a parameter; the effects of all parameters are applied in the order of the kinds."""
 
     DATUM = "datum"
     """By how much the unit differs from its actuator file, or a probe from the truth."""

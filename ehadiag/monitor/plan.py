@@ -15,7 +15,7 @@ import numpy as np
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels
-from ehadiag.core.estimation_rules import ANCHORING, ESTIMATION
+from ehadiag.core.criteria import ANCHORING, ESTIMATION
 from ehadiag.model.batch import Anchor
 from ehadiag.model.laws import control_law
 from ehadiag.model.plant import PlantConstants

@@ -38,6 +38,7 @@ from ehadiag.onboard.onboard_optimum import (
     add_evidence,
     direction_count,
     end_conclusion,
+    refuse_verdict,
     start_conclusion,
     start_directions,
     write_result,
@@ -78,9 +79,6 @@ from ehadiag.onboard.onboard_search import (
     start_generation,
     start_grid,
     start_noise,
-)
-from ehadiag.onboard.onboard_verdict import (
-    refuse_verdict,
 )
 
 

@@ -9,7 +9,7 @@ from ehadiag.compile.elementary import exponential, logarithm
 from ehadiag.compile.jit import brief_kernel, inlined_exact
 from ehadiag.compile.vector import array_at, packer, places, unpacker
 from ehadiag.core.actuator import MAX_CALIBRATED_PARAMETERS
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION
 from ehadiag.model.plant import WALTHER_POINTS
 from ehadiag.monitor.monitor_memory import (
     MONITOR_PLAN_SIZE,

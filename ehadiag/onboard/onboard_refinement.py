@@ -13,7 +13,7 @@ import numpy as np
 from ehadiag.compile.elementary import exponential, logarithm
 from ehadiag.compile.jit import Array, bare_kernel
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
-from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.identify.posterior import FEW_UNKNOWNS_SCHEDULE
 from ehadiag.onboard.onboard_memory import (
     MATRIX_SIZE,

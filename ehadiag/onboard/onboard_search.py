@@ -14,7 +14,7 @@ import numpy as np
 
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
-from ehadiag.core.estimation_rules import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, REFINEMENT
 from ehadiag.identify.compact_ga import CompactGaState, draw_generation, update_state
 from ehadiag.identify.staged_search import SEARCH_STAGES
 from ehadiag.model.sensors import read_pressure
@@ -48,7 +48,7 @@ PLAN_PRESSURE_WEIGHT = MONITOR_PLAN_SETTINGS + MonitorSettings._fields.index("pr
 ANCHOR_SMALL_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_small")
 ANCHOR_LARGE_PLACE = MONITOR.settings + MonitorSettings._fields.index("anchor_large")
 HALVINGS_PLACE = MONITOR.settings + MonitorSettings._fields.index("halvings")
-KINTAS, FSS, FDJ = 0, 1, 2
+KINTAS, FSS, FDJ = range(ONBOARD_GENES)
 """Places of the severities."""
 
 

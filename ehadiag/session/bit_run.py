@@ -266,7 +266,7 @@ def measured_by_xcp(
     bus: opened to send, it stays open; ids: identifiers of the computer's slave; protocol: by which
     the test is requested. ConfigurationError, InputOutputError: see `XcpTransport`.
     """
-    from ehadiag_sim.scales import scales_of  # noqa: PLC0415 - loads numpy
+    from ehadiag_sim.simulation import scales_of  # noqa: PLC0415 - loads numpy
     from firmware_iface.recording import CommandMode  # noqa: PLC0415
     from firmware_iface.xcp_master import XcpTransport  # noqa: PLC0415 - loads cantools
 

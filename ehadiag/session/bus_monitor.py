@@ -21,7 +21,7 @@ from ehadiag.monitor.plan import default_noise
 from ehadiag.monitor.score_bank import ScoreBank
 from ehadiag.monitor.streaming import FreeMotionMonitor, Monitor, undecided_spool
 from ehadiag.session.unit_state import UnitState
-from firmware_iface.alignment.stretches import StretchTicks
+from firmware_iface.alignment.grid import StretchTicks
 from firmware_iface.bus_map import BusMap, MessageMap
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.live_decode import (

@@ -14,8 +14,13 @@ import msgspec
 import numpy as np
 
 from firmware_iface.find_test import MatchedTest
-from firmware_iface.recording import BoolArray, FloatArray, IntArray, RecordedSignal
-from firmware_iface.sampling import sampling_interval
+from firmware_iface.recording import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RecordedSignal,
+    sampling_interval,
+)
 from firmware_iface.signals.resample import (
     HELD,
     SignalGroup,

@@ -35,8 +35,8 @@ from firmware_iface.recording import (
     RecordedSignal,
     Recording,
     Samples,
+    sampling_interval,
 )
-from firmware_iface.sampling import sampling_interval
 from firmware_iface.signals.clock import fit_clock
 from firmware_iface.signals.columns import NEEDED_COLUMN_ROLES, ColumnMap
 from firmware_iface.signals.held import bus_signals, held_by_test

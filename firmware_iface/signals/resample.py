@@ -18,8 +18,14 @@ from collections.abc import Mapping
 import msgspec
 import numpy as np
 
-from firmware_iface.recording import FloatArray, IntArray, RecordedSignal
-from firmware_iface.sampling import SAMPLING, sampling_interval, values_at
+from firmware_iface.recording import (
+    SAMPLING,
+    FloatArray,
+    IntArray,
+    RecordedSignal,
+    sampling_interval,
+    values_at,
+)
 
 
 class HeldLimits(msgspec.Struct, frozen=True):

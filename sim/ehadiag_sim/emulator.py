@@ -16,9 +16,8 @@ from ehadiag.core.actuator import Actuator
 from ehadiag_sim.broken_hardware import Hardware, break_hardware
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.control import Conditions, SimulatorControl
-from ehadiag_sim.scales import scales_of
 from ehadiag_sim.sensing import ChannelFault
-from ehadiag_sim.simulation import Plant
+from ehadiag_sim.simulation import Plant, scales_of
 from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import TickEncoder

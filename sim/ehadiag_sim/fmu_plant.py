@@ -200,8 +200,7 @@ FIXED_VALUES: Final = frozenset(
 """Parameters that cannot be set in a run: errors of the data, sizes of the memory."""
 RANGED_VALUES: Final = len(_RANGED)
 """Number of values, the first ones, that have the range of a condition of the simulator, 1."""
-LOWEST_VALUES: Final = tuple(float(_RANGES[name][0]) for name in _RANGED)
-HIGHEST_VALUES: Final = tuple(float(_RANGES[name][1]) for name in _RANGED)
+LOWEST_VALUES, HIGHEST_VALUES = zip(*(map(float, _RANGES[key]) for key in _RANGED), strict=True)
 
 
 @bare_kernel

@@ -12,11 +12,11 @@ from ehadiag.model.registry import FAULTS, Unknowns, parameter
 from ehadiag.model.residual_models import ScalarModel, SimdModel
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.plant_dynamics import PlantDynamics
-from firmware_iface.recording import POSITION_CHANNEL, PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import resolve_test
 
 TICK = 1e-3
-LSB = np.array([SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb, POSITION_CHANNEL.lsb])
+LSB = np.array([CHANNELS.spool.lsb, CHANNELS.pressure.lsb, CHANNELS.position.lsb])
 MODELS = {"alone": ScalarModel, "block": SimdModel}
 CURRENT = resolve_test("open").command()[1900:3000]
 """A, one a tick: from creeping through both stops of the valve to rest."""

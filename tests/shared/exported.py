@@ -1,12 +1,18 @@
 """An exported object file loaded into this process, without a linker."""
 
 import ctypes
+import pickle
+import subprocess
+import sys
+from contextlib import suppress
 from functools import cache
+from unittest.mock import patch
 
 import llvmlite.binding as llvm
 import msgspec
 
 from ehadiag import default_actuator
+from ehadiag.compile import libraries
 from ehadiag.export.library import export_library
 from ehadiag.export.targets import find_target
 from firmware_iface.files import RESULT_MODE, Folder
@@ -23,12 +29,58 @@ def exported(name, place, ticks=0):
 
 @cache
 def _exported(name, place, ticks):
-    out = place / f"{name}-{ticks}"
+    return _export(name, place / f"{name}-{ticks}", ticks)
+
+
+def _export(name, out, ticks=0):
     out.mkdir()
     tests = [short_test(ticks)] if ticks else None
     with Folder.at(out, RESULT_MODE) as folder:
         export_library(default_actuator(), find_target(name), folder, tests=tests)
     return out
+
+
+TOGETHER = """
+import pickle, sys
+sys.path[:] = pickle.load(sys.stdin.buffer)
+from ehadiag.compile import worker
+worker.process_lanes = 1
+import ehadiag.compile.frontend
+from ehadiag.compile.object_code import emitted
+codes = [emitted(item) for item in pickle.load(sys.stdin.buffer)]
+sys.stdout.buffer.write(pickle.dumps(codes))
+"""
+"""As the process of `ehadiag.compile.worker`, for several object files."""
+
+
+class _WantedError(Exception):
+    """Instead of compiling an export."""
+
+
+def compile_together(names, place):
+    """Compile exports for targets of one order of bytes in one process, into the kernel cache.
+
+    numba translates the kernels once, which for one target is two thirds of the time.
+    """
+
+    wanted = {}
+
+    def refuse(item):
+        wanted[name] = item
+        raise _WantedError
+
+    for name in names:
+        with patch.object(libraries, "object_code", refuse), suppress(_WantedError):
+            _export(name, place / f"wanted-{name}")
+    done = subprocess.run(
+        [sys.executable, "-c", TOGETHER],
+        input=pickle.dumps(sys.path) + pickle.dumps(list(wanted.values())),
+        capture_output=True,
+        check=True,
+    )
+    for name, code in zip(wanted, pickle.loads(done.stdout), strict=True):
+        with patch.object(libraries, "object_code", lambda _, code=code: code):
+            _export(name, place / f"together-{name}")
 
 
 def short_test(ticks):

@@ -9,9 +9,9 @@ from ehadiag import CommandMode, Samples, default_actuator
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.simulator.units import damaged_unit
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import CHANNELS, PRESSURE_CHANNEL, SPOOL_CHANNEL, Environment
+from firmware_iface.recording import CHANNELS, Environment
 from firmware_iface.stored_test import resolve_test
 
 PAPER_FAULTS = ((0.3, 0.3, 0.3), (0.3, 0.6, 0.3), (0.6, 0.6, 0.3), (0.6, 0.6, 0.6))
@@ -62,6 +62,6 @@ def named(faults):
 
 
 NOISE = (
-    SPOOL_CHANNEL.lsb * np.sqrt(0.5**2 + 1 / 12),
-    PRESSURE_CHANNEL.lsb * np.sqrt(0.5**2 + 1 / 12),
+    CHANNELS.spool.lsb * np.sqrt(0.5**2 + 1 / 12),
+    CHANNELS.pressure.lsb * np.sqrt(0.5**2 + 1 / 12),
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,13 @@ from ehadiag.identify.experiment import build_experiment
 from ehadiag_sim.conditions import Faults
 from ehadiag_tools.accuracy import pictures, units, verdicts
 from ehadiag_tools.accuracy.cases import PAPER, Case, experiments_of, perform, random_faults
-from ehadiag_tools.accuracy.figures import cramer_rao, holds_truth, percent_errors, severity_rows
+from ehadiag_tools.accuracy.figures import (
+    accuracy_table,
+    cramer_rao,
+    holds_truth,
+    is_wrong,
+    percent_errors,
+)
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, record
 from ehadiag_tools.study import Options
 from firmware_iface.stored_test import resolve_test
@@ -56,9 +61,13 @@ def test_figures_of_two_records() -> None:
     ]
     assert holds_truth(records).tolist() == [[True] * 3, [False, True, True]]
     np.testing.assert_allclose(percent_errors(records), [[0.1, 0.0, -0.1], [0.3, 0.0, 0.0]])
-    kintas, _, jack = severity_rows([{"test": "open", **item} for item in records])
-    assert kintas[2:] == (2, "+0.2000", "0.2000", "0.2236", "0.3000", "50.0", "22.36")
-    assert jack[2:] == (2, "-0.0500", "0.0500", "0.0707", "0.1000", "100.0", "10.00")
+    lines = list(accuracy_table([{"test": "open", **item} for item in records], "test"))
+    cells = [line.strip("| ").split(" | ") for line in lines[2:]]
+    assert [row[1] for row in cells] == ["Kintas", "FSS", "FDJ", "all"]
+    assert cells[0][5:9] == ["+0.2000", "0.2000", "0.2900", "0.3000"]
+    assert cells[0][9:] == ["1 of 2", "50.0 %", "0.392", "22.36"]
+    assert cells[2][5:7] == ["-0.0500", "0.0500"]
+    assert cells[2][9:] == ["2 of 2", "100.0 %", "0.392", "10.00"]
 
 
 def test_bound_of_more_data_is_smaller() -> None:
@@ -112,13 +121,15 @@ def test_a_unit_is_the_same_each_time_and_a_group_changes_no_other_effect() -> N
     assert sensed[0].sensors.filter_time > 0.0
 
 
-def test_a_refused_calibration_counts_as_not_tested() -> None:
+def test_what_is_not_tested_states_no_interval() -> None:
     records = [
-        of([0.1, 0.2, 0.3], [0.1, 0.2, 0.4], 0.2, not_tested=bad, evaluations=10, processor_s=0.1)
-        for bad in (True, False)
+        of([0.1, 0.2, 0.3], [0.1, 0.2, 0.4], 0.2, verdict=verdict)
+        for verdict in ("NOT_TESTED", "answered")
     ]
-    row = units.unit_row(records)
-    assert row == ["2", "3.3333", "3.3333", "10.000", "100.0", "20.000", "50.0", "10", "100"]
+    (*_, row) = accuracy_table(records, of_all=True)
+    cells = row.strip("| ").split(" | ")
+    assert cells[:3] == ["all", "2", "1"]
+    assert cells[5:] == ["3.3333", "3.3333", "10.0000", "3 of 3", "100.0 %", "20.000", "–"]
 
 
 def test_severities_are_below_one_level_or_one_of_them_is_above_the_other() -> None:
@@ -148,7 +159,8 @@ def test_rates_count_recordings_and_units_with_any() -> None:
     assert "| 2 | sound, not HEALTHY | 2 | 1 | 50.00% | 1: 1.26% … 98.74% |" in lines
     assert "| 2 | worn, HEALTHY | 2 | 0 | 0.00% | 0: 0.00% … 84.19% |" in lines
     # What is NOT TESTED states nothing: one recording in open loop, one severity of it 3 % off.
-    assert "| open | 1 | 1.0000 | 1.0000 | 3.000 | 66.7 | 4.000 |" in lines
+    row = next(line for line in lines if line.startswith("| open | all | 2 | 1 |"))
+    assert "| 1.0000 | 1.0000 | 3.0000 | 2 of 3 | 66.7 % | 4.000 |" in row
 
 
 @pytest.mark.parametrize(
@@ -171,10 +183,8 @@ def test_rates_count_recordings_and_units_with_any() -> None:
 def test_a_class_is_wrong_if_the_interval_excludes_the_truth(
     verdict: Verdict, interval: tuple[float, float], truth: float, wrong: bool
 ) -> None:
-    estimates = [SimpleNamespace(interval95=interval)]
-    identification = SimpleNamespace(estimates=estimates)
-    found: Any = SimpleNamespace(verdict=verdict, identification=identification)
-    assert verdicts.is_wrong_class(found, [truth, 0.0, 0.0]) is wrong
+    found = {"faults": [truth, 0.0, 0.0], "value": [0.5], "interval95": [interval]}
+    assert is_wrong({**found, "verdict": verdict.name}) is wrong
 
 
 @pytest.mark.parametrize("name", ["Kintas", "FSS", "FDJ"])

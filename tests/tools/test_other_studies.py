@@ -12,7 +12,7 @@ import ehadiag
 from ehadiag.core.actuator import default_actuator
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults
-from ehadiag_tools.bench import tiled
+from ehadiag_tools.bench import prepare, tiled
 from ehadiag_tools.free_motion.motion import (
     KINDS,
     Motion,
@@ -25,7 +25,6 @@ from ehadiag_tools.free_motion.motion import (
 )
 from ehadiag_tools.prognosis.laws import LAWS
 from ehadiag_tools.prognosis.units import LIMIT, TABLE, read_noise, simulate_unit
-from ehadiag_tools.rigs.many import prepare
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import CommandMode
 

@@ -1,4 +1,4 @@
-"""Study of speed: kernels, estimate, live verdict, push, decoder, processes, as one table.
+"""Study of speed: kernels, estimate, live verdict, push, decoder, processes, folders, histories.
 
 Times are medians of CPU time of the thread or process, so that a machine shared with others still
 compares; wall time where it says so. Only ratios of one run count.
@@ -11,25 +11,34 @@ import itertools
 import json
 import os
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
+from io import StringIO
 from pathlib import Path
 
 import can
 import numpy as np
+import psutil
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+import ehadiag
+from ehadiag.cli.main import main
 from ehadiag.compile.vector import LANES
 from ehadiag.core.actuator import default_actuator
+from ehadiag.estimate import Severity
+from ehadiag.history.records import Entry, Usage, history_entry
+from ehadiag.history.store import History
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, unknowns_of
 from ehadiag.identify.identification_session import identify
 from ehadiag.identify.solvers import SEARCH_CAP
@@ -62,12 +71,16 @@ Figure = tuple[str, float | None, str, str]
 
 @dataclass(frozen=True, slots=True)
 class BenchCase:
-    """A section, runs of a median, seconds of pushes in time with a bus, frames to decode."""
+    """A section, runs of a median, seconds of pushes in time with a bus, sizes of what is read."""
 
     section: str
     repeats: int
     seconds: float
     frames: int
+    recordings: int
+    diagnoses: int
+    folder: str
+    seed: int
 
 
 def perform(case: BenchCase) -> Record:
@@ -360,6 +373,165 @@ def _measured(arguments: Sequence[str], cache: str) -> tuple[float, float, float
     return float(wall), float(cpu), float(peak) / per_mb
 
 
+SIMULATED = 40
+"""Number of different recordings in the folder that is diagnosed."""
+POLL_S = 0.1
+"""Time between two looks at the processes, s."""
+
+
+def _batch(case: BenchCase) -> Iterator[Figure]:
+    """A folder of recordings, by one process and by two."""
+    logs = prepare(Path(case.folder), case.recordings, case.seed)
+    walls, count = [], len(logs)
+    for jobs in (1, 2):
+        wall, processor, memory, results = _diagnosed_folder(logs[0].parent, jobs)
+        walls.append(wall)
+        if [item["source"] for item in results] != [str(log) for log in logs]:
+            raise InputOutputError("a result is missing, comes twice or out of order")
+        verdicts = Counter(str(item["verdict"]) for item in results)
+        name = f"{count} recordings, {jobs} {'job' if jobs == 1 else 'jobs'}"
+        yield f"{name}, wall", wall, "s", ", ".join(f"{n} {v}" for v, n in sorted(verdicts.items()))
+        yield f"{name}, rate", count / wall, "recordings/s", ""
+        yield f"{name}, CPU of all processes", processor, "s", ""
+        yield f"{name}, peak memory of all processes", memory, "MB", ""
+    yield "two jobs faster than one", walls[0] / walls[1], "times", ""
+
+
+def prepare(folder: Path, count: int, seed: int, simulated: int = SIMULATED) -> list[Path]:
+    """Simulate recordings and copy them, as far as they are not there yet; their paths."""
+    pool, copies = folder / "simulated", folder / f"of-{count}"
+    pool.mkdir(parents=True, exist_ok=True)
+    copies.mkdir(exist_ok=True)
+    for number in range(min(simulated, count)):
+        log = pool / f"{number:03}.blf"
+        if not log.exists():
+            _simulate(log, number, seed)
+    for number in range(count):
+        copy = copies / f"{number:05}.blf"
+        if not copy.exists():
+            shutil.copy(pool / f"{number % simulated:03}.blf", copy)
+    return sorted(copies.iterdir())
+
+
+def _simulate(log: Path, number: int, seed: int) -> None:
+    severities = np.random.default_rng([seed, number]).uniform(0.0, 0.9, 3).round(3)
+    words = ["bit", "--test", ("open", "closed")[number % 2], "--simulate", "--fast", "--plain"]
+    for name, value in zip(("Kintas", "FSS", "FDJ"), severities.tolist(), strict=True):
+        words += [f"--{name}", str(value)]
+    partly = log.with_name(f"partly-{log.name}")
+    words += ["--simulator-seed", str(seed + number), "--record", str(partly)]
+    words += ["--out", str(log.parent / "bit"), "--no-history", "--no-picture"]
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        main(words)
+    partly.rename(log)
+
+
+def _diagnosed_folder(folder: Path, jobs: int) -> tuple[float, float, float, list[Record]]:
+    """Wall and CPU time (s), memory (MB) of all processes together, results."""
+    # Files and not pipes: a pipe that nobody reads would hold the call up.
+    out, errors = (folder.with_name(f"{folder.name}.{end}") for end in ("jsonl", "log"))
+    words = ("diagnose", "--json", "--no-history", "--no-picture", str(folder), "--jobs", str(jobs))
+    begin = time.perf_counter()
+    with out.open("wb") as stdout, errors.open("wb") as stderr:
+        process = subprocess.Popen([*COMMAND, *words], stdout=stdout, stderr=stderr)
+        spent: dict[int, float] = {}
+        memory = 0.0
+        while process.poll() is None:
+            memory = max(memory, _usage(process.pid, spent))
+            time.sleep(POLL_S)
+    wall = time.perf_counter() - begin
+    if not out.stat().st_size:
+        raise InputOutputError(errors.read_text(encoding="utf-8", errors="replace"))
+    results = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
+    return wall, sum(spent.values()), memory, results
+
+
+def _usage(pid: int, spent: dict[int, float]) -> float:
+    """Memory, MB, of a process and those that it has started; `spent`: their processor time, s."""
+    together = 0
+    with suppress(psutil.Error):
+        root = psutil.Process(pid)
+        for item in (root, *root.children(recursive=True)):
+            with suppress(psutil.Error):
+                times = item.cpu_times()
+                spent[item.pid] = times.user + times.system
+                together += item.memory_info().rss
+    return together / 2**20
+
+
+DIAGNOSES = 50
+"""Number of diagnoses of a unit in the history: one every 100 h."""
+UNITS = 100
+"""Number of units that are appended together."""
+UNIT = ("--unit", "7")
+QUESTIONS = {
+    "one row": ("show", "301"),
+    "list of one unit": ("list", *UNIT),
+    "picture of one unit": ("plot", *UNIT),
+    "export of one unit": ("export", *UNIT),
+}
+"""Words behind `ehadiag history` by question."""
+
+
+def _history(case: BenchCase) -> Iterator[Figure]:
+    """Questions to a health history of many diagnoses, each a process from start to end."""
+    path = Path(case.folder) / f"{case.diagnoses}.sqlite"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _fill(path, case.diagnoses, case.seed)
+    yield f"history of {case.diagnoses} diagnoses", path.stat().st_size / 1e6, "MB", ""
+    commands = {name: ("history", *words) for name, words in QUESTIONS.items()}
+    commands["picture of one unit"] += ("--out", str(path.with_suffix(".png")))
+    for name, words in (commands | {"remaining life of one unit": ("rul", *UNIT)}).items():
+        with tempfile.TemporaryDirectory() as cache:
+            command = (*words, "--history", str(path))
+            _measured(command, cache)  # fills the caches of the system
+            runs = [_measured(command, cache) for _ in range(3)]
+        wall, processor, peak = np.median(runs, axis=0).tolist()
+        yield f"{name}, wall", wall, "s", ""
+        yield f"{name}, CPU", processor, "s", ""
+        yield f"{name}, peak memory", peak, "MB", ""
+
+
+def _fill(path: Path, count: int, seed: int) -> None:
+    """Append diagnoses of units that wear steadily, each at its own rate."""
+    result = ehadiag.diagnose(ehadiag.simulate("open", FSS=0.3))
+    like = history_entry(result, Usage(), simulated=False)
+    rng = np.random.default_rng(seed)
+    part = path.with_suffix(".part")
+    part.unlink(missing_ok=True)
+    with History(part, create=True) as history:
+        for first in range(0, count, UNITS * DIAGNOSES):
+            number = min(UNITS * DIAGNOSES, count - first)
+            history.append_all(list(_block(like, first // DIAGNOSES, number, rng)))
+    part.rename(path)
+
+
+def _block(like: Entry, unit: int, number: int, rng: np.random.Generator) -> Iterator[Entry]:
+    tree = json.loads(like.result)
+    rates = rng.uniform(0.3, 1.0, (UNITS, len(like.severities))) / DIAGNOSES
+    for visit in range(DIAGNOSES):
+        for place in range(number // DIAGNOSES):
+            noise = rng.normal(0.0, 2e-4, len(like.severities))
+            values = np.clip(rates[place] * (visit + 1) + noise, 0.0, 1.0).tolist()
+            serial, hours = unit + place + 1, 100.0 * (visit + 1)
+            yield replace(
+                like,
+                serial=serial,
+                usage=Usage(hours),
+                tested=f"{2000 + visit // 12}-{visit % 12 + 1:02}-01T12:00:00.000Z",
+                sources=tuple(
+                    replace(item, samples=f"{serial}-{visit}", sha256=None) for item in like.sources
+                ),
+                severities=tuple(
+                    Severity(name=item.name, estimate=value, std=2e-4,
+                             interval95=(max(value - 4e-4, 0.0), min(value + 4e-4, 1.0)))
+                    for item, value in zip(like.severities, values, strict=True)
+                ),
+                result=json.dumps(tree | {"serial": serial}),
+            )  # fmt: skip
+
+
 def _machine() -> str:
     """Processor, its cores that this process may use, and how busy they are."""
     model, cpuinfo = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
@@ -378,22 +550,31 @@ SECTIONS: dict[str, Callable[[BenchCase], Iterator[Figure]]] = {
     "push": _push,
     "decode": _decode,
     "process": _process,
+    "batch": _batch,
+    "history": _history,
 }
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--only", action="append", choices=list(SECTIONS), help="may be repeated (all)")
+    add("--only", action="append", choices=list(SECTIONS),
+        help="may be repeated (all but batch and history)")  # fmt: skip
     add("--repeats", type=int, default=15, help="runs of a median (%(default)d)")
     add("--seconds", type=float, default=20.0, help="of pushes at 1 kHz (%(default)g)")
     add("--frames", type=int, default=1_000_000, help="to decode (%(default)d)")
+    add("--recordings", type=int, default=400, help="in the folder of batch (%(default)d)")
+    add("--diagnoses", type=int, default=100_000, help="in the history, 5 kB each (%(default)d)")
+    add("--folder", type=Path, default=Path("out", "bench"), help="of both (%(default)s)")
 
 
 def _cases(options: Options) -> list[BenchCase]:
     return [
-        BenchCase(name, max(1, options.repeats), options.seconds, max(1, options.frames))
-        for name in options.only or SECTIONS
-    ]
+        BenchCase(
+            name, max(1, options.repeats), options.seconds, max(1, options.frames),
+            options.recordings, options.diagnoses, str(options.folder), options.seed,
+        )
+        for name in options.only or list(SECTIONS)[:-2]
+    ]  # fmt: skip
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
@@ -410,6 +591,6 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
 
 BENCH = Study(
     "bench",
-    "Speed of kernels, estimate, live verdict, push, decoder and processes.",
+    "Speed of kernels, estimate, live verdict, push, decoder, processes, folders, histories.",
     _cases, perform, _report, _options, count=None, measures_time=True,
 )  # fmt: skip

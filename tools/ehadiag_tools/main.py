@@ -14,11 +14,9 @@ from ehadiag_tools.accuracy.valves import VALVES
 from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE
 from ehadiag_tools.bench import BENCH
 from ehadiag_tools.free_motion.motion import FREE_MOTION
-from ehadiag_tools.history_times import LARGE_HISTORY
 from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
 from ehadiag_tools.prognosis.units import PROGNOSIS
 from ehadiag_tools.rigs.daq import DAQ_RECORDINGS
-from ehadiag_tools.rigs.many import MANY_RECORDINGS
 from ehadiag_tools.rigs.replay import FOREIGN_BUSES
 from ehadiag_tools.simulator.compare_logs import RECORDINGS
 from ehadiag_tools.soak import SOAK
@@ -26,7 +24,7 @@ from ehadiag_tools.study import Study, run_study
 
 STUDIES: tuple[Study[Any], ...] = (
     PAPER_CASES, CUBE, UNITS, RECORDED_UNITS, VALVES, ALARMS, HARDWARE, RECORDINGS,
-    FREE_MOTION, FOREIGN_BUSES, DAQ_RECORDINGS, MANY_RECORDINGS, PROGNOSIS, LARGE_HISTORY, ONBOARD,
+    FREE_MOTION, FOREIGN_BUSES, DAQ_RECORDINGS, PROGNOSIS, ONBOARD,
     ONBOARD_UNITS, SOAK, BENCH, PICTURES,
 )  # fmt: skip
 

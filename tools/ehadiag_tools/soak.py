@@ -51,6 +51,7 @@ OWN_LOAD = 2e9 / PERIOD_NS * FRAME_S
 """Load of the bus by telemetry and command, 1."""
 AGE_STEP_US, AGE_BINS = 10, 1_000_000
 """Step of the histogram of ages, µs, and its length; older ones than ten seconds count as such."""
+SETTINGS = ("interface", "channel", "seconds", "load", "diagnose")
 SILENCE_S, START_S = 1.0, 120.0
 """Silence after which the bus is empty, s, and longest time until the first frame."""
 FAULTS = (0.3, 0.3, 0.3)
@@ -311,31 +312,17 @@ def _cases(options: Options) -> list[SoakCase]:
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    def numbers(*values: float, places: int = 1) -> str:
-        return ", ".join(f"{value:.{places}f}" for value in values)
-
+    """Figures of each bus; percentiles are p50, p99, p99.9 and the largest."""
     for item in records:
-        ages = (1e3 * item[f"age_{name}"] for name in ("p50", "p99", "max"))
-        counts = ", ".join(str(item[name]) for name in ("sent", "received", "recorded"))
-        dropped = "unknown" if item["dropped_by_kernel"] is None else item["dropped_by_kernel"]
-        rows = {
-            "bus": item["interface"],
-            "length, load": f"{item['seconds']:.0f} s, {item['bus_load']:.0%} of 1 Mbit/s",
-            "frames sent, received, recorded": counts,
-            "lost: ours, foreign": f"{item['own_lost']}, {item['foreign_lost']}",
-            "dropped by the socket, by the queue": f"{dropped}, {item['dropped_by_queue']}",
-            "memory when warm, at the end, MiB": numbers(
-                item["rss_warm"] / 2**20, item["rss_end"] / 2**20
-            ),
-            "age at the reader: p50, p99, largest, ms": numbers(*ages, places=2),
-            "pushes, ticks lost, alarms": f"{item['pushes']}, {item['ticks_lost']},"
-            f" {item['alarms']}",
-            "diagnoses meanwhile": item["diagnoses"],
-            "push: p50, p99, p99.9, largest, µs": numbers(*item["push_us"]),
-            "all work on a tick: the same, µs": numbers(*item["work_us"]),
-            "residuals of spool and pressure, rms over noise": numbers(*item["residual"], places=2),
-        }
-        yield from markdown(("figure", "value"), rows.items())
+        yield f"{item['interface']}, {item['seconds']:.0f} s at {item['load']:.0%} of 1 Mbit/s\n"
+        figures = {name: value for name, value in item.items() if name not in SETTINGS}
+        yield from markdown(("figure", "value"), ((k, _text(v)) for k, v in figures.items()))
+
+
+def _text(value: object) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_text, value))
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _any_lost(records: Sequence[Record]) -> bool:

@@ -24,9 +24,8 @@ from places import LOGS
 
 from ehadiag.assess import acceptance, lost_samples
 from ehadiag.cli.main import parser_and_commands
-from ehadiag_tools.rigs.buses import CURRENT, POSITION, PRESSURE, SPOOL, ForeignBus, Message, Signal
 from ehadiag_tools.rigs.replay import as_sent
-from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, logged, played
+from ehadiag_tools.rigs.rerecord import Disturbance, ForeignBus, frames_on, logged, played
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.stored_test import resolve_test
 from firmware_iface.transport.frames import FrameTable
@@ -154,36 +153,38 @@ def assert_worn(result: Result, truth: tuple[float, ...] = WORN) -> None:
     assert found == pytest.approx(truth, abs=2e-3)
 
 
+RIG = f"""VERSION "1.0"
+BU_: FCC RIG
+BO_ 769 Servo: 4 FCC
+ SG_ channels_current : 0|16@1- ({24 / 4096},0) [0|0] "mA" RIG
+ SG_ channels_spool : 16|16@1- ({1 / 4096},0) [0|0] "mm" RIG
+BO_ 770 Hydraulics: 2 FCC
+ SG_ channels_pressure : 0|16@1- ({50 / 4096},0) [0|0] "MPa" RIG
+BO_ 771 Jack: 2 FCC
+ SG_ channels_position : 0|16@1- (-{120 / 4096},0) [0|0] "mm" RIG
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 10000;
+BA_DEF_ BO_ "GenMsgStartDelayTime" FLOAT 0 1000;
+BA_DEF_DEF_ "GenMsgCycleTime" 1;
+BA_DEF_DEF_ "GenMsgStartDelayTime" 0.5;
+BA_ "GenMsgStartDelayTime" BO_ 770 0.6;
+BA_ "GenMsgStartDelayTime" BO_ 771 0.7;
+"""
+
+
 def test_own_bus(run: Run, tmp_path: Path) -> None:
     """The page's signals; the stroke's has the other sign, as its mapping says."""
     text = page("own-bus")
-    servo = (
-        Signal("channels.current", 0, 16, CURRENT, "mA"),
-        Signal("channels.spool", 16, 16, SPOOL, "mm"),
-    )
-    bus = ForeignBus(
-        "rig",
-        "the page's",
-        {
-            "Servo": Message(0x301, 4, servo),
-            "Hydraulics": Message(
-                0x302, 2, (Signal("channels.pressure", 0, 16, PRESSURE, "MPa"),), at=0.6
-            ),
-            "Jack": Message(
-                0x303, 2, (Signal("channels.position", 0, 16, -POSITION, "mm"),), at=0.7
-            ),
-        },
-    )
+    bus = ForeignBus("rig", RIG)
     recording = read_recording(LOGS / "paper-closed-3.blf")
     assert recording.samples is not None
     this = played(recording.samples, as_sent(resolve_test("closed")), 0.2)
     table, _ = frames_on(bus, recording, this, Disturbance(), 1)
-    dbc = bus.dbc().replace("(-", "(")
+    dbc = RIG.replace("(-", "(")
     for role, name in (
-        ("ChannelsCurrent", "CoilCurrent"),
-        ("ChannelsSpool", "Lvdt"),
-        ("ChannelsPressure", "LoadPressure"),
-        ("ChannelsPosition", "Stroke"),
+        ("channels_current", "CoilCurrent"),
+        ("channels_spool", "Lvdt"),
+        ("channels_pressure", "LoadPressure"),
+        ("channels_position", "Stroke"),
     ):
         dbc = dbc.replace(role, name)
     (tmp_path / "rig.dbc").write_text(dbc)

@@ -21,8 +21,7 @@ from places import LOGS
 from ehadiag import Actuator, Calibrated, Recording, StoredTest, default_actuator
 from ehadiag.cli.main import main
 from ehadiag.core.actuator import Calibration, FitQuality
-from ehadiag.design.propose import Proposal
-from ehadiag.design.score import Score
+from ehadiag.design.score import Proposal, Score
 from ehadiag.identify.experiment import build_experiment
 
 HEALTHY = LOGS / "healthy-open.blf"
@@ -101,7 +100,7 @@ def nothing_slow(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("ehadiag.calibration.calibrate_unit.calibrate", calibrate)
     monkeypatch.setattr("ehadiag.design.score.score", lambda *_: score)
-    monkeypatch.setattr("ehadiag.design.propose.propose", propose)
+    monkeypatch.setattr("ehadiag.design.score.propose", propose)
     monkeypatch.setattr("ehadiag.export.library.object_file", lambda *_, **__: b"code")
 
 

@@ -46,16 +46,16 @@ from ehadiag.identify.prior import FAULT_OF_DATUM, datum_name, unit_prior
 from ehadiag.model.parameter import DATA_ERROR_PARAMETERS
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS
-from firmware_iface.recording import CHANNELS, SPOOL_CHANNEL, StatedConverter
+from firmware_iface.recording import CHANNELS, StatedConverter
 
 TICKS = 4000
 WAVE = np.sin(np.linspace(0.0, 30.0, TICKS)) + 0.003 * np.random.default_rng(2).normal(size=TICKS)
 
 
-def samples(step: float = SPOOL_CHANNEL.lsb, **others: object) -> Samples:
+def samples(step: float = CHANNELS.spool.lsb, **others: object) -> Samples:
     """All channels on half their ranges, the spool in steps of its own."""
     values = {c.name: c.decode(c.encode(0.5 * c.full_scale * WAVE)) for c in CHANNELS}
-    values["spool"] = step * np.rint(0.5 * SPOOL_CHANNEL.full_scale * WAVE / step)
+    values["spool"] = step * np.rint(0.5 * CHANNELS.spool.full_scale * WAVE / step)
     made = Samples(
         period_ns=1_000_000,
         mode=CommandMode.CURRENT,
@@ -80,15 +80,15 @@ def test_default_bus_has_the_default_converters_to_the_last_bit():
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 1.0 / 16.0, 2.0, 3.7])
 def test_step_of_the_data_counts_where_nothing_is_stated(share):
-    seen = conversion_of(samples(share * SPOOL_CHANNEL.lsb), default_actuator()).channels.spool
-    assert seen.lsb == pytest.approx(share * SPOOL_CHANNEL.lsb, rel=1e-6)
-    assert seen.full_scale == SPOOL_CHANNEL.full_scale
+    seen = conversion_of(samples(share * CHANNELS.spool.lsb), default_actuator()).channels.spool
+    assert seen.lsb == pytest.approx(share * CHANNELS.spool.lsb, rel=1e-6)
+    assert seen.full_scale == CHANNELS.spool.full_scale
 
 
 def test_a_converter_that_lost_its_low_bits_is_not_taken_for_a_coarse_one():
     assert (
-        conversion_of(samples(64 * SPOOL_CHANNEL.lsb), default_actuator()).channels.spool
-        == SPOOL_CHANNEL
+        conversion_of(samples(64 * CHANNELS.spool.lsb), default_actuator()).channels.spool
+        == CHANNELS.spool
     )
 
 

@@ -6,11 +6,18 @@ import pytest
 
 from ehadiag import default_actuator, load_test
 from ehadiag.core.actuator import with_tolerance
-from ehadiag.design.propose import PENALTY_BEYOND_LIMITS, MotionLimits, propose, variant_space
-from ehadiag.design.score import play_stored_test, score, typical_effects
+from ehadiag.design.score import (
+    PENALTY_BEYOND_LIMITS,
+    MotionLimits,
+    play_stored_test,
+    propose,
+    score,
+    typical_effects,
+    variant_space,
+)
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import simulate
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import encode_test, resolve_test
 
 DEGRADED = (0.3, 0.3, 0.3)
@@ -22,8 +29,8 @@ def test_an_open_loop_test_is_played_as_the_detailed_simulator_does():
     played = play_stored_test(test, ACTUATOR, DEGRADED, {}).experiment
     sensors = Sensors(noise_lsb=0.0)
     samples = simulate(ACTUATOR, test, Faults(*DEGRADED), Effects(), sensors, seed=0).samples
-    assert np.std(samples.spool - played.spool) < 0.5 * SPOOL_CHANNEL.lsb
-    assert np.std(samples.pressure - played.pressure) < 0.5 * PRESSURE_CHANNEL.lsb
+    assert np.std(samples.spool - played.spool) < 0.5 * CHANNELS.spool.lsb
+    assert np.std(samples.pressure - played.pressure) < 0.5 * CHANNELS.pressure.lsb
 
 
 def test_a_closed_loop_test_follows_its_command():

@@ -10,13 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported import Loaded, exported, object_of
+from exported import Loaded, compile_together, exported, object_of
 from places import LOGS, ROOT
 
 from ehadiag import ConfigurationError, Monitor, default_actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
-from ehadiag.export.library import FIRMWARE_C_FILES, export_library
-from ehadiag.export.plan import exported_unit, library_plan
+from ehadiag.export.library import FIRMWARE_C_FILES, export_library, exported_unit, library_plan
 from ehadiag.export.targets import TARGETS, find_target
 from ehadiag.model.simd_layout import ROWS
 from ehadiag.monitor.monitor_memory import MODEL, MONITOR, MONITOR_SIZE
@@ -37,6 +36,20 @@ MOST_INSTRUCTIONS_OF_A_SLICE = 2_000_000
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     return tmp_path_factory.mktemp("exports")
+
+
+@pytest.fixture(scope="module")
+def together(place):
+    names = [item.target for item in EMULATED if not missing(item)]
+    compile_together([name for name in names if "powerpc" not in name], place)
+
+
+def of_targets(test):
+    """Mark a slow test of other targets: one process runs all of them, and compiles once."""
+    marks = (pytest.mark.slow, pytest.mark.xdist_group("exports"))
+    for mark in (*marks, pytest.mark.usefixtures("together")):
+        test = mark(test)
+    return test
 
 
 @pytest.fixture(scope="module")
@@ -235,21 +248,17 @@ FEWEST_KINDS = 250
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
-@pytest.mark.parametrize(
-    "host",
-    [EMULATED[0], pytest.param(EMULATED[1], marks=pytest.mark.slow)],
-    ids=lambda item: item.target,
-)
 @pytest.mark.parametrize("sane", [False, True])
-def test_bad_input_on_this_computer_and_without_floating_point_exceptions(
-    sane, host, place, tmp_path
-):
+def test_bad_input_on_this_computer_and_without_floating_point_exceptions(sane, place, tmp_path):
+    host = EMULATED[0]
     options = (*SANITIZERS, *host.options[1:]) if sane else host.options
     assert_holds(replace(host, options=options), place, tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4-single", "cortex-a53", "powerpc-e500mc"])
+@of_targets
+@pytest.mark.parametrize(
+    "name", ["host-single", "cortex-m7", "cortex-m4-single", "cortex-a53", "powerpc-e500mc"]
+)
 def test_bad_input_on_a_target(name, place, tmp_path):
     emulator = next(item for item in EMULATED if item.target == name)
     if missing(emulator):
@@ -309,7 +318,7 @@ def test_every_target_can_be_emulated():
     assert [item.target for item in EMULATED] == [item.name for item in TARGETS]
 
 
-@pytest.mark.slow
+@of_targets
 @pytest.mark.parametrize("emulator", EMULATED, ids=lambda item: item.target)
 def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
     absent = missing(emulator)
@@ -326,7 +335,7 @@ def test_a_target_has_the_digits_of_the_host(emulator, place, tmp_path):
     assert 0 < replay.init_stack <= 2048
 
 
-@pytest.mark.slow
+@of_targets
 @pytest.mark.parametrize("target", ["cortex-m7", "powerpc-e500mc"])
 def test_the_identification_has_the_digits_of_the_host(target, place, tmp_path):
     host, other = (
@@ -410,7 +419,7 @@ def test_cmake_builds_the_export(place, tmp_path):
     assert done.stdout.startswith("alarms 0")
 
 
-@pytest.mark.slow
+@of_targets
 @pytest.mark.skipif(
     not shutil.which("cmake") or not shutil.which("arm-none-eabi-gcc"), reason="no CMake for Arm"
 )
@@ -434,7 +443,7 @@ def test_a_number_of_hours_that_no_threshold_gives(place):
         export_library(default_actuator(), find_target("host"), None, hours=1e9)
 
 
-@pytest.mark.slow
+@of_targets
 @pytest.mark.skipif(not shutil.which("arm-none-eabi-nm"), reason="no binutils for Arm here")
 @pytest.mark.parametrize("name", ["cortex-m7", "cortex-m4", "cortex-m4-single", "cortex-r5"])
 def test_arm_code_hands_numbers_to_nobody(name, place):

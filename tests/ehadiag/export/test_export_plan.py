@@ -7,7 +7,7 @@ from exported import short_test
 
 from ehadiag import ConfigurationError, default_actuator
 from ehadiag.core.actuator import Calibration, CalibrationSource, FitQuality
-from ehadiag.export.plan import identity_of, library_plan, uncertain_constants, verdict_rules
+from ehadiag.export.library import identity_of, library_plan, uncertain_constants, verdict_rules
 from ehadiag.identify.prior import DAILY_PRIORS
 from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.registry import unit_constants

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from places import LOGS
 
-from ehadiag.batch import test_list
-from ehadiag.batch.test_list import list_tests
+from ehadiag.batch import journal
+from ehadiag.batch.journal import list_tests
 from ehadiag.request import Request
 from ehadiag.result import ListedTest
 from ehadiag.setup import Setup
@@ -21,7 +21,7 @@ from firmware_iface.logs.reader import read_frames
 @pytest.fixture
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("EHADIAG_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(test_list, "MIN_READ_S", 0.0)
+    monkeypatch.setattr(journal, "MIN_READ_S", 0.0)
     shutil.copy(LOGS / "paper-open-1.blf", tmp_path / "one.blf")
     return tmp_path / "one.blf"
 
@@ -67,21 +67,21 @@ def test_a_damaged_index_is_made_anew(
     log: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
 ) -> None:
     assert readings(log, monkeypatch, Request()) == [True, False]
-    (index,) = (log.parent / "cache" / test_list.INDEX_FOLDER).iterdir()
+    (index,) = (log.parent / "cache" / journal.INDEX_FOLDER).iterdir()
     index.write_bytes(content)
     assert readings(log, monkeypatch, Request()) == [True, False]
 
 
 def test_the_oldest_indexes_go_first(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(test_list, "MAX_INDEXES", 2)
+    monkeypatch.setattr(journal, "MAX_INDEXES", 2)
     for k in range(4):
         os.utime(log, ns=(0, (k + 1) * 10**9))
         assert readings(log, monkeypatch, Request()) == [True, False]
-    assert len(list((log.parent / "cache" / test_list.INDEX_FOLDER).iterdir())) == 2
+    assert len(list((log.parent / "cache" / journal.INDEX_FOLDER).iterdir())) == 2
 
 
 def test_a_short_log_gets_no_index(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(test_list, "MIN_READ_S", 1e9)
+    monkeypatch.setattr(journal, "MIN_READ_S", 1e9)
     assert readings(log, monkeypatch, Request()) == [True, True]
 
 
@@ -99,7 +99,7 @@ def test_reading_reports_its_progress(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_files, "PROGRESS_PERIOD_S", 0.0)
-    monkeypatch.setattr(test_list, "MIN_READ_S", 1e9)  # a busy machine would leave an index
+    monkeypatch.setattr(journal, "MIN_READ_S", 1e9)  # a busy machine would leave an index
     monkeypatch.setenv("EHADIAG_CACHE_DIR", str(tmp_path / "cache"))
     path = LOGS / name
     if not path.exists():

@@ -20,7 +20,7 @@ from ehadiag.identify.signals import commanded_current, resolution_by_current
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.plant_laws import PositionController
 from ehadiag_sim.simulation import simulate
-from firmware_iface.recording import CURRENT_CHANNEL, POSITION_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import resolve_test
 
 STORED = resolve_test("closed").command()
@@ -30,20 +30,20 @@ GAP = 1.7
 def follows(seed):
     """Jack position that the control law works on: behind its command, with the sensor's noise."""
     rng = np.random.default_rng(seed)
-    place = np.roll(STORED, 40) + POSITION_CHANNEL.lsb * 0.5 * rng.standard_normal(len(STORED))
-    return POSITION_CHANNEL.decode(POSITION_CHANNEL.encode(place))
+    place = np.roll(STORED, 40) + CHANNELS.position.lsb * 0.5 * rng.standard_normal(len(STORED))
+    return CHANNELS.position.decode(CHANNELS.position.encode(place))
 
 
 def measured_current(command, seen, seed):
     """As the converter gives it."""
     rng = np.random.default_rng([seed, 1])
-    volts = GAP * (command - seen) + 0.4 * CURRENT_CHANNEL.lsb
-    volts += CURRENT_CHANNEL.lsb * 0.5 * rng.standard_normal(len(STORED))
-    return CURRENT_CHANNEL.decode(CURRENT_CHANNEL.encode(volts))
+    volts = GAP * (command - seen) + 0.4 * CHANNELS.current.lsb
+    volts += CHANNELS.current.lsb * 0.5 * rng.standard_normal(len(STORED))
+    return CHANNELS.current.decode(CHANNELS.current.encode(volts))
 
 
 @pytest.mark.parametrize(
-    "step", [0.0, 1e-6, 2e-6, 5e-6, POSITION_CHANNEL.lsb / 16, POSITION_CHANNEL.lsb / 4]
+    "step", [0.0, 1e-6, 2e-6, 5e-6, CHANNELS.position.lsb / 16, CHANNELS.position.lsb / 4]
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_step_is_found_by_its_effect_of_less_than_a_step_of_current(step, seed):
@@ -52,15 +52,15 @@ def test_the_step_is_found_by_its_effect_of_less_than_a_step_of_current(step, se
     measured = measured_current(command, seen, seed)
     measured[100:150] = np.nan
     found = resolution_by_current(
-        STORED, lambda item: GAP * (item - seen), measured, POSITION_CHANNEL.lsb
+        STORED, lambda item: GAP * (item - seen), measured, CHANNELS.position.lsb
     )
     assert found == pytest.approx(step, rel=1e-9)
 
 
 def test_nothing_measured_tells_nothing():
     nothing = np.full(len(STORED), np.nan)
-    assert resolution_by_current(STORED, lambda item: item, nothing, POSITION_CHANNEL.lsb) == 0.0
-    assert resolution_by_current(STORED, lambda item: item, STORED, POSITION_CHANNEL.lsb) == 0.0
+    assert resolution_by_current(STORED, lambda item: item, nothing, CHANNELS.position.lsb) == 0.0
+    assert resolution_by_current(STORED, lambda item: item, STORED, CHANNELS.position.lsb) == 0.0
 
 
 TEST = resolve_test("closed")
@@ -77,22 +77,22 @@ def closed_loop(data, *, seed=0, lag=40.0, offset_lsb=0.0, noise_lsb=0.5):
     rng = np.random.default_rng(seed)
     command = np.rint(TEST.command() / 2e-6) * 2e-6
     law = PositionController(data)
-    place, seen = 0.0, POSITION_CHANNEL.lsb * rng.integers(-1, 2)
+    place, seen = 0.0, CHANNELS.position.lsb * rng.integers(-1, 2)
     current, position = np.empty(TEST.ticks), np.empty(TEST.ticks)
     for k, wanted in enumerate(command.tolist()):
         current[k] = law.current(wanted, CommandMode.POSITION, float(seen))
         place += lag * current[k] * 1e-3
-        volts = np.array([place + noise_lsb * POSITION_CHANNEL.lsb * rng.standard_normal()])
-        seen = POSITION_CHANNEL.decode(POSITION_CHANNEL.encode(volts))[0]
+        volts = np.array([place + noise_lsb * CHANNELS.position.lsb * rng.standard_normal()])
+        seen = CHANNELS.position.decode(CHANNELS.position.encode(volts))[0]
         position[k] = seen
-    measured = current + CURRENT_CHANNEL.lsb * (
+    measured = current + CHANNELS.current.lsb * (
         offset_lsb + noise_lsb * rng.standard_normal(TEST.ticks)
     )
     nothing = np.zeros(TEST.ticks)
     samples = Samples(
         period_ns=1_000_000,
         mode=CommandMode.POSITION,
-        current=CURRENT_CHANNEL.decode(CURRENT_CHANNEL.encode(measured)),
+        current=CHANNELS.current.decode(CHANNELS.current.encode(measured)),
         spool=nothing,
         pressure=nothing,
         position=position,
@@ -162,7 +162,7 @@ def test_lost_samples_have_their_exact_codes(seed, share):
     told[rows] = False
     np.testing.assert_allclose(trace.current[told], truth[told], atol=EXACT)
     # Elsewhere the position is bridged: it moves few codes a tick.
-    code = controller().GAP * POSITION_CHANNEL.lsb
+    code = controller().GAP * CHANNELS.position.lsb
     assert np.abs(trace.current - truth).max() < 200.0 * code
 
 
@@ -171,10 +171,10 @@ def test_a_current_sensor_with_an_offset_does_not_spoil_lost_codes():
     rows = np.arange(100, TEST.ticks, 50)
     trace = commanded_current(without(samples, rows), TEST, controller())
     # Within the offset of saturation nothing tells whether the law was linear.
-    linear = np.abs(truth) < controller().IM - 10.0 * CURRENT_CHANNEL.lsb
+    linear = np.abs(truth) < controller().IM - 10.0 * CHANNELS.current.lsb
     told = np.setdiff1d(np.flatnonzero(linear), rows)
     np.testing.assert_allclose(trace.current[told], truth[told], atol=EXACT)
-    assert trace.offset == pytest.approx(5.0 * CURRENT_CHANNEL.lsb, abs=0.3 * CURRENT_CHANNEL.lsb)
+    assert trace.offset == pytest.approx(5.0 * CHANNELS.current.lsb, abs=0.3 * CHANNELS.current.lsb)
 
 
 @pytest.mark.parametrize("gains", [{"GAI": 10.0}, {"GAD": 0.01}, {"GAI": 10.0, "GAD": 0.01}])
@@ -186,7 +186,7 @@ def test_integral_and_derivative_are_rebuilt(gains):
     assert trace.rebuilt
     assert not plain.rebuilt
     # The unlogged sample before the test enters the first two ticks, and the integral for good.
-    np.testing.assert_allclose(trace.current[2:], truth[2:], atol=0.2 * CURRENT_CHANNEL.lsb)
+    np.testing.assert_allclose(trace.current[2:], truth[2:], atol=0.2 * CHANNELS.current.lsb)
 
 
 def test_another_control_law_is_noticed():

@@ -28,13 +28,7 @@ from ehadiag.model.registry import FAULT_NAMES, FAULTS, Unknowns, parameter
 from ehadiag.model.residual_models import SimdModel
 from ehadiag_sim import conditions
 from ehadiag_tools.simulator.units import random_unit, record
-from firmware_iface.recording import (
-    CHANNELS,
-    POSITION_CHANNEL,
-    PRESSURE_CHANNEL,
-    SPOOL_CHANNEL,
-    Environment,
-)
+from firmware_iface.recording import CHANNELS, Environment
 from firmware_iface.stored_test import resolve_test
 
 PAPER_FIRST = {"open": (0.7147, 7.7791, 9.6052, 9.5992), "closed": (0.3005, 4.5653, 5.1306, 2.2902)}
@@ -186,7 +180,7 @@ def test_random_cases_of_the_cube(test):
 SEVERITIES = (0.52, 0.34, 0.47)
 NOISE_LSB = np.sqrt(0.5**2 + 1.0 / 12.0)
 """Of the electronics and of rounding (PHY-22)."""
-LSB = np.array([SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb, POSITION_CHANNEL.lsb])
+LSB = np.array([CHANNELS.spool.lsb, CHANNELS.pressure.lsb, CHANNELS.position.lsb])
 
 
 @lru_cache(maxsize=4)

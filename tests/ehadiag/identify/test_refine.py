@@ -27,7 +27,7 @@ from ehadiag.identify.posterior import cauchy_weights
 from ehadiag.model.registry import FAULT_NAMES, parameter
 from ehadiag.model.registry import FAULTS as SEVERITIES
 from ehadiag.model.residual_models import SimdModel
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 CASES = ((0.3, 0.6, 0.3), (0.6, 0.2, 0.9), (0.1, 0.9, 0.5))
 
@@ -80,8 +80,8 @@ def test_constant_offsets_are_told_from_faults():
     experiment = own_experiment(faults, offsets_lsb=(3.0, -5.0))
     found = refined(experiment, faults)
     total = (
-        (experiment.spool_offset + found.values["spool_offset"]) / SPOOL_CHANNEL.lsb,
-        (experiment.pressure_offset + found.values["pressure_offset"]) / PRESSURE_CHANNEL.lsb,
+        (experiment.spool_offset + found.values["spool_offset"]) / CHANNELS.spool.lsb,
+        (experiment.pressure_offset + found.values["pressure_offset"]) / CHANNELS.pressure.lsb,
     )
     assert total == pytest.approx((3.0, -5.0), abs=0.05)
     np.testing.assert_allclose(severities(found), severities(clean), atol=4e-4)
@@ -93,7 +93,7 @@ def test_glitches_are_left_out():
     experiment = own_experiment(faults)
     whole = refined(experiment, faults)
     rows = np.random.default_rng(0).choice(experiment.ticks, 55, replace=False)
-    experiment.pressure[rows] += 40 * PRESSURE_CHANNEL.lsb
+    experiment.pressure[rows] += 40 * CHANNELS.pressure.lsb
     found = refined(experiment, faults)
     assert not found.used[1, rows].any()
     assert (np.abs(severities(found) - severities(whole)) < deviations(whole)).all()
@@ -104,8 +104,8 @@ def test_median_offsets_are_those_of_the_sensors():
     found = median_offsets(*free_run_residuals([experiment], None, named((0.4, 0.5, 0.6))))
     spool = found["spool_offset"] + experiment.spool_offset
     pressure = found["pressure_offset"] + experiment.pressure_offset
-    assert spool / SPOOL_CHANNEL.lsb == pytest.approx(3.0, abs=0.1)
-    assert pressure / PRESSURE_CHANNEL.lsb == pytest.approx(-5.0, abs=0.1)
+    assert spool / CHANNELS.spool.lsb == pytest.approx(3.0, abs=0.1)
+    assert pressure / CHANNELS.pressure.lsb == pytest.approx(-5.0, abs=0.1)
 
 
 FAULTS = (0.3, 0.3, 0.3)

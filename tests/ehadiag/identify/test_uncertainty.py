@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from ehadiag.core.estimation_rules import ESTIMATION
+from ehadiag.core.criteria import ESTIMATION
 from ehadiag.identify.estimates import estimate_covariance, interval95
 from ehadiag.identify.least_squares import Refinement
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS

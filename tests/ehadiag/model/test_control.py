@@ -31,7 +31,7 @@ from ehadiag.model.laws import (
 )
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.residual_models import processor_count
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.simulator.units import damaged_unit
 
 TICK = 1e-3
 GAP = default_actuator().controller.GAP

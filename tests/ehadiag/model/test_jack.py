@@ -22,11 +22,11 @@ from ehadiag.model.second_stage import jack_piece
 from ehadiag.model.sensors import JackState, PathPiece, PressureProbe
 from ehadiag.model.simd_jack import driven_jack_costs
 from ehadiag_sim.conditions import Effects
-from ehadiag_tools.damaged import damaged_unit
-from firmware_iface.recording import POSITION_CHANNEL, Environment
+from ehadiag_tools.simulator.units import damaged_unit
+from firmware_iface.recording import CHANNELS, Environment
 
 SPAN = 1e-3
-PLACE = 0.5 * POSITION_CHANNEL.lsb
+PLACE = 0.5 * CHANNELS.position.lsb
 """Largest error of the place, m: each step goes by its mean velocity, and no residual has it."""
 CONSTANTS = damaged_unit((0.0, 0.0, 0.4))
 LAW = jack_law(CONSTANTS)

@@ -20,11 +20,11 @@ from ehadiag.model.batch import Anchor
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.residual_models import model_response
 from ehadiag.model.simd_jack import driven_jack_costs
-from ehadiag_tools.damaged import damaged_unit
-from firmware_iface.recording import POSITION_CHANNEL, PRESSURE_CHANNEL, SPOOL_CHANNEL
+from ehadiag_tools.simulator.units import damaged_unit
+from firmware_iface.recording import CHANNELS
 
 TICK = 1e-3
-LSB = np.array([[SPOOL_CHANNEL.lsb], [PRESSURE_CHANNEL.lsb], [POSITION_CHANNEL.lsb]])
+LSB = np.array([[CHANNELS.spool.lsb], [CHANNELS.pressure.lsb], [CHANNELS.position.lsb]])
 CORNERS = [
     (0, 0, 0),
     (1, 1, 1),
@@ -113,9 +113,9 @@ def test_without_friction_the_spool_is_the_linear_system():
         state[4] = value
         state = step @ state
         exact.append(state[2])
-    assert np.abs(exact).max() > 20 * SPOOL_CHANNEL.lsb
+    assert np.abs(exact).max() > 20 * CHANNELS.spool.lsb
     answer = model(actuator, (kintas, 0.0, 0.0), current)
-    np.testing.assert_allclose(answer[0], exact, atol=1e-3 * SPOOL_CHANNEL.lsb)
+    np.testing.assert_allclose(answer[0], exact, atol=1e-3 * CHANNELS.spool.lsb)
 
 
 def jack_by_small_steps(constants, spool, step=0.5e-6):
@@ -154,14 +154,14 @@ def test_jack_alone_follows_small_steps(fdj):
     before = np.concatenate([[0.0], spool[:-1]])
     rate = (spool - before) / TICK
     nodes = np.column_stack([np.full(60, TICK), spool, rate, rate, np.zeros(60)])
-    truth, lsb = jack_by_small_steps(constants, spool), PRESSURE_CHANNEL.lsb
+    truth, lsb = jack_by_small_steps(constants, spool), CHANNELS.pressure.lsb
     row = np.array([constants], dtype=np.float64)
     (cost,) = driven_jack_costs(row, nodes, 0.0, truth, lsb, np.inf)
     assert np.sqrt(cost / 60) < 0.3
 
 
 CONSTANTS = plant_constants(default_actuator())
-ANCHOR = Anchor(0.3, 1.3 * SPOOL_CHANNEL.lsb, 6.0 * SPOOL_CHANNEL.lsb)
+ANCHOR = Anchor(0.3, 1.3 * CHANNELS.spool.lsb, 6.0 * CHANNELS.spool.lsb)
 
 share = st.floats(0.0, 1.0)
 faults_of = st.tuples(share, share, share).map(np.array)
@@ -231,7 +231,7 @@ def test_anchoring_leaves_a_true_model_alone(faults, current):
 def test_anchoring_ignores_noise_and_missing_samples(faults, current, seed):
     free = run(faults, current)
     rng = np.random.default_rng(seed)
-    measured = free.spool + 0.5 * SPOOL_CHANNEL.lsb * np.clip(
+    measured = free.spool + 0.5 * CHANNELS.spool.lsb * np.clip(
         rng.standard_normal(len(current)), -2.5, 2.5
     )
     measured[rng.random(len(current)) < 0.1] = np.nan
@@ -244,18 +244,18 @@ def test_anchoring_takes_a_wrong_start_back():
     time = np.arange(400) * TICK
     current = 0.3e-3 * np.sin(2 * np.pi * 2 * time)
     truth = run((0.3, 1.0, 0.3), current)
-    off = 20 * SPOOL_CHANNEL.lsb
+    off = 20 * CHANNELS.spool.lsb
     free = run((0.3, 1.0, 0.3), current, origin=off)
     held = run((0.3, 1.0, 0.3), current, origin=off, measured=truth.spool, anchor=ANCHOR)
-    assert np.abs(free.spool - truth.spool)[:30].min() > 10 * SPOOL_CHANNEL.lsb
+    assert np.abs(free.spool - truth.spool)[:30].min() > 10 * CHANNELS.spool.lsb
     assert held.anchored.size >= 1
-    assert np.abs(held.spool - truth.spool)[1:].max() < SPOOL_CHANNEL.lsb
+    assert np.abs(held.spool - truth.spool)[1:].max() < CHANNELS.spool.lsb
 
 
 def first_motion(faults):
     """Tick at which a slow ramp of current first moves the spool by more than one LSB."""
     current = np.linspace(0.0, 2e-3, 1500)
-    return int(np.flatnonzero(run(faults, current).spool > SPOOL_CHANNEL.lsb)[0])
+    return int(np.flatnonzero(run(faults, current).spool > CHANNELS.spool.lsb)[0])
 
 
 @pytest.mark.parametrize("kintas", [0.0, 0.5, 1.0])

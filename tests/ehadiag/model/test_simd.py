@@ -23,9 +23,9 @@ from ehadiag.model.batch import NO_ANCHOR, Anchor, Batch
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, Unknowns, parameter
 from ehadiag.model.residual_models import ScalarModel, SimdModel, model_response
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.simulator.units import damaged_unit
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import resolve_test
 
 CORNERS = np.array(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0])).reshape(3, 8).T
@@ -57,8 +57,8 @@ def own_batch(
         position=truth.position,
         weight=np.vstack(
             [
-                np.full(n, channels[0] / SPOOL_CHANNEL.lsb),
-                np.full(n, channels[1] / PRESSURE_CHANNEL.lsb),
+                np.full(n, channels[0] / CHANNELS.spool.lsb),
+                np.full(n, channels[1] / CHANNELS.pressure.lsb),
             ]
         ),
         anchor=NO_ANCHOR.as_array()[None, :],
@@ -199,9 +199,9 @@ def test_the_sampling_instant_is_that_of_finer_ticks(lead):
     unknowns = space(free=(*FAULTS, parameter("sampling_lead")))
     for kind in (SimdModel, ScalarModel):
         residuals, _ = kind(batch, unknowns).residuals(np.array([(*faults, lead)]))
-        seen = batch.spool - residuals[0, 0] * SPOOL_CHANNEL.lsb
-        assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * SPOOL_CHANNEL.lsb
-        assert np.abs(seen - expected).max() < 0.3 * SPOOL_CHANNEL.lsb
+        seen = batch.spool - residuals[0, 0] * CHANNELS.spool.lsb
+        assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * CHANNELS.spool.lsb
+        assert np.abs(seen - expected).max() < 0.3 * CHANNELS.spool.lsb
 
 
 def test_spans_start_from_their_own_origin():

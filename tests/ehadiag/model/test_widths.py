@@ -18,7 +18,7 @@ from ehadiag.export.targets import c_compiler, link_shared
 from ehadiag.model.batch import SIGNAL_ROWS, Anchor
 from ehadiag.model.residual_models import SimdModel
 from ehadiag.model.simd_residuals import block_scratch, run_blocks
-from firmware_iface.recording import SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 WIDTHS = (1, 8, 16)
 CURRENT = np.concatenate(
@@ -73,7 +73,7 @@ def test_each_width_has_the_same_bits(kernels, effects, kind):
     rng = np.random.default_rng(5)
     zeros = np.zeros((SIGNAL_ROWS, len(CURRENT)))
     zeros[0] = 30e-6 * np.sin(np.arange(len(CURRENT)) * 0.05)
-    anchor = Anchor(0.1, 3.0 * SPOOL_CHANNEL.lsb, 90.0 * SPOOL_CHANNEL.lsb)
+    anchor = Anchor(0.1, 3.0 * CHANNELS.spool.lsb, 90.0 * CHANNELS.spool.lsb)
     batch = batch_of(zeros, CURRENT, anchor=anchor)
     space = unknowns_of({"Kintas": 0, "FSS": 0, "FDJ": 0, **effects}, actuator)
     base = tuple(item._replace(NPL=3.0) for item in space.base)

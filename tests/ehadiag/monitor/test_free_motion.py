@@ -25,7 +25,7 @@ from ehadiag_sim.simulation import Plant
 from ehadiag_tools.free_motion.motion import Motion, free_motion
 from firmware_iface.codec import Encoder
 from firmware_iface.live_decode import LiveTicks
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import resolve_test
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.base import Receiver
@@ -80,14 +80,14 @@ def test_the_pressure_says_nothing_while_the_surface_is_held():
 def test_what_friction_hides_grows_with_it_and_is_never_less_than_some_steps():
     sizes = [undecided_spool(ACTUATOR, severity) for severity in (0.0, 0.5, 1.0)]
     assert sizes == sorted(sizes)
-    assert sizes[0] > 3.0 * SPOOL_CHANNEL.lsb
+    assert sizes[0] > 3.0 * CHANNELS.spool.lsb
     assert sizes[-1] < 0.01 * ACTUATOR.servovalve.XSM
 
 
 def test_a_spool_that_rests_beside_the_middle_is_found_while_the_monitor_settles():
     """It is half a step beside the noisy sample that the monitor began with."""
     rng = np.random.default_rng(1)
-    place, lsb = 0.5 * SPOOL_CHANNEL.lsb, SPOOL_CHANNEL.lsb
+    place, lsb = 0.5 * CHANNELS.spool.lsb, CHANNELS.spool.lsb
     monitor = monitor_of((0.0, 0.9, 0.0), CommandMode.CURRENT)
     monitor.reset(-lsb)
     residuals = []
@@ -200,7 +200,7 @@ def test_no_threshold_for_a_rate_too_high():
 
 def count_alarms(mean_ticks, pushes, seed, shift=1.0):
     """Alarms of a monitor on an actuator at rest; its sensors show white noise of known size."""
-    noise = SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb
+    noise = CHANNELS.spool.lsb, CHANNELS.pressure.lsb
     monitor = Monitor(
         default_actuator(),
         (0.0, 0.0, 0.0),

@@ -26,9 +26,9 @@ from ehadiag import CommandMode, ConfigurationError, Monitor, Tick, default_actu
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.model.batch import NO_ANCHOR, Anchor
 from ehadiag.model.residual_models import model_response
-from ehadiag_tools.damaged import damaged, damaged_unit
+from ehadiag_tools.simulator.units import damaged, damaged_unit
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import resolve_test
 
 MATCHED = {
@@ -40,7 +40,7 @@ MATCHED = {
     "hot-worn-closed.asc": (0.2, 0.5, 0.1),
 }
 """Reference recordings (PHY-41) and their true severities (truth.csv)."""
-ANCHOR = Anchor(0.3, 1.3 * SPOOL_CHANNEL.lsb, 6.0 * SPOOL_CHANNEL.lsb)
+ANCHOR = Anchor(0.3, 1.3 * CHANNELS.spool.lsb, 6.0 * CHANNELS.spool.lsb)
 NAN = float("nan")
 NOTHING = Tick(NAN, NAN, NAN, NAN, NAN)
 
@@ -97,7 +97,7 @@ def test_tick_by_tick_equals_the_whole_record(file, anchor):
     for column, values in enumerate((whole.spool, whole.pressure, whole.position)):
         scale = np.abs(values).max()
         np.testing.assert_allclose(predicted[:, column], values, rtol=0.0, atol=1e-12 * scale)
-    noise = np.sqrt(0.5**2 + 1 / 12) * np.array([SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb])
+    noise = np.sqrt(0.5**2 + 1 / 12) * np.array([CHANNELS.spool.lsb, CHANNELS.pressure.lsb])
     seen = np.column_stack([recording.samples.spool, recording.samples.pressure])
     np.testing.assert_allclose(residual, (seen - predicted[:, :2]) / noise, atol=1e-9)
 

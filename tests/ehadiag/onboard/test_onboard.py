@@ -22,7 +22,7 @@ from ehadiag.compile.elementary import (
     square_root,
 )
 from ehadiag.compile.jit import brief_kernel
-from ehadiag.export.plan import library_plan
+from ehadiag.export.library import library_plan
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
 from ehadiag.onboard.onboard_memory import ONBOARD, REASONS, OnboardOutcome

@@ -18,13 +18,12 @@ from places import LOGS
 from ehadiag import Verdict, bundled_tests, default_actuator
 from ehadiag.assess import acceptance, verdict
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.core.criteria import FIT
-from ehadiag.core.estimation_rules import ESTIMATION
-from ehadiag.export.plan import library_plan
+from ehadiag.core.criteria import ESTIMATION, FIT
+from ehadiag.export.library import library_plan
 from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.model.plant import relative_viscosity
 from ehadiag.monitor.plan import design_cusum
-from ehadiag.onboard import onboard_verdict
+from ehadiag.onboard import onboard_optimum
 from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
 from ehadiag.onboard.onboard_memory import (
     ONBOARD,
@@ -40,7 +39,7 @@ from ehadiag.onboard.onboard_memory import (
 )
 from ehadiag_tools.onboard.replay import surrounded, ticks_of
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 LEVELS = verdict.Levels()
 ACTUATOR = default_actuator()
@@ -58,7 +57,7 @@ def on_board(values, stds, outliers=0.0, rms=1.0):
         samples=1000.0, outliers=outliers, spool_rms=rms, pressure_rms=1.0
     )
     memory[: len(known)] = known
-    assert onboard_verdict.write_verdict(memory.ctypes.data, PLAN) == 0
+    assert onboard_optimum.write_verdict(memory.ctypes.data, PLAN) == 0
     return OnboardOutcome(*memory[: len(known)].tolist())
 
 
@@ -92,7 +91,7 @@ def test_the_deviations_are_those_of_the_package():
         (ONBOARD.considered, directions), (ONBOARD.believed, believed),
     ):  # fmt: skip
         memory[place : place + numbers.size] = numbers.ravel()
-    assert onboard_verdict.write_deviations(memory.ctypes.data, PLAN, 2, 1.3) == 0
+    assert onboard_optimum.write_deviations(memory.ctypes.data, PLAN, 2, 1.3) == 0
     inverse = np.linalg.inv(normal + np.diag([12.0] * ONBOARD_GENES + [0.0] * 2))
     sandwich = inverse @ meat @ inverse
     curved = inverse * 1.3 / ESTIMATION.capped_variance
@@ -185,7 +184,7 @@ def damaged(damage):
     samples = RECORDING.samples
     changed = {name: work(getattr(samples, name)) for name, work in damage.items()}
     saturated = np.array(samples.saturated)
-    for channel in (SPOOL_CHANNEL, PRESSURE_CHANNEL):
+    for channel in (CHANNELS.spool, CHANNELS.pressure):
         if channel.name in changed:
             top = channel.full_scale - channel.lsb
             row = ("current", "spool", "pressure", "position").index(channel.name)
@@ -218,9 +217,9 @@ def test_a_damaged_channel_carries_none(name):
 
 def test_a_few_samples_at_the_end_do_no_harm():
     ticks = ticks_of(RECORDING)
-    ticks[:100, 2] = SPOOL_CHANNEL.full_scale
+    ticks[:100, 2] = CHANNELS.spool.full_scale
     assert carried(ticks)
-    ticks[:120, 2] = SPOOL_CHANNEL.full_scale
+    ticks[:120, 2] = CHANNELS.spool.full_scale
     assert not carried(ticks)
 
 

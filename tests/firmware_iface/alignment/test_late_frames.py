@@ -15,9 +15,8 @@ from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import CommandMode, bundled_tests, default_actuator
-from ehadiag_tools.rigs.buses import BUSES
 from ehadiag_tools.rigs.replay import as_sent
-from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, played
+from ehadiag_tools.rigs.rerecord import BUSES, Disturbance, frames_on, played
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.alignment.ticks import place_late, settle_gaps, spacing_of
 from firmware_iface.codec import Encoder
@@ -117,12 +116,13 @@ LATER_NS = 7_000_000_000
 @pytest.fixture(scope="module")
 def log():
     """An open and a closed loop test, one after the other, frames late by 0.5 ms."""
-    (bus,) = (item for item in BUSES if item.name == "command")
     tables = []
     for index, (name, test) in enumerate((("paper-open-2", "open"), ("paper-closed-3", "closed"))):
         recording = read_recording(LOGS / f"{name}.blf")
         this = played(recording.samples, as_sent(TESTS[test]), 0.5)
-        table, bus_map = frames_on(bus, recording, this, Disturbance(0.5, drift_ppm=100.0), 1)
+        table, bus_map = frames_on(
+            BUSES["command"], recording, this, Disturbance(0.5, drift_ppm=100.0), 1
+        )
         tables.append(replace(table, time_ns=table.time_ns + index * LATER_NS))
     return concatenate(tables), bus_map
 

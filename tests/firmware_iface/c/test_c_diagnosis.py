@@ -311,6 +311,7 @@ def check(told, heard, expected):
 
 
 @pytest.mark.slow
+@pytest.mark.xdist_group("exports")  # of which another test compiles the library
 @pytest.mark.parametrize(("target", "ticks"), [("host", TICKS), ("cortex-m7", 400)])
 def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place, tmp_path):
     emulator = next(item for item in EMULATED if item.target == target)

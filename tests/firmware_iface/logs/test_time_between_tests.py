@@ -6,9 +6,8 @@ import pytest
 from places import LOGS
 
 from ehadiag import bundled_tests, default_actuator
-from ehadiag_tools.rigs.buses import BUSES
 from ehadiag_tools.rigs.replay import as_sent
-from ehadiag_tools.rigs.rerecord import Disturbance, frames_on, played
+from ehadiag_tools.rigs.rerecord import BUSES, Disturbance, frames_on, played
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs.reader import read_recording
@@ -23,11 +22,10 @@ WINDOW = 14_000
 @pytest.fixture(scope="module")
 def bus_log():
     """A test after more idle time than is held at once."""
-    bus = next(item for item in BUSES if item.name == "command")
     source = read_recording(LOGS / "paper-open-1.blf")
     how = Disturbance(lead_in_s=8.0)
     this = played(source.samples, as_sent(bundled_tests()["open"]), how.lead_in_s)
-    return frames_on(bus, source, this, how, 1)
+    return frames_on(BUSES["command"], source, this, how, 1)
 
 
 def stretches(table, bus_map, sought):

@@ -26,7 +26,7 @@ from ehadiag import (
     default_actuator,
     load_actuator,
 )
-from ehadiag_sim.scales import scales_of
+from ehadiag_sim.simulation import scales_of
 from firmware_iface.bus_map import default_map, load_map, signal_layout
 from firmware_iface.dbc import SignalLayout, plain_message
 from firmware_iface.mapping_file import si_factor

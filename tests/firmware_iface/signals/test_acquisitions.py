@@ -109,4 +109,4 @@ def test_a_verdict_that_holds_the_truth(this):
 def test_a_refusal_names_a_rate_that_is_too_low():
     found = perform(case("open", 500.0, bits=16))
     assert found["verdict"] == "NOT_TESTED"
-    assert "took 500 samples a second, and the computer makes 1000 ticks" in found["why"]
+    assert "took 500 samples a second, and the computer makes 1000 ticks" in found["reasons"][0]

@@ -13,9 +13,9 @@ from ehadiag_sim.conditions import Effects, Sensors
 from ehadiag_sim.emulator import FccCore
 from ehadiag_sim.plant_laws import PositionController
 from ehadiag_sim.simulation import simulate
-from ehadiag_tools.rigs.buses import ForeignBus, Message, Signal
+from ehadiag_tools.rigs.rerecord import ForeignBus
 from firmware_iface.codec import Encoder, decode
-from firmware_iface.recording import CHANNEL_ROLES, BitState
+from firmware_iface.recording import BitState
 from firmware_iface.tester import Assembler
 from firmware_iface.transport.frames import FrameTable
 
@@ -110,27 +110,23 @@ def test_recording_is_that_of_the_bus(name):
 
 ALL_IN_ONE = ForeignBus(
     "one",
-    "all in one message",
-    {
-        "All": Message(
-            0x410,
-            48,
-            (
-                Signal("command.position", 0, 32, 1e-9, "m"),
-                Signal("command.mode", 32, 8, 1, "", signed=False),
-                Signal("status.state", 40, 8, 1, "", signed=False),
-                Signal("status.test_id", 48, 8, 1, "", signed=False),
-                *(
-                    Signal(role, 64 + 32 * k, 32, 1e-6, ("mA", "mm", "MPa", "mm")[k])
-                    for k, role in enumerate(CHANNEL_ROLES)
-                ),
-                Signal("environment.supply_pressure", 192, 16, 0.01, "bar", signed=False),
-                Signal("environment.return_pressure", 208, 16, 0.01, "bar", signed=False),
-                Signal("environment.oil_temperature", 224, 16, 0.1, "K", signed=False),
-            ),
-            fd=True,
-        )
-    },
+    """VERSION "1.0"
+BU_: FCC RIG
+BO_ 1040 All: 48 FCC
+ SG_ command_position : 0|32@1- (1e-9,0) [0|0] "m" RIG
+ SG_ command_mode : 32|8@1+ (1,0) [0|0] "" RIG
+ SG_ status_state : 40|8@1+ (1,0) [0|0] "" RIG
+ SG_ status_test_id : 48|8@1+ (1,0) [0|0] "" RIG
+ SG_ channels_current : 64|32@1- (1e-6,0) [0|0] "mA" RIG
+ SG_ channels_spool : 96|32@1- (1e-6,0) [0|0] "mm" RIG
+ SG_ channels_pressure : 128|32@1- (1e-6,0) [0|0] "MPa" RIG
+ SG_ channels_position : 160|32@1- (1e-6,0) [0|0] "mm" RIG
+ SG_ environment_supply_pressure : 192|16@1+ (0.01,0) [0|0] "bar" RIG
+ SG_ environment_return_pressure : 208|16@1+ (0.01,0) [0|0] "bar" RIG
+ SG_ environment_oil_temperature : 224|16@1+ (0.1,0) [0|0] "K" RIG
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","StandardCAN_FD";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN_FD";
+""",
 )
 
 

@@ -22,7 +22,7 @@ import ehadiag
 from ehadiag import Recording, StoredTest, default_actuator
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
 from ehadiag_sim.faulty_bus import FaultyTransport, FrameMoment, HarnessFault
-from ehadiag_sim.scales import scales_of
+from ehadiag_sim.simulation import scales_of
 from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
@@ -407,7 +407,7 @@ BIT = """
 import json, subprocess, sys
 from live_ends import LOADED_MACHINE
 from ehadiag import default_actuator
-from ehadiag_sim.scales import scales_of
+from ehadiag_sim.simulation import scales_of
 from firmware_iface.bus_map import default_map
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.recording import CommandMode

@@ -17,10 +17,10 @@ from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S, plant_response
 from ehadiag_sim.simulation import simulate
 from ehadiag_tools.simulator.units import COARSE_STEP, random_unit
-from firmware_iface.recording import POSITION_CHANNEL, PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 from firmware_iface.stored_test import resolve_test
 
-STEPS_LSB = np.array([[SPOOL_CHANNEL.lsb], [PRESSURE_CHANNEL.lsb], [POSITION_CHANNEL.lsb]])
+STEPS_LSB = np.array([[CHANNELS.spool.lsb], [CHANNELS.pressure.lsb], [CHANNELS.position.lsb]])
 STEPS = np.array([8e-6, 4e-6, 2e-6, 1e-6, 0.5e-6])
 SPAN = np.arange(200) * 1e-3
 
@@ -76,7 +76,7 @@ def test_default_step_is_converged():
     assert rms.max() < 0.05
 
 
-LSB = np.array([[SPOOL_CHANNEL.lsb], [PRESSURE_CHANNEL.lsb], [POSITION_CHANNEL.lsb]])
+LSB = np.array([[CHANNELS.spool.lsb], [CHANNELS.pressure.lsb], [CHANNELS.position.lsb]])
 TIME = np.arange(150) * 1e-3
 FAULTS = Faults(0.3, 0.4, 0.2)
 LINEAR = default_actuator()

@@ -20,7 +20,7 @@ from ehadiag_sim.plant_dynamics import STATE, PlantDynamics, advance_plant, plan
 from ehadiag_sim.plant_laws import plant_coefficients, relative_viscosity
 from ehadiag_sim.sensing import SimulatedConverters
 from ehadiag_sim.simulation import Plant, bus_command, simulate
-from firmware_iface.recording import CHANNELS, CURRENT_CHANNEL, POSITION_CHANNEL, BitState
+from firmware_iface.recording import CHANNELS, BitState
 
 ACTUATOR = default_actuator()
 TESTS = bundled_tests()
@@ -62,18 +62,18 @@ def test_ticks_and_bulk_are_one():
 
 def test_control_law_works_on_the_digitised_position_of_the_tick_before():
     result = run(seed=2)
-    seen = POSITION_CHANNEL.decode(result.codes[3])
+    seen = CHANNELS.position.decode(result.codes[3])
     wanted = 1.7 * (result.command[1:] - seen[:-1])
     np.testing.assert_allclose(result.current[1:], np.clip(wanted, -10e-3, 10e-3), atol=1e-15)
     # It would not be so with the position of the same tick.
     late = np.clip(1.7 * (result.command - seen), -10e-3, 10e-3)
-    assert np.abs(result.current - late).max() > CURRENT_CHANNEL.lsb
+    assert np.abs(result.current - late).max() > CHANNELS.current.lsb
 
 
 def test_sample_before_the_test_is_noisy_too():
     first = {run_first_current(seed) for seed in range(20)}
     assert len(first) > 1
-    steps = np.array(sorted(first)) / (1.7 * POSITION_CHANNEL.lsb)
+    steps = np.array(sorted(first)) / (1.7 * CHANNELS.position.lsb)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
 
 
@@ -129,7 +129,7 @@ def test_offset_shifts_its_channel_only():
 def test_offset_of_the_jack_sensor_moves_the_jack_in_closed_loop():
     moved = run(sensors=Sensors(noise_lsb=0.0, offsets_lsb=(0.0, 0.0, 0.0, 20.0)))
     plain = run(sensors=NOISELESS)
-    gap = (moved.position - plain.position)[1500:1690].mean() / POSITION_CHANNEL.lsb
+    gap = (moved.position - plain.position)[1500:1690].mean() / CHANNELS.position.lsb
     assert gap == pytest.approx(-20.0, abs=2.0)
 
 

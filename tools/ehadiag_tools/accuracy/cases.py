@@ -26,19 +26,13 @@ from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.model.residual_models import model_response
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import simulate
-from ehadiag_tools.accuracy.figures import (
-    SEVERITY_HEADINGS,
-    cramer_rao,
-    holds_truth,
-    percent_errors,
-    severity_rows,
-)
-from ehadiag_tools.damaged import damaged_unit
+from ehadiag_tools.accuracy.figures import accuracy_table, cramer_rao, percent_errors
 from ehadiag_tools.simulator.compare_logs import read_truth
+from ehadiag_tools.simulator.units import damaged_unit
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL, Environment, Samples
+from firmware_iface.recording import CHANNELS, Environment, Samples
 from firmware_iface.stored_test import resolve_test
 
 Severities = tuple[float, float, float]
@@ -225,7 +219,7 @@ def _monitoring(test: str, faults: Severities, seed: int) -> tuple[Samples, Envi
     rng = np.random.default_rng(np.random.SeedSequence((seed, 7)))
     noise = Sensors().noise_lsb
     measured = []
-    for channel, clean in ((SPOOL_CHANNEL, truth.spool), (PRESSURE_CHANNEL, truth.pressure)):
+    for channel, clean in ((CHANNELS.spool, truth.spool), (CHANNELS.pressure, truth.pressure)):
         volts = clean + noise * channel.lsb * rng.standard_normal(len(clean))
         measured.append(channel.decode(channel.encode(volts)))
     return replace(samples, spool=measured[0], pressure=measured[1]), environment
@@ -268,15 +262,13 @@ def _recorded_cases(folder: Path) -> list[Case]:
 
 def _paper_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     source = options.recordings or f"plant {options.plant}"
-    for test, title in TITLES.items():
-        part = [record for record in records if record["test"] == test]
-        if part:
-            yield f"{title}: mean absolute error in percent, {source}\n"
-            yield from _stage_table(test, part)
-            yield ""
-            yield from _bound_table(test, part)
-            yield ""
-    yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+    for (test,), part in grouped(records, "test").items():
+        yield f"{TITLES[test]}: mean absolute error in percent, {source}\n"
+        yield from _stage_table(test, part)
+        yield ""
+    yield from accuracy_table(records, "test", "faults")
+    yield ""
+    yield from accuracy_table(records, "test")
 
 
 def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
@@ -300,21 +292,6 @@ def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
         rows,
     )  # fmt: skip
     yield f"\nThe paper's final mean is {paper / error.mean():.0f} times ours."
-
-
-def _bound_table(test: str, records: Sequence[Record]) -> Iterator[str]:
-    """Rms errors of each case against its Cramér–Rao bound."""
-    rows = []
-    for (faults,), part in grouped(records, "faults").items():
-        published = _paper_case(test, faults)
-        if published is not None:
-            bound = 100.0 * np.array(part[0]["bound"])
-            ratios = np.sqrt((percent_errors(part) ** 2).mean(axis=0)) / bound
-            pairs = zip(bound, ratios, strict=True)
-            cells = [cell for b, r in pairs for cell in (f"{b:.4f}", f"{r:.2f}")]
-            rows.append((f"{test} {published.number}", len(part), *cells))
-    headings = [cell for name in FAULT_NAMES for cell in (f"{name}: bound, %", "rms / bound")]
-    yield from markdown(("case", "runs", *headings), rows)
 
 
 def _label(faults: Sequence[float]) -> str:
@@ -363,20 +340,28 @@ def _cube_cases(options: Options) -> list[Case]:
 
 def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
     yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
-    yield from markdown(SEVERITY_HEADINGS, severity_rows(records))
+    yield from accuracy_table(records, "test")
     if options.conditions:
-        yield "\nIntervals that hold, by the temperature of the oil:\n"
-        yield from markdown(("test", "oil, degC", "cases", *FAULT_NAMES), _band_rows(records))
+        yield "\nBy the temperature of the oil, degC:\n"
+        yield from accuracy_table([{**item, "oil": _band(item)} for item in records], "test", "oil")
     if options.wear:
         yield "\nFrom an earlier diagnosis, beside a search:\n"
         yield from markdown(WEAR_HEADINGS, _wear_rows(records))
     for (test,), part in grouped(records, "test").items():
-        yield f"\n{test}\n"
-        yield from markdown(("figure", "value"), _summary_rows(part))
-        yield f"\n{test}, largest errors\n"
-        yield from markdown(
-            ("noise seed", "truth", "errors", "stated deviations", "outliers, %"), _worst_rows(part)
+        first = np.abs(percent_errors(part, "first")).mean()
+        outliers = max(record["outliers"] for record in part)
+        yield (
+            f"\n{test}: mean after the first approximation {first:.3f}, sent back to the whole cube"
+            f" {sum(bool(record['rescued']) for record in part)}, not converged"
+            f" {sum(not record['converged'] for record in part)}, largest share of outliers"
+            f" {outliers:.2%}"
         )
+
+
+def _band(record: Record) -> str:
+    oil = record["conditions"][0]
+    bands = itertools.pairwise(OIL_BANDS)
+    return next(f"{low:g} … {high:g}" for low, high in bands if low <= oil <= high)
 
 
 WEAR_HEADINGS = (
@@ -395,50 +380,6 @@ def _wear_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
         time_share = float(np.median([item["time_share"] for item in begun]))
         share = f"{np.mean([item['begun'] for item in part]):.0%}"
         yield test, f"{wear:g}", len(part), share, *cells, f"{time_share:.2f}"
-
-
-def _band_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for (test,), part in grouped(records, "test").items():
-        for low, high in itertools.pairwise(OIL_BANDS):
-            mine = [item for item in part if low <= item["conditions"][0] < high]
-            held = holds_truth(mine).mean(axis=0) if mine else ()
-            yield test, f"{low:g} … {high:g}", len(mine), *(f"{100.0 * x:.0f} %" for x in held)
-
-
-def _summary_rows(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
-    error = np.abs(percent_errors(records))
-    case, held = error.mean(axis=1), holds_truth(records)
-    truth = np.array([record["faults"] for record in records])
-    inside = held[(truth > 0.0) & (truth < 1.0)]
-    count = len(records)
-    rescued = sum(bool(record["rescued"]) for record in records)
-    unfinished = sum(not record["converged"] for record in records)
-    yield "mean of all constants", f"{case.mean():.4f}"
-    yield "95th percentile of the case mean", f"{np.percentile(case, 95.0):.4f}"
-    yield "worst case mean", f"{case.max():.4f}"
-    yield "maximum of any constant", f"{error.max():.4f}"
-    first = np.abs(percent_errors(records, "first")).mean()
-    yield "mean after the first approximation", f"{first:.3f}"
-    yield "coverage of 95 %, all", f"{100.0 * held.mean():.1f} %"
-    if inside.size:
-        yield "coverage of 95 %, truths inside the cube", f"{100.0 * inside.mean():.1f} %"
-    yield "sent back to the whole cube", f"{rescued} ({rescued / count:.1%})"
-    yield "not converged", f"{unfinished} ({unfinished / count:.1%})"
-    outliers = max(record["outliers"] for record in records)
-    yield "largest share of outliers", f"{outliers:.2%}"
-
-
-def _worst_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    error = percent_errors(records)
-    for index in np.argsort(-np.abs(error).max(axis=1))[:5]:
-        record = records[index]
-        yield (
-            record["noise_seed"],
-            ", ".join(f"{x:.4f}" for x in record["faults"]),
-            ", ".join(f"{x:+.4f}" for x in error[index]),
-            ", ".join(f"{100.0 * x:.4f}" for x in record["std"]),
-            f"{100.0 * record['outliers']:.2f}",
-        )
 
 
 PAPER_CASES = Study(

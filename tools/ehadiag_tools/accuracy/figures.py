@@ -13,34 +13,38 @@ from ehadiag.identify.experiment import Experiment
 from ehadiag.model.registry import FAULT_NAMES, FAULTS
 from ehadiag.model.residual_models import model_response
 from ehadiag_sim.conditions import Sensors
-from ehadiag_tools.damaged import damaged
-from ehadiag_tools.study import Record, grouped
+from ehadiag_tools.simulator.units import damaged
+from ehadiag_tools.study import Record, grouped, markdown
 from firmware_iface.errors import EhadiagError
-from firmware_iface.recording import PRESSURE_CHANNEL, SPOOL_CHANNEL
+from firmware_iface.recording import CHANNELS
 
 Array = NDArray[np.float64]
+NOT_TESTED = Verdict.NOT_TESTED.name
 ROUNDING = 1e-12
 """Rounding of a severity, 1; an interval that ends at the truth holds it."""
 STEPS = (2e-5, 5e-6)
 """Half-widths of the differences for derivatives, 1; the wide and the narrow one."""
 AGREEMENT = 0.2
 """Largest relative difference of derivatives by both widths, 1; others are left out."""
-SEVERITY_HEADINGS = (
-    "test", "severity", "runs", "bias", "mean", "rms", "maximum", "coverage of 95 %, %",
-    "rms / Cramér–Rao bound",
+HEADINGS = (
+    "severity", "cases", "answered", "sure and wrong", "bias", "mean", "p95", "worst",
+    "intervals that hold", "coverage of 95 %", "mean width", "rms / Cramér–Rao bound",
 )  # fmt: skip
+LEVEL_MARGIN = 0.02
+"""Distance of a severity from a level within which either class will do, 1."""
 
 
 def outcome(found: Diagnosis | EhadiagError) -> Record:
     """Verdict, estimates, reasons and notes of a diagnosis, or why there is none."""
     if isinstance(found, EhadiagError):
-        return {"verdict": "error", "value": [], "why": str(found), "notes": []}
+        return {"verdict": "error", "value": [], "reasons": [str(found)], "notes": []}
     estimates = found.identification.estimates if found.identification else ()
     return {
         "verdict": found.verdict.name,
         "value": [item.value for item in estimates],
+        "std": [item.std for item in estimates],
         "interval95": [list(item.interval95) for item in estimates],
-        "why": "; ".join(found.reasons),
+        "reasons": list(found.reasons),
         "notes": [note for item in found.recordings for note in item.quality.notes],
     }
 
@@ -54,73 +58,80 @@ def percent_errors(records: Sequence[Record], stage: str = "value") -> Array:
 
 def holds_truth(records: Sequence[Record]) -> NDArray[np.bool_]:
     """Whether the 95 % interval of each severity holds the truth, shape (n, 3)."""
-    low, high = _ends(records)
+    interval = np.array([record["interval95"] for record in records])
     truth = np.array([record["faults"] for record in records])
+    low, high = interval[..., 0], interval[..., 1]
     return np.asarray((low <= truth + ROUNDING) & (truth - ROUNDING <= high))
 
 
-def is_wrong(record: Record, levels: Levels | None = None) -> bool:
-    """Whether a verdict is another than the truth's, and the intervals exclude the truth.
+def is_answered(record: Record) -> bool:
+    """Whether a record has estimates, and no verdict that withholds them."""
+    return bool(record["value"]) and record.get("verdict") not in ("error", NOT_TESTED)
 
-    An interval that holds the truth on the other side of a level says that it may be so.
+
+def is_wrong(record: Record) -> bool:
+    """Whether a verdict is of another class than the truth, although the intervals exclude that.
+
+    Another effect than the faults may make it DEGRADED.
     """
-    levels = levels or Levels()
-    worst = max(record["faults"])
-    true = Verdict.HEALTHY if worst < levels.advisory else Verdict.DEGRADED
-    true = Verdict.FAULT if worst >= levels.limit else true
-    if record["verdict"] in (None, Verdict.NOT_TESTED.name, true.name):
+    levels, worst = Levels(), max(record["faults"])
+    if record.get("verdict") == Verdict.HEALTHY.name:
+        return worst > levels.advisory + LEVEL_MARGIN
+    if "verdict" not in record or not is_answered(record):
         return False
-    return not bool(holds_truth([record]).all())
+    lows, tops = zip(*record["interval95"], strict=True)
+    if record["verdict"] == Verdict.FAULT.name:
+        return worst < levels.limit - LEVEL_MARGIN and max(lows) > levels.limit
+    if worst > levels.limit + LEVEL_MARGIN:
+        return max(tops) < levels.limit
+    return worst < levels.advisory - LEVEL_MARGIN and max(lows) > levels.advisory
 
 
-def stated_of(records: Sequence[Record]) -> list[Record]:
-    """Records with a verdict and estimates."""
-    without = ("error", Verdict.NOT_TESTED.name)
-    return [item for item in records if item["verdict"] not in without and item["value"]]
+def accuracy_table(records: Sequence[Record], *by: str, of_all: bool = False) -> Iterator[str]:
+    """Table of errors and intervals in percent of damage, by the records' values of these names.
+
+    Errors are of what is answered, or of all that has estimates; intervals of what is answered.
+    p95 of all severities is that of the cases' means; the bound's ratio is of truths inside 0 … 1.
+    """
+    rows: list[tuple[object, ...]] = []
+    for key, part in grouped(records, *by).items():
+        answered = [item for item in part if is_answered(item)]
+        counts = (len(part), len(answered), sum(map(is_wrong, part)))
+        estimated = [item for item in part if item["value"]] if of_all else answered
+        columns = [*range(len(FAULTS)), slice(None)] if estimated else []
+        for name, column in zip((*FAULT_NAMES, "all"), columns, strict=False):
+            rows.append((*key, name, *counts, *_error_cells(estimated, answered, column)))
+        rows += [] if estimated else [(*key, "all", *counts, *"–" * (len(HEADINGS) - 4))]
+    yield from markdown((*by, *HEADINGS), rows)
 
 
-ERROR_HEADINGS = ("mean", "largest", "intervals that hold")
+def _error_cells(
+    estimated: Sequence[Record], answered: Sequence[Record], column: int | slice
+) -> list[str]:
+    error = percent_errors(estimated)[:, column].reshape(len(estimated), -1)
+    cells = [
+        f"{error.mean():+.4f}", f"{np.abs(error).mean():.4f}",
+        f"{np.quantile(np.abs(error).mean(axis=1), 0.95):.4f}", f"{np.abs(error).max():.4f}",
+    ]  # fmt: skip
+    if not answered:
+        return [*cells, "0 of 0", "–", "–", "–"]
+    held = holds_truth(answered)[:, column]
+    interval = np.array([item["interval95"] for item in answered])
+    width = 100.0 * (interval[..., 1] - interval[..., 0])[:, column].mean()
+    cells += [f"{held.sum()} of {held.size}", f"{100.0 * held.mean():.1f} %", f"{width:.3f}"]
+    return [*cells, _over_bound(estimated, column)]
 
 
-def error_cells(stated: Sequence[Record]) -> list[str]:
-    """Mean and largest of the records' largest errors in percent, and coverage."""
-    if not stated:
-        return ["", "", "0 of 0"]
-    largest, held = np.abs(percent_errors(stated)).max(axis=1), holds_truth(stated)
-    return [f"{largest.mean():.3f} %", f"{largest.max():.3f} %", f"{held.sum()} of {held.size}"]
-
-
-def percent_widths(records: Sequence[Record]) -> Array:
-    """Width of the 95 % interval of each severity in percent, shape (n, 3)."""
-    low, high = _ends(records)
-    return 100.0 * (high - low)
-
-
-def _ends(records: Sequence[Record]) -> tuple[Array, Array]:
-    interval = np.array([record["interval95"] for record in records])
-    return interval[..., 0], interval[..., 1]
-
-
-def rms(values: Array) -> float:
-    """Root of the mean square of what is finite; NaN where nothing is."""
-    finite = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
-
-
-def severity_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    """Rows of a table with `SEVERITY_HEADINGS`; the bound's ratio is of truths inside 0 … 1."""
-    for (test,), part in grouped(records, "test").items():
-        error, held = percent_errors(part), holds_truth(part)
-        truth = np.array([record["faults"] for record in part])
-        bound = 100.0 * np.array([record["bound"] for record in part], dtype=np.float64)
-        ratio = np.where((truth > 0.0) & (truth < 1.0), error / bound, np.nan)
-        for j, name in enumerate(FAULT_NAMES):
-            mine = error[:, j]
-            yield (
-                test, name, len(part), f"{mine.mean():+.4f}", f"{np.abs(mine).mean():.4f}",
-                f"{rms(mine):.4f}", f"{np.abs(mine).max():.4f}", f"{100.0 * held[:, j].mean():.1f}",
-                f"{rms(ratio[:, j]):.2f}",
-            )  # fmt: skip
+def _over_bound(records: Sequence[Record], column: int | slice) -> str:
+    """Rms error over the Cramér–Rao bound."""
+    bounded = [item for item in records if item.get("bound") is not None]
+    if not bounded:
+        return "–"
+    truth = np.array([item["faults"] for item in bounded])
+    ratio = percent_errors(bounded) / (100.0 * np.array([item["bound"] for item in bounded]))
+    inside = np.where((truth > 0.0) & (truth < 1.0), ratio, np.nan)[:, column]
+    finite = inside[np.isfinite(inside)]
+    return f"{np.sqrt(np.mean(finite**2)):.2f}" if finite.size else "–"
 
 
 def cramer_rao(experiments: Sequence[Experiment], faults: Sequence[float]) -> Array:
@@ -153,7 +164,7 @@ def _information(experiment: Experiment, faults: Sequence[float]) -> Array:
 def _derivatives(experiment: Experiment, truth: Array, step: float) -> Array:
     """Derivatives of spool and pressure in units of their noise, shape (k, 2, n)."""
     noise = np.sqrt(Sensors().noise_lsb ** 2 + 1.0 / 12.0) * np.array(
-        [SPOOL_CHANNEL.lsb, PRESSURE_CHANNEL.lsb]
+        [CHANNELS.spool.lsb, CHANNELS.pressure.lsb]
     )
     out = np.empty((len(FAULTS), len(noise), experiment.ticks))
     for j in range(len(FAULTS)):

@@ -10,16 +10,20 @@ from itertools import product
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.calibrate_unit import calibrate
 from ehadiag.core.actuator import Actuator, ExponentOrRange, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag_tools.accuracy.figures import cramer_rao, holds_truth, is_wrong, percent_errors
+from ehadiag_tools.accuracy.figures import (
+    NOT_TESTED,
+    accuracy_table,
+    cramer_rao,
+    outcome,
+    percent_errors,
+)
 from ehadiag_tools.simulator.compare_logs import read_rows
-from ehadiag_tools.study import Options, Record, Study, grouped, markdown
+from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError, EhadiagError
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.stored_test import bundled_tests
@@ -110,22 +114,11 @@ def with_exponent(actuator: Actuator, exponent: ExponentOrRange) -> Actuator:
 
 
 def _diagnosed(path: Path, truth: list[float], unit: Actuator) -> Record:
-    begin = time.process_time()
     found = diagnose([read_recording(path)], unit, bundled_tests().values())
     if found.identification is None:
         raise EhadiagError(f"{path.name}: {'; '.join(found.reasons)}")
-    estimates = found.identification.estimates
-    return {
-        "recording": path.stem,
-        "faults": truth,
-        "value": [item.value for item in estimates],
-        "std": [item.std for item in estimates],
-        "interval95": [list(item.interval95) for item in estimates],
-        "bound": cramer_rao(found.experiments, truth).tolist(),
-        "verdict": found.verdict.name,
-        "refused": list(found.reasons) if found.verdict is Verdict.NOT_TESTED else [],
-        "diagnosis_s": time.process_time() - begin,
-    }
+    bound = cramer_rao(found.experiments, truth).tolist()
+    return {"recording": path.stem, "faults": truth, **outcome(found), "bound": bound}
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
@@ -138,39 +131,20 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
             yield f"refused: {'; '.join(record['reasons'])}"
             continue
         yield f"learned: {record['learned']}\n"
-        if record["worn"]:
-            headings = ("m", "recording", *FAULT_NAMES, "bounds", "covered", "verdict")
-            yield from markdown(headings, _rows(record["worn"]))
-            for item in record["worn"]:
-                if item["refused"]:
-                    yield f"m {item['m']}, {item['recording']}: {'; '.join(item['refused'])}"
-    yield from _summary([item for record in records for item in record["worn"]])
+        yield from markdown(("m", "recording", *FAULT_NAMES, "bounds", "verdict"), _rows(record))
+    yield "\nErrors of what is answered, by m:\n"
+    yield from accuracy_table([item for record in records for item in record["worn"]], "m")
 
 
-def _summary(worn: Sequence[Record]) -> Iterator[str]:
-    """What was answered: mean and worst error of each severity, coverage."""
-    for (said,), part in grouped(worn, "m").items():
-        answered = [item for item in part if not item["refused"]]
-        yield f"\nm {said}: answered {len(answered)} of {len(part)}"
-        if answered:
-            error = np.abs(percent_errors(answered))
-            means, worst = error.mean(axis=0), error.max(axis=0)
-            each = (
-                f"{name} mean {mean:.3f}, worst {most:.3f}"
-                for name, mean, most in zip(FAULT_NAMES, means, worst, strict=True)
-            )
-            held = holds_truth(answered)
-            wrong = sum(map(is_wrong, answered))
-            yield f"{'; '.join(each)}; {held.sum()} of {held.size} hold; sure and wrong: {wrong}"
-
-
-def _rows(worn: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for item, error, held in zip(worn, percent_errors(worn), holds_truth(worn), strict=True):
+def _rows(record: Record) -> Iterator[tuple[object, ...]]:
+    for item in record["worn"]:
+        (error,) = percent_errors([item])
         cells = [f"{e:+.3f} ± {100.0 * s:.3f}" for e, s in zip(error, item["std"], strict=True)]
         bounds = " ".join(f"{100.0 * value:.3f}" for value in item["bound"])
-        covered = "yes" if held.all() else "no"
         verdict = item["verdict"].replace("_", " ")
-        yield item["m"], item["recording"], *cells, bounds, covered, verdict
+        if item["verdict"] == NOT_TESTED:
+            verdict += f": {'; '.join(item['reasons'])}"
+        yield item["m"], item["recording"], *cells, bounds, verdict
 
 
 RECORDED_UNITS = Study(

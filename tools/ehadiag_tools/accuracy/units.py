@@ -29,15 +29,9 @@ from ehadiag.model.residual_models import SimdModel
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S
 from ehadiag_tools.accuracy.cases import TESTS
-from ehadiag_tools.accuracy.figures import (
-    SEVERITY_HEADINGS,
-    holds_truth,
-    percent_errors,
-    percent_widths,
-    severity_rows,
-)
+from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, add_group, record, unit_with
-from ehadiag_tools.study import Options, Record, Study, grouped, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped
 from firmware_iface.recording import Recording
 from firmware_iface.stored_test import bundled_tests, resolve_test
 
@@ -46,10 +40,6 @@ DATA = ("known", "tolerance", "calibrated", "textbook")
 those of its file and there is no effect, so that the Cramér–Rao bound is known."""
 TOLERANCE = 0.05
 """Tolerance of the data sheet, 1; that of the units' ten values."""
-HEADINGS = (
-    "test", "data", "nuisances", "cases", "mean", "p95", "worst", "coverage, %", "mean width",
-    "NOT TESTED, %", "model runs", "processor, ms",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +76,7 @@ def perform_unit(case: UnitCase) -> Record:
         "faults": faults,
         "value": [item.value for item in result.estimates],
         "interval95": [list(item.interval95) for item in result.estimates],
-        "not_tested": bool(reasons or objections),
+        "verdict": NOT_TESTED if reasons or objections else "answered",
         "refused": list(reasons),
         "attempts": result.attempts,
         "evaluations": result.evaluations,
@@ -164,33 +154,13 @@ def _unit_cases(options: Options) -> list[UnitCase]:
 
 
 def _unit_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    groups = grouped(records, "test", "data", "nuisances")
-    yield from markdown(HEADINGS, ((*key, *unit_row(part)) for key, part in groups.items()))
-    bounded = [item for item in records if item["bound"] is not None]
-    if bounded:
-        yield "\nBeside the Cramér–Rao bound of the same unknowns:\n"
-        yield from markdown(SEVERITY_HEADINGS, severity_rows(bounded))
-
-
-def unit_row(records: Sequence[Record]) -> list[str]:
-    """Cells of the table behind test, data and nuisances, in percent of damage.
-
-    Errors are of every case, 95th percentile and mean of the cases' mean; coverage and width are
-    those of the intervals that are stated, NOT TESTED states none.
-    """
-    error = np.abs(percent_errors(records))
-    stated = [item for item in records if not item["not_tested"]]
-    return [
-        str(len(records)),
-        f"{error.mean():.4f}",
-        f"{np.quantile(error.mean(axis=1), 0.95):.4f}",
-        f"{error.max():.3f}",
-        f"{100.0 * holds_truth(stated).mean():.1f}" if stated else "–",
-        f"{percent_widths(stated).mean():.3f}" if stated else "–",
-        f"{100.0 * (1.0 - len(stated) / len(records)):.1f}",
-        f"{np.mean([item['evaluations'] for item in records]):.0f}",
-        f"{1e3 * np.mean([item['processor_s'] for item in records]):.0f}",
-    ]
+    yield from accuracy_table(records, "test", "data", "nuisances", of_all=True)
+    yield "\nModel runs and processor time of an identification, mean:\n"
+    for key, part in grouped(records, "test", "data", "nuisances").items():
+        runs, spent = (
+            np.mean([item[name] for item in part]) for name in ("evaluations", "processor_s")
+        )
+        yield f"- {', '.join(key)}: {runs:.0f}, {1e3 * spent:.0f} ms"
 
 
 def bound_of(experiment: Experiment, faults: Sequence[float]) -> NDArray[np.float64]:

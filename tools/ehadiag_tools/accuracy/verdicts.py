@@ -12,13 +12,13 @@ from functools import cache
 import numpy as np
 from scipy.stats import binomtest
 
-from ehadiag.assess.diagnosis import Diagnosis, diagnose
-from ehadiag.assess.verdict import Levels, Verdict
+from ehadiag.assess.diagnosis import diagnose
+from ehadiag.assess.verdict import Verdict
 from ehadiag.calibration.calibrate_unit import calibrate
-from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.core.actuator import default_actuator
 from ehadiag_sim.broken_hardware import HARDWARE_FAULTS, simulate_broken
 from ehadiag_sim.conditions import Faults
-from ehadiag_tools.accuracy.figures import holds_truth, outcome, percent_errors, percent_widths
+from ehadiag_tools.accuracy.figures import accuracy_table, is_wrong, outcome
 from ehadiag_tools.simulator.units import COARSE_STEP, add_group, record, unit_with
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.recording import Recording
@@ -27,12 +27,6 @@ from firmware_iface.stored_test import bundled_tests, resolve_test
 TESTS = ("open", "closed")
 SOUND, WORN = 0.20, 0.30
 """Largest severity of a sound unit, 1; least of the largest one of a worn unit."""
-LEVEL_MARGIN = 0.02
-"""Distance of a severity from a level within which either class will do, 1."""
-
-
-def _diagnosed(recording: Recording, actuator: Actuator) -> Record:
-    return outcome(diagnose([recording], actuator, bundled_tests().values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +57,8 @@ def perform_alarms(case: AlarmCase) -> Record:
         assert found.actuator is not None
         faults, name = draw_severities(rng, sound=k % 2 == 0), TESTS[k // 2 % 2]
         recording = recorded(name, Faults(*faults))
-        tested.append({"faults": faults, "test": name, **_diagnosed(recording, found.actuator)})
+        answer = outcome(diagnose([recording], found.actuator, bundled_tests().values()))
+        tested.append({"faults": faults, "test": name, **answer})
     return {"refused": list(found.reasons), "tested": tested, "calibration_s": spent}
 
 
@@ -118,26 +113,7 @@ def alarm_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     counts = Counter((item["verdict"], "sound" if _is_sound(item) else "worn") for item in tested)
     cells = [f"{kind} {name} {count}" for (name, kind), count in sorted(counts.items())]
     yield f"\n{', '.join(cells)}\n"
-    yield from markdown(
-        ("test", "recordings", "mean", "p95", "worst", "coverage, %", "mean width"),
-        _error_rows(tested),
-    )
-
-
-def _error_rows(tested: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    """Errors in percent of damage of what is not NOT TESTED, and how often an interval holds."""
-    for test in TESTS:
-        part = [
-            item for item in tested
-            if item["test"] == test and item["value"] and item["verdict"] != Verdict.NOT_TESTED.name
-        ]  # fmt: skip
-        if part:
-            error = np.abs(percent_errors(part))
-            yield (
-                test, len(part), f"{error.mean():.4f}",
-                f"{np.quantile(error.mean(axis=1), 0.95):.4f}", f"{error.max():.3f}",
-                f"{100.0 * holds_truth(part).mean():.1f}", f"{percent_widths(part).mean():.3f}",
-            )  # fmt: skip
+    yield from accuracy_table(tested, "test")
 
 
 def _is_sound(item: Record) -> bool:
@@ -170,36 +146,10 @@ def perform_broken(case: HardwareCase) -> Record:
     _load_kernels(case.test)
     recording, faults = _broken(case)
     begin = time.process_time()
-    found = diagnose([recording], default_actuator(), bundled_tests().values())
-    spent = time.process_time() - begin
-    hidden = HARDWARE_FAULTS[case.kind].hidden
-    wrong = (found.verdict is Verdict.HEALTHY and not hidden) or is_wrong_class(found, faults)
-    return {
-        "faults": faults,
-        "verdict": found.verdict.name,
-        "reasons": list(found.reasons),
-        "not_allowed": wrong,
-        "processor_s": spent,
-    }
-
-
-def is_wrong_class(found: Diagnosis, faults: Sequence[float]) -> bool:
-    """Whether a verdict is of another class than the truth, although the intervals exclude that.
-
-    Another nuisance than the faults may make it DEGRADED.
-    """
-    levels, worst = Levels(), max(faults)
-    if found.verdict is Verdict.HEALTHY:
-        return worst > levels.advisory + LEVEL_MARGIN
-    if found.verdict is Verdict.NOT_TESTED or found.identification is None:
-        return False
-    tops = [item.interval95[1] for item in found.identification.estimates]
-    lows = [item.interval95[0] for item in found.identification.estimates]
-    if found.verdict is Verdict.FAULT:
-        return worst < levels.limit - LEVEL_MARGIN and max(lows) > levels.limit
-    if worst > levels.limit + LEVEL_MARGIN:
-        return max(tops) < levels.limit
-    return worst < levels.advisory - LEVEL_MARGIN and max(lows) > levels.advisory
+    found = outcome(diagnose([recording], default_actuator(), bundled_tests().values()))
+    record = {"faults": faults, **found, "processor_s": time.process_time() - begin}
+    missed = found["verdict"] == Verdict.HEALTHY.name and not HARDWARE_FAULTS[case.kind].hidden
+    return {**record, "not_allowed": missed or is_wrong(record)}
 
 
 def _broken(case: HardwareCase) -> tuple[Recording, list[float]]:
@@ -226,7 +176,6 @@ def _hardware_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=TESTS, help="may be repeated (both)")
     add("--kind", action="append", choices=list(HARDWARE_FAULTS), help="may be repeated (all)")
-    add("--reasons", action="store_true", help="list every case with its reasons, too")
 
 
 def _hardware_cases(options: Options) -> list[HardwareCase]:
@@ -238,7 +187,7 @@ def _hardware_cases(options: Options) -> list[HardwareCase]:
     ]
 
 
-def hardware_report(records: Sequence[Record], options: Options) -> Iterator[str]:
+def hardware_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     """Verdicts and times of each kind, and of all."""
     groups = grouped(records, "test", "kind") | {("all", "all"): list(records)}
     verdicts = [verdict.name.replace("_", " ") for verdict in Verdict]
@@ -246,12 +195,11 @@ def hardware_report(records: Sequence[Record], options: Options) -> Iterator[str
         ("test", "kind", *verdicts, "not allowed", "median, s", "longest, s"),
         ((*key, *_hardware_cells(part)) for key, part in groups.items()),
     )
-    for item in records if options.reasons else ():
+    for item in (item for item in records if item["not_allowed"]):
         faults = ", ".join(f"{value:.2f}" for value in item["faults"])
-        mark = " NOT ALLOWED" if item["not_allowed"] else ""
         yield (
             f"- {item['test']} {item['kind']} case {item['case']} ({faults}): "
-            f"{item['verdict']}{mark}, {item['processor_s']:.2f} s: {'; '.join(item['reasons'])}"
+            f"{item['verdict']} NOT ALLOWED: {'; '.join(item['reasons'])}"
         )
 
 

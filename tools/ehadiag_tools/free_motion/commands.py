@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,22 +18,33 @@ KINDS = (
     "manoeuvres", "gusts", "dither",
 )  # fmt: skip
 """Kinds of motion; a piece has one, broken by holds."""
+Array = NDArray[np.float64]
 CORNER_HZ = 2.0
 """Frequency beyond which amplitudes fall, Hz."""
+
+
+class Segment(NamedTuple):
+    """Commands of one kind: how many, rate in Hz, the one before them, the largest, m or A."""
+
+    ticks: int
+    rate: float
+    last: float
+    largest: float
 
 
 def random_command(
     rng: np.random.Generator, kind: str, ticks: int, rate: float, largest: float
 ) -> list[float]:
     """Commands of one kind of motion, m or A, at a rate in Hz; one segment of five is a hold."""
-    out: list[NDArray[np.float64]] = []
+    out: list[Array] = []
     last, length = 0.0, 0
-    segment = HELD_OUT.get(kind, _segment)
     while length < ticks:
         count = int(rng.uniform(0.5, 6.0) * rate)
         chosen = "hold" if rng.uniform() < 0.2 else kind
-        make = _segment if chosen == "hold" else segment
-        piece = np.clip(make(rng, chosen, count, rate, last, largest), -largest, largest)
+        segment = Segment(count, rate, last, largest)
+        make = HELD_OUT.get(chosen)
+        drawn = make(rng, segment) if make else _segment(rng, chosen, *segment)
+        piece = np.clip(drawn, -largest, largest)
         out.append(piece)
         last, length = float(piece[-1]), length + count
     commands: list[float] = np.concatenate(out)[:ticks].tolist()
@@ -41,7 +53,7 @@ def random_command(
 
 def _segment(  # noqa: PLR0911 - one return a kind
     rng: np.random.Generator, kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+) -> Array:
     time = np.arange(count) / rate
     share = np.arange(count) / count
     target = rng.uniform(-largest, largest)
@@ -87,118 +99,95 @@ def even_in_octaves(rng: np.random.Generator, ends: tuple[float, float]) -> floa
     return math.exp(rng.uniform(math.log(ends[0]), math.log(ends[1])))
 
 
-Segment = Callable[[np.random.Generator, str, int, float, float, float], NDArray[np.float64]]
-
-
-def _multisine(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _multisine(rng: np.random.Generator, s: Segment) -> Array:
     """Eight sines at once, random in phase."""
     hertz = np.exp(rng.uniform(math.log(0.1), math.log(25.0), (8, 1)))
     phase = rng.uniform(0.0, 2.0 * math.pi, (8, 1))
-    size = rng.uniform(0.05, 0.5) * largest / (1.0 + hertz / CORNER_HZ)
-    waves = size * np.sin(2.0 * math.pi * hertz * np.arange(count) / rate + phase)
-    wave: NDArray[np.float64] = waves.sum(axis=0)
-    return last + wave - wave[0]
+    size = rng.uniform(0.05, 0.5) * s.largest / (1.0 + hertz / CORNER_HZ)
+    waves = size * np.sin(2.0 * math.pi * hertz * np.arange(s.ticks) / s.rate + phase)
+    wave: Array = waves.sum(axis=0)
+    return s.last + wave - wave[0]
 
 
-def _binary(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _binary(rng: np.random.Generator, s: Segment) -> Array:
     """Two values in turn, random in length."""
-    ends = rng.exponential(rng.uniform(0.03, 0.5) * rate, count).cumsum()
-    turns = (ends.searchsorted(np.arange(count)) % 2).astype(np.float64)
-    return last + rng.uniform(-0.4, 0.4) * largest * turns
+    ends = rng.exponential(rng.uniform(0.03, 0.5) * s.rate, s.ticks).cumsum()
+    turns = (ends.searchsorted(np.arange(s.ticks)) % 2).astype(np.float64)
+    return s.last + rng.uniform(-0.4, 0.4) * s.largest * turns
 
 
-def _walk(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _walk(rng: np.random.Generator, s: Segment) -> Array:
     """Random walk that is drawn back to the middle."""
-    pull = rng.uniform(0.2, 2.0) / rate
-    size = rng.uniform(0.1, 0.5) * largest * math.sqrt(2.0 * pull)
-    out, value = np.empty(count), last
-    for k, draw in enumerate(rng.standard_normal(count).tolist()):
+    pull = rng.uniform(0.2, 2.0) / s.rate
+    size = rng.uniform(0.1, 0.5) * s.largest * math.sqrt(2.0 * pull)
+    out, value = np.empty(s.ticks), s.last
+    for k, draw in enumerate(rng.standard_normal(s.ticks).tolist()):
         value += size * draw - pull * value
         out[k] = value
     return out
 
 
-def _sawtooth(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _sawtooth(rng: np.random.Generator, s: Segment) -> Array:
     """Slow rise and fast return."""
     hertz = even_in_octaves(rng, (0.2, 4.0))
-    share = np.arange(count) * hertz / rate % 1.0
+    share = np.arange(s.ticks) * hertz / s.rate % 1.0
     fast = rng.uniform(0.02, 0.3)
     tooth = np.minimum(share / (1.0 - fast), (1.0 - share) / fast)
-    return last + rng.uniform(-0.8, 0.8) * largest * tooth
+    return s.last + rng.uniform(-0.8, 0.8) * s.largest * tooth
 
 
-def _approach(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _approach(rng: np.random.Generator, s: Segment) -> Array:
     """Exponential approach to a target, as behind a first-order filter."""
-    lag = even_in_octaves(rng, (0.02, 2.0)) * rate
-    target = rng.uniform(-largest, largest)
-    return target + (last - target) * np.exp(-np.arange(count) / lag)
+    lag = even_in_octaves(rng, (0.02, 2.0)) * s.rate
+    target = rng.uniform(-s.largest, s.largest)
+    return target + (s.last - target) * np.exp(-np.arange(s.ticks) / lag)
 
 
-def _trapezoid(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
-    """There at a limited rate, a while, and back."""
-    speed = even_in_octaves(rng, (0.05, 10.0)) * largest / rate
-    target = rng.uniform(-largest, largest)
-    away = np.minimum(np.arange(count), np.arange(count)[::-1]) * speed
-    return last + np.sign(target - last) * np.minimum(away, abs(target - last))
+def _trapezoid(rng: np.random.Generator, s: Segment) -> Array:
+    """There at a limited s.rate, a while, and back."""
+    speed = even_in_octaves(rng, (0.05, 10.0)) * s.largest / s.rate
+    target = rng.uniform(-s.largest, s.largest)
+    away = np.minimum(np.arange(s.ticks), np.arange(s.ticks)[::-1]) * speed
+    return s.last + np.sign(target - s.last) * np.minimum(away, abs(target - s.last))
 
 
-def _creep(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _creep(rng: np.random.Generator, s: Segment) -> Array:
     """A motion so slow that the jack sticks and slips."""
-    speed = rng.choice((-1.0, 1.0)) * even_in_octaves(rng, (0.002, 0.05)) * largest / rate
-    return last + speed * np.arange(count)
+    speed = rng.choice((-1.0, 1.0)) * even_in_octaves(rng, (0.002, 0.05)) * s.largest / s.rate
+    return s.last + speed * np.arange(s.ticks)
 
 
-def _taps(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _taps(rng: np.random.Generator, s: Segment) -> Array:
     """Short pulses of either sign, far between."""
-    out = np.full(count, last)
+    out = np.full(s.ticks, s.last)
     for _ in range(int(rng.integers(1, 6))):
-        begin, width = int(rng.integers(count)), int(rng.uniform(0.02, 0.3) * rate)
-        out[begin : begin + width] += rng.uniform(-0.5, 0.5) * largest
+        begin, width = int(rng.integers(s.ticks)), int(rng.uniform(0.02, 0.3) * s.rate)
+        out[begin : begin + width] += rng.uniform(-0.5, 0.5) * s.largest
     return out
 
 
-def _beats(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _beats(rng: np.random.Generator, s: Segment) -> Array:
     """A sine whose size comes and goes."""
     hertz, slow = even_in_octaves(rng, (1.0, 12.0)), even_in_octaves(rng, (0.1, 1.0))
-    time = np.arange(count) / rate
-    size = rng.uniform(0.1, 0.8) * largest / (1.0 + hertz / CORNER_HZ)
-    return last + size * np.sin(2 * np.pi * slow * time) * np.sin(2 * np.pi * hertz * time)
+    time = np.arange(s.ticks) / s.rate
+    size = rng.uniform(0.1, 0.8) * s.largest / (1.0 + hertz / CORNER_HZ)
+    return s.last + size * np.sin(2 * np.pi * slow * time) * np.sin(2 * np.pi * hertz * time)
 
 
-def _hops(
-    rng: np.random.Generator, _kind: str, count: int, rate: float, last: float, largest: float
-) -> NDArray[np.float64]:
+def _hops(rng: np.random.Generator, s: Segment) -> Array:
     """Holds of random length at random places, each reached smoothly."""
-    out, at = np.empty(count), 0
-    while at < count:
-        width = int(even_in_octaves(rng, (0.05, 0.6)) * rate)
-        target = rng.uniform(-largest, largest)
-        share = np.minimum(np.arange(count - at) / width, 1.0)
+    out, at, last = np.empty(s.ticks), 0, s.last
+    while at < s.ticks:
+        width = int(even_in_octaves(rng, (0.05, 0.6)) * s.rate)
+        target = rng.uniform(-s.largest, s.largest)
+        share = np.minimum(np.arange(s.ticks - at) / width, 1.0)
         out[at:] = last + (target - last) * 0.5 * (1.0 - np.cos(np.pi * share))
-        at += width + int(rng.exponential(0.5) * rate)
+        at += width + int(rng.exponential(0.5) * s.rate)
         last = target
     return out
 
 
-HELD_OUT: dict[str, Segment] = {
+HELD_OUT: dict[str, Callable[[np.random.Generator, Segment], Array]] = {
     "multisine": _multisine, "binary": _binary, "walk": _walk, "sawtooth": _sawtooth,
     "approach": _approach, "trapezoid": _trapezoid, "creep": _creep, "taps": _taps,
     "beats": _beats, "hops": _hops,

@@ -18,23 +18,26 @@ from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator, load_actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.export.library import (
     MANIFEST_FILE,
     SHARED_LIBRARY_FILE,
     STATIC_LIBRARY_FILE,
     export_library,
+    exported_unit,
+    library_plan,
 )
-from ehadiag.export.plan import exported_unit, library_plan
 from ehadiag.export.targets import find_target
 from ehadiag.identify.experiment import build_experiment
 from ehadiag.identify.identification_session import NuisanceMode, identify
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD as PLACES
 from ehadiag.onboard.onboard_memory import OnboardOutcome
+from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, is_answered
 from ehadiag_tools.accuracy.units import UnitCase, draw_unit, record_worn
 from ehadiag_tools.onboard.emulators import EMULATED, Emulator, missing
 from ehadiag_tools.onboard.replay import identified, replayed, surrounded, ticks_of, unit_of
-from ehadiag_tools.study import Options, Record, Study, grouped, markdown
+from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import RESULT_MODE, Folder
 from firmware_iface.logs.reader import read_recording
@@ -54,7 +57,7 @@ class OnboardCase:
     """One recording on one target, replayed through the monitor or identified.
 
     Folder of an export: empty for one that is made here. Actuator: path of a file, empty for the
-    reference actuator. Ticks: from the start of the recording; 0: all.
+    reference actuator.
     """
 
     log: str
@@ -62,7 +65,6 @@ class OnboardCase:
     export: str
     actuator: str
     identify: bool
-    ticks: int
 
 
 @cache
@@ -109,7 +111,7 @@ def _digits(case: OnboardCase) -> list[str]:
 def _run(emulator: Emulator, export: Path, case: OnboardCase) -> Record:
     recording, work = read_recording(Path(case.log)), Path(_work().name)
     actuator = load_actuator(Path(case.actuator)) if case.actuator else default_actuator()
-    ticks = ticks_of(recording)[: case.ticks or None]
+    ticks = ticks_of(recording)
     if case.identify:
         done = identified(emulator, export, surrounded(recording, actuator), ticks, work)
         outcome = done.outcome
@@ -139,7 +141,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("logs", nargs="+", type=Path, help="recordings, or folders of them")
     add("--identify", action="store_true", help="identify them as a whole")
-    add("--ticks", type=int, default=0, help="of each recording, from its start (all)")
     add("--target", action="append", help="only this one; may be repeated")
     add("--actuator", type=Path, metavar="FILE", help="of the unit that was recorded")
     add("--into", type=Path, metavar="FOLDER",
@@ -154,7 +155,6 @@ def _cases(options: Options) -> list[OnboardCase]:
     return [
         OnboardCase(
             str(log), name, str(given or ""), str(options.actuator or ""), options.identify,
-            options.ticks,
         )
         for log in _logs(options.logs)
         for name in present
@@ -247,7 +247,7 @@ ONBOARD = Study(
 )  # fmt: skip
 
 
-NOT_TESTED = 30.0
+UNTESTED = 30.0
 """Verdict of an identification that carries none."""
 GOES_ON = 1
 """What a slice returns before the last one."""
@@ -317,7 +317,16 @@ def perform_random(case: OnboardUnit) -> Record:
     begin = time.process_time()
     found = _library().identified(surrounded(recording), ticks[: round(case.share * len(ticks))])
     spent = time.process_time() - begin
-    out = {"faults": severities, "processor_s": spent, **found._asdict(), "value": found[:3]}
+    std = [found.std_Kintas, found.std_FSS, found.std_FDJ]
+    ends = [
+        (v - NORMAL_HALF_WIDTH_95 * s, v + NORMAL_HALF_WIDTH_95 * s)
+        for v, s in zip(found[:3], std, strict=True)
+    ]
+    out = {
+        "faults": severities, "processor_s": spent, "value": found[:3], "std": std,
+        "interval95": ends, "runs": found.runs, "outliers": found.outliers,
+        "verdict": NOT_TESTED if found.verdict == UNTESTED else "answered",
+    }  # fmt: skip
     if case.share == 1.0:
         assert recording.samples is not None
         experiment = build_experiment(
@@ -353,29 +362,16 @@ def _random_cases(options: Options) -> list[OnboardUnit]:
 
 
 def _random_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    rows, far = [], []
-    for (test,), part in grouped(records, "test").items():
-        stated = [item for item in part if item["verdict"] != NOT_TESTED]
-        errors = [_errors(item) for item in stated]
-        off = np.array([error / _stds(item) for error, item in zip(errors, stated, strict=True)])
-        far += [item for item, row in zip(stated, off, strict=True) if row.max() > FAR_OFF]
-        host = np.array([_distance(item) for item in stated if "host" in item])
-        rows.append((
-            test, len(part), len(part) - len(stated), sum(row.max() > FAR_OFF for row in off),
-            *_figures([100.0 * error for error in errors]), *_figures(host),
-            f"{100.0 * np.mean(off < 1.96):.1f}" if stated else "–",
-            f"{np.mean([item['runs'] for item in part]):.0f}",
-            f"{np.mean([item['processor_s'] for item in part]):.2f}",
-        ))  # fmt: skip
-    yield from markdown(
-        ("test", "cases", "NOT TESTED", f"beyond {FAR_OFF:g} deviations", "error, %: mean", "worst",
-         "from the package, deviations: mean", "worst", "coverage, %", "model runs",
-         "processor, s"),
-        rows,
-    )  # fmt: skip
-    wrong = [*far, *(i for i in records if i["verdict"] == NOT_TESTED and i["share"] == 1.0)]
+    yield from accuracy_table(records, "test")
+    host = [_distance(item).max() for item in records if "host" in item and is_answered(item)]
+    effort = [(item["runs"], item["processor_s"]) for item in records]
+    runs, spent = np.mean(effort, axis=0)
+    yield f"\n{runs:.0f} model runs and {spent:.2f} s of processor a test"
+    if host:
+        yield f"from the package, deviations: median {np.median(host):.2f}, most {max(host):.2f}"
+    wrong = [item for item in records if _is_far(item) or _is_refused(item)]
     if wrong:
-        yield "\nNOT TESTED, or beyond:\n"
+        yield f"\nNOT TESTED, or beyond {FAR_OFF:g} deviations:\n"
         yield from markdown(
             ("test", "case", "share of the test", "truth", "estimate", "outliers"),
             ((i["test"], i["case"], f"{i['share']:.3f}", _text(i["faults"]), _text(i["value"]),
@@ -383,20 +379,20 @@ def _random_report(records: Sequence[Record], _options: Options) -> Iterator[str
         )  # fmt: skip
 
 
-def _errors(item: Record) -> NDArray[np.float64]:
-    return np.abs(np.array(item["value"]) - np.array(item["faults"]))
+def _is_refused(item: Record) -> bool:
+    """Whether a whole test is NOT TESTED."""
+    return item["share"] == 1.0 and not is_answered(item)
 
 
-def _stds(item: Record) -> NDArray[np.float64]:
-    return np.array([item[f"std_{name}"] for name in ("Kintas", "FSS", "FDJ")])
+def _is_far(item: Record) -> bool:
+    if not is_answered(item):
+        return False
+    errors = np.abs(np.array(item["value"]) - item["faults"])
+    return bool((errors > FAR_OFF * np.array(item["std"])).any())
 
 
 def _distance(item: Record) -> NDArray[np.float64]:
     return np.asarray(np.abs(np.array(item["value"]) - item["host"]) / np.array(item["host_std"]))
-
-
-def _figures(values: Sequence[NDArray[np.float64]] | NDArray[np.float64]) -> tuple[str, str]:
-    return (f"{np.mean(values):.4f}", f"{np.max(values):.3f}") if len(values) else ("–", "–")
 
 
 def _text(values: Sequence[float | None]) -> str:
@@ -404,8 +400,7 @@ def _text(values: Sequence[float | None]) -> str:
 
 
 def _any_wrong(records: Sequence[Record]) -> bool:
-    stated = [item for item in records if item["verdict"] != NOT_TESTED]
-    return any((_errors(item) > FAR_OFF * _stds(item)).any() for item in stated)
+    return any(map(_is_far, records))
 
 
 ONBOARD_UNITS = Study(

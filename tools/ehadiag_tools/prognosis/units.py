@@ -219,7 +219,7 @@ def _cases(options: Options) -> list[LifeCase]:
         )
         for law in laws
         for place in range(each)
-    ]  # fmt: skip
+    ]
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -229,8 +229,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
-    fleet = f"{options.fleet}{' taken out early' if options.censored else ''}"
-    yield f"{len(records)} units, laws {options.laws}, seed {options.seed}, fleet of {fleet}\n"
+    fleet = f"fleet of {options.fleet}{' taken out early' if options.censored else ''}"
+    yield f"{len(records)} units, laws {options.laws}, seed {options.seed}, {fleet}\n"
     rows: list[tuple[str, ...]] = [("all", *_cells(records))]
     for law in SETS[options.laws]:
         part = [item for item in records if item["law"] == law]

@@ -7,7 +7,6 @@ sees their codes.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -18,16 +17,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 
 from ehadiag.assess.diagnosis import diagnose
-from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag_sim.conditions import Faults, Sensors, UnmodelledEffects
 from ehadiag_sim.plant_dynamics import PlantDynamics
 from ehadiag_sim.plant_laws import PositionController
 from ehadiag_sim.sensing import SimulatedConverters
 from ehadiag_sim.simulation import bus_command
-from ehadiag_tools.accuracy.figures import ERROR_HEADINGS, error_cells, outcome, stated_of
+from ehadiag_tools.accuracy.figures import accuracy_table, is_answered, outcome
 from ehadiag_tools.rigs.rerecord import TESTS, read_columns
-from ehadiag_tools.study import Options, Record, Study, grouped, markdown
+from ehadiag_tools.study import Options, Record, Study
 from firmware_iface.errors import EhadiagError
 from firmware_iface.recording import CHANNELS, Channels, CommandMode
 from firmware_iface.stored_test import bundled_tests
@@ -147,20 +145,13 @@ def perform(case: DaqCase) -> Record:
         return outcome(error)
 
 
-def _options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--test", action="append", choices=("open", "closed"), help="may be repeated (both)")
-    add("--rate", action="append", type=float, metavar="HZ", help="may be repeated (1 to 10 kHz)")
-    add("--bits", action="append", type=int, choices=tuple(NOISE_STEPS), help="(both)")
-
-
 def _cases(options: Options) -> list[DaqCase]:
     """Each kind of recording in turn, with severities, phase and clock of its own."""
     kinds = [
         (test, rate, bits, with_command)
-        for test in options.test or ("closed", "open")
-        for rate in options.rate or RATES
-        for bits in options.bits or tuple(NOISE_STEPS)
+        for test in ("closed", "open")
+        for rate in RATES
+        for bits in NOISE_STEPS
         for with_command in (False, True)
     ]
     out = []
@@ -175,27 +166,16 @@ def _cases(options: Options) -> list[DaqCase]:
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    """One line for each kind; errors and coverage are of what has a verdict."""
-    yield from markdown(
-        ("test", "rate", "bits", "verdicts", *ERROR_HEADINGS),
-        ((test, f"{rate:g} Hz", bits, *_cells(items))
-         for (test, rate, bits), items in grouped(records, "test", "rate", "bits").items()),
-    )  # fmt: skip
+    yield from accuracy_table(records, "test", "rate", "bits")
     for item in records:
-        if item["verdict"] in ("error", Verdict.NOT_TESTED.name):
+        if not is_answered(item):
             command = "with" if item["with_command"] else "without"
             yield f"\n{item['test']} {item['rate']:g} Hz, {item['bits']} bit, {command} command:"
-            yield f"{item['why']}"
-
-
-def _cells(records: Sequence[Record]) -> list[str]:
-    """Verdicts given, mean and largest error in percent, coverage."""
-    stated = stated_of(records)
-    return [f"{len(stated)} of {len(records)}", *error_cells(stated)]
+            yield f"{'; '.join(item['reasons'])}"
 
 
 DAQ_RECORDINGS = Study(
     "daq-recordings",
     "Recordings by a data acquisition with its own converters: verdicts and errors.",
-    _cases, perform, _report, _options, count=64, counted="recordings, each kind in turn",
+    _cases, perform, _report, count=64, counted="recordings, each kind in turn",
 )  # fmt: skip

@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag_tools.accuracy.figures import ERROR_HEADINGS, error_cells, outcome, stated_of
-from ehadiag_tools.rigs.buses import BUSES, ForeignBus
+from ehadiag_tools.accuracy.figures import accuracy_table, outcome
 from ehadiag_tools.rigs.rerecord import (
+    BUSES,
     TESTS,
     Disturbance,
+    ForeignBus,
     frames_on,
     logged,
     played,
     read_columns,
 )
 from ehadiag_tools.simulator.compare_logs import read_rows
-from ehadiag_tools.study import Options, Record, Study, grouped, markdown
+from ehadiag_tools.study import Options, Record, Study, grouped
 from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
 from firmware_iface.find_test import CandidateTests
@@ -38,7 +39,9 @@ DAQ = "daq"
 """Name of the decoded signals."""
 DEFAULT = "default"
 """Name of the recording as it is."""
-NAMES = (*(item.name for item in BUSES), DAQ)
+NAMES = (*BUSES, DAQ)
+CLOCK_DRIFT_PPM = 100.0
+"""Error of the host's clock, ppm: that of a usual crystal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +76,7 @@ def _played(case: BusReplay, recording: Recording, actuator: Actuator) -> Record
     test = next(item for item in TESTS if item.id == recording.test_id)
     if case.bus == DAQ:
         return on_daq(recording, test, case.how, actuator, case.seed, case.rate)
-    bus = next(item for item in BUSES if item.name == case.bus)
-    return on_bus(bus, recording, test, case.how, actuator, case.seed)
+    return on_bus(BUSES[case.bus], recording, test, case.how, actuator, case.seed)
 
 
 @cache
@@ -140,10 +142,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--bus", action="append", choices=NAMES, help="may be repeated (all)")
     add("--jitter", action="append", type=float, metavar="MS", help="half-normal (0 0.2 0.5 1)")
     add("--lead-in", type=float, metavar="S", help="instead of one drawn from 0 … 10 s for each")
-    add("--drift", type=float, default=100.0, help="ppm (%(default)g)")
-    add("--batch", type=float, default=0.0, help="ms (%(default)g)")
-    add("--lost", type=float, default=0.0, help="share of the frames")
-    add("--unordered", action="store_true", help="log sorted by its stamps")
     add("--rate", type=float, default=2000.0, help="of the decoded signals, Hz (%(default)g)")
 
 
@@ -179,30 +177,23 @@ def _foreign_cases(case: BusReplay, options: Options) -> Iterator[BusReplay]:
         rng = np.random.default_rng([options.seed, *name, *bus.encode(), round(1e3 * jitter)])
         drawn = round(float(rng.uniform(0.0, 10.0)), 3)
         lead_in = drawn if options.lead_in is None else options.lead_in
-        ordered = not options.unordered
-        how = Disturbance(jitter, lead_in, options.drift, options.batch, options.lost, kept=ordered)
+        how = Disturbance(jitter, lead_in, CLOCK_DRIFT_PPM)
         seed = int(rng.integers(1 << 31))
         yield BusReplay(case.recording, case.faults, case.actuator, bus, how, case.rate, seed)
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
-    """One line for each bus and jitter; errors and coverage are of what has a verdict."""
+    """Errors and coverage of what has a verdict, and how many verdicts are the default bus's."""
     usual = {item["recording"]: item["verdict"] for item in records if item["bus"] == DEFAULT}
-    items = ({**item, "jitter": item["how"]["jitter_ms"]} for item in records)
-    groups = grouped(items, "bus", "jitter")
-    order = sorted(groups, key=lambda key: ((DEFAULT, *NAMES).index(key[0]), key[1]))
-    yield from markdown(
-        ("bus", "jitter", "verdicts", "wrong", *ERROR_HEADINGS),
-        ((bus, f"{jitter:g} ms", *_cells(groups[bus, jitter], usual)) for bus, jitter in order),
-    )
-
-
-def _cells(records: Sequence[Record], usual: dict[str, str]) -> list[str]:
-    """Verdicts that agree with the default bus, wrong ones, mean and largest error, coverage."""
-    stated = stated_of(records)
-    same = sum(item["verdict"] == usual[item["recording"]] for item in records)
-    wrong = sum(item["verdict"] != usual[item["recording"]] for item in stated)
-    return [f"{same} of {len(records)}", str(wrong), *error_cells(stated)]
+    order = (DEFAULT, *NAMES)
+    items = [
+        {**item, "jitter, ms": item["how"]["jitter_ms"]}
+        for item in sorted(records, key=lambda item: order.index(item["bus"]))
+    ]
+    yield from accuracy_table(items, "bus", "jitter, ms")
+    for (bus,), part in grouped(items, "bus").items():
+        same = sum(item["verdict"] == usual[item["recording"]] for item in part)
+        yield f"\n{bus}: verdicts as on the default bus {same} of {len(part)}"
 
 
 FOREIGN_BUSES = Study(

@@ -1,4 +1,7 @@
-"""Plays a recording again on another bus: other messages, late time stamps, idle time before it."""
+"""Plays a recording again on another bus: other messages, late time stamps, idle time before it.
+
+The buses are the DBC files of this folder.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,17 @@ from typing import Any
 
 import numpy as np
 import pandas
+from cantools.database.can import Database
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, default_actuator
-from ehadiag_tools.rigs.buses import ForeignBus
-from firmware_iface.bus_map import BusMap, default_map
+from firmware_iface.bus_map import BusMap, default_map, resolve
 from firmware_iface.codec import TickEncoder
+from firmware_iface.dbc import parse_dbc
+from firmware_iface.files import decode_toml
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs.reader import choose_recording
+from firmware_iface.mapping_file import MappingFile
 from firmware_iface.recording import CHANNELS, BitState, CommandMode, Recording, Samples
 from firmware_iface.signals.recordings import Interpretation, recorded_tests
 from firmware_iface.stored_test import bundled_tests
@@ -30,20 +36,70 @@ REST_S = 0.15
 
 
 @dataclass(frozen=True, slots=True)
+class ForeignBus:
+    """A bus by its DBC, whose signals have the names of their roles, `channels_spool`.
+
+    The attributes `GenMsgCycleTime` and `GenMsgStartDelayTime` say when a message is sent, ms.
+    """
+
+    name: str
+    dbc: str
+
+    def schedule(self) -> dict[str, tuple[int, float]]:
+        """Ticks between two messages of a name, and the instant within the tick, both 1 ms."""
+        database = self._database()
+        assert database.dbc is not None
+        usual = {
+            name: item.default_value for name, item in database.dbc.attribute_definitions.items()
+        }
+        out = {}
+        for message in database.messages:
+            assert message.dbc is not None
+            own: dict[str, Any] = {k: item.value for k, item in message.dbc.attributes.items()}
+            every, at = (
+                float({**usual, **own}[f"GenMsg{key}Time"]) for key in ("Cycle", "StartDelay")
+            )
+            out[message.name] = int(every), at
+        return out
+
+    def _database(self) -> Database:
+        database = Database()
+        database.add_dbc_string(self.dbc)
+        return database
+
+    def mapping(self) -> str:
+        """The mapping file."""
+        lines = ['schema = "ehadiag.mapping/1"', f'dbc = "{self.name}.dbc"', "tick_ms = 1.0"]
+        for message in self._database().messages:
+            for signal in message.signals:
+                role = signal.name.replace("_", ".", 1)
+                lines.append(f'{role} = {{ message = "{message.name}", signal = "{signal.name}" }}')
+        return "\n".join(lines) + "\n"
+
+    def bus_map(self) -> BusMap:
+        """What decoder and encoder work from."""
+        where = f"mapping of {self.name}"
+        tree = decode_toml(self.mapping().encode(), MappingFile, where)
+        return resolve(tree, parse_dbc(self.dbc.encode(), self.name), where, f"{self.name}.dbc")
+
+
+BUSES = {
+    name: ForeignBus(name, Path(__file__).with_name(f"{name}.dbc").read_text(encoding="ascii"))
+    for name in ("psi29", "single", "canfd", "status", "command")
+}
+"""Foreign buses by name; what each tries is the comment of its DBC."""
+
+
+@dataclass(frozen=True, slots=True)
 class Disturbance:
     """What the bus, its adapter and the host's clock do to the time stamps.
 
-    `jitter_ms`: deviation of a half-normal delay of each frame; `batch_ms`: period at whose end an
-    adapter stamps all that came, 0: each frame alone; `lost`: share of the frames; `kept`: the log
-    keeps the order of arrival, otherwise it is sorted by stamps that are each late by themselves.
+    `jitter_ms`: deviation of a half-normal delay of each frame; the log keeps the order of arrival.
     """
 
     jitter_ms: float = 0.0
     lead_in_s: float = 0.0
     drift_ppm: float = 0.0
-    batch_ms: float = 0.0
-    lost: float = 0.0
-    kept: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,14 +135,15 @@ def frames_on(
     """Frames of a recording on a bus, in order of arrival, and what they mean."""
     bus_map, rng = bus.bus_map(), np.random.default_rng(seed)
     tick_ns = default_map().tick_ns
-    sent: dict[str, list[tuple[float, bytes]]] = {name: [] for name in bus.messages}
+    schedule = bus.schedule()
+    sent: dict[str, list[tuple[float, bytes]]] = {name: [] for name in schedule}
     encoder = _Encoder(bus_map, recording)
     for tick in range(this.channels.shape[1]):
         payloads = encoder.tick(this, tick)
         for name, data in payloads.items():
-            item = bus.messages[name]
-            if tick % item.every == 0 and (how.lost == 0.0 or rng.random() >= how.lost):
-                sent[name].append((tick + item.at, data))
+            every, at = schedule[name]
+            if tick % every == 0:
+                sent[name].append((tick + at, data))
     rows: list[tuple[float, int, Frame]] = []
     for name, items in sent.items():
         message = bus_map.messages[name]
@@ -104,13 +161,8 @@ def _stamps(
     true: NDArray[Any], how: Disturbance, tick_ns: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Time stamps in ticks, of the instants at which frames were sent."""
-    out = true + np.abs(rng.normal(0.0, how.jitter_ms * 1e6 / tick_ns, len(true)))
-    if how.kept:
-        out = np.maximum.accumulate(out)
-    if how.batch_ms:
-        period = how.batch_ms * 1e6 / tick_ns
-        out = np.ceil(out / period) * period
-    return out
+    late = true + np.abs(rng.normal(0.0, how.jitter_ms * 1e6 / tick_ns, len(true)))
+    return np.maximum.accumulate(late)
 
 
 class _Encoder:
@@ -140,12 +192,9 @@ class _Encoder:
             self._encoder.command(this.mode, float(this.command[tick]), 0, 0)
         if self._has["environment"]:
             known = self._recording.environment
-            self._encoder.environment(
-                known.supply_pressure or 0.0,
-                known.return_pressure or 0.0,
-                known.oil_temperature or 0.0,
-                0,
-            )
+            probes = known.supply_pressure, known.return_pressure, known.oil_temperature
+            supply, back, oil = (value or 0.0 for value in probes)
+            self._encoder.environment(supply, back, oil, 0)
         if self._has["status"]:
             state = BitState.RUNNING if inside else BitState.IDLE
             elapsed = (tick - this.begin) * 1e-3 if inside else 0.0

@@ -29,14 +29,7 @@ from ehadiag_tools.simulator.units import Unit
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import (
-    CHANNELS,
-    CURRENT_CHANNEL,
-    POSITION_CHANNEL,
-    CommandMode,
-    Environment,
-    Samples,
-)
+from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
 from firmware_iface.stored_test import resolve_test
 
 EFFECTS = "truth-effects.csv"
@@ -64,21 +57,24 @@ class RecordedCase:
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("folder", type=Path, help="recordings and their truth.csv; where truth-effects.csv lies"
-        " beside it the units have those effects, others are left out")  # fmt: skip
-    add("--exact-command", action="store_true",
-        help="do not round the command to the bus's resolution")  # fmt: skip
+    parser.add_argument(
+        "folder",
+        type=Path,
+        help="recordings, truth.csv and, for units with effects, truth-effects.csv",
+    )
+    parser.add_argument(
+        "--exact-command",
+        action="store_true",
+        help="do not round the command to the bus's resolution",
+    )
 
 
 def _cases(options: Options) -> list[RecordedCase]:
     rows = read_truth(options.folder / "truth.csv")
     units = _units(options.folder)
-    return [
-        RecordedCase(str(options.folder), row.file, options.exact_command)
-        for row in rows
-        if row.unit in units
-    ]
+    folder = str(options.folder)
+    exact = options.exact_command
+    return [RecordedCase(folder, row.file, exact) for row in rows if row.unit in units]
 
 
 def _units(folder: Path) -> dict[str, Unit]:
@@ -135,17 +131,10 @@ def read_truth(path: Path) -> list[Truth]:
 
 def effects_of(environment: Environment, effects: Effects | None = None) -> Effects:
     """Effects under the oil and pressures of a recording; as they are where the bus did not say."""
-    default = effects or Effects()
-
-    def value_of(value: float | None, otherwise: float) -> float:
-        return otherwise if value is None else value
-
-    return replace(
-        default,
-        oil_temperature=value_of(environment.oil_temperature, default.oil_temperature),
-        supply_pressure=value_of(environment.supply_pressure, default.supply_pressure),
-        return_pressure=value_of(environment.return_pressure, default.return_pressure),
-    )
+    names = ("oil_temperature", "supply_pressure", "return_pressure")
+    measured = {name: getattr(environment, name) for name in names}
+    known = {name: value for name, value in measured.items() if value is not None}
+    return replace(effects or Effects(), **known)
 
 
 def residuals(
@@ -202,17 +191,17 @@ def replay(
 
 def _missing(law: PositionController, command: float, current: float, simulated: float) -> float:
     """Jack position that the converter may have shown, m."""
-    nearest = round(simulated / POSITION_CHANNEL.lsb)
+    nearest = round(simulated / CHANNELS.position.lsb)
     if math.isnan(current):
-        return nearest * POSITION_CHANNEL.lsb
+        return nearest * CHANNELS.position.lsb
 
     def misfit(code: int) -> tuple[int, int]:
-        trial = copy.copy(law).current(command, CommandMode.POSITION, code * POSITION_CHANNEL.lsb)
+        trial = copy.copy(law).current(command, CommandMode.POSITION, code * CHANNELS.position.lsb)
         # In saturation many codes give one current: take the nearest position then.
-        return round(abs(trial - current) / CURRENT_CHANNEL.lsb), abs(code - nearest)
+        return round(abs(trial - current) / CHANNELS.current.lsb), abs(code - nearest)
 
     codes = range(nearest - NEIGHBOURS, nearest + NEIGHBOURS + 1)
-    return min(codes, key=misfit) * POSITION_CHANNEL.lsb
+    return min(codes, key=misfit) * CHANNELS.position.lsb
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -249,38 +238,34 @@ def read_units(path: Path, actuator: Actuator) -> dict[str, Unit]:
 def _with_effect(unit: Unit, effect: str, value: float) -> Unit | None:
     """Give a unit one effect of the table; None where it is not known."""
     effects, sensors, actuator = unit.effects, unit.sensors, unit.actuator
-    changes: dict[str, tuple[str, Any]] = {
-        "torque motor gain": ("gain_change", value - 1.0),
-        "hysteresis": ("hysteresis", value),
-        "backlash half-width": ("backlash", value),
-        "null bias": ("null_bias", value * 1e-3),
-        "number of plays": ("plays", round(value)),
-        "Stribeck velocity spool": ("spool_stribeck", value),
-        "Stribeck velocity jack": ("jack_stribeck", value),
+    changes: dict[str, dict[str, Any]] = {
+        "torque motor gain": {"gain_change": value - 1.0},
+        "hysteresis": {"hysteresis": value},
+        "backlash half-width": {"backlash": value},
+        "null bias": {"null_bias": value * 1e-3},
+        "number of plays": {"plays": round(value)},
+        "Stribeck velocity spool": {"spool_stribeck": value},
+        "Stribeck velocity jack": {"jack_stribeck": value},
     }
-    stages: dict[str, tuple[str, Any]] = {
-        "second stage": ("kind", "orifice" if value == 2.0 else "linear"),
-        "bulk modulus": ("beta", value),
+    stages: dict[str, dict[str, Any]] = {
+        "second stage": {"kind": "orifice" if value == 2.0 else "linear"},
+        "bulk modulus": {"beta": value},
     }
-    offsets = [f"{channel.name} offset" for channel in CHANNELS]
-    if effect in changes:
-        name, size = changes[effect]
-        return replace(unit, effects=replace(effects, **{name: size}))
+    offsets = {f"{channel.name} offset": place for place, channel in enumerate(CHANNELS)}
     if effect in {item.name for item in fields(DataErrors)}:
         part = actuator.jack if hasattr(actuator.jack, effect) else actuator.servovalve
         share = value / getattr(part, effect) - 1.0
-        return replace(
-            unit, effects=replace(effects, data=replace(effects.data, **{effect: share}))
-        )
+        changes[effect] = {"data": replace(effects.data, **{effect: share})}
+    if effect in changes:
+        return replace(unit, effects=replace(effects, **changes[effect]))
+    if effect in stages:
+        stage = msgspec.structs.replace(actuator.second_stage, **stages[effect])
+        return replace(unit, actuator=msgspec.structs.replace(actuator, second_stage=stage))
     if effect in offsets:
-        channel, codes = CHANNELS[offsets.index(effect)], list(sensors.offsets_lsb)
-        codes[offsets.index(effect)] = value * channel.per_unit / channel.lsb
+        place, codes = offsets[effect], list(sensors.offsets_lsb)
+        codes[place] = value * CHANNELS[place].per_unit / CHANNELS[place].lsb
         a, b, c, d = codes
         return replace(unit, sensors=replace(sensors, offsets_lsb=(a, b, c, d)))
-    if effect in stages:
-        name, content = stages[effect]
-        stage = msgspec.structs.replace(actuator.second_stage, **{name: content})
-        return replace(unit, actuator=msgspec.structs.replace(actuator, second_stage=stage))
     if effect == "analogue filter time constant":
         return replace(unit, sensors=replace(sensors, filter_time=value))
     return None

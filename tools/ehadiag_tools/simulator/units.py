@@ -10,18 +10,21 @@ those of a recording:
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.model.plant import PlantConstants, plant_constants
+from ehadiag.model.registry import FAULTS, Unknowns
 from ehadiag_sim.conditions import DataErrors, Effects, Faults, Sensors, UnmodelledEffects
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S
 from ehadiag_sim.simulation import simulate
-from firmware_iface.recording import CHANNELS, Recording
+from firmware_iface.recording import CHANNELS, Environment, Recording
 from firmware_iface.stored_test import StoredTest
 
 COARSE_STEP = 1e-6
@@ -142,6 +145,23 @@ def record(
         effects = replace(effects, supply_pressure=supply_pressure)
     done = simulate(unit.actuator, test, faults, effects, unit.sensors, seed=seed, step=step)
     return done.recording("simulated", unit.serial)
+
+
+def damaged(
+    constants: PlantConstants, severities: Sequence[float] | NDArray[np.float64]
+) -> PlantConstants:
+    """Constants of a unit, given those as new, with severities 0 … 1 in the order of `FAULTS`."""
+    point = np.asarray(severities, dtype=np.float64)
+    return Unknowns(FAULTS, (constants,), {}).constants(point)
+
+
+def damaged_unit(
+    severities: Sequence[float] | NDArray[np.float64],
+    actuator: Actuator | None = None,
+    environment: Environment | None = None,
+) -> PlantConstants:
+    """Constants of an actuator, the reference one unless given, with these severities."""
+    return damaged(plant_constants(actuator or default_actuator(), environment), severities)
 
 
 STRANGE_SIZES = {
