@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from firmware_iface.alignment.frame_faults import (
     _expected,
-    _late,
     _sequence,
     count_frames,
     count_within,
@@ -39,10 +38,12 @@ def test_sequence_takes_the_nearest(counter, expected):
 
 @pytest.mark.parametrize(
     ("position", "late"),
-    [([], 0), ([1, 2, 3], 0), ([1, 1, 2, 2], 0), ([1, 3, 2, 4], 1), ([4, 1, 2, 4, 1], 2)],
+    [([1, 2, 3], 0), ([1, 1, 2, 2], 0), ([1, 3, 2, 4], 1), ([4, 1, 2, 4, 1], 2)],
 )
 def test_late(position, late):
-    assert _late(np.array(position, dtype=np.int64)) == late
+    ticks = [TEST.first + item for item in position]
+    got = count_frames(counted(range(len(ticks))), on_axis(ticks), TEST, 0, len(ticks))
+    assert (got.out_of_order, got.accepted) == (late, len(set(position)))
 
 
 @given(st.integers(1, 50), st.integers(1, 5), st.integers(0, 4))
