@@ -324,7 +324,7 @@ def render_bus_report(report: BusReport) -> str:
     if report.ranges:
         lines += [
             "",
-            f"{'channel':<12}{'codes seen':>16}{'of':>8}{'use':>7}{'at end':>8}"
+            f"{'channel':<12}{'codes seen':>20}{'of':>10}{'use':>7}{'at end':>8}"
             f"{'now':>11}{'least':>11}{'most':>11}",
         ]
     for use in report.ranges:
@@ -335,7 +335,7 @@ def render_bus_report(report: BusReport) -> str:
         channel: Channel = getattr(CHANNELS, use.channel)
         unit, per_unit = channel.unit, channel.per_unit
         values = (f"{item / per_unit:>11.4g}" for item in (use.now, use.lowest, use.highest))
-        codes = f"{use.channel:<12}{seen:>16}{of:>8}{share:>7}{use.saturated:>8}"
+        codes = f"{use.channel:<12}{seen:>20}{of:>10}{share:>7}{use.saturated:>8}"
         lines.append(f"{codes}{''.join(values)} {unit}")
     if report.state:
         lines += ["", report.state]

@@ -15,7 +15,11 @@ from firmware_iface.codec import Decoded, DecodedTable
 from firmware_iface.mapping_file import Policy
 from firmware_iface.protection import CONFLICTS, NO_POSITION, conflicting, event_positions
 from firmware_iface.recording import BoolArray, FloatArray, IntArray, MessageCounts
-from firmware_iface.slow_values import repeated_frames, slow_value_conflict
+from firmware_iface.slow_values import (
+    brings_slow_values,
+    repeated_frames,
+    slow_value_conflict,
+)
 
 
 class Conflicts(msgspec.Struct, frozen=True, eq=False):
@@ -176,9 +180,13 @@ def slow_values(
     inside = slice(*np.searchsorted(item.row, [begin, end]))
     found: dict[str, list[FloatArray]] = {role: [] for role in roles}
     reasons: list[str] = []
-    for stream in np.unique(item.stream[inside]) if roles else ():
+    streams = np.unique(item.stream[inside]) if roles else ()
+    for stream in streams:
         mine = inside.start + np.flatnonzero(item.stream[inside] == stream)
-        message, data, counter = item.message, item.data[mine], item.counter
+        message, data = item.message, item.data[mine]
+        # Between two frames of a slow page the counter goes on with all the fast ones.
+        counts = len(streams) == 1 or brings_slow_values(message)
+        counter = item.counter if counts else None
         if counter is not None and message.counter is not None:
             counted = message.counter.present(data)
             counter = counter[mine] if counted is None or counted.all() else None
