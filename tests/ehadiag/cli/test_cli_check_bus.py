@@ -314,8 +314,8 @@ def test_columns_of_24_bits_do_not_run_together() -> None:
 
 def test_what_the_model_does_not_explain_is_refused_here_too(tmp_path: Path, run: Run) -> None:
     text = (ROOT / "ehadiag" / "data" / "actuator.toml").read_text(encoding="utf-8")
-    assert "GP  = 2.0e12" in text
-    (tmp_path / "a.toml").write_text(text.replace("GP  = 2.0e12", "GP  = 1.0e12"))
+    assert "MJ  = 150.0" in text
+    (tmp_path / "a.toml").write_text(text.replace("MJ  = 150.0", "MJ  = 900.0"))
     log = LOGS / "paper-open-1.blf"
     told = run("check-bus", "--log", log, "--actuator", tmp_path / "a.toml")
     found = run("diagnose", log, "--actuator", tmp_path / "a.toml", "--json")
