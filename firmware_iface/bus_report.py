@@ -322,22 +322,27 @@ def render_bus_report(report: BusReport) -> str:
             f" {1e3 * item.longest_pause:>8.2f} {lost:>5} {item.conflicts:>4} {check:>4}"
             f" {item.length_errors:>4} {item.range_errors:>5}"
         )
+    codes = [
+        (f"{use.lowest_code} … {use.highest_code}", str(use.codes),
+         f"{100 * (use.highest_code - use.lowest_code + 1) / use.codes:.0f} %")
+        if use.lowest_code is not None and use.highest_code is not None and use.codes
+        else ("-", "-", "-")
+        for use in report.ranges
+    ]  # fmt: skip
+    wide = max((len(seen) for seen, _, _ in codes), default=0)
+    wide, many = max(wide, len("codes seen")), max((len(of) for _, of, _ in codes), default=0)
     if report.ranges:
         lines += [
             "",
-            f"{'channel':<8} {'codes seen':>13} {'of':>5} {'use':>5} {'at end':>6}"
+            f"{'channel':<8} {'codes seen':>{wide}} {'of':>{many}} {'use':>5} {'at end':>6}"
             f" {'now':>10} {'least':>10} {'most':>10}",
         ]
-    for use in report.ranges:
-        seen, of, share = "-", "-", "-"
-        if use.lowest_code is not None and use.highest_code is not None and use.codes:
-            seen, of = f"{use.lowest_code} … {use.highest_code}", str(use.codes)
-            share = f"{100 * (use.highest_code - use.lowest_code + 1) / use.codes:.0f} %"
+    for use, (seen, of, share) in zip(report.ranges, codes, strict=True):
         channel: Channel = getattr(CHANNELS, use.channel)
         unit, per_unit = channel.unit, channel.per_unit
         values = (f" {item / per_unit:>10.4g}" for item in (use.now, use.lowest, use.highest))
-        codes = f"{use.channel:<8} {seen:>13} {of:>5} {share:>5} {use.saturated:>6}"
-        lines.append(f"{codes}{''.join(values)} {unit}")
+        first = f"{use.channel:<8} {seen:>{wide}} {of:>{many}} {share:>5} {use.saturated:>6}"
+        lines.append(f"{first}{''.join(values)} {unit}")
     if report.state:
         lines += ["", report.state]
     if report.delay is not None:

@@ -242,7 +242,7 @@ def _observed_command(
 
 def _best_instants(seen: FloatArray, test: StoredTest, by: str) -> list[MatchedTest]:
     """The best instant of a test, and the best one elsewhere."""
-    stored, ones = test.command(), np.ones(test.ticks)
+    stored = test.command()
     # What a control law tells has the offsets of position and current in it.
     free = by == "control law"
     power = float(np.var(stored) if free else np.mean(stored**2))
@@ -251,13 +251,21 @@ def _best_instants(seen: FloatArray, test: StoredTest, by: str) -> list[MatchedT
         return []
     lags = np.arange(1 - len(stored), len(seen))
     value = np.where(known > 0.0, seen, 0.0)
-    own = _correlate(known, stored**2, len(lags))
-    square = _correlate(value**2, ones, len(lags)) - 2.0 * _correlate(value, stored, len(lags))
-    square += own
+    size = 1 << len(lags).bit_length()
+    known_waves, value_waves = np.fft.rfft(known, size), np.fft.rfft(value, size)
+    stored_waves = np.conj(np.fft.rfft(stored, size))
+
+    def summed(waves: NDArray[np.complex128]) -> FloatArray:
+        """Sum of values[k + lag] * stored[k] over k, for each lag."""
+        whole = np.fft.irfft(waves, size)
+        return np.concatenate([whole[size - len(stored) + 1 :], whole[: len(seen)]])
+
+    own = summed(known_waves * np.conj(np.fft.rfft(stored**2, size)))
+    square = _windowed(value**2, len(stored)) - 2.0 * summed(value_waves * stored_waves) + own
     if free:
-        count = np.maximum(_correlate(known, ones, len(lags)), 1.0)
-        mean = _correlate(known, stored, len(lags))
-        square -= (_correlate(value, ones, len(lags)) - mean) ** 2 / count
+        count = np.maximum(_windowed(known, len(stored)), 1.0)
+        mean = summed(known_waves * stored_waves)
+        square -= (_windowed(value, len(stored)) - mean) ** 2 / count
         own -= mean**2 / count
     density = float(known.sum()) / max(int(np.ptp(np.flatnonzero(known))) + 1, 1)
     enough = own >= MATCH.motion * density * power * len(stored)
@@ -274,12 +282,10 @@ def _best_instants(seen: FloatArray, test: StoredTest, by: str) -> list[MatchedT
     return out
 
 
-def _correlate(values: FloatArray, stored: FloatArray, lags: int) -> FloatArray:
-    """Sum of values[k + lag] * stored[k] over k, for lags from 1 - len(stored) on."""
-    size = 1 << int(lags).bit_length()
-    spectrum = np.fft.rfft(values, size) * np.conj(np.fft.rfft(stored, size))
-    whole = np.fft.irfft(spectrum, size)
-    return np.concatenate([whole[size - len(stored) + 1 :], whole[: len(values)]])
+def _windowed(values: FloatArray, ticks: int) -> FloatArray:
+    """Sum of values[k + lag] over so many ticks k, for lags from 1 - ticks on."""
+    whole = np.cumsum(np.pad(values, ticks))
+    return np.asarray((whole[ticks:] - whole[:-ticks])[:-1])
 
 
 def _telemetry_shift(samples: Samples, found: MatchedTest, controller: Controller) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -89,6 +90,10 @@ TESTER_POLL_S = 0.02
 MIN_STALL_NS = 100_000_000
 """A wait so much longer than `TESTER_POLL_S`: this process did not run, which is no silence of the
 bus."""
+
+MAX_BEHIND_S = 10.0
+"""Longest time, s, by which a busy machine is taken to read frames late: a host clock that was set
+back looks the same."""
 
 
 class BitProgress(msgspec.Struct, frozen=True):
@@ -304,6 +309,7 @@ class _BitSession:
         self._frames = 0
         self._sample: Sample | None = None
         self._serial: int | None = None
+        self._least_late: float = math.inf
         self._shown = 0
         self._shown_phase: Phase | None = None
         self.on_frame: Callable[[Frame], None] | None = None
@@ -339,6 +345,7 @@ class _BitSession:
                 machine.excuse(now - before)
             if stop.is_set():
                 self._act(machine.stop(now, "stopped by the user"))
+            machine.behind = self._behind(frame, now)
             if frame is not None:
                 self._take(frame, now)
             elif source.at_end:
@@ -346,6 +353,17 @@ class _BitSession:
             self._act(machine.on_time(now))
             self._send_due(now)
             self._report(now)
+
+    def _behind(self, frame: Frame | None, now: int) -> float:
+        """How much later a frame is read than it came, s; stamps and time may differ by a constant.
+
+        On a busy machine frames wait in the buffers of the system.
+        """
+        if frame is None or frame.sent or not self._transport.real_time:
+            return 0.0
+        late = (now - frame.time_ns) / 1e9
+        self._least_late = min(self._least_late, late)
+        return min(late - self._least_late, MAX_BEHIND_S)
 
     def _send_due(self, now: int) -> None:
         """Send what the protocol asks for of its own, as long as the handshake goes on."""

@@ -64,8 +64,9 @@ def check_frames(
     actuator; tests: tests that may have been played; source: where the frames are from, for people.
     Returns the report; with a complete test the diagnosis decides on its problems.
     """
-    from ehadiag.assess.diagnosis import examined_recordings  # noqa: PLC0415 - loads kernels
+    from ehadiag.assess.diagnosis import diagnose  # noqa: PLC0415 - loads kernels
     from ehadiag.assess.plausibility import objections_to_units  # noqa: PLC0415 - only where frames came
+    from ehadiag.assess.verdict import Verdict  # noqa: PLC0415
     from firmware_iface.alignment.align import windowed_recordings  # noqa: PLC0415
     from firmware_iface.bus_report import report_bus  # noqa: PLC0415
 
@@ -85,17 +86,18 @@ def check_frames(
         if item.samples.ticks == test.ticks
     ]
     if not complete:
-        report = replace(report, problems=(*report.problems, *units))
+        remarks = (*report.remarks, "no whole test is in it: a diagnosis needs one")
+        report = replace(report, problems=(*report.problems, *units), remarks=remarks)
         return BusCheck(source, report, "", samples)
     recording, test = complete[-1]
-    _, refusals = examined_recordings([recording], [test], actuator)
-    why = tuple(f"a diagnosis of test {test.name!r} refuses: {item}" for item in refusals)
-    if why:
+    found = diagnose([recording], actuator, [test])
+    if found.verdict is Verdict.NOT_TESTED:
+        why = (f"a diagnosis of test {test.name!r} refuses: {item}" for item in found.reasons)
         report = replace(report, problems=(*report.problems, *units, *why))
-    else:  # a diagnosis takes the test in spite of the report's problems
+    else:  # in spite of the report's problems
         verdict = f"test {test.name!r} is in it whole, and a diagnosis takes it"
-        remarks = (*report.remarks, *report.problems, verdict)
-        report = replace(report, problems=units, remarks=remarks)
+        remarks = (*report.remarks, *report.problems, *units, verdict)
+        report = replace(report, problems=(), remarks=remarks)
     return BusCheck(source, report, test.name, samples)
 
 

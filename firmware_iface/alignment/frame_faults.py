@@ -15,7 +15,11 @@ from firmware_iface.codec import Decoded, DecodedTable
 from firmware_iface.mapping_file import Policy
 from firmware_iface.protection import CONFLICTS, NO_POSITION, conflicting, event_positions
 from firmware_iface.recording import BoolArray, FloatArray, IntArray, MessageCounts
-from firmware_iface.slow_values import repeated_frames, slow_value_conflict
+from firmware_iface.slow_values import (
+    brings_slow_values,
+    repeated_frames,
+    slow_value_conflict,
+)
 
 
 class Conflicts(msgspec.Struct, frozen=True, eq=False):
@@ -176,9 +180,13 @@ def slow_values(
     inside = slice(*np.searchsorted(item.row, [begin, end]))
     found: dict[str, list[FloatArray]] = {role: [] for role in roles}
     reasons: list[str] = []
-    for stream in np.unique(item.stream[inside]) if roles else ():
+    streams = np.unique(item.stream[inside]) if roles else ()
+    for stream in streams:
         mine = inside.start + np.flatnonzero(item.stream[inside] == stream)
-        message, data, counter = item.message, item.data[mine], item.counter
+        message, data = item.message, item.data[mine]
+        # Between two frames of a slow page the counter goes on with all the fast ones.
+        counts = len(streams) == 1 or brings_slow_values(message)
+        counter = item.counter if counts else None
         if counter is not None and message.counter is not None:
             counted = message.counter.present(data)
             counter = counter[mine] if counted is None or counted.all() else None
@@ -239,13 +247,15 @@ def count_frames(
         # Nothing tells of frames that did not come.
         position = np.arange(inside.stop - inside.start)
         expected = 0
-    accepted = len(np.unique(position))
+    first = np.unique(position, return_index=True)[1]
+    accepted, once = len(first), position[np.sort(first)]
     return MessageCounts(
         received=received,
         accepted=accepted,
         lost=max(expected - accepted - crc_errors - length_errors, 0),
         repeated=len(position) - accepted,
-        out_of_order=_late(position),
+        # That came after a later one, repeats aside.
+        out_of_order=int(np.count_nonzero(once < np.maximum.accumulate(once))),
         conflicts=conflicts,
         crc_errors=crc_errors,
         length_errors=length_errors,
@@ -259,11 +269,11 @@ def _expected(at: IntArray, stream: IntArray, ticks: int, every: int) -> int:
         return -(-ticks // every)
     expected, streams = 0, np.unique(stream)
     for item in streams:
-        own = np.unique(at[stream == item])
+        own = at[stream == item]
         spacing = every
-        if len(streams) > 1 and len(own) > 1:
-            spacing = max(every, int(np.median(np.diff(own))))
-        expected += len(range(int(own[0] % spacing), ticks, spacing))
+        if len(streams) > 1 and len(apart := np.diff(np.unique(own))):
+            spacing = max(every, int(np.median(apart)))
+        expected += len(range(int(own.min() % spacing), ticks, spacing))
     return expected
 
 
@@ -274,13 +284,6 @@ def _sequence(counter: IntArray, modulus: int) -> IntArray:
     step = np.diff(counter) % modulus
     step = np.where(step > modulus // 2, step - modulus, step)
     return np.concatenate(([0], np.cumsum(step)))
-
-
-def _late(position: IntArray) -> int:
-    """Frames that came after a later one, repeats aside."""
-    first = np.unique(position, return_index=True)[1]
-    once = position[np.sort(first)]
-    return int(np.count_nonzero(once < np.maximum.accumulate(once)))
 
 
 FAULT_KINDS = {

@@ -7,9 +7,10 @@ the group's in MF4.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +83,12 @@ def array_signals(
     return checked_signals(out.items(), path)
 
 
-def _short_names(paths: Mapping[str, ArrayChannel]) -> dict[str, ArrayChannel]:
-    """Channels by the last part of their path, where that is of one channel alone."""
-    last = [path.rpartition("/")[2] for path in paths]
+def _by_name(found: Mapping[tuple[str, str], ArrayChannel]) -> dict[str, ArrayChannel]:
+    """Channels by their name, where that is of one channel alone; else with their group's."""
+    counts = Counter(name for _, name in found)
     return {
-        short if last.count(short) == 1 else path: channel
-        for (path, channel), short in zip(paths.items(), last, strict=True)
+        name if counts[name] == 1 else f"{group}/{name}": channel
+        for (group, name), channel in found.items()
     }
 
 
@@ -145,33 +146,27 @@ class Mf4SignalReader(_ArrayReader):
         from asammdf import MDF  # noqa: PLC0415 - optional, and slow
 
         with closing(MDF(path)) as file:
-            yield _Mf4Channels(file)
-
-
-class _Mf4Channels(Mapping[str, ArrayChannel]):
-    """Channels of a measurement, each read when it is looked up."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._names = sorted(file.channels_db)
-        self._read: dict[str, ArrayChannel] = {}
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, name: str) -> ArrayChannel:
-        if name not in self._read:
-            got = self._file.get(name)
-            self._read[name] = ArrayChannel(
-                len(got.samples),
-                str(got.unit or ""),
-                partial(np.asarray, got.samples, dtype=np.float64),
-                partial(np.asarray, got.timestamps, dtype=np.float64),
+            yield _by_name(
+                {
+                    (str(number), channel.name): _mf4_channel(file, number, index)
+                    for number, group in enumerate(file.groups)
+                    for index, channel in enumerate(group.channels)
+                    if index != file.masters_db.get(number)
+                }
             )
-        return self._read[name]
+
+
+def _mf4_channel(file: Any, group: int, index: int) -> ArrayChannel:
+    @cache
+    def found() -> Any:
+        return file.get(group=group, index=index)
+
+    return ArrayChannel(
+        file.groups[group].channel_group.cycles_nr,
+        file.get_channel_unit(group=group, index=index) or "",
+        lambda: np.asarray(found().samples, dtype=np.float64),
+        lambda: np.asarray(found().timestamps, dtype=np.float64),
+    )
 
 
 class TdmsReader(_ArrayReader):
@@ -184,9 +179,9 @@ class TdmsReader(_ArrayReader):
         from nptdms import TdmsFile  # noqa: PLC0415 - optional
 
         with TdmsFile.open(path) as file:
-            yield _short_names(
+            yield _by_name(
                 {
-                    f"{group.name}/{channel.name}": _tdms_channel(channel)
+                    (group.name, channel.name): _tdms_channel(channel)
                     for group in file.groups()
                     for channel in group.channels()
                 }
@@ -218,29 +213,30 @@ class HdfReader(_ArrayReader):
                 f"log {path}: not a file of HDF5; of MATLAB save it as version 7.3 (-v7.3)"
             )
         with h5py.File(path, "r") as file:
-            found: dict[str, ArrayChannel] = {}
+            found: dict[tuple[str, str], ArrayChannel] = {}
 
             def take(name: str, item: Any) -> None:
                 if isinstance(item, h5py.Dataset) and not name.startswith(MATLAB_REFERENCES):
                     found.update(_hdf_channels(name, item))
 
             file.visititems(take)
-            yield _short_names(found)
+            yield _by_name(found)
 
 
-def _hdf_channels(name: str, item: Any) -> dict[str, ArrayChannel]:
+def _hdf_channels(path: str, item: Any) -> dict[tuple[str, str], ArrayChannel]:
     """Channels of one data set: a row or column of numbers, or a table with named columns."""
     unit = next((item.attrs[key] for key in UNIT_ATTRIBUTES if key in item.attrs), "")
     text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
     if item.dtype.names and item.ndim == 1:
         return {
-            f"{name}/{field}": ArrayChannel(item.size, "", partial(_numbers, item, field))
+            (path, field): ArrayChannel(item.size, "", partial(_numbers, item, field))
             for field in item.dtype.names
         }
     line = item.ndim > 0 and item.size == max(item.shape)
     if not line or item.dtype.kind not in "fiu":
         return {}
-    return {name: ArrayChannel(item.size, text, partial(_numbers, item, ()))}
+    group, _, name = path.rpartition("/")
+    return {(group, name): ArrayChannel(item.size, text, partial(_numbers, item, ()))}
 
 
 def _numbers(item: Any, part: Any) -> FloatArray:

@@ -16,6 +16,7 @@ import can
 import can.interfaces.virtual
 import pytest
 from cli_result import Run
+from msgspec.structs import replace
 from other_valve import CONVERTERS, frames_of_a_test, write_rig
 from places import LOGS, ROOT
 from two_actuators import write_log, write_mappings
@@ -24,6 +25,8 @@ from ehadiag import bundled_tests, load_actuator, load_test
 from ehadiag.cli.main import main
 from ehadiag_sim.conditions import Effects, Faults
 from firmware_iface.bus_map import load_map
+from firmware_iface.bus_report import RangeUse, render_bus_report, report_bus
+from firmware_iface.transport.frames import ColumnBuilder
 
 DATA = ROOT / "firmware_iface" / "data"
 
@@ -296,3 +299,26 @@ def test_spool_at_the_converters_end_is_seen_though_the_bus_reaches_further(tmp_
     assert main(["diagnose", str(log), *options(rig), *said]) == 30
     reasons = json.loads(capsys.readouterr().out)["reasons"]
     assert any("spool samples stand at the converter's end" in reason for reason in reasons)
+
+
+def test_columns_of_24_bits_do_not_run_together() -> None:
+    report = report_bus(ColumnBuilder().table(), load_map(DATA / "eha_fcc.toml"))
+    use = RangeUse("spool", -8388608, 8388607, 1 << 24, -5e-4, 5e-4, 0.0, 0)
+    (line,) = (
+        line.split()
+        for line in render_bus_report(replace(report, ranges=(use,))).splitlines()
+        if line.startswith("spool ")
+    )
+    assert line[1:6] == ["-8388608", "…", "8388607", "16777216", "100"]
+
+
+def test_what_the_model_does_not_explain_is_refused_here_too(tmp_path: Path, run: Run) -> None:
+    text = (ROOT / "ehadiag" / "data" / "actuator.toml").read_text(encoding="utf-8")
+    assert "MJ  = 150.0" in text
+    (tmp_path / "a.toml").write_text(text.replace("MJ  = 150.0", "MJ  = 900.0"))
+    log = LOGS / "paper-open-1.blf"
+    told = run("check-bus", "--log", log, "--actuator", tmp_path / "a.toml")
+    found = run("diagnose", log, "--actuator", tmp_path / "a.toml", "--json")
+    assert (told.code, found.code) == (30, 30)
+    (tree,) = found.objects
+    assert all(f"refuses: {item}" in told.out for item in tree["reasons"])

@@ -9,14 +9,16 @@ import pytest
 from bus_synth import ENVIRONMENT, START, TICK, flip, make_truth, play, recordings
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from firmware_iface.alignment.frame_faults import (
     _expected,
-    _late,
     _sequence,
     count_frames,
     count_within,
+    slow_values,
 )
+from firmware_iface.bus_map import default_map
 from firmware_iface.recording import MessageCounts
 from firmware_iface.transport.frames import Frame
 
@@ -39,10 +41,12 @@ def test_sequence_takes_the_nearest(counter, expected):
 
 @pytest.mark.parametrize(
     ("position", "late"),
-    [([], 0), ([1, 2, 3], 0), ([1, 1, 2, 2], 0), ([1, 3, 2, 4], 1), ([4, 1, 2, 4, 1], 2)],
+    [([1, 2, 3], 0), ([1, 1, 2, 2], 0), ([1, 3, 2, 4], 1), ([4, 1, 2, 4, 1], 2)],
 )
 def test_late(position, late):
-    assert _late(np.array(position, dtype=np.int64)) == late
+    ticks = [TEST.first + item for item in position]
+    got = count_frames(counted(range(len(ticks))), on_axis(ticks), TEST, 0, len(ticks))
+    assert (got.out_of_order, got.accepted) == (late, len(set(position)))
 
 
 @given(st.integers(1, 50), st.integers(1, 5), st.integers(0, 4))
@@ -70,6 +74,24 @@ def test_expected_frames_of_a_slow_page_beside_a_fast_one():
     assert _expected(at, stream, 5500, 1) == len(at)
     kept = np.delete(np.arange(len(at)), [40, np.flatnonzero(stream)[9]])
     assert _expected(at[kept], stream[kept], 5500, 1) == len(at)
+
+
+@pytest.mark.parametrize(("pages", "senders"), [(2, 0), (1, 1)])
+def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(pages, senders):
+    """A page of 10 Hz was taken for a second sender: its counter leaps by what lies between."""
+    bus = default_map()
+    roles = bus.messages["Environment"].roles + bus.messages["ServoTelemetry"].roles
+    count = 60
+    frames = SimpleNamespace(
+        message=replace(bus.messages["Environment"], roles=roles),
+        row=np.arange(count),
+        stream=np.arange(count) % pages,
+        data=np.arange(8 * count, dtype=np.uint8).reshape(count, 8),
+        time_ns=np.arange(count) * 50_000_000,
+        counter=np.arange(count) * 101 % 256,
+        values={"environment.oil_temperature": np.full(count, 40.0)},
+    )
+    assert len(slow_values(frames, 0, count, 3_000_000_000)[1]) == senders
 
 
 def test_within():

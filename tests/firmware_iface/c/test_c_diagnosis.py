@@ -10,7 +10,7 @@ import c_side
 import numpy as np
 import pytest
 from exported import exported
-from live_ends import cable
+from live_ends import LOADED_MACHINE, cable
 from msgspec.structs import replace
 from onboard_frames import DATABASE
 from onboard_node import bare_node, build_bare_node, build_node, write_played
@@ -20,6 +20,7 @@ from ehadiag import diagnose
 from ehadiag.cli.main import main
 from ehadiag_tools.onboard.emulators import EMULATED, missing
 from ehadiag_tools.onboard.replay import identified, surrounded, ticks_of
+from firmware_iface import tester
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import OnboardState
 from firmware_iface.transport.frames import Frame
@@ -313,7 +314,10 @@ def check(told, heard, expected):
 @pytest.mark.slow
 @pytest.mark.xdist_group("exports")  # of which another test compiles the library
 @pytest.mark.parametrize(("target", "ticks"), [("host", TICKS), ("cortex-m7", 400)])
-def test_what_the_node_tells_is_what_the_library_finds_here(target, ticks, place, tmp_path):
+def test_what_the_node_tells_is_what_the_library_finds_here(
+    target, ticks, place, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tester, "TimeLimits", lambda: LOADED_MACHINE)
     emulator = next(item for item in EMULATED if item.target == target)
     absent = [*missing(emulator), *missing(EMULATED[0])]
     if absent or not shutil.which("make"):

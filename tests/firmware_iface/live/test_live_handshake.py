@@ -80,6 +80,23 @@ def test_nothing_is_sent_before_the_bus_was_listened_to() -> None:
     assert driver.sent == []
 
 
+@pytest.mark.parametrize(("until", "complete"), [(1.0, True), (0.5, False)])
+def test_a_slow_computer_is_waited_for_as_long_as_it_counts(until: float, complete: bool) -> None:
+    driver = Driver().running()
+    for k in range(1, 101):
+        elapsed = min(0.01 * k, until)
+        driver.wait(0.05).hear(replace(status(BitState.RUNNING), elapsed=elapsed))
+    assert (driver.machine.phase is Phase.RUNNING) is complete
+    assert (HandshakeAction.ABORT in driver.sent) is not complete
+
+
+def test_what_is_still_to_be_read_is_not_late() -> None:
+    driver = Driver().requested()
+    driver.machine.behind = 2.0
+    assert driver.wait(2.9).sent == [HandshakeAction.START]
+    assert driver.wait(0.1).sent == [HandshakeAction.START, HandshakeAction.ABORT]
+
+
 def test_nothing_missing_ends_the_listening_at_once() -> None:
     driver = Driver().running().wait(1.0).hear(status(BitState.COMPLETE))
     assert driver.machine.phase is Phase.TRAILING

@@ -84,3 +84,18 @@ def test_mf4_needs_no_name_of_its_time(tmp_path):
         file.append([asammdf.Signal(v, TIME, name=k) for k, v in VALUES.items()])
         file.save(path)
     assert_read(path, named_columns(["time=t_s:s"], ColumnMap()))
+
+
+def test_mf4_of_several_groups(tmp_path):
+    """Each group has a time of its own; a name that two groups have is told with its group."""
+    asammdf = pytest.importorskip("asammdf")
+    path = tmp_path / "rig.mf4"
+    slow = np.arange(20) / 10.0
+    with asammdf.MDF() as file:
+        file.append([asammdf.Signal(slow, slow, name=name) for name in ("oil", "spool")])
+        for name, values in VALUES.items():
+            file.append([asammdf.Signal(values, TIME, name=name)])
+        file.save(path)
+    with pytest.raises(ConfigurationError, match="spool"):
+        read_signals(path, ColumnMap(), Budget())
+    assert_read(path, named_columns(["spool=2/spool"], ColumnMap()))
