@@ -6,6 +6,7 @@ the group's in MF4.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -22,6 +23,7 @@ from firmware_iface.errors import (
     install_command,
     printable,
 )
+from firmware_iface.logs.can_readers import MAX_PACKED_BLOCK, check_packed_blocks
 from firmware_iface.logs.log_files import Budget
 from firmware_iface.recording import FloatArray, RecordedSignal
 from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
@@ -104,13 +106,13 @@ class _ArrayReader(ABC):
         self,
         path: Path,
         columns: ColumnMap,
-        budget: Budget,  # noqa: ARG002
+        budget: Budget,
         *,
         complete: bool,
     ) -> dict[str, RecordedSignal]:
         """Read a file, see `SignalReader`."""
         try:
-            with self._channels(path) as channels:
+            with self._channels(path, budget) as channels:
                 return array_signals(channels, self._needed(columns), path, complete=complete)
         except (ConfigurationError, InputOutputError):
             raise
@@ -127,7 +129,9 @@ class _ArrayReader(ABC):
         return columns
 
     @abstractmethod
-    def _channels(self, path: Path) -> AbstractContextManager[Mapping[str, ArrayChannel]]:
+    def _channels(
+        self, path: Path, budget: Budget
+    ) -> AbstractContextManager[Mapping[str, ArrayChannel]]:
         """Open the file; channels by name while it is open."""
 
 
@@ -141,37 +145,31 @@ class Mf4SignalReader(_ArrayReader):
         return ColumnMap(rest, columns.tick_ns)
 
     @contextmanager
-    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+    def _channels(self, path: Path, budget: Budget) -> Iterator[Mapping[str, ArrayChannel]]:
         from asammdf import MDF  # noqa: PLC0415 - optional, and slow
 
+        check_packed_blocks(path, budget.size)
         with closing(MDF(path)) as file:
-            yield _Mf4Channels(file)
-
-
-class _Mf4Channels(Mapping[str, ArrayChannel]):
-    """Channels of a measurement, each read when it is looked up."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._names = sorted(file.channels_db)
-        self._read: dict[str, ArrayChannel] = {}
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, name: str) -> ArrayChannel:
-        if name not in self._read:
-            got = self._file.get(name)
-            self._read[name] = ArrayChannel(
-                len(got.samples),
-                str(got.unit or ""),
-                partial(np.asarray, got.samples, dtype=np.float64),
-                partial(np.asarray, got.timestamps, dtype=np.float64),
+            yield _short_names(
+                {
+                    f"{number}/{channel.name}": _mf4_channel(file, number, index)
+                    for number, group in enumerate(file.groups)
+                    for index, channel in enumerate(group.channels)
+                    if index != file.masters_db.get(number)
+                }
             )
-        return self._read[name]
+
+
+def _mf4_channel(file: Any, number: int, index: int) -> ArrayChannel:
+    group = file.groups[number]
+    channel = group.channels[index]
+    unit = channel.unit or (channel.conversion.unit if channel.conversion else "")
+    return ArrayChannel(
+        int(group.channel_group.cycles_nr),
+        str(unit or ""),
+        lambda: np.asarray(file.get(group=number, index=index).samples, dtype=np.float64),
+        lambda: np.asarray(file.get_master(number), dtype=np.float64),
+    )
 
 
 class TdmsReader(_ArrayReader):
@@ -180,7 +178,7 @@ class TdmsReader(_ArrayReader):
     signature, library, kind = b"TDSm", "npTDMS", "TDMS"
 
     @contextmanager
-    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+    def _channels(self, path: Path, _: Budget) -> Iterator[Mapping[str, ArrayChannel]]:
         from nptdms import TdmsFile  # noqa: PLC0415 - optional
 
         with TdmsFile.open(path) as file:
@@ -210,7 +208,7 @@ class HdfReader(_ArrayReader):
     library, kind = "h5py", "HDF5"
 
     @contextmanager
-    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+    def _channels(self, path: Path, _: Budget) -> Iterator[Mapping[str, ArrayChannel]]:
         import h5py  # noqa: PLC0415 - optional, and slow
 
         if not h5py.is_hdf5(path):
@@ -244,4 +242,9 @@ def _hdf_channels(name: str, item: Any) -> dict[str, ArrayChannel]:
 
 
 def _numbers(item: Any, part: Any) -> FloatArray:
+    if item.chunks and math.prod(item.chunks) * item.dtype.itemsize > MAX_PACKED_BLOCK:
+        raise InputOutputError(
+            f"log {item.file.filename}: {printable(item.name)!r} is stored in blocks of more than"
+            f" {MAX_PACKED_BLOCK >> 20} MiB; store it in smaller ones"
+        )
     return np.asarray(item[part], dtype=np.float64).reshape(-1)
