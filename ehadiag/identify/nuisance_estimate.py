@@ -299,6 +299,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         alone.
         """
         calibrated = self.prior.joint is not None
+        experiments = [item.without_creep() for item in experiments]
         if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)

@@ -10,8 +10,11 @@ import gc
 import importlib
 import logging
 import math
+import mmap
 import re
+import struct
 import sys
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
@@ -33,6 +36,12 @@ if TYPE_CHECKING:
 
 MAX_MF4_BYTES = 128 << 20
 """Bytes of an MF4 file: its library holds all frames in memory, and more than once."""
+MAX_PACKED_BLOCK = 64 << 20
+"""Bytes that one packed block of an MF4 or HDF5 file may unpack to; usual are 1 to 4 MiB."""
+MF4_PACKED_BLOCK = b"##DZ"
+MF4_PACKED_HEAD = struct.Struct("<26xB13xQ")
+"""Of a packed block: its method (0 deflate, 1 transposed and deflate), bytes that follow."""
+INFLATED_PIECE = 1 << 16
 
 MF4_LIBRARY = "asammdf"
 
@@ -215,7 +224,50 @@ class Mf4Reader(_PythonCanReader):
                 f"log {path}: an MF4 file beyond {MAX_MF4_BYTES >> 20} MiB takes too much memory;"
                 " convert it to BLF"
             )
+        check_packed_blocks(path, MAX_MF4_BYTES)
         yield lambda: _open_mf4(path)
+
+
+def check_packed_blocks(path: Path, most: int) -> None:
+    """Refuse an MF4 file whose packed blocks take too much memory; what they state is not believed.
+
+    path: the file; most: bytes that all blocks may unpack to. InputOutputError: they unpack to
+    more, a single one to more than `MAX_PACKED_BLOCK`, or are not packed by deflate.
+    """
+    unpacked = 0
+    with path.open("rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as file:
+        at = -1
+        while (at := file.find(MF4_PACKED_BLOCK, at + 1)) >= 0:
+            begin = at + MF4_PACKED_HEAD.size
+            if begin > len(file):
+                return
+            method, length = MF4_PACKED_HEAD.unpack(file[at:begin])
+            if method > 1:
+                raise InputOutputError(
+                    f"log {path}: packed by another method than deflate; save it by deflate"
+                )
+            limit = min(most - unpacked, MAX_PACKED_BLOCK)
+            size = _inflated_size(file, begin, min(begin + length, len(file)), limit)
+            if size > limit:
+                raise InputOutputError(
+                    f"log {path}: unpacks to more than {most >> 20} MiB, or one block of it to more"
+                    f" than {MAX_PACKED_BLOCK >> 20} MiB; split it"
+                )
+            unpacked += size
+
+
+def _inflated_size(file: mmap.mmap, begin: int, end: int, limit: int) -> int:
+    """Bytes that a packed block holds, at most one more than the limit; 0: it is none."""
+    inflate, size = zlib.decompressobj(), 0
+    try:
+        for at in range(begin, end, INFLATED_PIECE):
+            piece = file[at : min(at + INFLATED_PIECE, end)]
+            size += len(inflate.decompress(piece, limit + 1 - size))
+            if size > limit or inflate.eof:
+                break
+    except zlib.error:  # data that look like a block, or damage: the reader says so
+        return 0
+    return size
 
 
 def _open_mf4(path: Path) -> Any:

@@ -6,6 +6,7 @@ the group's in MF4.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +24,7 @@ from firmware_iface.errors import (
     install_command,
     printable,
 )
+from firmware_iface.logs.can_readers import MAX_PACKED_BLOCK, check_packed_blocks
 from firmware_iface.logs.log_files import Budget
 from firmware_iface.recording import FloatArray, RecordedSignal
 from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
@@ -105,13 +107,13 @@ class _ArrayReader(ABC):
         self,
         path: Path,
         columns: ColumnMap,
-        budget: Budget,  # noqa: ARG002
+        budget: Budget,
         *,
         complete: bool,
     ) -> dict[str, RecordedSignal]:
         """Read a file, see `SignalReader`."""
         try:
-            with self._channels(path) as channels:
+            with self._channels(path, budget) as channels:
                 return array_signals(channels, self._needed(columns), path, complete=complete)
         except (ConfigurationError, InputOutputError):
             raise
@@ -128,7 +130,9 @@ class _ArrayReader(ABC):
         return columns
 
     @abstractmethod
-    def _channels(self, path: Path) -> AbstractContextManager[Mapping[str, ArrayChannel]]:
+    def _channels(
+        self, path: Path, budget: Budget
+    ) -> AbstractContextManager[Mapping[str, ArrayChannel]]:
         """Open the file; channels by name while it is open."""
 
 
@@ -142,9 +146,10 @@ class Mf4SignalReader(_ArrayReader):
         return ColumnMap(rest, columns.tick_ns)
 
     @contextmanager
-    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+    def _channels(self, path: Path, budget: Budget) -> Iterator[Mapping[str, ArrayChannel]]:
         from asammdf import MDF  # noqa: PLC0415 - optional, and slow
 
+        check_packed_blocks(path, budget.size)
         with closing(MDF(path)) as file:
             yield _by_name(
                 {
@@ -175,7 +180,7 @@ class TdmsReader(_ArrayReader):
     signature, library, kind = b"TDSm", "npTDMS", "TDMS"
 
     @contextmanager
-    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+    def _channels(self, path: Path, _: Budget) -> Iterator[Mapping[str, ArrayChannel]]:
         from nptdms import TdmsFile  # noqa: PLC0415 - optional
 
         with TdmsFile.open(path) as file:
@@ -205,7 +210,7 @@ class HdfReader(_ArrayReader):
     library, kind = "h5py", "HDF5"
 
     @contextmanager
-    def _channels(self, path: Path) -> Iterator[Mapping[str, ArrayChannel]]:
+    def _channels(self, path: Path, _: Budget) -> Iterator[Mapping[str, ArrayChannel]]:
         import h5py  # noqa: PLC0415 - optional, and slow
 
         if not h5py.is_hdf5(path):
@@ -240,4 +245,9 @@ def _hdf_channels(path: str, item: Any) -> dict[tuple[str, str], ArrayChannel]:
 
 
 def _numbers(item: Any, part: Any) -> FloatArray:
+    if item.chunks and math.prod(item.chunks) * item.dtype.itemsize > MAX_PACKED_BLOCK:
+        raise InputOutputError(
+            f"log {item.file.filename}: {printable(item.name)!r} is stored in blocks of more than"
+            f" {MAX_PACKED_BLOCK >> 20} MiB; store it in smaller ones"
+        )
     return np.asarray(item[part], dtype=np.float64).reshape(-1)

@@ -160,7 +160,7 @@ def _by_edges(
         count = np.stack([_explained(low, high, period * (1.0 + item)) for item in rates])
         best = count.max() - max(CLOCK.slack * len(low), 0.5)
         where, phase = np.nonzero(count >= best)
-        if away is not None and away.name == "control law" and most == CLOCK.rates[0]:
+        if away is not None and most == CLOCK.rates[0]:
             kept = _fitting_rates(rates, where, phase, away.residuals)
             where, phase = where[kept], phase[kept]
         weight = count[where, phase] - best + 1.0
@@ -184,8 +184,8 @@ def _fitting_rates(
 ) -> BoolArray:
     """Which of the rates and phases (bins) that the edges allow fit the test, too.
 
-    With few samples a tick a logger that gains a tick and one that loses it see the same edges. In
-    closed loop the jack moves on between them.
+    With few samples a tick a logger that gains a tick and one that loses it see the same edges. The
+    command, or the jack in closed loop, moves on between them.
     """
     cost = np.full(len(rates), np.inf)
     for index in np.unique(where).tolist():

@@ -12,7 +12,7 @@ import ehadiag
 from ehadiag.identify.experiment import build_experiment, share_offsets
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import Plant, SimulatedRun, bus_command, simulate
-from ehadiag_tools.accuracy.units import UnitCase, draw_unit
+from ehadiag_tools.accuracy.units import UnitCase, draw_unit, perform_unit
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, record
 from firmware_iface.recording import CommandMode, Environment, Recording
 
@@ -129,3 +129,30 @@ def test_friction_and_hysteresis_do_not_trade_by_a_wrong_origin(
     found = result.severities["FSS"]
     assert found.std is not None
     assert abs(found.value - faults[1]) < 4.0 * found.std < 0.03
+
+
+def test_what_creeps_before_the_motion_is_left_out(
+    biased: tuple[Unit, list[float], Recording],
+) -> None:
+    samples = biased[2].samples
+    assert samples is not None
+    begun = build_experiment(samples, ENVIRONMENT, CLOSED, ehadiag.default_actuator())
+    left = begun.without_creep()
+    seen = np.flatnonzero(np.isfinite(left.pressure))
+    assert seen[0] == 251  # the command moves from tick 201 on
+    assert np.array_equal(left.pressure[251:], begun.pressure[251:], equal_nan=True)
+    held = np.isnan(begun.pressure)
+    assert held[:251].any()
+    assert np.array_equal(left.spool[held], begun.spool[held], equal_nan=True)
+    opened = replace(begun, test=ehadiag.bundled_tests()["open"])
+    assert opened.without_creep() is opened
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [153, 165])
+def test_friction_is_not_decided_by_a_break_away_in_the_noise(case: int) -> None:
+    """A spool crept up to its break-away before the command moved: 0.006 and 0.11 off, and sure."""
+    done = perform_unit(UnitCase("closed", case, 9300, "all"))
+    assert not done["not_tested"]
+    low, high = done["interval95"][1]
+    assert abs(done["value"][1] - done["faults"][1]) < 0.9 * (high - low)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 
 from ehadiag import ConfigurationError, InputOutputError
 from firmware_iface.logs.log_files import Budget
+from firmware_iface.logs.reader import read_frames
 from firmware_iface.signals.columns import ColumnMap, named_columns
 from firmware_iface.signals.tables import read_signals
 
@@ -99,3 +103,66 @@ def test_mf4_of_several_groups(tmp_path):
     with pytest.raises(ConfigurationError, match="spool"):
         read_signals(path, ColumnMap(), Budget())
     assert_read(path, named_columns(["spool=2/spool"], ColumnMap()))
+
+
+def packed_bomb(path, method=0, unpacked=96 << 20):
+    """Write an MF4 file one of whose blocks unpacks to much more than it states."""
+    asammdf = pytest.importorskip("asammdf")
+    with asammdf.MDF() as file:
+        file.append([asammdf.Signal(values, TIME, name=name) for name, values in VALUES.items()])
+        file.save(path, compression=1)
+    content = path.read_bytes()
+    at = content.index(b"##DZ")
+    data = zlib.compress(bytes(unpacked))
+    head = struct.pack("<4xQQ2sBxIQQ", 48 + len(data), 0, b"DT", method, 0, 6400, len(data))
+    end = len(content) + -len(content) % 8
+    content = content.replace(struct.pack("<Q", at), struct.pack("<Q", end))
+    path.write_bytes(content.ljust(end, b"\0") + b"##DZ" + head + data)
+    return path
+
+
+@pytest.mark.parametrize("method", [0, 1])
+def test_a_block_of_mf4_that_unpacks_to_more_than_it_states(tmp_path, monkeypatch, method):
+    path = packed_bomb(tmp_path / "bomb.mf4", method)
+    assert path.stat().st_size < 1 << 20
+    asammdf = pytest.importorskip("asammdf")
+    monkeypatch.setattr(asammdf, "MDF", None)  # nothing is left to the library
+    with pytest.raises(InputOutputError, match="one block of it to more than 64 MiB"):
+        read_signals(path, ColumnMap(), Budget())
+    with pytest.raises(InputOutputError, match="one block of it to more than 64 MiB"):
+        read_frames(path)
+
+
+def test_another_packing_of_mf4_is_named(tmp_path):
+    path = packed_bomb(tmp_path / "bomb.mf4", method=2, unpacked=100)
+    with pytest.raises(InputOutputError, match="save it by deflate"):
+        read_signals(path, ColumnMap(), Budget())
+
+
+def test_rows_that_an_mf4_file_states_are_bounded(tmp_path):
+    asammdf = pytest.importorskip("asammdf")
+    path = tmp_path / "long.mf4"
+    with asammdf.MDF() as file:
+        file.append([asammdf.Signal(values, TIME, name=name) for name, values in VALUES.items()])
+        file.save(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"##CG")
+    rows = at + 32 + 8 * int.from_bytes(content[at + 16 : at + 24], "little")
+    assert int.from_bytes(content[rows : rows + 8], "little") == len(TIME)
+    content[rows : rows + 8] = (10**15).to_bytes(8, "little")
+    path.write_bytes(content)
+    with pytest.raises(InputOutputError, match="more than 800000 values"):
+        read_signals(path, ColumnMap(), Budget())
+
+
+def test_blocks_of_hdf5_are_bounded(tmp_path):
+    """A block is unpacked whole, however few of its values are the data set's."""
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "rig.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in (VALUES | {"time": TIME}).items():
+            shape = {"shape": values.shape, "maxshape": (None,), "dtype": "f8"}
+            item = file.create_dataset(name, **shape, chunks=(1 << 24,), compression="gzip")
+            assert len(item) == len(values)  # nothing is written: no block is on the disk
+    with pytest.raises(InputOutputError, match="blocks of more than 64 MiB"):
+        read_signals(path, ColumnMap(), Budget())
