@@ -78,7 +78,7 @@ def print_result(result: Result, console: Console, *, verbose: bool = False) -> 
             _line(console, f"- {reason}")
     for line in result.culprit.lines if result.culprit else ():
         _line(console, f"  {line}")
-    if result.identified:
+    if result.estimated:
         console.print(_severities(head, result, console), crop=False)
     if result.identified and verbose:
         for name in ("first", "search"):
@@ -171,7 +171,7 @@ def _line(console: Console, text: str) -> None:
 
 def _severities(head: Head, result: Result, console: Console) -> Table:
     """Numbers of the severities, grey where there is no verdict."""
-    untested = not head.drawn
+    untested = not head.drawn and result.identified
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 1), style="dim" if untested else "")
     table.add_column("severity", no_wrap=True)
     for name in ("estimate", "std", "95 % interval"):
