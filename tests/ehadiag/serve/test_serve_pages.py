@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from page_sessions import fail, talk
 
 from ehadiag import ConfigurationError, Levels
-from ehadiag.estimate import Severity
+from ehadiag.estimate import FREE_MOTION, Severity
 from ehadiag.history.records import Entry, Usage
 from ehadiag.history.store import History
 from ehadiag.serve.pages import Pages
@@ -230,6 +230,15 @@ def test_the_fleet_says_what_to_do_worst_unit_first(tmp_path):
     assert ">0 h, limit reached<" in page
     assert ">too few diagnoses<" in page
     assert ">trend<" not in page  # no unit has two diagnoses
+
+
+def test_free_motion_takes_no_verdict_away(tmp_path):
+    place = tmp_path / "history.db"
+    tested = an_entry(3, 100.0, verdict="HEALTHY")
+    with History(place, create=True) as history:
+        history.append_all([tested, replace(tested, test=FREE_MOTION, verdict="NOT_TESTED")])
+    with site(tmp_path, place, watch=None) as (port, _):
+        assert "<h1>Fleet: 1 HEALTHY</h1>" in request(port, "/")[1]
 
 
 def test_only_reports_of_the_folder_are_served_and_as_strangers(tmp_path):
