@@ -14,7 +14,7 @@ from msgspec import Meta, field
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
-from ehadiag.estimate import Culprit, Effect, Severity
+from ehadiag.estimate import FREE_MOTION, Culprit, Effect, Severity
 from ehadiag.request import MOST_SEED, Request
 from firmware_iface.errors import ConfigurationError, NotTestedError
 from firmware_iface.files import read_small_file, write_file
@@ -331,8 +331,13 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def identified(self) -> bool:
-        """Whether there are estimates."""
+        """Whether there are estimates of a test."""
         return self.fit is not None
+
+    @property
+    def estimated(self) -> bool:
+        """Whether there are estimates, of a test or of free motion."""
+        return self.identified or self.test == FREE_MOTION
 
     @property
     def exit_code(self) -> int:

@@ -26,9 +26,10 @@ from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, with_tolerance
 from ehadiag.core.conventions import date_text, fingerprint
 from ehadiag.core.interruption import COMPUTING_THREAD_NAME
+from ehadiag.estimate import FREE_MOTION, Severity
 from ehadiag.records import failed_result, result_of
 from ehadiag.request import Request
-from ehadiag.result import Log, Mapped, Result, Sources, load_result
+from ehadiag.result import Log, Mapped, Origin, Result, Sources, load_result
 from firmware_iface.errors import ConfigurationError, EhadiagError, NotTestedError, valid_text
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.stored_test import StoredTest
@@ -430,6 +431,33 @@ class Setup:
             read_s=origin.get("read_s", 0.0),
             after_test_s=None if ended_at is None else time.perf_counter() - ended_at,
         )
+
+    def monitored(
+        self,
+        source: str,
+        date: str | None,
+        serial: int | None,
+        severities: Sequence[Severity],
+        why: tuple[str, ...],
+    ) -> Result:
+        """Return severities by free motion as a result: NOT TESTED, for no test ran.
+
+        source: bus or log; date: of its beginning; serial: of the unit; why: some have no number.
+        """
+        empty = failed_result(source, "", 0, self.request, self.actuator, sources=self.sources)
+        advised = {
+            item.name: msgspec.structs.replace(item, advice=empty.severities[item.name].advice)
+            for item in severities
+        }
+        return msgspec.structs.replace(
+            empty, test=FREE_MOTION, serial=serial, state="NOT_TESTED", reasons=why,
+            severities=empty.severities | advised, error=None, date=date,
+            origins=(Origin(
+                source=valid_text(source), date=date, length_s=None, serial=serial, channel=None,
+                test=None, oil_temperature_degC=None, supply_pressure_MPa=None,
+                return_pressure_MPa=None, log=log_of(source), onboard=None,
+            ),),
+        )  # fmt: skip
 
     def failure(self, log: str, error: str, exit_code: int) -> Result:
         """Return the result of a log that could not be read."""

@@ -19,6 +19,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.conversion import conversion_of
 from ehadiag.core.interruption import stop_on_signals
+from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.report.rendering import isolated_png
 from ehadiag.request import TEST
 from ehadiag.terminal.output import (
@@ -70,6 +71,13 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of the unit, to find it in the health history (default: as the bus says)",
     )
+    for name, what in (("hours", "operating hours"), ("cycles", "cycles")):
+        group.add_argument(
+            f"--unit-{name}",
+            type=options.positive_number,
+            metavar="N",
+            help=f"{what} of the unit, for its severities in the file of --history",
+        )
     group = parser.add_argument_group("alarms")
     group.add_argument(
         "--hours",
@@ -159,6 +167,8 @@ def run_monitor(
     refuse_overwriting(arguments, outputs, [(kind, name) for kind, name in reads if name])
     print_compiling_notice(identification=False)
     unit, find = _initial_unit_state(arguments, actuator)
+    from ehadiag.history.records import Usage, history_entry  # noqa: PLC0415
+    from ehadiag.history.store import History  # noqa: PLC0415
     from ehadiag.session.alarm_outlets import (  # noqa: PLC0415
         AlarmCommand,
         AlarmLog,
@@ -194,6 +204,19 @@ def run_monitor(
         f"{found.monitored} of {found.ticks} ticks monitored, {found.share:.0%}; {found.lost} lost;"
         f" {found.alarm_count} alarms" + (f", {found.repeated} repeated" if found.repeated else "")
     )
+    assert found.result is not None
+    stated = [
+        f"{item.name} {item.estimate:.3f} ± {INTERVAL_STDS * item.std:.3f}"
+        for item in found.result.severities.values()
+        if item.estimate is not None and item.std is not None
+    ]
+    print_status("; ".join(
+        [f"severities by free motion: {', '.join(stated) or 'none'}", *found.result.reasons]
+    ))  # fmt: skip
+    if stated and arguments.history:
+        with History(Path(arguments.history)) as history:
+            usage = Usage(arguments.unit_hours, arguments.unit_cycles)
+            history.append(history_entry(found.result, usage, simulated=False))
     if found.alarm_count:
         return 40
     if found.bus_lost:

@@ -21,6 +21,7 @@ from ehadiag.cli.history_options import (
 )
 from ehadiag.cli.options import unit_number
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
+from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.history.records import DIAGNOSIS_TABLE, EVENT_TABLE
 from ehadiag.report.head import shown_date
 from ehadiag.terminal.output import print_status, print_text, render_for_terminal, write_output
@@ -310,7 +311,7 @@ def _read(arguments: argparse.Namespace) -> tuple[list[Entry], list[MaintenanceE
 
 def _entry_row(entry: Entry) -> tuple[str, ...]:
     severities = ", ".join(
-        f"{item.name} {item.estimate:.4f} ± {1.96 * item.std:.4f}"
+        f"{item.name} {item.estimate:.4f} ± {INTERVAL_STDS * item.std:.4f}"
         for item in entry.severities
         if item.estimate is not None and item.std is not None
     )

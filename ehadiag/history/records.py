@@ -21,7 +21,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.core.conventions import utc_text
-from ehadiag.estimate import Effect, Severity
+from ehadiag.estimate import FREE_MOTION, Effect, Severity
 from firmware_iface.errors import ConfigurationError, valid_text
 
 if TYPE_CHECKING:
@@ -146,6 +146,11 @@ class Entry(msgspec.Struct, frozen=True):
     def when(self) -> str:
         """Time of the test, else of the diagnosis; UTC, ISO 8601."""
         return self.tested or self.appended
+
+    @property
+    def by_test(self) -> bool:
+        """Whether it is of a test; else of a monitor, which gives no verdict."""
+        return self.test != FREE_MOTION
 
 
 class MaintenanceEvent(msgspec.Struct, frozen=True):
@@ -326,7 +331,7 @@ def history_entry(result: Result, usage: Usage, *, simulated: bool) -> Entry:
             SourceRecord(item.source, hash_of_file(name), item.samples_sha256)
             for item, name in zip(result.origins, names, strict=True)
         ),
-        severities=tuple(result.severities.values()) if result.identified else (),
+        severities=tuple(result.severities.values()) if result.estimated else (),
         covariance=result.covariance,
         effects=result.effects,
         version=result.package.version,

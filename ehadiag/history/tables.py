@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ehadiag.core.conventions import utc_time_text
-from ehadiag.estimate import AT_BOUND, NOT_SHOWN, Severity
+from ehadiag.estimate import AT_BOUND, INTERVAL_STDS, NOT_SHOWN, Severity
 from ehadiag.history.records import Entry, SourceRecord, Usage, current_utc_text
 from firmware_iface.errors import ConfigurationError, install_command, valid_text
 
@@ -28,8 +28,6 @@ NEEDED_COLUMNS = ("when", "actuator", "serial", "verdict", "severity", "estimate
 FORMULA_PREFIXES = ("=", "+", "-", "@", "\t", "\r")
 IMPORT_SCHEMA = "ehadiag.history-import/1"
 KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
-MAX_INTERVAL_STDS = 1.96
-"""Half width of an interval of 95 %, in deviations."""
 
 
 def history_csv(entries: Sequence[Entry]) -> str:
@@ -180,7 +178,7 @@ def _severity_of(row: dict[str, str], severities: Sequence[str]) -> Severity:
     estimate, std = _number(row["estimate"]), _number(row["std"])
     low, high = _number(row.get("low95")), _number(row.get("high95"))
     if estimate is not None and std is not None and None in (low, high):
-        low, high = estimate - MAX_INTERVAL_STDS * std, estimate + MAX_INTERVAL_STDS * std
+        low, high = estimate - INTERVAL_STDS * std, estimate + INTERVAL_STDS * std
     return Severity(
         name=row["severity"],
         estimate=estimate,

@@ -25,13 +25,19 @@ import numpy as np
 
 from ehadiag.compile.jit import Array, Array2
 from ehadiag.model.registry import FAULT_NAMES, parameter
+from ehadiag.monitor.flight import FlightEstimate
 from ehadiag.monitor.plan import FALSE_ALARM_HOURS_RANGE
-from ehadiag.monitor.score_bank import BANK, BANK_NAMES, REST, BlockScore, ScoreBank
+from ehadiag.monitor.score_bank import (
+    BANK,
+    BANK_NAMES,
+    BLOCK_S,
+    REST,
+    BlockScore,
+    ScoreBank,
+)
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.recording import CommandMode, Environment
 
-BLOCK_S: Final = 0.5
-"""Length of a block, s."""
 SETTLING_BLOCKS: Final = 2
 """Blocks that only put the modelled spool where it is seen, 1."""
 SPANS: Final = (20, 60)
@@ -171,6 +177,8 @@ class ChangeTest:
         self._since = math.inf
         self._looks = 0
         self._ignored = 0
+        self.flight = FlightEstimate(bank)
+        """Severities by all blocks since the beginning, or the last change."""
         self.value = 0.0
         """Of the test when it looked last, over its threshold."""
         self.values: Array2 = np.zeros((len(SPANS) + 2, len(CAUSES)))
@@ -220,6 +228,7 @@ class ChangeTest:
             self._bank.settle(rows)
             return None
         self._scores.append(self._bank.push(rows))
+        self.flight.add(self._scores[-1])
         gain = self._scores[-1].gain[:, CAUSES]
         votes = gain / (np.abs(gain) + VOTE_GAIN)
         worn = np.arange(len(FAULT_NAMES))
@@ -279,6 +288,9 @@ class ChangeTest:
             return None
         self._clear_votes()
         self._since = 0.0
+        # What else has changed is not what holds the nuisances.
+        others = [item for item in causes if item.name not in FAULT_NAMES]
+        self.flight.begin_anew(f"an alarm named {others[0]}" if others else "")
         return Change(causes, self.value, repeated=False)
 
     def _causes(

@@ -63,6 +63,8 @@ BANK_NAMES: Final = tuple(item.name for item in BANK)
 MODELLED: Final = BANK_NAMES.index("current_offset")
 """Number of parameters with a monitor of their own: the current's sensor needs none."""
 REST: Final = BANK_NAMES.index("rest")
+BLOCK_S: Final = 0.5
+"""Length of a block, s."""
 UNSTATED: Final = {"oil": 30.0, "supply": 2e6}
 """Standard deviation of oil (K) and supply (Pa) that the bus does not state."""
 HUBER: Final = 3.0
@@ -121,6 +123,8 @@ class ScoreBank:
         channels: Channels | None = None,
     ) -> None:
         channels = channels or actuator_channels(actuator)
+        self.faults = faults
+        """Severities as last identified, 1."""
         self._channels, self._rated = channels, actuator.controller.IM
         self._offset, self._undecided = offsets[0], undecided_spool(actuator, faults[2])
         self._noise = default_noise(channels)

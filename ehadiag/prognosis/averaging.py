@@ -68,6 +68,15 @@ class AveragingRules(msgspec.Struct, frozen=True):
     """Lives that the experts' own statement of their misses stands for."""
     early: float = 1.4
     """Lower half of that statement over the upper one, 1: what speeds up is commoner."""
+    early_alone: float = 0.8
+    """The same without a fleet, 1: there `unseen` and `later_alone` hold."""
+    unseen: float = 0.75
+    """Least lower half of an interval over the logarithm of the way that few lives have passed, 1:
+    growth may be faster there."""
+    unseen_quantile: float = 0.25
+    """Quantile of the highest severities of the lives up to which the way counts as passed, 1."""
+    later_alone: float = 0.3
+    """Least logarithm of the upper half of an interval without a fleet: growth may slow down."""
     max_widening: float = 1.1
     """Largest ratio of the calibrated chances' distance from the median to the asked one, 1."""
     law_power: float = 0.3
@@ -274,9 +283,20 @@ def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     median, low, high = _middle(drawn, weights)
     off = truth - median[past]
     miss = off / np.where(off > 0.0, high[past] - median[past], median[past] - low[past])
-    calibrated = _calibrated(miss, counted[past])
+    alone = len(fleet.seen) < rules.min_lives
+    early = rules.early_alone if alone else rules.early
+    calibrated = _calibrated(miss, counted[past], early)
     middle, lower, upper = float(median[-1]), float(low[-1]), float(high[-1])
     logs = middle + np.where(calibrated > 0.0, upper - middle, middle - lower) * calibrated
+    passed = [MIN_SEVERITY, float(life.value.max())]
+    if not alone:
+        tops = [float(item.value.max()) for item in fleet.seen]
+        passed.append(float(np.quantile(tops, rules.unseen_quantile)))
+    earlier = rules.unseen * max(math.log(level / max(passed)), 0.0)
+    least = np.where(CHANCES < 0.5, earlier, rules.later_alone if alone else 0.0)
+    least *= _normal_score(CHANCES) / _normal_score(np.array(0.9))
+    apart = logs - np.median(logs)
+    logs += np.where(np.abs(apart) < np.abs(least), least - apart, 0.0)
     never = logs > rules.max_log_time - 0.01
     quantiles = np.where(never, np.inf, np.exp(np.minimum(logs, rules.max_log_time)))
     found = {name: float(weight) for name, weight in zip(names, weights[:, -1], strict=True)}
@@ -496,11 +516,14 @@ def _middle(drawn: Array, weights: Array) -> tuple[Array, Array, Array]:
     return median, np.minimum(low, median - 0.02), np.maximum(high, median + 0.02)
 
 
-def _calibrated(miss: Array, counted: Array) -> Array:
-    """Quantiles of the misses at `CHANCES`, in half intervals, beside those that were stated."""
+def _calibrated(miss: Array, counted: Array, early: float) -> Array:
+    """Quantiles of the misses at `CHANCES`, in half intervals, beside those that were stated.
+
+    early: lower half of those over the upper one, 1.
+    """
     rules = AVERAGING_RULES
     stated = _normal_score((np.arange(99) + 0.5) / 99) / _normal_score(np.array(0.9))
-    stated = np.where(stated < 0.0, rules.early * stated, stated)
+    stated = np.where(stated < 0.0, early * stated, stated)
     every = np.r_[miss, stated]
     weight = np.r_[counted, np.full(99, rules.even_misses / 99)]
     order = np.argsort(every)

@@ -73,7 +73,8 @@ def lives_of(
     dated: dict[int, list[tuple[str, float]]] = {}
     for entry in entries:
         at = usage_of(entry, unit)
-        if entry.serial is None or at is None or entry.verdict == "NOT_TESTED":
+        untested = entry.verdict == "NOT_TESTED" and entry.by_test
+        if entry.serial is None or at is None or untested:
             continue
         dated.setdefault(entry.serial, []).append((entry.when, at))
         for item in entry.severities:

@@ -79,7 +79,7 @@ def print_result(
     if verbose:
         for reason in result.reasons:
             _line(console, f"- {reason}")
-    if result.identified:
+    if result.estimated:
         console.print(_severities(head, result, console), crop=False)
     if result.identified and verbose:
         for name in ("first", "search"):
@@ -172,7 +172,7 @@ def _line(console: Console, text: str) -> None:
 
 def _severities(head: Head, result: Result, console: Console) -> Table:
     """Numbers of the severities, grey where there is no verdict."""
-    untested = not head.drawn
+    untested = not head.drawn and result.identified
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 1), style="dim" if untested else "")
     table.add_column("severity", no_wrap=True)
     for name in ("estimate", "std", "95 % interval"):

@@ -132,7 +132,11 @@ class Pages:
         by_unit: dict[int | None, list[Entry]] = {}
         for entry in entries:
             by_unit.setdefault(entry.serial, []).append(entry)
-        newest = {serial: counted_entries(mine)[-1] for serial, mine in by_unit.items()}
+        counted = {serial: counted_entries(mine) for serial, mine in by_unit.items()}
+        newest = {
+            serial: next((item for item in mine[::-1] if item.by_test), mine[-1])
+            for serial, mine in counted.items()
+        }
         known = [serial for serial in newest if serial is not None]
         known.sort(key=lambda serial: -_worst_value(newest[serial]))
         levels = (self._levels.advisory, self._levels.limit)

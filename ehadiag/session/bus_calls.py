@@ -233,7 +233,7 @@ def watch(
     Returns
     -------
     MonitorSummary
-        Alarms and numbers of ticks, also where the bus was lost.
+        Alarms, numbers of ticks, severities by free motion; also where the bus was lost.
 
     Raises
     ------
@@ -271,7 +271,11 @@ def watch(
             open_source(transport) as source,
             publish(session.look, snapshots) as refresh,
         ):
-            return session.run(source, stop or threading.Event(), duration_s, refresh)
+            found = session.run(source, stop or threading.Event(), duration_s, refresh)
+    severities, why = session.watcher.severities()
+    place = os.fspath(bus) if isinstance(bus, str | os.PathLike) else source.name
+    result = setup.monitored(place, found.begun, session.watcher.serial, severities, why)
+    return msgspec.structs.replace(found, result=result)
 
 
 def record(

@@ -14,7 +14,7 @@ import msgspec
 
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import stated_channels
-from ehadiag.estimate import finite
+from ehadiag.estimate import Severity, finite
 from ehadiag.live import Residuals, RunningTest, SignalTrace
 from ehadiag.monitor.change_test import LEAST, Cause, ChangeTest
 from ehadiag.monitor.plan import default_noise
@@ -208,6 +208,10 @@ class BusMonitor:
             duration_s=duration,
             left_s=left,
         )
+
+    def severities(self) -> tuple[tuple[Severity, ...], tuple[str, ...]]:
+        """Return severities by free motion so far, and why some have no number."""
+        return ((), ()) if self._changes is None else self._changes.flight.severities()
 
     def residuals(self) -> Residuals | None:
         """Return residuals and sums; None while the monitor settles."""

@@ -21,6 +21,7 @@ from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S
 
 if TYPE_CHECKING:
+    from ehadiag.result import Result
     from firmware_iface.live_decode import BitStatus
     from firmware_iface.transport.base import FrameSource
     from firmware_iface.transport.frames import Frame
@@ -59,6 +60,10 @@ class MonitorSummary(msgspec.Struct, frozen=True):
     """Ticks whose telemetry was lost or damaged."""
     bus_lost: str
     """Why the bus failed; empty where it did not."""
+    begun: str | None = None
+    """Time of the first frame, UTC, ISO 8601; None: not known."""
+    result: Result | None = None
+    """Severities by free motion, without verdict; `reasons`: why some have no number."""
 
     @property
     def share(self) -> float:
@@ -101,6 +106,7 @@ class MonitorSession:
         self._notes: list[str] = []
         self._ended = False
         self._bus_lost = ""
+        self._begun: str | None = None
         self._refresh: Callable[[], None] | None = None
         self.watcher = BusMonitor(actuator, bus_map, unit, tests, hours, self._take_alarm, least)
 
@@ -180,6 +186,8 @@ class MonitorSession:
                     if source.at_end:
                         break
                 else:
+                    if not self._traffic.frames:
+                        self._begun = date_text(frame.time_ns) if self._of_log else utc_now_text()
                     self._traffic.take(len(frame.data), extended=frame.extended)
                     outlets.surroundings.take(frame)
                     watcher.take(frame)
@@ -191,6 +199,7 @@ class MonitorSession:
             self._bus_lost = str(error)
         watcher.finish()
         self._ended = True
+        severities, why = watcher.severities()
         outlets.log.write(
             "end",
             alarms=watcher.alarms,
@@ -203,11 +212,20 @@ class MonitorSession:
             frames=self._traffic.frames,
             dropped=source.overflow,
             bus_lost=self._bus_lost or None,
+            severities={
+                item.name: {
+                    "estimate": item.estimate,
+                    "std": item.std,
+                    "interval95": item.interval95,
+                }
+                for item in severities
+            },
+            not_stated=why,
         )
         count, newest = self._alarms
         return MonitorSummary(
             newest, count, watcher.repeated, watcher.ticks, watcher.pushed, watcher.lost,
-            self._bus_lost,
+            self._bus_lost, self._begun,
         )  # fmt: skip
 
     def look(self, number: int) -> Snapshot:

@@ -92,7 +92,8 @@ def unit_state_from_history(path: Path, serial: int, actuator: Actuator) -> Unit
     from ehadiag.history.store import History  # noqa: PLC0415
 
     with History(path) as history:
-        entries = [item for item in counted_entries(history.entries(serial)) if item.severities]
+        counted = counted_entries(history.entries(serial))
+    entries = [item for item in counted if item.severities and item.by_test]
     if not entries:
         return None
     newest = max(entries, key=lambda item: item.when)

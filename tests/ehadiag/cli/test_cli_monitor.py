@@ -18,6 +18,9 @@ from places import LOGS
 from stored_results import former_result
 
 from ehadiag import bundled_tests, default_actuator
+from ehadiag.history.records import counted_entries
+from ehadiag.history.store import History
+from ehadiag.result import Result
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.emulator import FccCore
 from firmware_iface.codec import Encoder
@@ -94,6 +97,34 @@ def test_a_history_knows_the_unit_by_the_serial_number_on_the_bus(run: Run, tmp_
     assert named.code == 0
     other = run("monitor", "--log", WORN, "--history", "h.sqlite", "--unit", 999)
     assert (other.code, "no diagnosis of serial number 999" in other.err) == (2, True)
+
+
+def test_severities_by_free_motion_are_kept_and_taken_for_no_diagnosis(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each block is a part here: the recording has some seconds only."""
+    monkeypatch.setattr("ehadiag.monitor.flight.PART_BLOCKS", 1)
+    monkeypatch.setattr("ehadiag.monitor.flight.PARTS", (4, 120))
+    run("diagnose", WORN, "--history", "h.sqlite")
+    for _ in range(2):
+        found = run(
+            "monitor", "--log", WORN, "--history", "h.sqlite", "--log-file", "a.jsonl",
+            "--unit-hours", "100",
+        )  # fmt: skip
+        assert "severities by free motion: " in found.err
+    end = events(tmp_path / "a.jsonl")[-1]
+    with History(tmp_path / "h.sqlite") as history:
+        first, _, last = history.entries()
+        assert [item.number for item in counted_entries(history.entries())] == [1, 3]
+    assert (last.test, last.verdict, last.by_test) == ("free motion", "NOT_TESTED", False)
+    assert (last.serial, last.usage.hours) == (first.serial, 100.0)
+    assert last.when[:19] == first.when[:19]
+    stated = {item.name: item for item in last.severities if item.shown}
+    assert stated["FSS"].value == pytest.approx(0.6, abs=0.02)
+    assert end["severities"]["FSS"]["std"] == stated["FSS"].std
+    assert str(Result.from_json(last.result)).startswith("NOT TESTED")
+    assert events(tmp_path / "a.jsonl")[-2]["known"].startswith("diagnosis 1 of ")
+    assert " free motion " in run("history", "list", "--history", "h.sqlite").out
 
 
 def test_a_unit_that_the_history_does_not_know_is_taken_as_new_and_said(run: Run) -> None:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from history_cases import an_entry, an_event
 
-from ehadiag.prognosis.averaging import learn_fleet
+from ehadiag.estimate import FREE_MOTION
+from ehadiag.prognosis.averaging import AVERAGING_RULES, learn_fleet
 from ehadiag.prognosis.forecast import Forecast, forecast
-from ehadiag.prognosis.lives import Life
+from ehadiag.prognosis.lives import Life, lives_of
 from ehadiag.prognosis.units import prognosis_of
 
 RATE = 2.5e-4
@@ -183,6 +184,33 @@ def test_what_no_life_has_shown_is_called_extrapolated() -> None:
     found = of(worn(1, 6), learn_fleet(young, 2000.0), (0.95,))
     assert "0.95 is extrapolated" in found.note
     assert of(worn(1, 6)).note == ""
+
+
+def test_a_way_that_few_lives_have_passed_may_be_passed_faster() -> None:
+    """The lower half of the interval grows with it; without a fleet the upper one has a floor."""
+    young = learn_fleet([worn(serial, 8) for serial in range(10, 22)], 2000.0)
+    for fleet, level in ((young, 0.6), (ALONE, 0.6), (ALONE, 0.2)):
+        life = worn(1, 6)
+        left = of(life, fleet, (level,)).remaining[0]
+        assert left.median is not None
+        assert left.low is not None
+        assert left.high is not None
+        tops = [0.0] if fleet is ALONE else [float(item.value.max()) for item in fleet.seen]
+        passed = max(life.value.max(), np.quantile(tops, AVERAGING_RULES.unseen_quantile))
+        least = AVERAGING_RULES.unseen * np.log(level / passed)
+        assert np.log(left.median / left.low) > 0.99 * least
+        if fleet is ALONE:
+            assert np.log(left.high / left.median) > 0.99 * AVERAGING_RULES.later_alone
+
+
+def test_severities_by_free_motion_count_and_a_refused_test_does_not() -> None:
+    rows = [an_entry(7, 100.0 * n, (0.03 * n, 0.1, 0.1)) for n in range(1, 5)]
+    untested = {"verdict": "NOT_TESTED"}
+    moved = an_entry(7, 500.0, (0.15, 0.1, 0.1), 0.01, test=FREE_MOTION, **untested)
+    refused = an_entry(7, 600.0, (0.9, 0.1, 0.1), **untested)
+    life = lives_of([*rows, moved, refused], [], "Kintas", "hours")[7][0]
+    assert life.age.tolist() == [100.0, 200.0, 300.0, 400.0, 500.0]
+    assert life.std[-1] == 0.01
 
 
 def running_away(serial: int, top: float) -> tuple[Life, float]:

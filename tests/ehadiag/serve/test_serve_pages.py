@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from page_sessions import fail, talk
 
 from ehadiag import ConfigurationError, Levels
-from ehadiag.estimate import Severity
+from ehadiag.estimate import FREE_MOTION, Severity
 from ehadiag.history.records import Entry, Usage
 from ehadiag.history.store import History
 from ehadiag.prognosis.forecast import RemainingLife, forecast, learn_fleet
@@ -272,6 +272,15 @@ def test_too_few_diagnoses_are_counted_and_not_read_from_a_reason():
 
     assert left(2) == "too few diagnoses"
     assert left(3) == "no number"
+
+
+def test_free_motion_takes_no_verdict_away(tmp_path):
+    place = tmp_path / "history.db"
+    tested = an_entry(3, 100.0, verdict="HEALTHY")
+    with History(place, create=True) as history:
+        history.append_all([tested, replace(tested, test=FREE_MOTION, verdict="NOT_TESTED")])
+    with site(tmp_path, place, watch=None) as (port, _):
+        assert "<h1>Fleet: 1 HEALTHY</h1>" in request(port, "/")[1]
 
 
 def test_only_reports_of_the_folder_are_served_and_as_strangers(tmp_path):

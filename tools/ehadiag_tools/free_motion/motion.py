@@ -26,7 +26,6 @@ from ehadiag.compile.vector import unpacker
 from ehadiag.core.actuator import Actuator, default_actuator
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.monitor.change_test import (
-    BLOCK_S,
     CAUSES,
     PIECE_H,
     SPANS,
@@ -35,7 +34,7 @@ from ehadiag.monitor.change_test import (
     ChangeTest,
     alarm_threshold,
 )
-from ehadiag.monitor.score_bank import BANK_NAMES, ScoreBank
+from ehadiag.monitor.score_bank import BANK_NAMES, BLOCK_S, ScoreBank
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.plant_dynamics import STATE, advance_plant
 from ehadiag_sim.plant_laws import PlantCoefficients, scale_unit_data, unit_condition, unit_data
@@ -241,6 +240,8 @@ CHANGES = (
     ("supply", -4e6), ("oil", 15.0), ("oil", -15.0), ("load", 400.0),
 )  # fmt: skip
 """Changes and their sizes, SI."""
+GROWN = 0.05
+"""Largest growth of a severity since its diagnosis in the study of severities, 1."""
 SPREAD_SHARE = 0.97
 """Share of healthy values below a cause's spread."""
 
@@ -253,17 +254,21 @@ class MotionCase:
     hours: float
     calibrates: bool = False
     """Whether all values are recorded, not alarms alone."""
+    grown: float = 0.0
+    """Largest growth of a severity since the diagnosis that the monitor has."""
 
 
 def perform(case: MotionCase) -> Record:
     """Move the simulated unit, and test its motion for changes.
 
-    `alarms`: time (s) and causes (name, size, standard error) of each that repeats none.
+    `alarms`: time (s) and causes (name, size, standard error) of each that repeats none;
+    `severities`: estimate, standard error, interval and truth of those that are stated.
     """
     begin = time.process_time()
     actuator, motion = default_actuator(), case.motion
     record = free_motion(actuator, motion)
-    error = np.random.default_rng(motion.seed).normal(0.0, SEVERITY_ERROR, 3)
+    rng = np.random.default_rng(motion.seed)
+    error = rng.normal(0.0, SEVERITY_ERROR, 3) - rng.uniform(0.0, case.grown, 3)
     given = np.clip(np.add(motion.faults, error), 0.0, 1.0).tolist()
     rate, mode = actuator.controller.rate, CommandMode[motion.mode.upper()]
     test = ChangeTest(ScoreBank(actuator, tuple(given), mode=mode), rate, case.hours)
@@ -278,8 +283,13 @@ def perform(case: MotionCase) -> Record:
             alarms.append((tick / rate, causes))
         if case.calibrates and (tick + 1) % (block * STRIDE) == 0:
             values.append(np.abs(test.values).round(2).tolist())
+    severities = {
+        item.name: (item.estimate, item.std, item.interval95, truth)
+        for item, truth in zip(test.flight.severities()[0], motion.faults, strict=True)
+        if item.estimate is not None
+    }
     spent = time.process_time() - begin
-    return {"alarms": alarms, "values": values, "processor_s": spent}
+    return {"alarms": alarms, "values": values, "severities": severities, "processor_s": spent}
 
 
 def garwood(count: int) -> tuple[float, float]:
@@ -293,6 +303,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--hours", type=float, default=10.0, metavar="H", help="between false alarms (%(default)g)")
     add("--changes", action="store_true", help="study changes instead, --cases rounds of all")
     add("--cause", choices=dict(CHANGES), help="study its change in all kinds of motion instead")
+    add("--severities", action="store_true", help="study the stated severities instead")
     add("--calibrate", action="store_true", help="find the monitor's spreads and threshold instead")
     add("--kinds", choices=("known", "held-out"), default="known",
         help="known: those that the thresholds come from (%(default)s)")  # fmt: skip
@@ -322,6 +333,8 @@ def _cases(options: Options) -> list[MotionCase]:
             ),
             options.hours,
             options.calibrate,
+            # Every second pair of modes.
+            GROWN * (options.severities and number // 2 % 2),
         )
         for number in range(options.cases)
     ]  # fmt: skip
@@ -350,6 +363,8 @@ def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
         yield from _calibration(records, options.hours)
     elif options.changes or options.cause:
         yield from _changes(records)
+    elif options.severities:
+        yield from _severities(records)
     else:
         yield from _false_alarms(records, options)
     spent = sum(item["processor_s"] for item in records)
@@ -374,6 +389,30 @@ def _false_alarms(records: Sequence[Record], options: Options) -> Iterator[str]:
         for when, causes in item["alarms"]:
             piece = f"seed {motion['seed']} {motion['kind']} {motion['mode']}"
             yield f"- {piece}: {when:.0f} s, {causes}"
+
+
+def _severities(records: Sequence[Record]) -> Iterator[str]:
+    """How often severities are stated, and how near the truth; `grown` since their diagnosis."""
+    rows = []
+    for mode, grown, name in itertools.product(
+        ("current", "position"), (False, True), ("Kintas", "FSS", "FDJ")
+    ):
+        part = [
+            item["severities"] for item in records
+            if item["motion"]["mode"] == mode and (item["grown"] > 0.0) == grown
+        ]  # fmt: skip
+        found = [item[name] for item in part if name in item]
+        if found:
+            errors = np.array([value - truth for value, _, _, truth in found])
+            covered = sum(low <= truth <= high for _, _, (low, high), truth in found)
+            numbers = (np.sqrt(np.mean(errors**2)), np.abs(errors).max(),
+                       np.median([std for _, std, _, _ in found]))  # fmt: skip
+            rows.append((
+                mode, "grown" if grown else "as diagnosed", name, f"{len(found)} of {len(part)}",
+                f"{covered}", *(f"{value:.4f}" for value in numbers),
+            ))  # fmt: skip
+    heads = ("mode", "unit", "severity", "stated", "covered", "rms error", "largest", "stated std")
+    yield from markdown(heads, rows)
 
 
 def _changes(records: Sequence[Record]) -> Iterator[str]:
