@@ -58,10 +58,10 @@ class RestRules(msgspec.Struct, frozen=True):
     breakaway_s: float = 0.25
     """Longest time, s, from the command's first change to the pressure's: a spool at its limit of
     friction takes 0.1 s on a ramp of the closed test."""
-    creep_s: float = 0.05
+    creep_s: float = 0.1
     """Time after the command's first change, s, in which a spool breaks away from where the noise
-    of a closed loop has left it: with 0 one of four friction estimates that were 6 to 31 deviations
-    off stays so, with 0.025 none."""
+    of a closed loop has left it: at its limit of friction it takes that long on a ramp. With 0,
+    0.025 and 0.05 one or two of six frictions that were 6 to 31 deviations off stay so."""
     motionless_ticks: int = 10
     """Ticks in which the jack has not yet left its middle, 1."""
     slow_ticks: int = 25

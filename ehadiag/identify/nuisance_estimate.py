@@ -50,6 +50,7 @@ from ehadiag.identify.posterior import (
     FEW_UNKNOWNS_SCHEDULE,
     FINAL_SCHEDULE,
     cauchy_cost,
+    cauchy_costs,
     no_interruption,
     search_posterior,
 )
@@ -78,6 +79,12 @@ class ValleyRules(msgspec.Struct, frozen=True):
     deviations away, of which the density's width is two."""
     points: int = 160
     """Points of each spread, 1: ten blocks of runs."""
+    block: int = 25
+    """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
+    event_cost: float = 30.0
+    """Cost of a block beyond the usual from which on it counts by its logarithm."""
+    unit: float = 10.0
+    """Difference of the cost that is one variance, 1: what the model errs about break-aways."""
     starts: int = 2
     """Searches from the best of them, 1: of 12 pairs on such a unit 10 found the right basin."""
 
@@ -144,6 +151,7 @@ def estimate_about(
     at_first = prior_density(fine, *priors), prior_information(fine, *priors)
     between = no_interruption if settings.progress is None else partial(settings.progress, 1.0)
     density = ParameterDensity(found.density.x * model.scale / fine.scale, found.density.root)
+    valley = np.zeros((len(fine.scale), len(fine.scale)))
     given_up = not found.explained and is_unexplainable(found.residuals, found.starts)
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
@@ -163,7 +171,7 @@ def estimate_about(
             fine, density, FINAL_SPREAD_RATIO * density.root, at_first, draw, between
         )
         if settings.joint is None and all(item.test.closed_loop for item in judged):
-            density = _search_valley(fine, density, at_first, draw, between, rng)
+            density, valley = _search_valley(fine, density, at_first, draw, between, rng)
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=at_first[1]
@@ -175,7 +183,8 @@ def estimate_about(
         experiments=judged,
         covariance=optima_covariance(found, model.scale)
         + _ambiguity_covariance(refined, judged)
-        + profile,
+        + profile
+        + valley * np.outer(model.scale, model.scale),
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
@@ -253,29 +262,47 @@ def _search_valley(
     draw: LinearisationMethod,
     between: Callable[[], None],
     rng: np.random.Generator,
-) -> ParameterDensity:
-    """Search from the best of points far along the valley; the end if it is far better, else there.
+) -> tuple[ParameterDensity, Array]:
+    """Search from the best of points far along the valley in closed loop.
 
     Friction, hysteresis and backlash trade along it. Break-aways divide it into basins, of which
-    several starts may find the same wrong one.
+    several starts may find the same wrong one. Returns the best end, and the covariance of all that
+    explain the recording as well, in units of the model's scales, shape (k, k).
     """
     directions, widths, _ = np.linalg.svd(there.root)
-    best = there
+    ends = [there]
     for ratio in VALLEY.ratios:
         reach = widths * np.where(np.arange(len(widths)) < VALLEY.directions, ratio, 0.5)
         points = np.repeat(there.x[None, :], VALLEY.points, axis=0)
         shifts = rng.standard_normal((VALLEY.points, len(widths))) * reach
         points[:, fine.curved] += shifts @ directions.T
         points = np.clip(points, fine.lower, fine.upper)
-        for place in np.argsort(cauchy_cost(fine.many(points)))[: VALLEY.starts]:
-            begin = ParameterDensity(points[place], there.root)
-            seen = _search_about(
-                fine, begin, FINAL_SPREAD_RATIO * there.root, before, draw, between
+        for place in np.argsort(_event_cost(fine.many(points)))[: VALLEY.starts]:
+            begin = ParameterDensity(points[place], FINAL_SPREAD_RATIO * there.root)
+            found = search_posterior(
+                fine, before[0], begin, before[1], draw, FINAL_SCHEDULE, between
             )
-            costs = cauchy_cost(fine.many(np.vstack([best.x, seen.x])))
-            if costs[0] - costs[1] > GIVE_UP.min_other_end_gain:
-                best = seen
-    return best
+            ends.append(found.density)
+    places = np.array([item.x for item in ends])
+    costs = _event_cost(fine.many(places))
+    best = int(np.argmin(costs))
+    weights = np.exp(-0.5 * (costs - costs[best]) / VALLEY.unit)
+    shifts = places - places[best]
+    return ends[best], np.asarray((shifts.T * (weights / weights.sum())) @ shifts)
+
+
+def _event_cost(residuals: Array) -> Array:
+    """Cost of residuals, shape (…, signals, N): shape (…).
+
+    A break-away at a wrong tick costs a block of ticks, which counts by its logarithm.
+    """
+    count = residuals.shape[-1] // VALLEY.block * VALLEY.block
+    blocks = residuals[..., :count].reshape(*residuals.shape[:-1], -1, VALLEY.block)
+    costs = cauchy_costs(blocks).sum(axis=(-3, -1))
+    usual = np.median(costs, axis=-1, keepdims=True)
+    over = np.maximum(costs - usual, 0.0)
+    capped = np.minimum(costs, usual) + VALLEY.event_cost * np.log1p(over / VALLEY.event_cost)
+    return np.asarray(capped.sum(axis=-1))
 
 
 def optima_covariance(found: MultistartResult, scale: Array) -> Array:

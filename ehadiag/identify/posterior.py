@@ -189,10 +189,13 @@ class _ObjectiveHistory:
 
 def cauchy_cost(residuals: Array) -> Array:
     """Cauchy's cost of weighted residuals, shape (…, signals, N): shape (…)."""
-    return np.asarray(
-        ESTIMATION.cauchy_scale**2
-        * np.log1p((residuals / ESTIMATION.cauchy_scale) ** 2).sum(axis=(-2, -1))
-    )
+    return np.asarray(cauchy_costs(residuals).sum(axis=(-2, -1)))
+
+
+def cauchy_costs(residuals: Array) -> Array:
+    """Cauchy's cost of each weighted residual."""
+    scale = ESTIMATION.cauchy_scale
+    return np.asarray(scale**2 * np.log1p((residuals / scale) ** 2))
 
 
 def cauchy_weights(linear: LinearModel) -> Array:

@@ -139,10 +139,10 @@ def test_what_creeps_before_the_motion_is_left_out(
     begun = build_experiment(samples, ENVIRONMENT, CLOSED, ehadiag.default_actuator())
     left = begun.without_creep()
     seen = np.flatnonzero(np.isfinite(left.pressure))
-    assert seen[0] == 251  # the command moves from tick 201 on
-    assert np.array_equal(left.pressure[251:], begun.pressure[251:], equal_nan=True)
+    assert seen[0] == 301  # the command moves from tick 201 on
+    assert np.array_equal(left.pressure[301:], begun.pressure[301:], equal_nan=True)
     held = np.isnan(begun.pressure)
-    assert held[:251].any()
+    assert held[:301].any()
     assert np.array_equal(left.spool[held], begun.spool[held], equal_nan=True)
     opened = replace(begun, test=ehadiag.bundled_tests()["open"])
     assert opened.without_creep() is opened
