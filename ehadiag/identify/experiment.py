@@ -166,11 +166,11 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
     def without_creep(self) -> Experiment:
         """Return the same, in closed loop without what comes after a hold and before the motion.
 
-        The control law follows the noise of the position until the command moves. Where the spool
-        creeps up to its break-away by that, the tick is decided by as little as the model errs,
-        which hysteresis and a friction far off would explain.
+        Without a rest the control law follows the noise of the position until the command moves.
+        Where the spool creeps up to its break-away by that, the tick is decided by as little as the
+        model errs, which hysteresis and a friction far off would explain.
         """
-        if not self.test.closed_loop:
+        if not self.test.closed_loop or self.rested:
             return self
         end = _ticks_before_motion(self.test) + round(REST.creep_s * self.test.rate)
         creeps = (np.arange(self.ticks) < end) & np.isfinite(self.pressure)
