@@ -92,22 +92,6 @@ def add_batch_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--summary", metavar="FILE", help="write the counts of all as JSON")
 
 
-def diagnose_all(
-    arguments: argparse.Namespace,
-    setups: Sequence[Setup],
-    results: ResultWriter,
-    inputs: Sequence[LogInput],
-) -> int:
-    """Diagnose each recording by itself; return the exit code of all.
-
-    arguments: the parsed command line; setups: what is wanted, of each actuator on the bus;
-    results: where each result goes; inputs: the recordings. Returns that of one; the worst of
-    several, see `worst_exit_code`.
-    """
-    call = _BatchRun(arguments, setups, results, inputs)
-    return call.run()
-
-
 def diagnose_and_deliver(
     setup: Setup,
     results: ResultWriter,
@@ -149,12 +133,16 @@ class Finding(NamedTuple):
     """PNG; None where none was wanted, or none can be drawn."""
 
 
-def work(setup: Setup, log: str, folder: str, *, draw: bool) -> tuple[Finding, ...]:
+def _run_task(
+    setups: Sequence[Setup], folder: str, task: _BatchTask, *, draw: bool
+) -> tuple[Finding, ...]:
     """Read and diagnose one log in a worker; whatever is wrong with it becomes a finding.
 
-    setup: what is wanted; log: file to read; folder: working folder of the call, which names of
-    logs start from; draw: whether a picture is wanted. Returns at least one.
+    setups: what is wanted, of each actuator; folder: working folder of the call, which names of
+    logs start from; task: log and actuator; draw: whether a picture is wanted. Returns at least
+    one.
     """
+    setup, log = setups[task.unit], task.item.name
     ignore_interrupt_in_worker()
     with contextlib.suppress(OSError):  # a cluster's worker may not have it
         os.chdir(folder)
@@ -182,8 +170,12 @@ class _BatchTask(msgspec.Struct, frozen=True):
     item: LogInput
 
 
-class _BatchRun:
-    """What the recordings of one call share."""
+class BatchRun:
+    """One call that diagnoses each recording by itself.
+
+    arguments: the parsed command line; setups: what is wanted, of each actuator on the bus;
+    results: where each result goes; inputs: the recordings.
+    """
 
     def __init__(
         self,
@@ -207,7 +199,10 @@ class _BatchRun:
         self._interrupted = False
 
     def run(self) -> int:
-        """Diagnose all; a file that cannot be written keeps no verdict from being printed."""
+        """Diagnose all; return the exit code: that of one, the worst of several.
+
+        A file that cannot be written keeps no verdict from being printed.
+        """
         workers = self._workers()
         try:
             with ExitStack() as stack:
@@ -413,12 +408,6 @@ class _BatchRun:
                 if not self._interrupted:
                     code = worst_exit_code({code, INPUT_OUTPUT_EXIT_CODE})
         return code
-
-
-def _run_task(
-    setups: Sequence[Setup], folder: str, task: _BatchTask, *, draw: bool
-) -> tuple[Finding, ...]:
-    return work(setups[task.unit], task.item.name, folder, draw=draw)
 
 
 def _abandoned_task(setups: Sequence[Setup], task: _BatchTask) -> tuple[Finding, ...]:

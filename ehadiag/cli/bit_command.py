@@ -109,8 +109,6 @@ def define_bit(parser: argparse.ArgumentParser) -> None:
     options.add_json_option(parser)
     add_history_options(parser)
     options.add_result_options(parser)
-    options.add_report_option(parser)
-    options.add_signals_option(parser)
     option_values.add_bus_options(parser)
     option_values.add_protocol_option(parser)
     add_simulator_options(parser)

@@ -21,7 +21,6 @@ from ehadiag.core.conversion import conversion_of
 from ehadiag.core.interruption import stop_on_signals
 from ehadiag.estimate import INTERVAL_STDS
 from ehadiag.report.rendering import isolated_png
-from ehadiag.request import TEST
 from ehadiag.terminal.output import (
     INPUT_OUTPUT_EXIT_CODE,
     print_compiling_notice,
@@ -129,11 +128,9 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--log", metavar="LOG", help="watch a recording instead of a bus, as fast as it goes"
     )
-    parser.add_argument(
-        "--test",
-        action="append",
-        default=[],
-        metavar=TEST,
+    options.add_request_options(
+        parser,
+        "test",
         help="further test that the computer may run, to call it by its name; repeatable",
     )
     options.add_screen_options(parser)
@@ -404,12 +401,8 @@ def define_sim(parser: argparse.ArgumentParser) -> None:
         "Run the emulated flight-control computer and its actuator on a bus until"
         " Ctrl-C, SIGTERM or --duration."
     )
-    parser.add_argument(
-        "--test",
-        action="append",
-        default=[],
-        metavar=TEST,
-        help="further test that the computer stores; repeatable",
+    options.add_request_options(
+        parser, "test", help="further test that the computer stores; repeatable"
     )
     parser.add_argument(
         "--duration", type=options.positive_number, metavar="S", help="stop after so many seconds"

@@ -123,16 +123,17 @@ def _write_outputs(
     What cannot be written is said, and its exit code added to `codes`.
     """
     written = []
+    picture, page = out.with_suffix(".png"), out.with_suffix(".html")
     if found.actuator is not None:
         with report_failure(codes):
             _write_actuator(folder, out.name, found.actuator, replaced=arguments.update)
             written.append(out)
-            _write_picture(folder, _picture_path(out).name, found)
-            written.append(_picture_path(out))
+            _write_picture(folder, picture.name, found)
+            written.append(picture)
     if arguments.report:
         with report_failure(codes):
-            _write_page(folder, _page_path(out).name, found)
-            written.append(_page_path(out))
+            _write_page(folder, page.name, found)
+            written.append(page)
     return written
 
 
@@ -145,26 +146,15 @@ def _checked_out(arguments: argparse.Namespace) -> Path:
         raise ConfigurationError("--update: needs --actuator, the calibrated file to refine")
     if arguments.update and arguments.compare:
         raise ConfigurationError("--update keeps the model that was chosen: --compare does nothing")
-    same = arguments.update and _is_same_file(out, Path(arguments.actuator))
-    beside = (_picture_path(out), _page_path(out)) if arguments.report else (_picture_path(out),)
-    for path in () if same else (out, *beside):
+    if arguments.update and out.exists() and out.samefile(arguments.actuator):
+        return out
+    for suffix in (".toml", ".png", ".html") if arguments.report else (".toml", ".png"):
+        path = out.with_suffix(suffix)
         if os.path.lexists(path):
             raise ConfigurationError(
                 f"--out {arguments.out}: {path.name} exists; name another file, or remove it"
             )
     return out
-
-
-def _is_same_file(one: Path, other: Path) -> bool:
-    return one.exists() and other.exists() and one.samefile(other)
-
-
-def _picture_path(out: Path) -> Path:
-    return out.with_suffix(".png")
-
-
-def _page_path(out: Path) -> Path:
-    return out.with_suffix(".html")
 
 
 def _read_logs(setup: Setup) -> tuple[list[Recording], list[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from firmware_iface.errors import printable
@@ -13,6 +13,13 @@ FORMER_OPTIONS = {
     "--serial-number": "--unit N",
 }
 """Options of earlier versions, with what is given instead."""
+
+
+def closest_name(word: str, known: Iterable[str]) -> str | None:
+    """Return the known name that a misspelt one is most like; None where it is like none."""
+    from difflib import get_close_matches  # noqa: PLC0415 - not where nothing is misspelt
+
+    return next(iter(get_close_matches(word, sorted(known), n=1)), None)
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -31,14 +38,12 @@ class CommandParser(argparse.ArgumentParser):
 
     def refuse_unknown(self, words: Sequence[str]) -> NoReturn:
         """End for options that the command does not have; name the one most alike."""
-        from difflib import get_close_matches  # noqa: PLC0415 - not where nothing is misspelt
-
         known = [name for action in self._actions for name in action.option_strings]
         texts = []
         for word in words:
             name = word.split("=", 1)[0]
-            near = get_close_matches(name, known, n=1) if name.startswith("-") else []
-            texts.append(word + (f" (did you mean {near[0]}?)" if near else ""))
+            near = closest_name(name, known) if name.startswith("-") else None
+            texts.append(word + (f" (did you mean {near}?)" if near else ""))
         self.error(f"unrecognized arguments: {' '.join(texts)}")
 
     def format_help(self) -> str:
@@ -68,10 +73,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
-            from difflib import get_close_matches  # noqa: PLC0415 - not where nothing is misspelt
-
-            near = get_close_matches(str(value), list(action.choices), n=1)
-            hint = f", did you mean {near[0]}?" if near else ""
+            near = closest_name(str(value), action.choices)
+            hint = f", did you mean {near}?" if near else ""
             raise argparse.ArgumentError(None, f"there is no command {value!r}{hint}")
         super()._check_value(action, value)
 

@@ -12,10 +12,11 @@ from __future__ import annotations
 import argparse
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ehadiag.cli.command_parser import closest_name
 from ehadiag.request import request_options
 from firmware_iface.errors import ConfigurationError, reason_of
 from firmware_iface.files import read_toml, refuse_foreign
@@ -237,20 +238,11 @@ def apply_defaults(
         if chosen.set(key, text, f"variable {name}"):
             used.append(name)
         elif key not in everywhere:
-            near = _closest_name(key, everywhere)
+            near = closest_name(key, everywhere)
             hint = f"; {VARIABLE_PREFIX}{near.upper()}?" if near else ""
-            ignored.append(f"variable {name}: there is no option --{_option_name(key)}{hint}")
+            option = key.replace("_", "-")
+            ignored.append(f"variable {name}: there is no option --{option}{hint}")
     return AppliedDefaults(tuple(used), tuple(ignored))
-
-
-def _option_name(key: str) -> str:
-    return key.replace("_", "-")
-
-
-def _closest_name(word: str, known: Iterable[str]) -> str | None:
-    from difflib import get_close_matches  # noqa: PLC0415 - only for what nobody knows
-
-    return next(iter(get_close_matches(word, sorted(known), n=1)), None)
 
 
 def _refuse_unknown_keys(
@@ -262,18 +254,18 @@ def _refuse_unknown_keys(
         if isinstance(value, dict):
             if name not in known:
                 raise _unknown_key_error(
-                    where, f"[{name}]", "command", _closest_name(name, known), "[{}]"
+                    where, f"[{name}]", "command", closest_name(name, known), "[{}]"
                 )
             for key in value:
                 if option_key(key) not in known[name]:
-                    near = _closest_name(option_key(key), known[name])
+                    near = closest_name(option_key(key), known[name])
                     raise _unknown_key_error(
                         where, f"[{name}] {key}", f"option of {name}", near, "{}"
                     )
         elif option_key(name) not in everywhere:
             if name in known:
                 raise ConfigurationError(f"{where}: {name} is a command, need a table [{name}]")
-            near = _closest_name(option_key(name), everywhere)
+            near = closest_name(option_key(name), everywhere)
             raise _unknown_key_error(where, name, "option of any command", near, "{}")
 
 

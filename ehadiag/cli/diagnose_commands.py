@@ -14,7 +14,7 @@ from ehadiag.assess.verdict import Levels
 from ehadiag.batch.journal import list_tests
 from ehadiag.batch.workers import LogInput, expand_logs
 from ehadiag.cli import options
-from ehadiag.cli.batch_run import add_batch_options, diagnose_all, diagnose_and_deliver
+from ehadiag.cli.batch_run import BatchRun, add_batch_options, diagnose_and_deliver
 from ehadiag.cli.command_parser import show_usual
 from ehadiag.cli.history_options import add_history_option, add_history_options, history_path
 from ehadiag.cli.option_values import (
@@ -87,8 +87,6 @@ def define_diagnose(parser: argparse.ArgumentParser) -> None:
     options.add_request_options(parser, "prior")
     add_history_options(parser)
     options.add_result_options(parser)
-    options.add_report_option(parser)
-    options.add_signals_option(parser)
     add_batch_options(parser)
     show_usual(
         parser,
@@ -135,7 +133,7 @@ def run_diagnose(arguments: argparse.Namespace) -> int:
     elif arguments.joint:
         code = _diagnose_joint(setups[0], results, inputs)
     else:
-        code = diagnose_all(arguments, setups, results, inputs)
+        code = BatchRun(arguments, setups, results, inputs).run()
     defer_signals()
     return code
 

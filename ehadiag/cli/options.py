@@ -134,8 +134,18 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_result_options(parser: argparse.ArgumentParser) -> None:
-    """Add how a result is written."""
+    """Add what is written of a result beside its JSON object."""
     parser.add_argument("--no-picture", action="store_true", help="draw nothing")
+    add_report_option(parser)
+    parser.add_argument(
+        "--signals",
+        action="append",
+        choices=SIGNAL_FILE_KINDS,
+        default=[],
+        metavar="KIND",
+        help="also write recorded and modelled signals, residuals and events to the output folder:"
+        " mf4 (ASAM MDF4) or mcap (Foxglove, PlotJuggler); repeatable",
+    )
 
 
 def add_screen_options(parser: argparse.ArgumentParser) -> None:
@@ -171,19 +181,6 @@ def xcp_ids(arguments: argparse.Namespace) -> XcpIds | None:
     from firmware_iface.xcp import XcpIds, parse_xcp_ids  # noqa: PLC0415 - loads numpy
 
     return XcpIds() if arguments.xcp is True else parse_xcp_ids(arguments.xcp)
-
-
-def add_signals_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--signals`."""
-    parser.add_argument(
-        "--signals",
-        action="append",
-        choices=SIGNAL_FILE_KINDS,
-        default=[],
-        metavar="KIND",
-        help="also write recorded and modelled signals, residuals and events to the output folder:"
-        " mf4 (ASAM MDF4) or mcap (Foxglove, PlotJuggler); repeatable",
-    )
 
 
 def add_report_option(parser: argparse.ArgumentParser, place: str = "to the output folder") -> None:

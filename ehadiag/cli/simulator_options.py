@@ -8,10 +8,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ehadiag.cli.command_parser import closest_name
 from ehadiag.cli.options import seed_number
 from ehadiag_sim.conditions import (
     ConditionOption,
@@ -146,8 +146,8 @@ def _refuse_unknown_keys(scenario: Mapping[str, Any], where: str) -> None:
     known = scenario_keys()
     for name in scenario:
         if name not in known:
-            near = get_close_matches(name, known, n=1)
-            hint = f", did you mean {near[0]}?" if near else ""
+            near = closest_name(name, known)
+            hint = f", did you mean {near}?" if near else ""
             raise ConfigurationError(f"{where}: there is no key {name}{hint}")
 
 
