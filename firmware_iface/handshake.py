@@ -262,6 +262,7 @@ class Handshake:
         """Take out a time in which the reader itself did not run: what came then still waits."""
         self._since += pause_ns
         self._last_ns += pause_ns
+        self._counted_ns += pause_ns
         self._watch.excuse(pause_ns)
 
     def on_status(self, now: int, status: BitStatus) -> list[HandshakeAction]:

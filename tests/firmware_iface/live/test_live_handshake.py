@@ -90,6 +90,16 @@ def test_a_slow_computer_is_waited_for_as_long_as_it_counts(until: float, comple
     assert (HandshakeAction.ABORT in driver.sent) is not complete
 
 
+def test_a_pause_of_the_reader_is_no_end_of_the_counting() -> None:
+    driver = Driver().running()
+    for k in range(1, 41):
+        driver.wait(0.05).hear(replace(status(BitState.RUNNING), elapsed=0.01 * k))
+    driver.now += 1_500 * MS
+    driver.machine.excuse(1_500 * MS)
+    assert driver.wait(0.05).machine.phase is Phase.RUNNING
+    assert driver.wait(1.0).sent[-1] is HandshakeAction.ABORT  # it counts no more
+
+
 def test_what_is_still_to_be_read_is_not_late() -> None:
     driver = Driver().requested()
     driver.machine.behind = 2.0
