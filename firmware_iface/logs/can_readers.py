@@ -40,8 +40,11 @@ MAX_PACKED_BLOCK = 64 << 20
 """Bytes that one packed block of an MF4 or HDF5 file may unpack to; usual are 1 to 4 MiB."""
 MF4_PACKED_BLOCK = b"##DZ"
 MF4_PACKED_HEAD = struct.Struct("<26xB13xQ")
-"""Of a packed block: its method (0 deflate, 1 transposed and deflate), bytes that follow."""
+"""Of a packed block: its method, bytes that follow."""
+MF4_OTHER_METHODS = range(2, 6)
+"""Zstandard and LZ4; 0 and 1 are deflate, no other number has a meaning."""
 INFLATED_PIECE = 1 << 16
+"""Bytes that are unpacked at once."""
 
 MF4_LIBRARY = "asammdf"
 
@@ -242,12 +245,12 @@ def check_packed_blocks(path: Path, most: int) -> None:
             if begin > len(file):
                 return
             method, length = MF4_PACKED_HEAD.unpack(file[at:begin])
-            if method > 1:
+            if method in MF4_OTHER_METHODS:
                 raise InputOutputError(
                     f"log {path}: packed by another method than deflate; save it by deflate"
                 )
             limit = min(most - unpacked, MAX_PACKED_BLOCK)
-            size = _inflated_size(file, begin, min(begin + length, len(file)), limit)
+            size = inflated_size(file, begin, min(begin + length, len(file)), limit)
             if size > limit:
                 raise InputOutputError(
                     f"log {path}: unpacks to more than {most >> 20} MiB, or one block of it to more"
@@ -256,17 +259,23 @@ def check_packed_blocks(path: Path, most: int) -> None:
             unpacked += size
 
 
-def _inflated_size(file: mmap.mmap, begin: int, end: int, limit: int) -> int:
-    """Bytes that a packed block holds, at most one more than the limit; 0: it is none."""
+def inflated_size(packed: bytes | mmap.mmap, begin: int, end: int, limit: int) -> int:
+    """Bytes that data of deflate hold, or some number beyond the limit.
+
+    Of damaged ones those before the damage, or some more: the work on them counts, too.
+    """
     inflate, size = zlib.decompressobj(), 0
     try:
-        for at in range(begin, end, INFLATED_PIECE):
-            piece = file[at : min(at + INFLATED_PIECE, end)]
-            size += len(inflate.decompress(piece, limit + 1 - size))
-            if size > limit or inflate.eof:
+        while size <= limit and not inflate.eof:
+            piece = inflate.unconsumed_tail
+            if not piece:
+                piece = packed[begin : min(begin + INFLATED_PIECE, end)]
+                begin += len(piece)
+            if not piece:
                 break
+            size += len(inflate.decompress(piece, INFLATED_PIECE))
     except zlib.error:  # data that look like a block, or damage: the reader says so
-        return 0
+        size += INFLATED_PIECE
     return size
 
 

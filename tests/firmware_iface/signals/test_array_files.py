@@ -113,12 +113,15 @@ def packed_bomb(path, method=0, unpacked=96 << 20):
         file.save(path, compression=1)
     content = path.read_bytes()
     at = content.index(b"##DZ")
-    data = zlib.compress(bytes(unpacked))
-    head = struct.pack("<4xQQ2sBxIQQ", 48 + len(data), 0, b"DT", method, 0, 6400, len(data))
     end = len(content) + -len(content) % 8
     content = content.replace(struct.pack("<Q", at), struct.pack("<Q", end))
-    path.write_bytes(content.ljust(end, b"\0") + b"##DZ" + head + data)
+    path.write_bytes(content.ljust(end, b"\0") + block(zlib.compress(bytes(unpacked)), method))
     return path
+
+
+def block(data, method=0):
+    head = struct.pack("<4xQQ2sBxIQQ", 48 + len(data), 0, b"DT", method, 0, 6400, len(data))
+    return b"##DZ" + head + data
 
 
 @pytest.mark.parametrize("method", [0, 1])
@@ -131,6 +134,28 @@ def test_a_block_of_mf4_that_unpacks_to_more_than_it_states(tmp_path, monkeypatc
         read_signals(path, ColumnMap(), Budget())
     with pytest.raises(InputOutputError, match="one block of it to more than 64 MiB"):
         read_frames(path)
+
+
+def test_damaged_blocks_of_mf4_count_with_what_they_unpack_to(tmp_path):
+    """Each is below the limit of one; the work on all of them is not."""
+    path = packed_bomb(tmp_path / "bombs.mf4", unpacked=6400)
+    damaged = zlib.compress(bytes(63 << 20))[:-4] + b"none"
+    with path.open("ab") as file:
+        file.write(3 * block(damaged))
+    with pytest.raises(InputOutputError, match="unpacks to more than 128 MiB"):
+        read_frames(path)
+
+
+@pytest.mark.parametrize("method", [6, 0])
+def test_data_that_look_like_a_block_of_mf4_are_none(tmp_path, method):
+    asammdf = pytest.importorskip("asammdf")
+    path = tmp_path / "rig.mf4"
+    with asammdf.MDF() as file:
+        file.append([asammdf.Signal(values, TIME, name=name) for name, values in VALUES.items()])
+        file.save(path)
+    with path.open("ab") as file:
+        file.write(block(b"no deflate", method) + b"##DZ")
+    assert_read(path)
 
 
 def test_another_packing_of_mf4_is_named(tmp_path):
