@@ -24,7 +24,11 @@ from firmware_iface.errors import (
     install_command,
     printable,
 )
-from firmware_iface.logs.can_readers import MAX_PACKED_BLOCK, check_packed_blocks
+from firmware_iface.logs.can_readers import (
+    MAX_PACKED_BLOCK,
+    check_packed_blocks,
+    inflated_size,
+)
 from firmware_iface.logs.log_files import Budget
 from firmware_iface.recording import FloatArray, RecordedSignal
 from firmware_iface.signals.columns import TIME_ROLE, ColumnMap, column_unit, missing_channels
@@ -33,6 +37,8 @@ from firmware_iface.signals.tables import MAX_TABLE_ROWS, checked_signals
 UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units", "unit_string")
 MATLAB_REFERENCES = "#"
 """Begins the names of MATLAB's own groups."""
+CHECKSUM_BYTES = 4
+"""Of a block of HDF5, which may be packed with it."""
 
 
 class ArrayChannel(msgspec.Struct, frozen=True):
@@ -245,9 +251,43 @@ def _hdf_channels(path: str, item: Any) -> dict[tuple[str, str], ArrayChannel]:
 
 
 def _numbers(item: Any, part: Any) -> FloatArray:
-    if item.chunks and math.prod(item.chunks) * item.dtype.itemsize > MAX_PACKED_BLOCK:
-        raise InputOutputError(
-            f"log {item.file.filename}: {printable(item.name)!r} is stored in blocks of more than"
-            f" {MAX_PACKED_BLOCK >> 20} MiB; store it in smaller ones"
-        )
+    if item.chunks:
+        _check_blocks(item)
     return np.asarray(item[part], dtype=np.float64).reshape(-1)
+
+
+def _check_blocks(item: Any) -> None:
+    """Refuse a data set whose packed blocks take too much memory: one is unpacked whole.
+
+    The library unpacks whatever a block holds, before it cuts it to its size.
+    """
+    import h5py  # noqa: PLC0415 - loaded, see HdfReader
+
+    where = f"log {item.file.filename}: {printable(item.name)!r} is"
+    size = math.prod(item.chunks) * item.id.get_type().get_size()
+    if size > MAX_PACKED_BLOCK:
+        raise InputOutputError(
+            f"{where} stored in blocks of more than {MAX_PACKED_BLOCK >> 20} MiB; store it in"
+            " smaller ones"
+        )
+    made = item.id.get_create_plist()
+    filters = [made.get_filter(number)[0] for number in range(made.get_nfilters())]
+    packed = filters.count(h5py.h5z.FILTER_DEFLATE)
+    rest = set(filters) - {
+        h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32
+    }  # fmt: skip
+    if rest or packed > 1:
+        raise InputOutputError(f"{where} packed by another method than gzip; store it by gzip")
+    if not packed:
+        return
+    places: list[tuple[int, ...]] = []
+    item.id.chunk_iter(lambda block: places.append(block.chunk_offset))
+    for place in places:
+        skipped, block = item.id.read_direct_chunk(place)
+        if skipped >> filters.index(h5py.h5z.FILTER_DEFLATE) & 1:
+            continue  # packing did not make it smaller
+        if inflated_size(block, 0, len(block), size + CHECKSUM_BYTES) > size + CHECKSUM_BYTES:
+            raise InputOutputError(
+                f"{where} damaged: a block of it unpacks to more than the {size} bytes that it"
+                " states"
+            )

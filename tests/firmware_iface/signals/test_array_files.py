@@ -191,3 +191,43 @@ def test_blocks_of_hdf5_are_bounded(tmp_path):
             assert len(item) == len(values)  # nothing is written: no block is on the disk
     with pytest.raises(InputOutputError, match="blocks of more than 64 MiB"):
         read_signals(path, ColumnMap(), Budget())
+
+
+def write_hdf(path, **options):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values in (VALUES | {"time": TIME}).items():
+            file.create_dataset(name, data=values, chunks=(64,), **options)
+
+
+@pytest.mark.parametrize("more", [{}, {"compression": "gzip"}])
+def test_blocks_of_hdf5_with_checksums_are_read(tmp_path, more):
+    write_hdf(tmp_path / "rig.h5", shuffle=True, fletcher32=True, **more)
+    assert_read(tmp_path / "rig.h5")
+
+
+def test_a_block_of_hdf5_that_is_not_packed_is_read(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "rig.h5"
+    write_hdf(path, compression="gzip")
+    with h5py.File(path, "r+") as file:
+        raw = VALUES["spool"][64:128].astype("<f8").tobytes()
+        file["spool"].id.write_direct_chunk((64,), raw, filter_mask=1)
+    assert_read(path)
+
+
+@pytest.mark.parametrize("unpacked", [1 << 20, 1 << 25])
+def test_a_block_of_hdf5_that_unpacks_to_more_than_it_states(tmp_path, unpacked):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "bomb.h5"
+    write_hdf(path, compression="gzip")
+    with h5py.File(path, "r+") as file:
+        file["spool"].id.write_direct_chunk((64,), zlib.compress(bytes(unpacked)))
+    with pytest.raises(InputOutputError, match="'/spool' is damaged: a block of it unpacks to"):
+        read_signals(path, ColumnMap(), Budget())
+
+
+def test_another_packing_of_hdf5_is_named(tmp_path):
+    write_hdf(tmp_path / "rig.h5", compression="lzf")
+    with pytest.raises(InputOutputError, match="store it by gzip"):
+        read_signals(tmp_path / "rig.h5", ColumnMap(), Budget())
