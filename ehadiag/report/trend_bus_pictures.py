@@ -110,7 +110,8 @@ def trend_column(
         )
         for at, event in changes
     ]  # fmt: skip
-    lines += [ReferenceLine(at, "last test", "last test", upright=True) for at, _ in placed[-1:]]
+    tested = [at for at, entry in placed if entry.by_test]
+    lines += [ReferenceLine(at, "last test", "last test", upright=True) for at in tested[-1:]]
     fans = [_fan(item, f"forecast {list(names).index(item.name) % 3}")
             for item in prognosis.forecasts if unit is not None and item.name in names]  # fmt: skip
     areas = tuple(area for fan in fans for area in fan[0])

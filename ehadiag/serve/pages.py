@@ -16,6 +16,7 @@ from msgspec import structs
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
+from ehadiag.estimate import FREE_MOTION
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
@@ -133,10 +134,7 @@ class Pages:
         for entry in entries:
             by_unit.setdefault(entry.serial, []).append(entry)
         counted = {serial: counted_entries(mine) for serial, mine in by_unit.items()}
-        newest = {
-            serial: next((item for item in mine[::-1] if item.by_test), mine[-1])
-            for serial, mine in counted.items()
-        }
+        newest = {serial: _last_test(mine) for serial, mine in counted.items()}
         known = [serial for serial in newest if serial is not None]
         known.sort(key=lambda serial: -_worst_value(newest[serial]))
         levels = (self._levels.advisory, self._levels.limit)
@@ -152,7 +150,7 @@ class Pages:
                 verdict=last.verdict,
                 word=_word(last),
                 severities=self._advised(last) if serial in futures else last.severities,
-                past=[_worst_value(entry) for entry in by_unit[serial] if entry.severities],
+                past=[_worst_value(item) for item in by_unit[serial] if item.severities and item.by_test],
                 tested=last.tested or last.appended,
                 link="" if serial is None else f"/history/{serial}",
                 prognosis=futures.get(serial) if serial is not None else None,
@@ -162,7 +160,7 @@ class Pages:
 
     def _advised(self, entry: Entry) -> list[Severity]:
         """Severities with what to do about them, which only the whole result has."""
-        advice = kept_advice(self._newest_result([entry]))
+        advice = kept_advice(self._result_of(entry))
         return [
             structs.replace(item, advice=advice.get(item.name, "")) for item in entry.severities
         ]
@@ -174,7 +172,8 @@ class Pages:
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
         used = counted_entries(mine)
-        first = first_to_the_limit(future, kept_advice(self._newest_result(used)))
+        last = _last_test(used) if used else None
+        first = first_to_the_limit(future, kept_advice(self._result_of(last)))
         lines = [" ".join(first)] if first else []
         lines += [
             f"{plain_name(item.name)} {item.alarm}" for item in future.forecasts if item.alarm
@@ -192,17 +191,17 @@ class Pages:
             none="No diagnosis of this unit is kept.",
             lines=lines,
             plots=plots,
-            summary=_word(used[-1]) if used else "",
-            kind=used[-1].verdict if used else "",
+            summary=_word(last) if last else "",
+            kind=last.verdict if last else "",
             left=_left_to_the_levels(future),
         )
 
-    def _newest_result(self, entries: Sequence[Entry]) -> str:
-        """Whole result of the newest of one unit's diagnoses; empty without any."""
-        if self._history is None or not entries:
+    def _result_of(self, entry: Entry | None) -> str:
+        """Whole result of a diagnosis; empty without any."""
+        if self._history is None or entry is None:
             return ""
         with History(self._history) as history:
-            return history.entry(entries[-1].number).result
+            return history.entry(entry.number).result
 
     def _reports_page(self) -> Page:
         """Return the list of the reports in the folder."""
@@ -307,8 +306,15 @@ def _diagnosed(entry: Entry) -> list[Cell]:
     ]
 
 
+def _last_test(entries: Sequence[Entry]) -> Entry:
+    """Last of a unit's rows that a test made; where none did, the last one."""
+    return next((item for item in entries[::-1] if item.by_test), entries[-1])
+
+
 def _word(entry: Entry) -> str:
-    """Word for the verdict of a history's row."""
+    """Word for the verdict of a history's row; of a monitor's, which has none, what it is."""
+    if not entry.by_test:
+        return FREE_MOTION.upper()
     return verdict_word(entry.verdict, identified=bool(entry.severities))
 
 

@@ -24,6 +24,8 @@ from places import LOGS
 import ehadiag
 from ehadiag import CommandMode, Samples
 from ehadiag.core.conversion import Conversion
+from ehadiag.estimate import FREE_MOTION
+from ehadiag.history.records import Usage
 from ehadiag.prognosis.units import prognosis_of
 from ehadiag.report.bokeh_plots import plot_column
 from ehadiag.report.matplotlib_figures import draw_picture, picture_png
@@ -168,6 +170,15 @@ def test_a_trend_has_levels_and_a_forecast_and_is_broken_at_an_event():
     assert ahead
     assert ahead[0].y[-1] == 75.0
     assert column.x_label == "operating hours"
+
+
+def test_the_last_test_of_a_trend_is_no_free_motion():
+    worn = [an_entry(1, 100.0 * n, (0.02 * n, 0.02 * n, 0.01 * n)) for n in range(1, 5)]
+    flown = structs.replace(worn[-1], usage=Usage(450.0), test=FREE_MOTION, verdict="NOT_TESTED")
+    entries = [*worn, flown]
+    (panel,) = trend_column(entries, [], future(entries)).panels
+    assert [line.at for line in panel.lines if line.label == "last test"] == [400.0]
+    assert panel.curves[0].x[-1] == 450.0
 
 
 def test_a_slow_severity_does_not_squeeze_the_trend_of_a_fast_one():

@@ -280,7 +280,13 @@ def test_free_motion_takes_no_verdict_away(tmp_path):
     with History(place, create=True) as history:
         history.append_all([tested, replace(tested, test=FREE_MOTION, verdict="NOT_TESTED")])
     with site(tmp_path, place, watch=None) as (port, _):
-        assert "<h1>Fleet: 1 HEALTHY</h1>" in request(port, "/")[1]
+        fleet = request(port, "/")[1]
+        unit = request(port, "/history/3")[1]
+    assert "<h1>Fleet: 1 HEALTHY</h1>" in fleet
+    assert "<svg" not in fleet  # there is one test
+    assert '<h1 class="HEALTHY">Unit 3: HEALTHY</h1>' in unit
+    assert ">FREE MOTION<" in unit
+    assert "INCONCLUSIVE" not in unit
 
 
 def test_only_reports_of_the_folder_are_served_and_as_strangers(tmp_path):
