@@ -36,17 +36,21 @@ class FlightEstimate:
     """Sums up the blocks of a flight; bank: that they are of."""
 
     def __init__(self, bank: ScoreBank) -> None:
-        self._bank = bank
+        self._bank, self._why = bank, ""
         self.begin_anew()
 
     def begin_anew(self, why: str = "") -> None:
-        """Forget all blocks; why: nothing is stated from now on."""
-        self._why = why
+        """Forget all blocks; why: nothing is stated from now on, whatever comes later."""
+        self._why = self._why or why
+        self._steady = self._bank.steady
         self._parts: list[tuple[Array, Array2]] = []
         self._length, self._blocks, self._ticks = PART_BLOCKS, 0, 0
 
     def add(self, block: BlockScore) -> None:
-        """Add a block."""
+        """Add a block; where oil or supply are stated at last, begin with it."""
+        if (self._bank.steady < self._steady).any():
+            self.begin_anew()
+        self._steady = self._bank.steady
         if self._blocks % self._length == 0:
             if len(self._parts) == PARTS[1]:
                 pairs = zip(self._parts[::2], self._parts[1::2], strict=True)
@@ -89,7 +93,7 @@ class FlightEstimate:
 
     def _changes(self) -> tuple[Array, Array]:
         """Changes of the severities and their standard errors, steps."""
-        steady, severities = self._bank.steady.copy(), slice(0, len(FAULTS))
+        steady, severities = self._steady.copy(), slice(0, len(FAULTS))
         steady[severities] = 1.0 / np.abs(self._bank.steps[severities])
         kept = np.arange(len(steady)) != REST
         scores = np.array([score[kept] for score, _ in self._parts])

@@ -8,6 +8,7 @@ import pytest
 from ehadiag import default_actuator
 from ehadiag.monitor.flight import MAX_STD, PART_BLOCKS, PARTS, FlightEstimate
 from ehadiag.monitor.score_bank import BANK, BlockScore, ScoreBank
+from firmware_iface.recording import Environment
 
 BANK_OF_UNIT = ScoreBank(default_actuator(), (0.3, 0.3, 0.97))
 COUNT = PARTS[0] * PART_BLOCKS
@@ -82,3 +83,21 @@ def test_after_an_alarm_of_something_else_there_are_none() -> None:
     made = flight(5, {})
     made.begin_anew("an alarm named load +400 ± 30 N")
     assert made.severities()[1] == ("an alarm named load +400 ± 30 N: run a test",)
+    made.begin_anew()  # one of a severity
+    assert made.severities()[1] == ("an alarm named load +400 ± 30 N: run a test",)
+
+
+def test_blocks_before_the_oil_was_stated_are_none_of_the_estimate() -> None:
+    """They are of the model's own oil: its error was taken for that of a stated one."""
+    bank = ScoreBank(default_actuator(), (0.3, 0.3, 0.3))
+    made = FlightEstimate(bank)
+    slopes = np.eye(len(BANK), 20)
+    block = BlockScore(slopes @ np.ones(20), slopes @ slopes.T, np.zeros((2, len(BANK))), 20)
+    for _ in range(COUNT):
+        made.add(block)
+    bank.tune(Environment(oil_temperature=40.0))
+    made.add(block)
+    assert made.severities()[1] == ("less than 5 min of free motion: run a test",)
+    bank.tune(Environment())
+    made.add(block)  # less is known: all blocks stay
+    assert made._blocks == 2
