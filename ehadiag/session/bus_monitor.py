@@ -110,6 +110,7 @@ class BusMonitor:
         self._sums = [0.0] * len(CUSUM_SIDES)
         self._threshold = 1.0
         self._status: BitStatus | None = None
+        self._stranger = ""
         self.unit = unit
         self.serial = unit.serial
         """Serial number on the bus, else that of the unit's state."""
@@ -153,7 +154,7 @@ class BusMonitor:
 
     def take_over(self, unit: UnitState) -> None:
         """Exchange the state of the unit; the monitor begins anew."""
-        self.unit = unit
+        self.unit, self._stranger = unit, ""
         self.serial = self.bus_serial if self.bus_serial is not None else unit.serial
         self._build()
 
@@ -176,6 +177,9 @@ class BusMonitor:
         """Take the state of the test: of the bus's own messages, or as another protocol says it."""
         before, self._status = self._status, status
         if status.serial is not None:
+            if self.serial not in (None, status.serial) and not self._stranger:
+                self._stranger = f"serial number {status.serial} on the bus, not {self.serial}"
+                self._end_estimate()
             self.bus_serial = self.serial = status.serial
         began = status.state is BitState.RUNNING
         if (
@@ -355,7 +359,14 @@ class BusMonitor:
             )  # fmt: skip
             self._changes = ChangeTest(bank, self._rate, self._hours, self._least)
             self._changes.tune(environment)
+            self._end_estimate()
         self._fresh = True
+
+    def _end_estimate(self) -> None:
+        """State no severities where the monitor's offsets and effects are not this unit's."""
+        why = self._stranger if self.unit.known else "the unit has no diagnosis"
+        if why and self._changes is not None:
+            self._changes.flight.begin_anew(why)
 
     def _tune(self, monitor: FreeMotionMonitor) -> None:
         """Take oil and supply on the bus, averaged since the last time."""

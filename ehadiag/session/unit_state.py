@@ -33,6 +33,8 @@ class UnitState(msgspec.Struct, frozen=True):
     effects: Mapping[str, float] = msgspec.field(default_factory=dict)
     """Effects of the unit, by the registry's names; SI."""
     serial: int | None = None
+    known: bool = True
+    """Whether offsets and effects are this unit's, by a diagnosis or a calibration."""
 
     @property
     def faults(self) -> tuple[float, ...]:
@@ -65,7 +67,7 @@ def new_unit_state(actuator: Actuator) -> UnitState:
     severities = tuple(
         Severity(name=item.name, estimate=0.0, meaning=item.short, source=source) for item in FAULTS
     )
-    return UnitState(source, severities, serial=serial)
+    return UnitState(source, severities, serial=serial, known=calibration is not None)
 
 
 def unit_state_from_result(path: Path, actuator: Actuator) -> UnitState:

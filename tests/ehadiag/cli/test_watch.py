@@ -30,13 +30,13 @@ from ehadiag.session.alarm_outlets import AlarmLog
 from ehadiag.session.bit_session import BitView
 from ehadiag.session.bus_monitor import BusMonitor, MonitorAlarm
 from ehadiag.session.monitor_session import BitMonitor
-from ehadiag.session.unit_state import UnitState
+from ehadiag.session.unit_state import UnitState, new_unit_state
 from ehadiag.setup import Setup
 from ehadiag_tools.free_motion.motion import Motion, free_motion
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.handshake import Phase
-from firmware_iface.live_decode import Sample
+from firmware_iface.live_decode import BitStatus, Sample
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import CHANNELS, BitReason, BitState
 from firmware_iface.stored_test import resolve_test
@@ -201,6 +201,36 @@ def test_a_change_that_lasts_is_an_alarm_that_says_what_changed(bus_map: BusMap)
     assert (alarms[0].during, alarms[0].signal) == ("", "")
     assert alarms[0].tick == 16_000
     assert watcher.alarms == len(alarms)
+
+
+def bus_monitor(unit: UnitState) -> BusMonitor:
+    return BusMonitor(REFERENCE, default_map(), unit, (), 100.0, lambda _: None)
+
+
+def why_none(watcher: BusMonitor) -> str:
+    severities, (why,) = watcher.severities()
+    assert not any(item.shown for item in severities)
+    return why
+
+
+def test_no_severities_by_free_motion_of_a_unit_without_a_diagnosis() -> None:
+    """Its offsets and effects are not known as well as the intervals take them to be."""
+    watcher = bus_monitor(new_unit_state(REFERENCE))
+    assert why_none(watcher) == "the unit has no diagnosis: run a test"
+    watcher.take_over(unit_with(**TRUE))
+    assert why_none(watcher) == "less than 5 min of free motion: run a test"
+
+
+def test_no_severities_by_free_motion_of_two_units() -> None:
+    seven = replace(unit_with(**TRUE), serial=7)
+    watcher = bus_monitor(seven)
+    watcher.take_status(BitStatus(BitState.IDLE, serial=7))
+    assert why_none(watcher) == "less than 5 min of free motion: run a test"
+    for serial in (8, 7):
+        watcher.take_status(BitStatus(BitState.IDLE, serial=serial))
+        assert why_none(watcher) == "serial number 8 on the bus, not 7: run a test"
+    watcher.take_over(seven)
+    assert why_none(watcher) == "less than 5 min of free motion: run a test"
 
 
 def test_while_a_test_runs_each_alarm_is_raised_at_once() -> None:
