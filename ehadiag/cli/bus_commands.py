@@ -27,16 +27,18 @@ from ehadiag.terminal.output import (
     print_status,
     print_text,
     progress_bar,
+    report_failure,
     transport_losses,
 )
 from ehadiag.terminal.screen import SessionScreen
-from firmware_iface.errors import ConfigurationError
+from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.files import write_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from ehadiag.live import Snapshot
+    from ehadiag.result import Result
     from ehadiag.session.unit_state import UnitState
     from ehadiag_sim.control import SimulatorControl
     from firmware_iface.transport.base import Transport
@@ -164,8 +166,6 @@ def run_monitor(
     refuse_overwriting(arguments, outputs, [(kind, name) for kind, name in reads if name])
     print_compiling_notice(identification=False)
     unit, find = _initial_unit_state(arguments, actuator)
-    from ehadiag.history.records import Usage, history_entry  # noqa: PLC0415
-    from ehadiag.history.store import History  # noqa: PLC0415
     from ehadiag.session.alarm_outlets import (  # noqa: PLC0415
         AlarmCommand,
         AlarmLog,
@@ -210,16 +210,31 @@ def run_monitor(
     print_status("; ".join(
         [f"severities by free motion: {', '.join(stated) or 'none'}", *found.result.reasons]
     ))  # fmt: skip
+    codes = [0]
     if stated and arguments.history:
-        with History(Path(arguments.history)) as history:
-            usage = Usage(arguments.unit_hours, arguments.unit_cycles)
-            history.append(history_entry(found.result, usage, simulated=False))
+        with report_failure(codes):
+            _keep(found.result, arguments)
     if found.alarm_count:
         return 40
     if found.bus_lost:
         return INPUT_OUTPUT_EXIT_CODE
     enough = found.monitored and found.share >= arguments.least_monitored
-    return 0 if enough else 30
+    return codes[-1] or (0 if enough else 30)
+
+
+def _keep(result: Result, arguments: argparse.Namespace) -> None:
+    """Append severities to the history; InputOutputError where they cannot be."""
+    from ehadiag.history.records import Usage, history_entry  # noqa: PLC0415
+    from ehadiag.history.store import History  # noqa: PLC0415
+
+    entry = history_entry(
+        result, Usage(arguments.unit_hours, arguments.unit_cycles), simulated=False
+    )
+    try:
+        with History(Path(arguments.history)) as history:
+            history.append(entry)
+    except ConfigurationError as error:  # exchanged since the call began
+        raise InputOutputError(str(error)) from None
 
 
 def _initial_unit_state(
@@ -232,6 +247,12 @@ def _initial_unit_state(
         unit_state_from_result,
     )
 
+    if arguments.history and arguments.no_history:
+        raise ConfigurationError("--history and --no-history exclude each other")
+    if not arguments.history and (arguments.unit_hours, arguments.unit_cycles) != (None, None):
+        raise ConfigurationError(
+            "--unit-hours, --unit-cycles: no health history to keep them in: name one by --history"
+        )
     if arguments.from_result:
         if arguments.history:
             raise ConfigurationError("--from and --history exclude each other: name one of them")

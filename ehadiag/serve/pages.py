@@ -150,7 +150,11 @@ class Pages:
                 verdict=last.verdict,
                 word=_word(last),
                 severities=self._advised(last) if serial in futures else last.severities,
-                past=[_worst_value(item) for item in by_unit[serial] if item.severities and item.by_test],
+                past=[
+                    _worst_value(item)
+                    for item in counted[serial]
+                    if item.severities and item.by_test
+                ],
                 tested=last.tested or last.appended,
                 link="" if serial is None else f"/history/{serial}",
                 prognosis=futures.get(serial) if serial is not None else None,

@@ -14,6 +14,7 @@ from typing import Any
 import can
 import pytest
 from cli_result import REPOSITORY, Run
+from msgspec.structs import replace
 from places import LOGS
 from stored_results import former_result
 
@@ -21,9 +22,11 @@ from ehadiag import bundled_tests, default_actuator
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
 from ehadiag.result import Result
+from ehadiag.session import bus_calls
 from ehadiag_sim.conditions import Faults
 from ehadiag_sim.emulator import FccCore
 from firmware_iface.codec import Encoder
+from firmware_iface.errors import InputOutputError
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.python_can import PythonCanTransport
@@ -127,6 +130,27 @@ def test_severities_by_free_motion_are_kept_and_taken_for_no_diagnosis(
     assert " free motion " in run("history", "list", "--history", "h.sqlite").out
 
 
+def test_an_alarm_is_said_though_the_history_takes_no_severities(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ehadiag.monitor.flight.PART_BLOCKS", 1)
+    monkeypatch.setattr("ehadiag.monitor.flight.PARTS", (4, 120))
+    run("diagnose", WORN, "--history", "h.sqlite")
+
+    watch = bus_calls.watch
+
+    def refuse(*_: object) -> None:
+        raise InputOutputError("history h.sqlite: cannot be written")
+
+    monkeypatch.setattr(History, "append", refuse)
+    monkeypatch.setattr(
+        bus_calls, "watch", lambda *args, **named: replace(watch(*args, **named), alarm_count=1)
+    )
+    found = run("monitor", "--log", WORN, "--history", "h.sqlite")
+    assert found.code == 40
+    assert "cannot be written" in found.err
+
+
 def test_a_unit_that_the_history_does_not_know_is_taken_as_new_and_said(run: Run) -> None:
     run("history", "init", "--history", "h.sqlite")
     found = run("monitor", "--log", HEALTHY, "--history", "h.sqlite")
@@ -158,6 +182,8 @@ def test_what_is_no_result_is_refused(run: Run, tmp_path: Path, content: str, sa
     [
         ((), "no bus named"),
         (("--log", HEALTHY, "--from", "r.json", "--history", "h"), "exclude each other"),
+        (("--log", HEALTHY, "--no-history", "--history", "h"), "exclude each other"),
+        (("--log", HEALTHY, "--unit-hours", 5), "no health history to keep them in"),
         (("--log", HEALTHY, "--unit", "3"), "no health history"),
         (("--log", HEALTHY, "--hours", "1e9"), "hours between false alarms"),
         (("--log", HEALTHY, "--on-alarm", "'open"), "--on-alarm"),
