@@ -163,11 +163,13 @@ class SlowValueWatch:
         ):
             return self._found
         self._judged_ns = time_ns
+        # Between two frames of a slow page the counter goes on with all the fast ones.
+        counts = len(self._streams) == 1 or brings_slow_values(self._message)
         stamps = np.array([item.time_ns for item in frames], dtype=np.int64)
         self._found = slow_value_conflict(
             self._message,
             stamps,
-            None if counter is None else np.array([item.counter for item in frames]),
+            np.array([item.counter for item in frames]) if counts and counter is not None else None,
             {key: np.array([item.values[key] for item in frames]) for key in values},
             int(np.ptp(stamps)) + SLOW_VALUES.late_ns,
         )

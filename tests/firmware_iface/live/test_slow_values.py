@@ -15,6 +15,7 @@ from ehadiag.session.bus_monitor import BusMonitor
 from ehadiag.session.unit_state import new_unit_state
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
+from firmware_iface.slow_values import SlowValueWatch
 from firmware_iface.transport.frames import Frame
 
 BUS = default_map()
@@ -148,3 +149,20 @@ def test_a_monitor_believes_neither() -> None:
         monitor.take(frame)
     assert monitor.conflicts > 50
     assert monitor._environment_values == {}
+
+
+@pytest.mark.parametrize(("paged", "found"), [(True, False), (False, True)])
+def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(paged: bool, found: bool) -> None:
+    """As in `alignment.frame_faults.slow_values`: a page of 10 Hz beside one of 1 kHz."""
+    roles = BUS.messages["Environment"].roles + BUS.messages["ServoTelemetry"].roles
+    watch = SlowValueWatch(replace(BUS.messages["Environment"], roles=roles))
+    why = ""
+    for number in range(60):
+        at = number * 100_000_000
+        slow = bytes((number % 256, 0, 1))
+        values = {"environment.oil_temperature": 40.0}
+        why = why or watch.take(at, number * 101 % 256, slow, values)
+        for tick in range(2 if paged else 0):
+            fast = bytes((number % 256, tick, 0))
+            why = why or watch.take(at + tick, tick, fast, {"channels.spool": 0.0})
+    assert bool(why) is found
