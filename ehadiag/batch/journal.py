@@ -28,7 +28,6 @@ from firmware_iface.files import RESULT_MODE, Folder, create_file, private_folde
 if TYPE_CHECKING:
     from ehadiag.api import PathLike
     from ehadiag.setup import Progress, Setup
-    from firmware_iface.files import Folder
     from firmware_iface.recording import Recording
 
 
