@@ -240,6 +240,9 @@ class Handshake:
                 actions = self._abort(f"still arming after {times.arming:g} s", now)
             case Phase.RUNNING if (now - self._last_ns) / 1e9 >= times.telemetry:
                 actions = self._abort(f"telemetry lost for {times.telemetry:g} s", now)
+            case Phase.RUNNING if self.behind > times.finish and any(self.limits.watched()):
+                late = f"frames are read {self.behind:.1f} s late: limits cannot be watched"
+                actions = self._abort(late, now)
             case Phase.RUNNING if why := self._watch.on_time(now):
                 actions = self._abort(why, now)
             case Phase.RUNNING if self._overdue(now, heard):

@@ -107,6 +107,15 @@ def test_what_is_still_to_be_read_is_not_late() -> None:
     assert driver.wait(0.1).sent == [HandshakeAction.START, HandshakeAction.ABORT]
 
 
+@pytest.mark.parametrize("watched", [True, False])
+def test_a_reader_too_late_to_watch_limits_ends_the_test(watched: bool) -> None:
+    driver = Driver().running()
+    driver.machine.limits = ChannelLimits(position=0.02 if watched else None)
+    driver.machine.behind = 1.1
+    driver.wait(0.01)
+    assert (HandshakeAction.ABORT in driver.sent) is watched
+
+
 def test_nothing_missing_ends_the_listening_at_once() -> None:
     driver = Driver().running().wait(1.0).hear(status(BitState.COMPLETE))
     assert driver.machine.phase is Phase.TRAILING
