@@ -240,10 +240,7 @@ class Handshake:
                 actions = self._abort(f"still arming after {times.arming:g} s", now)
             case Phase.RUNNING if (now - self._last_ns) / 1e9 >= times.telemetry:
                 actions = self._abort(f"telemetry lost for {times.telemetry:g} s", now)
-            case Phase.RUNNING if self.behind > times.finish and any(self.limits.watched()):
-                late = f"frames are read {self.behind:.1f} s late: limits cannot be watched"
-                actions = self._abort(late, now)
-            case Phase.RUNNING if why := self._watch.on_time(now):
+            case Phase.RUNNING if why := self._read_late() or self._watch.on_time(now):
                 actions = self._abort(why, now)
             case Phase.RUNNING if self._overdue(now, heard):
                 late = f"not complete {times.finish:g} s after its {self.duration:g} s"
@@ -479,6 +476,12 @@ class Handshake:
         whole = self.times.arming + self.duration + self.times.finish
         last = min(max(self._since, self._going_on_at), self._since + round(whole * 1e9))
         return (now - last) / 1e9 >= self.times.abort
+
+    def _read_late(self) -> str:
+        """Why limits cannot be watched; empty: they can, or there are none."""
+        if self.behind <= self.times.finish or not any(self.limits.watched()):
+            return ""
+        return f"frames are read {self.behind:.1f} s late: limits cannot be watched"
 
     def _overdue(self, now: int, heard: float) -> bool:
         """Whether the test should be complete; not while the computer counts on to its end."""
