@@ -141,7 +141,7 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         "--fmu",
         action="store_true",
-        help="co-simulation units (FMI 2.0 and 3.0) of simulator and monitor, for this computer",
+        help="co-simulation units (FMI 2.0 and 3.0) of simulator and monitor",
     )
     what.add_argument(
         "--a2l",
@@ -155,6 +155,15 @@ def define_export(parser: argparse.ArgumentParser) -> None:
         " replaced",
     )
     what.add_argument("--list", action="store_true", help="list the targets and exit")
+    parser.add_argument(
+        "--platform",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="with --fmu: computer that the units run on: x86_64-linux, aarch64-linux,"
+        " x86_64-windows, x86_64-darwin, aarch64-darwin or all; repeatable; needs ziglang (default"
+        " this computer, by its C compiler)",
+    )
     parser.add_argument("--out", metavar="DIR", help="folder to write into")
     parser.add_argument(
         "--hours",
@@ -167,10 +176,11 @@ def define_export(parser: argparse.ArgumentParser) -> None:
     options.add_xcp_option(parser, "with --a2l: how the computer is reached")
     show_usual(
         parser,
-        "--target --list --out --actuator --hours --fmu --a2l --pdx --help-all",
+        "--target --list --out --actuator --hours --fmu --platform --a2l --pdx --help-all",
         examples=(
             "ehadiag export --target cortex-m7 --out eha-m7",
             "ehadiag export --fmu --out units",
+            "ehadiag export --fmu --platform all --out units",
         ),
     )
     parser.set_defaults(run=partial(run_export, parser))
@@ -207,6 +217,8 @@ def run_export(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
     if arguments.a2l:
         print_text(printable(str(Path(arguments.out) / _write_a2l(arguments))))
         return 0
+    if arguments.platform and not arguments.fmu:
+        raise ConfigurationError("--platform: needs --fmu")
     actuator = options.setup_of(arguments).actuator
     names = (
         _write_fmus(arguments, actuator) if arguments.fmu else _write_library(arguments, actuator)
@@ -238,7 +250,7 @@ def _write_fmus(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:
 
     with open_output_folder(arguments.out) as folder:
         print_status(EXPORT_NOTICE)
-        return export_fmus(actuator, folder, hours=arguments.hours)
+        return export_fmus(actuator, folder, hours=arguments.hours, platforms=arguments.platform)
 
 
 def _write_library(arguments: argparse.Namespace, actuator: Actuator) -> list[str]:

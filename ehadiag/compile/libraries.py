@@ -16,7 +16,7 @@ import struct
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -246,18 +246,41 @@ def _made(library: str, level: tuple[str, str]) -> bytes:
     processor = LEVELS.get(level, HOST)
     replaced = C_FUNCTIONS if processor.rounds else C_FUNCTIONS | ROUNDING_FUNCTIONS
     lanes = LANES_OF.get(library, 1)
-    code = object_code(ObjectFile(functions, processor, replaced=replaced, lanes=lanes))
+    (code,) = object_code(ObjectFile(functions, processor, replaced=replaced, lanes=lanes))
     names = [item.name for item in functions]
     return code if level == NO_LEVEL else shared_library(code, names)
 
 
-def object_file(wanted: ObjectFile) -> bytes:
+def object_files(*wanted: ObjectFile) -> list[bytes]:
     """Object code with its tables, compiled or from the cache folder.
 
-    wanted: what is to be in it. The code does not depend on the values in its tables. Returns the
-    object file, of the format of the target. EhadiagError: the compiler is not installed, or has no
-    such target.
+    wanted: what is to be in each; of one order of bytes. The code does not depend on the values in
+    its tables. Returns the object files, of the formats of their targets. EhadiagError: the
+    compiler is not installed, or has no such target.
     """
+    blank = {
+        _export_file(item): replace(
+            item, tables={name: _placeholder(name, len(row)) for name, row in item.tables.items()}
+        )
+        for item in wanted
+    }
+    codes = {file: code for file in blank if (code := read_cached(file)) is not None}
+    absent = [file for file in blank if file not in codes]
+    made = object_code(*(blank[file] for file in absent)) if absent else []
+    codes |= {
+        file: cached(file, partial(bytes, code)) for file, code in zip(absent, made, strict=True)
+    }
+    filled = []
+    for item, (file, empty) in zip(wanted, blank.items(), strict=True):
+        code = codes[file]
+        for name, numbers in item.tables.items():
+            code = _with_table(code, empty.tables[name], numbers)
+        filled.append(code)
+    return filled
+
+
+def _export_file(wanted: ObjectFile) -> str:
+    """Name in the cache folder."""
     kernels = [item.kernel.py_func for item in wanted.functions]
     kernels += [item.py_func for item in wanted.replaced.values()]
     modules = {item.__module__ for item in kernels} | {"ehadiag.compile.object_code"}
@@ -272,14 +295,7 @@ def object_file(wanted: ObjectFile) -> bytes:
         wanted.processor,
         tool_versions(),
     )
-    blank = {name: _placeholder(name, len(numbers)) for name, numbers in wanted.tables.items()}
-    code = cached(
-        f"export-{KERNEL_DIGEST(repr(made_by).encode()).hexdigest()[:16]}.kernel",
-        lambda: object_code(replace(wanted, tables=blank)),
-    )
-    for name, numbers in wanted.tables.items():
-        code = _with_table(code, blank[name], numbers)
-    return code
+    return f"export-{KERNEL_DIGEST(repr(made_by).encode()).hexdigest()[:16]}.kernel"
 
 
 def _placeholder(name: str, count: int) -> list[float]:

@@ -108,11 +108,12 @@ BEGIN = (
 )
 
 
-def object_code(wanted: ObjectFile) -> bytes:
-    """Make an object file in a process of its own.
+def object_code(*wanted: ObjectFile) -> list[bytes]:
+    """Make object files in a process of their own, which translates a kernel once for all of them.
 
-    wanted: what is to be in it. Returns the object file, of the format of the target. EhadiagError:
-    the compiler is not installed, or has no such target; RuntimeError: the compiler has failed.
+    wanted: what is to be in each; of one order of bytes, and of the same lanes. Returns the object
+    files, of the formats of their targets. EhadiagError: the compiler is not installed, or has no
+    such target; RuntimeError: the compiler has failed.
     """
     if find_spec("numba") is None:
         raise ConfigurationError(
@@ -125,14 +126,14 @@ def object_code(wanted: ObjectFile) -> bytes:
     environment["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"  # of errors that it expects
     done = subprocess.run(
         [sys.executable, "-P", "-c", BEGIN],
-        input=b"".join(map(pickle.dumps, (sys.path, wanted.lanes, wanted))),
+        input=b"".join(map(pickle.dumps, (sys.path, wanted[0].lanes, wanted))),
         capture_output=True,
         env=environment,
         check=False,
     )
     if done.returncode != 0 or not done.stdout:
         raise RuntimeError(f"the compiler failed:\n{done.stderr.decode(errors='replace')}")
-    made: bytes | EhadiagError = pickle.loads(done.stdout)
+    made: list[bytes] | EhadiagError = pickle.loads(done.stdout)
     if isinstance(made, EhadiagError):
         raise made
     return made
@@ -148,9 +149,9 @@ def main() -> None:
     from ehadiag.compile.object_code import emitted  # noqa: PLC0415
 
     wanted = pickle.load(sys.stdin.buffer)
-    made: bytes | EhadiagError
+    made: list[bytes] | EhadiagError
     try:
-        made = emitted(wanted)
+        made = [emitted(item) for item in wanted]
     except EhadiagError as error:
         made = error
     sys.stdout.buffer.write(pickle.dumps(made))

@@ -12,9 +12,10 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
+from msgspec.structs import replace
 
 from ehadiag.compile.elementary import C_FUNCTIONS, ROUNDING_FUNCTIONS
-from ehadiag.compile.libraries import object_file
+from ehadiag.compile.libraries import object_files
 from ehadiag.compile.worker import (
     CFunction,
     DoublesArgument,
@@ -30,7 +31,7 @@ from ehadiag.export.library import (
     make_manifest,
     write_files,
 )
-from ehadiag.export.targets import HOST, c_compiler, link_shared
+from ehadiag.export.targets import HOST, c_compiler, cross_compiler, link_shared
 from ehadiag.model.plant import plant_constants
 from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.monitor.monitor_memory import (
@@ -169,11 +170,38 @@ def model_description(
 FMI_VERSIONS: Final = ("2.0", "3.0")
 C_LIBRARY_FUNCTIONS: Final = frozenset({"log10", "pow", "exp10"})
 """What the simulator's oil may call: the same library that Python's arithmetic calls here."""
-FMU_BINARY_FOLDERS: Final = {
-    ("linux", "x86_64"): ("linux64", "x86_64-linux"),
-    ("linux", "aarch64"): ("aarch64-linux", "aarch64-linux"),
+
+
+class FmuPlatform(msgspec.Struct, frozen=True):
+    """A computer for which a unit can carry a binary."""
+
+    triple: str
+    """In LLVM's names."""
+    zig: str
+    """In Zig's, with the oldest C library or system on which the binary runs."""
+    folder: str
+    """Of the binary in FMI 2.0."""
+    suffix: str
+    """Of a shared library."""
+
+
+FMU_PLATFORMS: Final[Mapping[str, FmuPlatform]] = {
+    "x86_64-linux": FmuPlatform(
+        "x86_64-unknown-linux-gnu", "x86_64-linux-gnu.2.17", "linux64", ".so"
+    ),
+    # FMI 2.0 has no names of its own for AArch64: 2.0.5 takes those of 3.0.
+    "aarch64-linux": FmuPlatform(
+        "aarch64-unknown-linux-gnu", "aarch64-linux-gnu.2.17", "aarch64-linux", ".so"
+    ),
+    "x86_64-windows": FmuPlatform("x86_64-pc-windows-gnu", "x86_64-windows-gnu", "win64", ".dll"),
+    "x86_64-darwin": FmuPlatform(
+        "x86_64-apple-macosx11", "x86_64-macos.11.0", "darwin64", ".dylib"
+    ),
+    "aarch64-darwin": FmuPlatform(
+        "arm64-apple-macosx11", "aarch64-macos.11.0", "aarch64-darwin", ".dylib"
+    ),
 }
-"""Folder of the binary in FMI 2.0 and 3.0."""
+"""By the names of FMI 3.0, which are also the binaries' folders in it."""
 
 
 class _FmuModel(msgspec.Struct, frozen=True):
@@ -279,54 +307,84 @@ VARIABLE_MEANINGS: Final[Mapping[str, tuple[str, str]]] = {
 
 
 def export_fmus(
-    actuator: Actuator, folder: Folder, *, hours: float = FALSE_ALARM_INTERVAL_H
+    actuator: Actuator,
+    folder: Folder,
+    *,
+    hours: float = FALSE_ALARM_INTERVAL_H,
+    platforms: Sequence[str] = (),
 ) -> list[str]:
-    """Write units of simulator and monitor, each for both versions of FMI, for this computer.
+    """Write units of simulator and monitor, each for both versions of FMI.
 
     actuator: whose data are in them as constants; folder: where to write; files of these names are
-    replaced; hours: mean time between false alarms of the monitor, h. Returns names of the files.
-    ConfigurationError: no C compiler, or a computer for which FMI has no name here;
-    InputOutputError: the folder cannot be written, or the compiler fails.
+    replaced; hours: mean time between false alarms of the monitor, h; platforms: names in
+    FMU_PLATFORMS, or "all"; none: this computer. Returns names of the files. ConfigurationError: no
+    such platform, or no C compiler for it; InputOutputError: the folder cannot be written, or the
+    compiler fails.
     """
-    compiler = c_compiler()
-    if compiler is None:
-        raise ConfigurationError("no C compiler (cc, or what CC names): a unit cannot be linked")
-    places = FMU_BINARY_FOLDERS.get((sys.platform, platform.machine()))
-    if places is None:
-        raise ConfigurationError(f"no units for {sys.platform} on {platform.machine()}")
+    compilers = _compilers(platforms)
     tick = 1.0 / actuator.controller.rate
-    files: dict[str, bytes] = {}
-    for model in (_simulator(actuator), _monitor(actuator, hours)):
-        code = object_file(
-            ObjectFile(
-                model.functions,
-                HOST,
-                model.tables,
-                C_FUNCTIONS | ROUNDING_FUNCTIONS,
-                allowed=model.allowed,
+    models = _simulator(actuator), _monitor(actuator, hours)
+    codes = iter(
+        object_files(
+            *(
+                ObjectFile(
+                    model.functions,
+                    replace(HOST, triple=FMU_PLATFORMS[name].triple),
+                    model.tables,
+                    C_FUNCTIONS | ROUNDING_FUNCTIONS,
+                    allowed=model.allowed,
+                )
+                for model in models
+                for name in compilers
             )
         )
-        for version, place in zip(FMI_VERSIONS, places, strict=True):
-            name = f"{model.name}_fmi{version[0]}"
-            token = hashlib.sha256(code + name.encode()).hexdigest()
-            binary = link_shared(
-                compiler,
-                f"{name}.so",
-                {
-                    "fmu.c": fill_template("fmu.c"),
-                    "model.h": _fmu_header(model, name, token, tick),
-                    "eha.o": code,
-                },
-            )
-            text = model_description(version, name, token, tick, model.meaning, model.variables)
-            files[f"{name}.fmu"] = _packed(
-                {"modelDescription.xml": text, f"binaries/{place}/{name}.so": binary}
-            )
-    files[MANIFEST_FILE] = make_manifest(
-        files, target="host", options={"actuator": actuator.name, "hours": hours}
     )
+    files: dict[str, bytes] = {}
+    for model in models:
+        code_of = {item: next(codes) for item in compilers}
+        for version in FMI_VERSIONS:
+            name = f"{model.name}_fmi{version[0]}"
+            token = hashlib.sha256(b"".join(code_of.values()) + name.encode()).hexdigest()
+            text = model_description(version, name, token, tick, model.meaning, model.variables)
+            packed = {"modelDescription.xml": text}
+            for item, compiler in compilers.items():
+                place = FMU_PLATFORMS[item].folder if version == "2.0" else item
+                library = f"{name}{FMU_PLATFORMS[item].suffix}"
+                packed[f"binaries/{place}/{library}"] = link_shared(
+                    compiler,
+                    library,
+                    {
+                        "fmu.c": fill_template("fmu.c"),
+                        "model.h": _fmu_header(model, name, token, tick),
+                        "eha.o": code_of[item],
+                    },
+                )
+            files[f"{name}.fmu"] = _packed(packed)
+    options = {"actuator": actuator.name, "hours": hours, "platforms": list(compilers)}
+    files[MANIFEST_FILE] = make_manifest(files, target="host", options=options)
     write_files(folder, files)
     return list(files)
+
+
+def _compilers(platforms: Sequence[str]) -> dict[str, list[str]]:
+    """Command of the C compiler by the platforms that a unit is for: this one's own, or Zig's."""
+    for name in platforms:
+        if name not in (*FMU_PLATFORMS, "all"):
+            raise ConfigurationError(
+                f"platform {name!r}: need one of {', '.join(FMU_PLATFORMS)}, all"
+            )
+    if platforms:
+        names = FMU_PLATFORMS if "all" in platforms else platforms
+        return {name: cross_compiler(FMU_PLATFORMS[name].zig) for name in names}
+    compiler, own = c_compiler(), f"{platform.machine()}-{sys.platform}"
+    if compiler is None:
+        raise ConfigurationError("no C compiler (cc, or what CC names): a unit cannot be linked")
+    if sys.platform != "linux" or own not in FMU_PLATFORMS:
+        raise ConfigurationError(
+            f"no units for {sys.platform} on {platform.machine()} by its own C compiler:"
+            " name what they are for by --platform"
+        )
+    return {own: compiler}
 
 
 def _simulator(actuator: Actuator) -> _FmuModel:
@@ -394,6 +452,6 @@ def _packed(files: Mapping[str, bytes]) -> bytes:
             # One date for all files (ZIP's first), so that the same kernels give the same unit.
             entry = zipfile.ZipInfo(name)
             entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = (0o755 if name.endswith(".so") else 0o644) << 16
+            entry.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
             archive.writestr(entry, data)
     return content.getvalue()

@@ -24,7 +24,7 @@ from ehadiag.compile.elementary import (
     square_root,
 )
 from ehadiag.compile.jit import Array
-from ehadiag.compile.libraries import object_file
+from ehadiag.compile.libraries import object_files
 from ehadiag.compile.sources import source_hash
 from ehadiag.compile.vector import BYTES_PER_NUMBER
 from ehadiag.compile.worker import (
@@ -278,18 +278,17 @@ def export_library(
     """
     design = design_cusum(hours, 1.0 / actuator.controller.rate, shift)
     plan = library_plan(actuator, design, tests, single=target.processor.single)
-    code = mark_either_convention(
-        object_file(
-            ObjectFile(
-                EXPORTED_FUNCTIONS,
-                target.processor,
-                {PLAN_TABLE: plan.tolist()},
-                _own_functions(target.processor),
-                # They add so much to a number that nothing is left of its fraction but a rounding.
-                exact=frozenset(ROUNDING_FUNCTIONS.values()),
-            )
+    (code,) = object_files(
+        ObjectFile(
+            EXPORTED_FUNCTIONS,
+            target.processor,
+            {PLAN_TABLE: plan.tolist()},
+            _own_functions(target.processor),
+            # They add so much to a number that nothing is left of its fraction but a rounding.
+            exact=frozenset(ROUNDING_FUNCTIONS.values()),
         )
     )
+    code = mark_either_convention(code)
     library = static_library("eha.o", code, [item.name for item in EXPORTED_FUNCTIONS])
     names = {"version": __version__, "target": target.name}
     files = {

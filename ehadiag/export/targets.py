@@ -14,15 +14,17 @@ import shlex
 import shutil
 import struct
 import subprocess
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
 
 from ehadiag.compile.worker import Processor
-from firmware_iface.errors import ConfigurationError, InputOutputError
+from firmware_iface.errors import ConfigurationError, InputOutputError, install_command
 
 AR_MAGIC = b"!<arch>\n"
 
@@ -82,6 +84,18 @@ def c_compiler() -> list[str] | None:
     return command if command and shutil.which(command[0]) else None
 
 
+def cross_compiler(triple: str) -> list[str]:
+    """Return the command that runs Zig's C compiler for a computer, in Zig's names.
+
+    ConfigurationError: it is not installed.
+    """
+    if find_spec("ziglang") is None:
+        raise ConfigurationError(
+            f"binaries for other computers: need ziglang: {install_command('cross')}"
+        )
+    return [sys.executable, "-P", "-m", "ziglang", "cc", "-target", triple, "-s"]
+
+
 def link_shared(
     compiler: Sequence[str],
     name: str,
@@ -105,7 +119,7 @@ def link_shared(
         done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             why = (done.stderr or done.stdout).strip().splitlines() or ["no reason given"]
-            raise InputOutputError(f"{compiler[0]}: {why[0]}")
+            raise InputOutputError(f"{shlex.join(compiler)}: {why[0]}")
         return Path(place, name).read_bytes()
 
 

@@ -1,9 +1,6 @@
 """An exported object file loaded into this process, without a linker."""
 
 import ctypes
-import pickle
-import subprocess
-import sys
 from contextlib import suppress
 from functools import cache
 from unittest.mock import patch
@@ -13,6 +10,7 @@ import msgspec
 
 from ehadiag import default_actuator
 from ehadiag.compile import libraries
+from ehadiag.compile.worker import object_code
 from ehadiag.export.library import export_library
 from ehadiag.export.targets import find_target
 from firmware_iface.files import RESULT_MODE, Folder
@@ -40,19 +38,6 @@ def _export(name, out, ticks=0):
     return out
 
 
-TOGETHER = """
-import pickle, sys
-sys.path[:] = pickle.load(sys.stdin.buffer)
-from ehadiag.compile import worker
-worker.process_lanes = 1
-import ehadiag.compile.frontend
-from ehadiag.compile.object_code import emitted
-codes = [emitted(item) for item in pickle.load(sys.stdin.buffer)]
-sys.stdout.buffer.write(pickle.dumps(codes))
-"""
-"""As the process of `ehadiag.compile.worker`, for several object files."""
-
-
 class _WantedError(Exception):
     """Instead of compiling an export."""
 
@@ -72,14 +57,8 @@ def compile_together(names, place):
     for name in names:
         with patch.object(libraries, "object_code", refuse), suppress(_WantedError):
             _export(name, place / f"wanted-{name}")
-    done = subprocess.run(
-        [sys.executable, "-c", TOGETHER],
-        input=pickle.dumps(sys.path) + pickle.dumps(list(wanted.values())),
-        capture_output=True,
-        check=True,
-    )
-    for name, code in zip(wanted, pickle.loads(done.stdout), strict=True):
-        with patch.object(libraries, "object_code", lambda _, code=code: code):
+    for name, code in zip(wanted, object_code(*wanted.values()), strict=True):
+        with patch.object(libraries, "object_code", lambda _, code=code: [code]):
             _export(name, place / f"together-{name}")
 
 

@@ -101,7 +101,7 @@ def nothing_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ehadiag.calibration.calibrate_unit.calibrate", calibrate)
     monkeypatch.setattr("ehadiag.design.score.score", lambda *_: score)
     monkeypatch.setattr("ehadiag.design.score.propose", propose)
-    monkeypatch.setattr("ehadiag.export.library.object_file", lambda *_, **__: b"code")
+    monkeypatch.setattr("ehadiag.export.library.object_files", lambda *_: [b"code"])
 
 
 @pytest.fixture

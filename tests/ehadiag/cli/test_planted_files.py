@@ -82,7 +82,7 @@ def test_python_m_loads_nothing_of_ours_from_the_working_folder(loaded: Path) ->
 COMPILING = """
 from ehadiag.compile.worker import ObjectFile, Processor, object_code
 if __name__ == "__main__":
-    print(object_code(ObjectFile((), Processor("", shared=True), {}))[:4])
+    print(object_code(ObjectFile((), Processor("", shared=True), {}))[0][:4])
 """
 
 

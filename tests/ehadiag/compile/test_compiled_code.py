@@ -74,7 +74,7 @@ def test_an_array_at_an_address_is_that_memory(compiled):
 )
 def test_a_constant_array_has_the_byte_order_of_the_target(triple, order):
     function = CFunction("f", replace_by_table, (PointerArgument(),))
-    code = object_code(ObjectFile((function,), Processor(triple)))
+    (code,) = object_code(ObjectFile((function,), Processor(triple)))
     assert struct.pack(f"{order}6d", *TABLE.ravel()) in code
 
 

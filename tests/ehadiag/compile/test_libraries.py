@@ -114,11 +114,11 @@ def test_one_compilation_serves_all_values_of_a_table(
     blank = worker.ObjectFile(functions, target, replaced=C_FUNCTIONS)
     with Folder.at(tmp_path, 0o600) as folder:
         monkeypatch.setattr(sources, "cache_folder", lambda: folder)
-        first = libraries.object_file(replace(blank, tables={"plan": one}))
-        assert first == worker.object_code(replace(blank, tables={"plan": one}))
+        (first,) = libraries.object_files(replace(blank, tables={"plan": one}))
+        assert [first] == worker.object_code(replace(blank, tables={"plan": one}))
         compiled_again = pytest.fail
         monkeypatch.setattr(libraries, "object_code", compiled_again)
-        second = libraries.object_file(replace(blank, tables={"plan": two}))
+        (second,) = libraries.object_files(replace(blank, tables={"plan": two}))
     assert struct.pack(">171d", *two) in second
     assert second == first.replace(struct.pack(">171d", *one), struct.pack(">171d", *two))
 

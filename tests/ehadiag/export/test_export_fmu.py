@@ -3,9 +3,11 @@
 import importlib.util
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +244,53 @@ def test_without_a_compiler_it_says_so(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(ConfigurationError, match="no C compiler"):
         export_fmus(default_actuator(), None)
+
+
+def test_without_zig_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("ehadiag.export.targets.find_spec", lambda _name: None)
+    with pytest.raises(ConfigurationError, match=r"need ziglang: .*install .*(ziglang|cross)"):
+        export_fmus(default_actuator(), None, platforms=["x86_64-windows"])
+    with pytest.raises(ConfigurationError, match="platform 'amiga': need one of x86_64-linux, "):
+        export_fmus(default_actuator(), None, platforms=["amiga"])
+
+
+BINARIES = {
+    ("linux64", "x86_64-linux", "so"): b"\x7fELF\x02\x01.{12}\x3e\0",
+    ("aarch64-linux", "aarch64-linux", "so"): b"\x7fELF\x02\x01.{12}\xb7\0",
+    ("win64", "x86_64-windows", "dll"): b"MZ.{1,500}PE\0\0\x64\x86",
+    ("darwin64", "x86_64-darwin", "dylib"): b"\xcf\xfa\xed\xfe\x07\0\0\x01",
+    ("aarch64-darwin", "aarch64-darwin", "dylib"): b"\xcf\xfa\xed\xfe\x0c\0\0\x01",
+}
+"""Beginning of a library, with the number of its machine, by folders in FMI 2 and 3 and suffix."""
+
+
+def test_a_unit_for_all_platforms_has_a_binary_for_each(units, tmp_path):
+    from fmpy.validation import validate_fmu
+
+    pytest.importorskip("ziglang", reason="no ziglang, which links for other computers")
+    with Folder.at(tmp_path, RESULT_MODE) as folder:
+        export_fmus(default_actuator(), folder, platforms=["all"])
+    for name in NAMES:
+        path = tmp_path / f"{name}.fmu"
+        assert validate_fmu(str(path)) == []
+        with zipfile.ZipFile(path) as archive:
+            assert len(archive.namelist()) == 1 + len(BINARIES)
+            for (two, three, suffix), begin in BINARIES.items():
+                place = two if name.endswith("2") else three
+                content = archive.read(f"binaries/{place}/{name}.{suffix}")
+                assert re.match(begin, content, re.DOTALL), place
+                assert f"fmi{name[-1]}DoStep\0".encode() in content
+    found = []
+    for place in (units, tmp_path):
+        path = place / "eha_actuator_fmi3.fmu"
+        unit = Running(path, tmp_path / f"run{len(found)}", {"Kintas": 0.3, "oil_temperature": 10})
+        found.append([])
+        for k in range(300):
+            unit.put({"command": 0.006 * math.sin(0.05 * k)})
+            unit.step()
+            found[-1].append(unit.read("spool", "true_pressure", "true_position"))
+    assert np.array(found[0]).tobytes() == np.array(found[1]).tobytes()
+    assert np.ptp(found[0], axis=0).all()
 
 
 def in_ecos(path, parameters, inputs, outputs):

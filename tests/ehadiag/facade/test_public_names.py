@@ -215,5 +215,5 @@ def test_no_hint_names_a_package_that_no_index_has() -> None:
     assert len(texts) > 200
     found = [path for path in texts if "install 'ehadiag[" in path.read_text(encoding="utf-8")]
     assert found == []
-    for extra in ("mf4", "mcap", "daq", "multicast", "dask", "parquet", "completion"):
+    for extra in ("mf4", "mcap", "daq", "multicast", "dask", "parquet", "cross", "completion"):
         assert re.fullmatch(r"(uv )?pip install('\S+'| )+|pipx .*", install_command(extra))

@@ -43,7 +43,7 @@ def kernels(tmp_path_factory):
         pytest.skip("needs Linux and a C compiler")
     made, folder = {}, tmp_path_factory.mktemp("widths")
     for width in WIDTHS:
-        code = object_code(
+        (code,) = object_code(
             ObjectFile(
                 [CFunction("run", run_blocks, SlotArguments())],
                 replace(level, fast=False),
