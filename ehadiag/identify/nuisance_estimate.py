@@ -19,6 +19,7 @@ from ehadiag.identify.estimates import (
     independent_covariance,
     is_pressure_misfit,
     is_unexplainable,
+    residual_outlier_share,
     signal_excess_costs,
 )
 from ehadiag.identify.experiment import (
@@ -377,17 +378,27 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         alone.
         """
         calibrated = self.prior.joint is not None
-        experiments = [item.without_creep() for item in experiments]
+        whole, experiments = experiments, [item.without_creep() for item in experiments]
         if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
         if not found.explained and any(item.origin_read for item in experiments):
             found = self._from_origin(experiments, found, hint, before)
+        if not found.explained and self._may_end_elsewhere(whole, found):
+            # What creeps leads a search, though it may end it in a wrong place.
+            found = _better_of(found, self._with(whole, self.prior, hint, before))
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
             return self._with_load(experiments, found)
         return self._loosened(experiments, found, hint) if calibrated else found
+
+    @staticmethod
+    def _may_end_elsewhere(whole: Sequence[Experiment], found: NuisanceEstimate) -> bool:
+        """Whether a closed loop leaves as much as a search away from the optimum does."""
+        closed = any(item.test.closed_loop and not item.rested for item in whole)
+        most = GIVE_UP.third_start_outliers[1]
+        return closed and residual_outlier_share(found.refined.residuals) <= most
 
     def _from_origin(
         self,
