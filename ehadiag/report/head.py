@@ -113,7 +113,7 @@ CUT_OFF = ("The recording ends early", "The recording begins late")
 LEAST_WEAR = 0.005
 """Least severity that is worth a word, 1: it is rounded to a percent."""
 CUT_NOTE = re.compile(r"the (last|first) .* are missing")
-NO_TIME = "By when: one test does not tell; ehadiag rul does, from the unit's health history."
+NO_TIME = "By when: not known from one test; a health history tells (ehadiag history init)."
 UNEXPLAINED = "does not explain the recording"
 """Words of the reason for which a culprit is looked for."""
 WIDE_RANGE = 10.0

@@ -156,7 +156,7 @@ def test_the_head_has_no_time_left_of_what_is_sound(worn: ehadiag.Result) -> Non
 
 
 def test_the_head_says_by_when_or_why_that_is_not_known(worn: ehadiag.Result) -> None:
-    assert head_of(worn, Levels(0.25, 0.75)).sentences[-1].startswith("By when: one test does not")
+    assert head_of(worn, Levels(0.25, 0.75)).sentences[-1].startswith("By when: not known from one")
     few = forecast_of(("FDJ", 0.6, 0.0, 0.0, 0.0), ("FSS", 0.6, 0.0, 0.0, 0.0))
     for item in few.forecasts:
         item.remaining = [RemainingLife(0.75, None, None, None, "2 diagnoses, needs 3")]
