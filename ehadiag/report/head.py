@@ -190,7 +190,7 @@ def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = No
             continue
         unit = "h" if prognosis.unit == "hours" else prognosis.unit
         low, high = two_digits(left.low), two_digits(left.high)
-        when = f"in about {two_digits(left.median)} {unit} (most likely {low} to {high} {unit})"
+        when = f"in about {two_digits(left.median)} {unit} (80 %: {low} to {high} {unit})"
         if left.high > WIDE_RANGE * left.low:
             when = f"not before about {low} {unit}"
         text = f"{plain_name(item.name)} reaches its limit {when}."

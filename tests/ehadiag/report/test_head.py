@@ -142,7 +142,7 @@ def forecast_of(*lives: tuple[str, float, float, float, float]) -> Any:
 def test_time_that_is_left_is_no_level_and_not_promised_where_it_is_wide() -> None:
     sure, vague = ("FDJ", 0.6, 89.0, 130.0, 190.0), ("FSS", 0.3, 100.0, 500.0, 1400.0)
     assert remaining_sentences(forecast_of(vague, sure)) == [
-        "Jack friction reaches its limit in about 130 h (most likely 89 to 190 h).",
+        "Jack friction reaches its limit in about 130 h (80 %: 89 to 190 h).",
         "Spool friction reaches its limit not before about 100 h.",
     ]
 
