@@ -257,6 +257,13 @@ def test_a_units_page_says_first_what_to_do_by_when(tmp_path):
     assert places == sorted(places)
     assert "needs" in life or "no growth" in life  # of the spool friction, which did not change
     assert "interval)" not in life
+    assert page.index('id="life"') < page.index('aria-label="Remaining life"')
+
+
+def test_only_the_page_that_begins_tests_says_that_they_are_simulated(tmp_path):
+    pages = Pages(tmp_path, None, Levels(), ("open",), simulated=True)
+    told = [b">simulated<" in pages(path).body for path in ("/session", "/", "/reports")]
+    assert told == [True, False, False]
 
 
 def test_too_few_diagnoses_are_counted_and_not_read_from_a_reason():
