@@ -64,7 +64,10 @@ def print_urgencies(
     cycles or days of each until the next inspection.
     """
     firsts = [item.first() for item in found]
-    dates = [first and _date(item, first[1]) for item, first in zip(found, firsts, strict=True)]
+    dates = [
+        _date(item, first[1]) if first and first[1].high else None  # not of what is at its limit
+        for item, first in zip(found, firsts, strict=True)
+    ]
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
     heads = ["serial", "actuator", "first", "to the limit (80 % interval)"]
     heads += ["about (date)"] * any(dates) + ["chance before"] * bool(before) + ["alarms"]
