@@ -235,7 +235,7 @@ def parser_and_commands(
     parser: argparse.ArgumentParser = CommandParser(
         prog="ehadiag",
         description="Diagnosis of electrohydraulic actuators: clogging of the first-stage filter\n"
-        "(Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (limit).",
+        "(Kintas), spool friction (FSS), jack friction (FDJ), each 0 (as new) … 1 (full damage).",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

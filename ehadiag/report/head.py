@@ -113,7 +113,7 @@ CUT_OFF = ("The recording ends early", "The recording begins late")
 LEAST_WEAR = 0.005
 """Least severity that is worth a word, 1: it is rounded to a percent."""
 CUT_NOTE = re.compile(r"the (last|first) .* are missing")
-NO_TIME = "By when: one test does not tell; ehadiag rul does, from the unit's health history."
+NO_TIME = "By when: not known from one test; a health history tells (ehadiag history init)."
 UNEXPLAINED = "does not explain the recording"
 """Words of the reason for which a culprit is looked for."""
 WIDE_RANGE = 10.0
@@ -190,7 +190,7 @@ def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = No
             continue
         unit = "h" if prognosis.unit == "hours" else prognosis.unit
         low, high = two_digits(left.low), two_digits(left.high)
-        when = f"in about {two_digits(left.median)} {unit} (most likely {low} to {high} {unit})"
+        when = f"in about {two_digits(left.median)} {unit} (80 %: {low} to {high} {unit})"
         if left.high > WIDE_RANGE * left.low:
             when = f"not before about {low} {unit}"
         text = f"{plain_name(item.name)} reaches its limit {when}."

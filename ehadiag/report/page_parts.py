@@ -56,8 +56,8 @@ def render_template(template: str, plots: Mapping[str, LayoutDOM], **texts: Any)
 def templates_of(package: str) -> Environment:
     """Return the templates of a package's folder `templates`.
 
-    They escape every text and write its control characters as numbers; a place left empty is an
-    error.
+    They escape every text, write its control characters as numbers and break no line before a
+    percent sign; a place left empty is an error.
     """
     return Environment(
         loader=PackageLoader(package),
@@ -71,7 +71,9 @@ def templates_of(package: str) -> Environment:
 def _finalized(value: Any) -> Any:
     if value is None:
         return "unknown"
-    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return printable(value).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def script_sources(scripts: Sequence[str]) -> str:

@@ -19,6 +19,7 @@ PROGNOSIS_SCHEMA = "ehadiag.rul/2"
 LEVEL_NAMES = ("advisory", "limit")
 SHORT_NAMES = {"Kintas": "filter clogging", "FSS": "spool friction", "FDJ": "jack friction"}
 """Those of the registry, which loads the compiler."""
+AT_LIMIT = "at its limit"
 FIGURES = 2
 """Figures of a time that is printed, 1: an interval of 80 % carries no more."""
 
@@ -62,34 +63,54 @@ def print_urgencies(
     found: of the units, in the order of the table; console: console to print to; before: hours,
     cycles or days of each until the next inspection.
     """
+    firsts = [item.first() for item in found]
+    dates = [
+        _date(item, first[1]) if first and first[1].high else None  # not of what is at its limit
+        for item, first in zip(found, firsts, strict=True)
+    ]
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
-    heads = ("serial", "actuator", "first", "to the limit (80 % interval)", "about")
-    for name in (*heads, *(("chance before",) if before else ()), "alarms"):
+    heads = ["serial", "actuator", "first", "to the limit (80 % interval)"]
+    heads += ["about (date)"] * any(dates) + ["chance before"] * bool(before) + ["alarms"]
+    for name in heads:
         table.add_column(name, overflow="fold", no_wrap=name == "actuator")
-    for place, item in enumerate(found):
-        first = item.first()
-        alarms = ", ".join(part.name for part in item.forecasts if part.alarm)
-        chance = [_percent(item.chance_within(before[place]))] if before else []
-        cells = ("-", "no number", "-")
-        if first is not None:
-            severity, left = first
-            cells = (severity.name, f"{remaining_text(left)} {item.unit}", _date(item, left) or "-")
-        table.add_row(
-            str(item.serial), printable(item.actuator or "unknown"), *cells, *chance, alarms or "-"
-        )
+    for place, (item, first) in enumerate(zip(found, firsts, strict=True)):
+        severity, left = ("-", _no_number(item)) if first is None else _urgency_texts(item, first)
+        cells = [str(item.serial), printable(item.actuator or "unknown"), severity, left]
+        if any(dates):
+            cells.append(dates[place] or "-")
+        if before:
+            reached = left == AT_LIMIT
+            cells.append(left if reached else _percent(item.chance_within(before[place])))
+        alarms = [SHORT_NAMES[part.name] for part in item.forecasts if part.alarm]
+        table.add_row(*cells, ", ".join(alarms) or "-")
     console.print(table, crop=False)
+
+
+def _urgency_texts(prognosis: Prognosis, first: tuple[Forecast, RemainingLife]) -> tuple[str, str]:
+    """Plain name of the severity that is first, and time until then."""
+    severity, left = first
+    time = AT_LIMIT if left.high == 0.0 else f"{remaining_text(left)} {prognosis.unit}"
+    return SHORT_NAMES[severity.name], time
+
+
+def _no_number(prognosis: Prognosis) -> str:
+    """Why no severity has a number, in short: of several reasons that of the most worn one."""
+    if all(item.too_few for item in prognosis.forecasts):
+        return "too few diagnoses"
+    return remaining_text(max(prognosis.forecasts, key=lambda i: i.value or 0.0).remaining[-1])
 
 
 def _sentences(prognosis: Prognosis, before: tuple[str, float] | None) -> list[str]:
     """What a planner wants to know, in sentences."""
-    out = []
+    out, reached = [], False
     if (first := prognosis.first()) is not None:
         item, left = first
         assert left.median is not None
         assert left.low is not None
         assert left.high is not None
-        if left.high == 0.0:
-            out.append(f"First: {SHORT_NAMES[item.name]} is at its limit.")
+        reached = left.high == 0.0
+        if reached:
+            out.append(f"First: {SHORT_NAMES[item.name]} is {AT_LIMIT}.")
         else:
             when = f" ({date})" if (date := _date(prognosis, left)) else ""
             out.append(
@@ -97,7 +118,7 @@ def _sentences(prognosis: Prognosis, before: tuple[str, float] | None) -> list[s
                 f" {_rounded(left.median)} {prognosis.unit}{when},"
                 f" {_rounded(left.low)} to {_rounded(left.high)} with 80 %."
             )
-    if before is not None:
+    if before is not None and not reached:
         name, time = before
         chance = prognosis.chance_within(time)
         without = [i.name for i in prognosis.forecasts if i.remaining[-1].median is None]

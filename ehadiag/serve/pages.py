@@ -277,7 +277,6 @@ class Pages:
             empty_text=none,
             lines=lines,
             left=left,
-            simulated=self._simulated,
             plot=next((Markup(item) for item in elements.values()), None),
         )
 

@@ -180,12 +180,12 @@ def _residuals(found: Residuals | None, width: int, *, unicode: bool) -> Rendera
     ):
         value = "   at rest" if residual is None else f"{residual:+8.1f} σ"
         high = max(above, below)
-        side = "above" if above >= below else "below"
+        side = "" if high == 0.0 else ", above" if above >= below else ", below"
         style = "bold red" if high >= FULL_BAR else ""
         table.add_row(
             Text(f"residual {name:8s}{value}"),
             Text(_bar(high, unicode=unicode, length=length), style=style),
-            Text(f"{high:4.0%} of the alarm, {side}", style=style),
+            Text(f"{high:4.0%} of the alarm{side}", style=style),
         )
     return Group(table, _line(f"against: {found.against}", "dim")) if found.against else table
 

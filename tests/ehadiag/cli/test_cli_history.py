@@ -65,7 +65,7 @@ def test_the_users_own_history_is_kept_once_it_was_begun(run: Run) -> None:
 
 
 def test_the_verdict_says_by_when_from_the_history(run: Run) -> None:
-    assert "By when: one test does not tell" in run("diagnose", WORN).out
+    assert "By when: not known from one test" in run("diagnose", WORN).out
     found = run("diagnose", "--history", "h.sqlite", "--hours", 100, WORN)
     assert "By when is not known yet: 1 diagnosis of the unit, needs 3." in found.out
 

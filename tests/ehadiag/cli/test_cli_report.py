@@ -43,7 +43,7 @@ def test_an_index_lists_the_results_worst_first_with_links(run: Run) -> None:
     page = Path("all.html").read_text()
     assert page.index(">DEGRADED<") < page.index(">HEALTHY<")
     assert 'href="o/paper-open-4.html"' in page
-    assert "60 %" in page
+    assert "60\N{NO-BREAK SPACE}%" in page
     assert "Plan to" in page
     assert "2 results, worst first: " in page
     assert page.count('href="o/') == 2  # one link a row

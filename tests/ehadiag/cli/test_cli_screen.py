@@ -127,6 +127,9 @@ def test_a_test_shows_residuals_and_alarms_too_and_against_what() -> None:
         for part in ("-3.2 σ", "100% of the alarm, below", "against: [bold red]x", "1 alarms",
                      "spool above what the model says during open"):  # fmt: skip
             assert part in whole
+    calm = "\n".join(printed(snapshot(command="bit", residuals=Residuals(spool=-33.6)), 80))
+    assert "0% of the alarm" in calm
+    assert not {"above", "below"} & set(calm.split())
     assert "residual" not in "\n".join(printed(snapshot(command="bit", residuals=None), 80))
     assert list(StatusLines().of(item))[3].endswith(f"during test 'open', compared with {HOSTILE}")
 

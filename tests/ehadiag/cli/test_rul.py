@@ -56,6 +56,29 @@ def test_all_units_by_urgency(place: Path, capsys: pytest.CaptureFixture[str]) -
     assert trees[0]["chance_before"] >= trees[-2]["chance_before"]
     code, out, _ = run(capsys, place, "--all")
     assert len(out.splitlines()) == 10
+    assert "about (date)" in out
+    assert "jack friction" in out
+
+
+def test_a_table_of_units_says_in_words_what_has_no_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "h"
+    with History(place, create=True) as history:
+        for n in range(1, 5):
+            day = f"2026-01-{5 * n:02}T12:00:00.000Z"
+            history.append(an_entry(1, 100.0 * n, (0.1, 0.2, 0.2 * n), tested=day))
+            history.append(an_entry(2, 100.0 * n, (0.1, 0.2, 0.3)))
+        history.append(an_entry(3, 100.0, (0.1, 0.2, 0.3)))
+    _, out, _ = run(capsys, place, "--all", "--before", "400")
+    assert "about" not in out  # the only unit with a use a day is at its limit
+    worn, still, new = (" ".join(line.split()) for line in out.splitlines()[1:])
+    assert worn == "1 reference-31 jack friction at its limit at its limit -"
+    assert "no number: 4 diagnoses over 300 hours show no growth" in still
+    assert "too few diagnoses" in new
+    _, out, _ = run(capsys, place, "--unit", "1", "--before", "400")
+    assert "First: jack friction is at its limit." in out
+    assert "%." not in out
 
 
 def test_a_date_is_a_time_at_the_units_own_use(

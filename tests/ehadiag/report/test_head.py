@@ -142,7 +142,7 @@ def forecast_of(*lives: tuple[str, float, float, float, float]) -> Any:
 def test_time_that_is_left_is_no_level_and_not_promised_where_it_is_wide() -> None:
     sure, vague = ("FDJ", 0.6, 89.0, 130.0, 190.0), ("FSS", 0.3, 100.0, 500.0, 1400.0)
     assert remaining_sentences(forecast_of(vague, sure)) == [
-        "Jack friction reaches its limit in about 130 h (most likely 89 to 190 h).",
+        "Jack friction reaches its limit in about 130 h (80 %: 89 to 190 h).",
         "Spool friction reaches its limit not before about 100 h.",
     ]
 
@@ -156,7 +156,7 @@ def test_the_head_has_no_time_left_of_what_is_sound(worn: ehadiag.Result) -> Non
 
 
 def test_the_head_says_by_when_or_why_that_is_not_known(worn: ehadiag.Result) -> None:
-    assert head_of(worn, Levels(0.25, 0.75)).sentences[-1].startswith("By when: one test does not")
+    assert head_of(worn, Levels(0.25, 0.75)).sentences[-1].startswith("By when: not known from one")
     few = forecast_of(("FDJ", 0.6, 0.0, 0.0, 0.0), ("FSS", 0.6, 0.0, 0.0, 0.0))
     for item in few.forecasts:
         item.remaining = [RemainingLife(0.75, None, None, None, "2 diagnoses, needs 3")]

@@ -81,6 +81,12 @@ def test_the_verdict_comes_first_and_in_words(worn: ehadiag.Result, plain: str) 
         assert words in text
 
 
+def test_no_line_breaks_before_a_percent_sign(with_trend: str) -> None:
+    text = Page(with_trend).text
+    assert "at 60\N{NO-BREAK SPACE}%" in text
+    assert " %" not in text
+
+
 def test_the_page_loads_nothing(with_trend: str) -> None:
     html = with_trend
     page = Page(html)
@@ -144,7 +150,7 @@ def test_what_was_not_tested_has_no_plots() -> None:
     assert "script-src 'none'" in page.policy
     for words in ("NOT TESTED", "The test was aborted", "not at hand"):
         assert words in page.text
-    assert "95 % interval" not in page.text
+    assert "% interval" not in page.text
 
 
 def test_what_was_not_tested_is_drawn_beside_what_was_expected(worn: ehadiag.Result) -> None:

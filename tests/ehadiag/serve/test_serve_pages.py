@@ -231,7 +231,10 @@ def test_the_fleet_says_what_to_do_worst_unit_first(tmp_path):
     assert places == sorted(places)
     assert "Act now: replace the servovalve" in page
     assert ">INCONCLUSIVE<" in page
-    assert "advisory level 25 %, limit 75 %. Worst unit first." in page
+    assert (
+        "advisory level 25\N{NO-BREAK SPACE}%, limit 75\N{NO-BREAK SPACE}%. Worst unit first."
+        in page
+    )
     assert ">0 h, limit reached<" in page
     assert ">too few diagnoses<" in page
     assert ">trend<" not in page  # no unit has two diagnoses
@@ -253,7 +256,14 @@ def test_a_units_page_says_first_what_to_do_by_when(tmp_path):
     places = [life.index(f"<td>{name}") for name in ("filter clogging", "jack f", "spool f")]
     assert places == sorted(places)
     assert "needs" in life or "no growth" in life  # of the spool friction, which did not change
-    assert "(80 % interval)" not in page
+    assert "interval)" not in life
+    assert page.index('id="life"') < page.index('aria-label="Remaining life"')
+
+
+def test_only_the_page_that_begins_tests_says_that_they_are_simulated(tmp_path):
+    pages = Pages(tmp_path, None, Levels(), ("open",), simulated=True)
+    told = [b">simulated<" in pages(path).body for path in ("/session", "/", "/reports")]
+    assert told == [True, False, False]
 
 
 def test_too_few_diagnoses_are_counted_and_not_read_from_a_reason():
