@@ -168,9 +168,10 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
 
         Without a rest the control law follows the noise of the position until the command moves.
         Where the spool creeps up to its break-away by that, the tick is decided by as little as the
-        model errs, which hysteresis and a friction far off would explain.
+        model errs, which hysteresis and a friction far off would explain. With oil in the second
+        stage nothing is left out: what rings on from then leads the search.
         """
-        if not self.test.closed_loop or self.rested:
+        if not self.test.closed_loop or self.rested or self.constants.OIL > 0.0:
             return self
         end = _ticks_before_motion(self.test) + round(REST.creep_s * self.test.rate)
         creeps = (np.arange(self.ticks) < end) & np.isfinite(self.pressure)

@@ -171,7 +171,8 @@ def estimate_about(
         density = _search_about(
             fine, density, FINAL_SPREAD_RATIO * density.root, at_first, draw, between
         )
-        if settings.joint is None and all(item.test.closed_loop for item in judged):
+        alone = all(item.test.closed_loop and item.constants.OIL == 0.0 for item in judged)
+        if settings.joint is None and alone:
             density, valley = _search_valley(fine, density, at_first, draw, between, rng)
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
     refined = refinement_at(

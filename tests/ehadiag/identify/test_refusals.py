@@ -21,7 +21,7 @@ from ehadiag_sim.simulation import simulate
 from ehadiag_tools.accuracy.units import UnitCase, perform_unit
 from firmware_iface.stored_test import resolve_test
 
-MOST_RUNS = {"open": 1200, "closed": 2800}
+MOST_RUNS = {"open": 1200, "closed": 3300}
 """Of the model, to refuse a recording: on short windows among them. In closed loop a search may end
 beside the optimum, so that others are made which take their time."""
 

@@ -166,15 +166,16 @@ def test_the_soak_accounts_for_every_frame(tmp_path):
         name.strip(): [float(number) for number in re.findall(r"[\d.]+", value)]
         for name, value in re.findall(r"^\| (.+?) \| (.+?) \|$", report.read_text(), re.MULTILINE)
     }
-    sent, received, _recorded = rows["frames sent, received, recorded"]
-    own_lost, foreign_lost = rows["lost: ours, foreign"]
-    pushes, ticks_lost, alarms = rows["pushes, ticks lost, alarms"]
+    names = ("sent", "received", "own_lost", "foreign_lost", "pushes", "ticks_lost", "alarms")
+    sent, received, own_lost, foreign_lost, pushes, ticks_lost, alarms = (
+        rows[name][0] for name in names
+    )
     assert done.returncode == (1 if own_lost + foreign_lost else 0)
     assert sent == received + own_lost + foreign_lost > 2000
     assert pushes + ticks_lost <= received / 2
     assert alarms == 0
-    assert rows["diagnoses meanwhile"] != [0]
-    for name in ("push: p50, p99, p99.9, largest, µs", "all work on a tick: the same, µs"):
+    assert rows["diagnoses"] != [0]
+    for name in ("push_us", "work_us"):
         assert rows[name][0] > 0.0
         assert rows[name] == sorted(rows[name])
 
