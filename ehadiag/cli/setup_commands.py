@@ -179,7 +179,6 @@ def define_export(parser: argparse.ArgumentParser) -> None:
         "--target --list --out --actuator --hours --fmu --platform --a2l --pdx --help-all",
         examples=(
             "ehadiag export --target cortex-m7 --out eha-m7",
-            "ehadiag export --fmu --out units",
             "ehadiag export --fmu --platform all --out units",
         ),
     )
