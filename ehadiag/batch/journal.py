@@ -27,7 +27,7 @@ from firmware_iface.files import RESULT_MODE, Folder, create_file, private_folde
 
 if TYPE_CHECKING:
     from ehadiag.api import PathLike
-    from ehadiag.setup import Progress, Setup
+    from ehadiag.setup import Progress
     from firmware_iface.recording import Recording
 
 

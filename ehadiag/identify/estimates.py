@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from statistics import NormalDist
 from types import MappingProxyType
 
 import numpy as np
@@ -17,7 +16,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_NOISE_EXCESS, WEAR_EXCESS_FACTOR, FitQuality
 from ehadiag.core.conventions import EXPONENT_NAME, FRICTION_NAME
-from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP
+from ehadiag.core.criteria import ESTIMATION, FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.identification_result import (
     Estimate,
@@ -35,8 +34,6 @@ from ehadiag.model.parameter import Parameter, ParameterKind
 from ehadiag.model.plant import PlantConstants
 from ehadiag.model.registry import FAULTS
 from ehadiag.model.severities import FAULT_LAWS
-
-STANDARD_NORMAL = NormalDist()
 
 
 def estimate_covariance(refinement: Refinement) -> Array:
@@ -109,7 +106,7 @@ def interval95(value: float, std: float) -> tuple[float, float]:
 
     For an estimate at a bound the interval begins there: the density beyond it does not count.
     """
-    half = STANDARD_NORMAL.inv_cdf(0.975) * std
+    half = NORMAL_HALF_WIDTH_95 * std
     return max(0.0, value - half), min(1.0, value + half)
 
 
@@ -425,11 +422,11 @@ def over_exponents(
     shown = max(friction.value + new, 1e-9)
     ratios = share ** (np.linspace(high, low, EXPONENTS) - with_exponent)
     frictions = np.clip(shown * ratios - new, 0.0, 1.0).tolist()
-    half = STANDARD_NORMAL.inv_cdf(0.975) * friction.std * ratios
+    half = NORMAL_HALF_WIDTH_95 * friction.std * ratios
     bottom = frictions[0] - float(half[0])
     top = min(frictions[-1] + float(half[-1]), max(frictions[0] + float(half[0]), 1.0))
     value = (bottom + top) / 2.0
-    std = (top - bottom) / 2.0 / STANDARD_NORMAL.inv_cdf(0.975)
+    std = (top - bottom) / 2.0 / NORMAL_HALF_WIDTH_95
     power = math.log((value + new) / shown) / math.log(share) if share < 1.0 else 0.0
     exponent = min(max(with_exponent + power, low), high)
     estimate = replace(

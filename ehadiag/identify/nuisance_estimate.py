@@ -33,7 +33,6 @@ from ehadiag.identify.least_squares import Refinement, refined_with_day, refinem
 from ehadiag.identify.linearisation import (
     ConsideredParameter,
     Derivatives,
-    LinearModel,
     ParameterDensity,
     linearised_by_regression,
 )
@@ -50,6 +49,7 @@ from ehadiag.identify.partial_refinement import considered_parameters
 from ehadiag.identify.posterior import (
     FEW_UNKNOWNS_SCHEDULE,
     FINAL_SCHEDULE,
+    PosteriorResult,
     cauchy_cost,
     cauchy_costs,
     no_interruption,
@@ -91,7 +91,8 @@ class ValleyRules(msgspec.Struct, frozen=True):
 
 
 VALLEY = ValleyRules()
-LinearisationMethod = Callable[[Derivatives, ParameterDensity], LinearModel]
+PosteriorSearch = Callable[..., PosteriorResult]
+"""`search_posterior` with all but where it begins."""
 
 
 class NuisanceEstimate(msgspec.Struct, frozen=True, eq=False):
@@ -149,34 +150,34 @@ def estimate_about(
         free_run_model(judged, (*settings.free, *held), staged.levels), judged, considered
     )
     priors = settings.priors, settings.joint
-    at_first = prior_density(fine, *priors), prior_information(fine, *priors)
-    between = no_interruption if settings.progress is None else partial(settings.progress, 1.0)
+    prior, information = prior_density(fine, *priors), prior_information(fine, *priors)
     density = ParameterDensity(found.density.x * model.scale / fine.scale, found.density.root)
     valley = np.zeros((len(fine.scale), len(fine.scale)))
     given_up = not found.explained and is_unexplainable(found.residuals, found.starts)
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
-        draw = partial(linearised_by_regression, rng=rng)
+        progress = settings.progress
+        search = partial(
+            search_posterior,
+            fine,
+            prior,
+            information=information,
+            linearise=partial(linearised_by_regression, rng=rng),
+            schedule=FINAL_SCHEDULE,
+            between=no_interruption if progress is None else partial(progress, 1.0),
+        )
         if settings.require_agreement and not found.confirmed:
             # A break-away may stand between the end of the search and the optimum.
             density = _search_about(
-                fine,
-                density,
-                staged.restart_root,
-                at_first,
-                draw,
-                between,
-                GIVE_UP.min_other_end_gain,
+                fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain
             )
-        density = _search_about(
-            fine, density, FINAL_SPREAD_RATIO * density.root, at_first, draw, between
-        )
+        density = _search_about(fine, search, density, FINAL_SPREAD_RATIO * density.root)
         alone = all(item.test.closed_loop and item.constants.OIL == 0.0 for item in judged)
         if settings.joint is None and alone:
-            density, valley = _search_valley(fine, density, at_first, draw, between, rng)
+            density, valley = _search_valley(fine, search, density, rng)
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
     refined = refinement_at(
-        fine, density.x, linear, settled=found.explained, information=at_first[1]
+        fine, density.x, linear, settled=found.explained, information=information
     )
     profile = _profile_covariance(fine, refined) if settings.require_agreement else 0.0
     refined = refined_with_day(fine, refined, linear)
@@ -238,31 +239,24 @@ def _with_judged_noise(experiments: Sequence[Experiment], residuals: Array) -> l
 
 def _search_about(
     fine: Derivatives,
+    search: PosteriorSearch,
     there: ParameterDensity,
     root: Array,
-    before: tuple[ParameterDensity, Array],
-    draw: LinearisationMethod,
-    between: Callable[[], None],
     least_gain: float = 0.0,
 ) -> ParameterDensity:
     """Search about a density; the end of it if that is better by a least gain, else the density.
 
-    root: of the covariance over which it searches; before: the prior and its information.
+    root: of the covariance over which it searches.
     """
-    wider = ParameterDensity(there.x, root)
-    seen = search_posterior(
-        fine, before[0], wider, before[1], draw, FINAL_SCHEDULE, between
-    ).density
+    seen = search(begin=ParameterDensity(there.x, root)).density
     costs = cauchy_cost(fine.many(np.vstack([there.x, seen.x])))
     return seen if costs[0] - costs[1] > least_gain else there
 
 
 def _search_valley(
     fine: Derivatives,
+    search: PosteriorSearch,
     there: ParameterDensity,
-    before: tuple[ParameterDensity, Array],
-    draw: LinearisationMethod,
-    between: Callable[[], None],
     rng: np.random.Generator,
 ) -> tuple[ParameterDensity, Array]:
     """Search from the best of points far along the valley in closed loop.
@@ -281,10 +275,7 @@ def _search_valley(
         points = np.clip(points, fine.lower, fine.upper)
         for place in np.argsort(_event_cost(fine.many(points)))[: VALLEY.starts]:
             begin = ParameterDensity(points[place], FINAL_SPREAD_RATIO * there.root)
-            found = search_posterior(
-                fine, before[0], begin, before[1], draw, FINAL_SCHEDULE, between
-            )
-            ends.append(found.density)
+            ends.append(search(begin=begin).density)
     places = np.array([item.x for item in ends])
     costs = _event_cost(fine.many(places))
     best = int(np.argmin(costs))
@@ -385,7 +376,10 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         found = self._with(experiments, self.prior, hint, before)
         if not found.explained and any(item.origin_read for item in experiments):
             found = self._from_origin(experiments, found, hint, before)
-        if not found.explained and self._may_end_elsewhere(whole, found):
+        shortened = any(one is not other for one, other in zip(whole, experiments, strict=True))
+        most = GIVE_UP.third_start_outliers[1]
+        outliers = residual_outlier_share(found.refined.residuals)
+        if not found.explained and shortened and outliers <= most:
             # What creeps leads a search, though it may end it in a wrong place.
             found = _better_of(found, self._with(whole, self.prior, hint, before))
         if found.explained:
@@ -393,13 +387,6 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if not self.prior.has_inexact_data:
             return self._with_load(experiments, found)
         return self._loosened(experiments, found, hint) if calibrated else found
-
-    @staticmethod
-    def _may_end_elsewhere(whole: Sequence[Experiment], found: NuisanceEstimate) -> bool:
-        """Whether a closed loop leaves as much as a search away from the optimum does."""
-        closed = any(item.test.closed_loop and not item.rested for item in whole)
-        most = GIVE_UP.third_start_outliers[1]
-        return closed and residual_outlier_share(found.refined.residuals) <= most
 
     def _from_origin(
         self,
