@@ -83,6 +83,11 @@ class Head(msgspec.Struct, frozen=True):
         return self.bars if self.verdict != Verdict.NOT_TESTED.name else ()
 
     @property
+    def relied_on(self) -> bool:
+        """Whether the stated intervals hold: no best fit of a test that it does not explain."""
+        return self.word != INCONCLUSIVE
+
+    @property
     def title(self) -> str:
         """Unit, where it is known, and word: the first line of a page."""
         serial = dict(self.facts)["unit"]

@@ -71,15 +71,19 @@ def print_result(
     """Print a result: its head, then the numbers.
 
     result: what was found; console: console to print to; prognosis: of its unit; verbose: the
-    course of the search, reasons in terms of the field, and every effect that was estimated, not
-    only those that are not 0 beyond doubt.
+    course of the search, reasons in terms of the field, numbers beside no verdict, and every effect
+    that was estimated, not only those that are not 0 beyond doubt.
     """
     head = head_of(result, Levels(result.request.advisory, result.request.limit), prognosis)
     _print_head(head, result, console)
     if verbose:
         for reason in result.reasons:
             _line(console, f"- {reason}")
-    if result.estimated:
+    relied_on = verbose or head.relied_on
+    if not relied_on:
+        fits = (f"{bar.symbol} {_number(bar.value, 2)}" for bar in head.bars)
+        _line(console, f"best fit, not to be relied on: {', '.join(fits)}")
+    elif result.estimated:
         console.print(_severities(head, result, console), crop=False)
     if result.identified and verbose:
         for name in ("first", "search"):
@@ -88,11 +92,11 @@ def print_result(
     onboard = result.origins[0].onboard if len(result.origins) == 1 else None
     if onboard is not None:
         _line(console, _on_board(onboard, result))
-    if result.other:
+    if result.other and relied_on:
         console.print(_limited(result), crop=False)
     effects = [item for item in result.effects if verbose or _is_shown(item)]
     effects = [item for item in effects if item.limit is None]
-    if effects:
+    if effects and relied_on:
         _line(console, f"also estimated: {', '.join(map(_size, effects))}")
     _line(console, _quality_text(result))
     cut_off = any(item.cause.startswith(CUT_OFF) for item in head.reasons)
