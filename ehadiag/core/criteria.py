@@ -135,6 +135,9 @@ class FitCriteria(msgspec.Struct, frozen=True):
     max_explained_excess: float = 1.25
     """Largest excess of an explained signal, 1: 1.02 to 1.15 at the optimum of 80 simulated
     tests."""
+    min_likelihood_ratio: float = 10.0
+    """Least likelihood of an exponent of 0 over that of the largest one, 1, where a recording bears
+    it out: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90, 1995)."""
     max_shown_std: float = 0.1
     """Largest standard deviation of a severity that the test shows, 1."""
     bound_tolerance: float = 1e-6

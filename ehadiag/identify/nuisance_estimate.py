@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -464,16 +465,19 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         One start with the other end decides. What was calibrated with the stated law is loosened,
         since it stands in for what that law leaves out. Where neither end leaves half of what the
         other one does, the recording shows `FSS / k^m` alone (PHY-45): 0 is not believed then,
-        which a file says that does not say anything. A unit that the model explains to the noise,
-        as new and now, is of the model's kind, with the file's exponent.
+        which a file says that does not say anything. Where the model explains the unit to the
+        noise, as new and now, 0 is believed if the recording is likelier with it, or if the file
+        says that the laws of the faults are exact.
         """
         low, stated = self.prior.exponents
         before, own = (
             float(signal_excess_costs(item.refined.residuals)[SPOOL_ROW]) for item in (found, loose)
         )
         shows = before > FIT.max_explained_excess
+        likely = False
         if stated == 0.0:
-            shows = shows or not self.prior.explains_unit_as_new
+            likely = not shows and self.prior.explains_unit_as_new
+            shows = not likely or any(self.prior.discrepancy.values())
         elif found.explained:
             shows = False
         if low < stated or not shows:
@@ -491,6 +495,11 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
         settings, _ = self._search(others, self.prior.loosened(), hint, budget=1)
         residuals = search_in_stages(others, settings).found.residuals
+        if likely:
+            more = sum(signal_excess_costs(residuals)) - sum(
+                signal_excess_costs(found.refined.residuals)
+            )
+            return None, more * residuals.shape[1] < 2.0 * math.log(FIT.min_likelihood_ratio)
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
         least = min(own, before)
         if least > FIT.max_explained_excess and _explains_far_more(left, least):
