@@ -8,10 +8,8 @@ from typing import Any
 
 from ehadiag_tools.accuracy.cases import CUBE, PAPER_CASES
 from ehadiag_tools.accuracy.pictures import PICTURES
-from ehadiag_tools.accuracy.recorded import RECORDED_UNITS
 from ehadiag_tools.accuracy.units import UNITS
-from ehadiag_tools.accuracy.valves import VALVES
-from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE
+from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE, RECORDED_UNITS, VALVES
 from ehadiag_tools.bench import BENCH
 from ehadiag_tools.free_motion.motion import FREE_MOTION
 from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
