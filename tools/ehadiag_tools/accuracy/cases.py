@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from ehadiag.core.actuator import default_actuator
 from ehadiag.identify.experiment import Experiment, build_experiment
@@ -225,7 +224,6 @@ def _monitoring(test: str, faults: Severities, seed: int) -> tuple[Samples, Envi
     return replace(samples, spool=measured[0], pressure=measured[1]), environment
 
 
-STAGES = {"first": "first approximation", "search": "genetic search", "value": "final"}
 TITLES = {"open": "Table 1, open loop", "closed": "Table 2, closed loop"}
 
 
@@ -243,83 +241,55 @@ def _paper_cases(options: Options) -> list[Case]:
             for case in PAPER
             for seed in seeds
         ]
-    found = _recorded_cases(options.recordings)
+    truth = options.recordings / "truth.csv"
+    found = [
+        Case(row.test, (row.faults.Kintas, row.faults.FSS, row.faults.FDJ),
+             recordings=(str(options.recordings / row.file),))
+        for row in read_truth(truth)
+        if row.test in TITLES
+    ]  # fmt: skip
     if not found:
-        raise ConfigurationError(
-            f"{options.recordings / 'truth.csv'}: no recording of {', '.join(TITLES)}"
-        )
+        raise ConfigurationError(f"{truth}: no recording of {', '.join(TITLES)}")
     return found
 
 
-def _recorded_cases(folder: Path) -> list[Case]:
-    cases = []
-    for row in read_truth(folder / "truth.csv"):
-        if row.test in TITLES:
-            faults = (row.faults.Kintas, row.faults.FSS, row.faults.FDJ)
-            cases.append(Case(row.test, faults, recordings=(str(folder / row.file),)))
-    return cases
-
-
 def _paper_report(records: Sequence[Record], options: Options) -> Iterator[str]:
-    source = options.recordings or f"plant {options.plant}"
+    """Mean errors of each case after two stages beside the paper's, then all errors."""
+    published = {(case.test, case.faults): case for case in PAPER}
     for (test,), part in grouped(records, "test").items():
+        source = options.recordings or f"plant {options.plant}"
         yield f"{TITLES[test]}: mean absolute error in percent, {source}\n"
-        yield from _stage_table(test, part)
+        rows, shared = [], []
+        for (faults,), runs in grouped(part, "faults").items():
+            case = published.get((test, faults))
+            means = [
+                float(np.abs(percent_errors(runs, item)).mean()) for item in ("first", "value")
+            ]
+            paper = [case.first, case.final] if case else [np.nan, np.nan]
+            label = ", ".join(f"{value:g}" for value in faults)
+            rows.append((label, len(runs), *(f"{value:.4f}" for value in means + paper)))
+            shared += [means + paper] * bool(case)
+        if shared:
+            cells = [f"{value:.4f}" for value in np.mean(shared, axis=0)]
+            rows.append(("mean of the paper's", "", *cells))
+        yield from markdown(
+            ("case (Kintas, FSS, FDJ)", "runs", "first approximation", "final", "the paper's first",
+             "the paper's final"),
+            rows,
+        )  # fmt: skip
         yield ""
     yield from accuracy_table(records, "test", "faults")
     yield ""
     yield from accuracy_table(records, "test")
 
 
-def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
-    """Errors of each constant after each stage, and the paper's."""
-    rows = []
-    for (faults,), part in grouped(records, "faults").items():
-        published = _paper_case(test, faults)
-        for stage, name in STAGES.items():
-            cell = "–"
-            if published is not None and stage != "search":
-                cell = f"{published.first if stage == 'first' else published.final:.4f}"
-            error = np.abs(percent_errors(part, stage))
-            rows.append((_label(faults), len(part), name, *_cells(error), cell))
-    shared = [item for item in records if _paper_case(test, tuple(item["faults"])) is not None]
-    error = np.abs(percent_errors(shared)) if shared else np.full((1, 3), np.nan)
-    paper = float(np.mean([case.final for case in PAPER if case.test == test]))
-    rows.append(("the paper's cases", len(shared), "final", *_cells(error), f"{paper:.4f}"))
-    yield from markdown(
-        ("case (Kintas, FSS, FDJ)", "runs", "stage", *FAULT_NAMES, "mean", "worst run",
-         "the paper's mean"),
-        rows,
-    )  # fmt: skip
-    yield f"\nThe paper's final mean is {paper / error.mean():.0f} times ours."
-
-
-def _label(faults: Sequence[float]) -> str:
-    return ", ".join(f"{value:g}" for value in faults)
-
-
-def _cells(error: NDArray[np.float64]) -> list[str]:
-    """Mean of each constant, of all, and the largest mean of one run."""
-    case = error.mean(axis=1)
-    return [f"{value:.4f}" for value in (*error.mean(axis=0), case.mean(), case.max())]
-
-
-def _paper_case(test: str, faults: Sequence[float]) -> PaperCase | None:
-    return next((c for c in PAPER if c.test == test and c.faults == tuple(faults)), None)
-
-
 def _cube_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
-    add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
     add("--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%")
-    add(
-        "--wear",
-        action="append",
-        type=float,
-        metavar="K",
-        help="also begin from a diagnosis with severities that differ by so much; may be repeated",
-    )
+    add("--wear", action="append", type=float, metavar="K",
+        help="also begin from a diagnosis with severities that differ by so much; may be repeated"
+    )  # fmt: skip
 
 
 def _cube_cases(options: Options) -> list[Case]:
@@ -329,7 +299,7 @@ def _cube_cases(options: Options) -> list[Case]:
         low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
         days = [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
     return [
-        Case(test, faults, noise_seed=index, plant=options.plant, conditions=day, wear=wear)
+        Case(test, faults, noise_seed=index, conditions=day, wear=wear)
         for test in options.test or ("open", "closed")
         for index, (faults, day) in enumerate(
             zip(random_faults(options.cases, options.seed), days, strict=True)
@@ -339,14 +309,18 @@ def _cube_cases(options: Options) -> list[Case]:
 
 
 def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
-    yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
+    yield f"Random cases, seed {options.seed}, errors in percent\n"
     yield from accuracy_table(records, "test")
     if options.conditions:
         yield "\nBy the temperature of the oil, degC:\n"
         yield from accuracy_table([{**item, "oil": _band(item)} for item in records], "test", "oil")
     if options.wear:
         yield "\nFrom an earlier diagnosis, beside a search:\n"
-        yield from markdown(WEAR_HEADINGS, _wear_rows(records))
+        yield from markdown(
+            ("test", "wear", "cases", "begun there", "apart, median", "95 %", "most",
+             "time, median"),
+            _wear_rows(records),
+        )  # fmt: skip
     for (test,), part in grouped(records, "test").items():
         first = np.abs(percent_errors(part, "first")).mean()
         outliers = max(record["outliers"] for record in part)
@@ -362,11 +336,6 @@ def _band(record: Record) -> str:
     oil = record["conditions"][0]
     bands = itertools.pairwise(OIL_BANDS)
     return next(f"{low:g} … {high:g}" for low, high in bands if low <= oil <= high)
-
-
-WEAR_HEADINGS = (
-    "test", "wear", "cases", "begun there", "apart, median", "95 %", "most", "time, median",
-)  # fmt: skip
 
 
 def _wear_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
