@@ -31,7 +31,7 @@ def positive_number(text: str, *, or_zero: bool = False) -> float:
     raise argparse.ArgumentTypeError(f"{text!r}: need a number {needed}")
 
 
-def whole_number(text: str, needed: str, least: int, largest: int = MAX_HISTORY_SERIAL) -> int:
+def integer_number(text: str, needed: str, least: int, largest: int = MAX_HISTORY_SERIAL) -> int:
     """Read a whole number between two; `needed` says in words which one will do."""
     digits = text.isascii() and text.isdigit() and len(text) <= len(str(MAX_HISTORY_SERIAL))
     if digits and least <= int(text) <= largest:
@@ -39,10 +39,10 @@ def whole_number(text: str, needed: str, least: int, largest: int = MAX_HISTORY_
     raise argparse.ArgumentTypeError(f"{text!r}: {needed}")
 
 
-positive_count = partial(whole_number, needed="need a whole number above 0", least=1)
-port_number = partial(whole_number, needed="need a port, 0 … 65535", least=0, largest=65535)
+positive_count = partial(integer_number, needed="need a whole number above 0", least=1)
+port_number = partial(integer_number, needed="need a port, 0 … 65535", least=0, largest=65535)
 seed_number = partial(
-    whole_number, needed="a seed is a whole number, 0 … 4294967295", least=0, largest=4294967295
+    integer_number, needed="a seed is a whole number, 0 … 4294967295", least=0, largest=4294967295
 )
 
 
@@ -51,7 +51,7 @@ def unit_number(text: str) -> int:
     if text in ("hours", "cycles"):
         raise argparse.ArgumentTypeError(f"{text!r}: the unit of the answer is --in {text} now")
     needed = f"a serial number is a whole number, 0 … {MAX_HISTORY_SERIAL}"
-    return whole_number(text, needed, least=0)
+    return integer_number(text, needed, least=0)
 
 
 BUS = ("mapping", "dbc", "id_offset")
