@@ -6,9 +6,8 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from ehadiag_tools.accuracy.cases import CUBE, PAPER_CASES
+from ehadiag_tools.accuracy.cases import CUBE, PAPER_CASES, UNITS
 from ehadiag_tools.accuracy.pictures import PICTURES
-from ehadiag_tools.accuracy.units import UNITS
 from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE, RECORDED_UNITS, VALVES
 from ehadiag_tools.bench import BENCH
 from ehadiag_tools.free_motion.motion import FREE_MOTION

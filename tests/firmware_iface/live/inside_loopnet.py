@@ -86,10 +86,10 @@ def test_a_test_between_two_processes_loses_no_sample(tmp_path: Path) -> None:
     assert recording.samples.ticks == short_test().ticks
 
 
-def test_a_soak_accounts_for_every_frame(tmp_path: Path) -> None:
-    from ehadiag_tools.soak import soak
+def test_a_soak_accounts_for_every_frame() -> None:
+    from ehadiag_tools.soak import SoakCase, soak
 
-    result = soak(BusOptions("udp_multicast"), 2.0, 0.4, tmp_path)
+    result = soak(SoakCase("udp_multicast", None, 2.0, 0.4))
     assert result["sent"] > 0
     assert result["sent"] == result["received"] + result["own_lost"] + result["foreign_lost"]
     assert result["recorded"] == result["received"] + result["dropped_by_queue"]

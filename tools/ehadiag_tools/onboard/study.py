@@ -33,8 +33,8 @@ from ehadiag.identify.identification_session import NuisanceMode, identify
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD as PLACES
 from ehadiag.onboard.onboard_memory import OnboardOutcome
+from ehadiag_tools.accuracy.cases import UnitCase, draw_unit, record_worn
 from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, is_answered
-from ehadiag_tools.accuracy.units import UnitCase, draw_unit, record_worn
 from ehadiag_tools.onboard.replay import (
     EMULATED,
     identified,
