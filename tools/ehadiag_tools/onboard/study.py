@@ -165,41 +165,27 @@ def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     for emulator in EMULATED if options.into is None else ():
         if missing(emulator):
             yield f"{emulator.target}: not installed: {', '.join(missing(emulator))}\n"
-    rows = (_identified_row if options.identify else _replayed_row)(records)
-    headings = ("recording", "target", "library, bytes", "ticks")
+    headings = ["recording", "target", "library, bytes", "ticks"]
+    rows: list[list[object]] = [
+        [Path(item["log"]).name, item["target"], item["bytes"], item["done"]] for item in records
+    ]
     if options.identify:
-        yield from markdown(
-            (*headings, "digits", "Kintas, FSS, FDJ", "model runs", "stack, bytes",
-             "million instructions", "most in a slice", f"s at {CLOCK_MHZ:g} MHz"),
-            rows,
-        )  # fmt: skip
+        headings += ["digits", "Kintas, FSS, FDJ", "model runs", "stack, bytes"]
+        headings += ["million instructions", "most in a slice", f"s at {CLOCK_MHZ:g} MHz"]
+        for row, item in zip(rows, records, strict=True):
+            severities = ", ".join(f"{value:.6f}" for value in item["severities"])
+            row.extend(["DIFFERENT" if item["differing"] else "same", severities, item["runs"]])
+            millions = item["millions"]
+            effort = millions, item["longest"], f"{millions / CLOCK_MHZ:.1f}"
+            row.extend([item["stack"], *(effort if millions else "–––")])
     else:
-        yield from markdown(
-            (*headings, "ticks that differ", "stack of init, bytes", "stack of push, bytes",
-             "instructions of push", "at most"),
-            rows,
-        )  # fmt: skip
-
-
-def _label(item: Record) -> tuple[object, ...]:
-    return Path(item["log"]).name, item["target"], item["bytes"], item["done"]
-
-
-def _identified_row(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for item in records:
-        digits = "DIFFERENT" if item["differing"] else "same"
-        severities = ", ".join(f"{value:.6f}" for value in item["severities"])
-        millions = item["millions"]
-        effort = ("–", "–", "–")
-        if millions:
-            effort = (millions, item["longest"], f"{millions / CLOCK_MHZ:.1f}")
-        yield *_label(item), digits, severities, item["runs"], item["stack"], *effort
-
-
-def _replayed_row(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for item in records:
-        effort = (item["mean"], item["worst"]) if item["worst"] else ("–", "–")
-        yield *_label(item), item["differing"], item["init_stack"], item["stack"], *effort
+        headings += ["ticks that differ", "stack of init, bytes", "stack of push, bytes"]
+        headings += ["instructions of push", "at most"]
+        for row, item in zip(rows, records, strict=True):
+            instructions = item["mean"], item["worst"]
+            row.extend([item["differing"], item["init_stack"], item["stack"]])
+            row.extend(instructions if item["worst"] else "––")
+    yield from markdown(headings, rows)
 
 
 def _write_manifest(manifest: Path, records: Sequence[Record]) -> None:
