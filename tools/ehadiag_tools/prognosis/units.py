@@ -8,7 +8,6 @@ finished.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -304,16 +303,12 @@ class Noise:
 
 def read_noise() -> dict[str, Noise]:
     """Read the table, by severity."""
-    with TABLE.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    out = {}
-    for name in FAULT_NAMES:
-        mine = [row for row in rows if row["severity"] == name]
-        truth, value, std = (
-            np.array([float(row[key]) for row in mine]) for key in ("truth", "estimate", "std")
-        )
-        out[name] = Noise(truth, value - truth, std)
-    return out
+    rows = np.genfromtxt(TABLE, delimiter=",", names=True, dtype=None, encoding="ascii")
+    each = {name: rows[rows["severity"] == name] for name in FAULT_NAMES}
+    return {
+        name: Noise(mine["truth"], mine["estimate"] - mine["truth"], mine["std"])
+        for name, mine in each.items()
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
