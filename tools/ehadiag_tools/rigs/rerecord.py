@@ -49,11 +49,12 @@ class ForeignBus:
         """Ticks between two messages of a name, and the instant within the tick, both 1 ms."""
         database, name, out = self._database(), "GenMsgStartDelayTime", {}
         assert database.dbc is not None
-        usual: float = database.dbc.attribute_definitions[name].default_value
+        usual = database.dbc.attribute_definitions[name].default_value
         for message in database.messages:
             assert message.dbc is not None
             own = message.dbc.attributes.get(name)
-            out[message.name] = message.cycle_time or 1, usual if own is None else own.value
+            at = float((usual if own is None else own.value) or 0.0)
+            out[message.name] = message.cycle_time or 1, at
         return out
 
     def _database(self) -> Database:
