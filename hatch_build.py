@@ -31,7 +31,7 @@ class KernelHook(BuildHookInterface):
             return
         self._folder = tempfile.TemporaryDirectory()
         made = Path(self._folder.name) / "kernels"
-        environment = os.environ | {"EHADIAG_CACHE_DIR": str(Path(self._folder.name) / "cache")}
+        environment = {"EHADIAG_CACHE_DIR": str(Path(self._folder.name) / "cache")} | os.environ
         # No PYTHONPATH: pip's own start-up drops from it what an editable installation names.
         begin = (
             "import runpy, sys;"

@@ -8,8 +8,6 @@ import msgspec
 
 from ehadiag.core.conventions import display_unit
 
-FREE_MOTION = "free motion"
-"""In place of a test's name: severities by a monitor, without verdict."""
 INTERVAL_STDS = 1.96
 """Half width of an interval of 95 %, in standard deviations."""
 AT_BOUND, NOT_SHOWN = "at_bound", "not_shown"

@@ -14,8 +14,9 @@ from msgspec import Meta, field
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
-from ehadiag.estimate import FREE_MOTION, Culprit, Effect, Severity
+from ehadiag.estimate import Culprit, Effect, Severity
 from ehadiag.request import MOST_SEED, Request
+from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, NotTestedError
 from firmware_iface.files import read_small_file, write_file
 

@@ -26,10 +26,11 @@ from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import Actuator, with_tolerance
 from ehadiag.core.conventions import date_text, fingerprint
 from ehadiag.core.interruption import COMPUTING_THREAD_NAME
-from ehadiag.estimate import FREE_MOTION, Severity
+from ehadiag.estimate import Severity
 from ehadiag.records import failed_result, result_of
 from ehadiag.request import Request
 from ehadiag.result import Log, Mapped, Origin, Result, Sources, load_result
+from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, EhadiagError, NotTestedError, valid_text
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.stored_test import StoredTest

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
+from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import decode_toml, read_toml
 from firmware_iface.recording import FloatArray
@@ -209,6 +210,8 @@ def resolve_test(name: str) -> StoredTest:
 
 
 def _checked(test: StoredTest, where: str) -> StoredTest:
+    if test.name == FREE_MOTION:
+        raise ConfigurationError(f"{where}: the name {test.name!r} is of what no test shows")
     if test.unit not in COMMAND_UNITS[test.mode]:
         choice = " or ".join(COMMAND_UNITS[test.mode])
         raise ConfigurationError(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ehadiag.cli import option_values, options
 from ehadiag.cli.command_parser import show_usual
-from ehadiag.cli.history_options import add_history_option, history_path
+from ehadiag.cli.history_options import add_history_option, append_result, history_path
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.cli.simulator_options import add_simulator_options, simulator_settings
 from ehadiag.core.actuator import Actuator
@@ -31,14 +31,13 @@ from ehadiag.terminal.output import (
     transport_losses,
 )
 from ehadiag.terminal.screen import SessionScreen
-from firmware_iface.errors import ConfigurationError, InputOutputError
+from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import write_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from ehadiag.live import Snapshot
-    from ehadiag.result import Result
     from ehadiag.session.unit_state import UnitState
     from ehadiag_sim.control import SimulatorControl
     from firmware_iface.transport.base import Transport
@@ -166,6 +165,7 @@ def run_monitor(
     refuse_overwriting(arguments, outputs, [(kind, name) for kind, name in reads if name])
     print_compiling_notice(identification=False)
     unit, find = _initial_unit_state(arguments, actuator)
+    from ehadiag.history.records import Usage  # noqa: PLC0415
     from ehadiag.session.alarm_outlets import (  # noqa: PLC0415
         AlarmCommand,
         AlarmLog,
@@ -213,28 +213,14 @@ def run_monitor(
     codes = [0]
     if stated and arguments.history:
         with report_failure(codes):
-            _keep(found.result, arguments)
+            usage = Usage(arguments.unit_hours, arguments.unit_cycles)
+            append_result(Path(arguments.history), found.result, usage, create=False)
     if found.alarm_count:
         return 40
     if found.bus_lost:
         return INPUT_OUTPUT_EXIT_CODE
     enough = found.monitored and found.share >= arguments.least_monitored
     return codes[-1] or (0 if enough else 30)
-
-
-def _keep(result: Result, arguments: argparse.Namespace) -> None:
-    """Append severities to the history; InputOutputError where they cannot be."""
-    from ehadiag.history.records import Usage, history_entry  # noqa: PLC0415
-    from ehadiag.history.store import History  # noqa: PLC0415
-
-    entry = history_entry(
-        result, Usage(arguments.unit_hours, arguments.unit_cycles), simulated=False
-    )
-    try:
-        with History(Path(arguments.history)) as history:
-            history.append(entry)
-    except ConfigurationError as error:  # exchanged since the call began
-        raise InputOutputError(str(error)) from None
 
 
 def _initial_unit_state(

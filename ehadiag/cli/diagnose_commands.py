@@ -45,6 +45,7 @@ from ehadiag.terminal.output import (
     print_compiling_notice,
     print_status,
     progress_bar,
+    report_failure,
     worst_exit_code,
 )
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError
@@ -179,22 +180,15 @@ def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInp
     """Make one estimate from all logs."""
     together: list[Recording] = []
     logs: list[Log | None] = []
-    read_s, codes = 0.0, []
+    read_s = 0.0
+    codes: list[int] = []
     for item in inputs:
-        try:
-            if item.why:
-                raise InputOutputError(item.why)
-            with progress_bar() as progress:
-                reading = setup.read(item.name, progress=progress)
-        except EhadiagError as error:
-            print_status(str(error))
-            codes.append(error.exit_code)
-            continue
-        codes.append(0)
-        for recording, log in reading.each():
-            together.append(recording)
-            logs.append(log)
-        read_s += reading.seconds
+        with report_failure(codes, EhadiagError), progress_bar() as progress:
+            reading = setup.read(_readable(item), progress=progress)
+            for recording, log in reading.each():
+                together.append(recording)
+                logs.append(log)
+            read_s += reading.seconds
     if any(codes):
         print_status("no joint estimate: not all of the logs could be read")
         return exit_code_of_inputs(codes)
@@ -204,16 +198,21 @@ def _diagnose_joint(setup: Setup, results: ResultWriter, inputs: Sequence[LogInp
 
 def _diagnose_merged(setup: Setup, results: ResultWriter, inputs: Sequence[LogInput]) -> int:
     """Diagnose one recording that lies in several files."""
-    for item in inputs:
-        if item.why:
-            raise InputOutputError(item.why)
+    names = [_readable(item) for item in inputs]
     with progress_bar() as progress:
-        reading = setup.read(*(item.name for item in inputs), progress=progress)
+        reading = setup.read(*names, progress=progress)
     codes = [
         diagnose_and_deliver(setup, results, [recording], reading.files, [log], reading.seconds)[1]
         for recording, log in reading.each()
     ]
     return worst_exit_code(codes)
+
+
+def _readable(item: LogInput) -> str:
+    """Name of an input; InputOutputError where it is known that it cannot be read."""
+    if item.why:
+        raise InputOutputError(item.why)
+    return item.name
 
 
 def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
@@ -228,22 +227,14 @@ def _list_tests(unit: ActuatorArguments, inputs: Sequence[LogInput]) -> int:
         print_status(f"--list diagnoses none, and has no use for {named}")
     # Whichever test is named once, all are listed.
     setup = options.setup_of(arguments)
-    codes = []
+    codes: list[int] = []
     groups = [list(inputs)] if arguments.merge else [[item] for item in inputs]
     for group in groups:
-        try:
-            for item in group:
-                if item.why:
-                    raise InputOutputError(item.why)
-            names = [item.name for item in group]
+        with report_failure(codes, EhadiagError):
+            names = [_readable(item) for item in group]
             with progress_bar() as progress:
                 tests = list(list_tests(setup, *names, progress=progress))
             print_test_list(", ".join(names) + of, tests, as_json=arguments.json)
-        except EhadiagError as error:
-            print_status(str(error))
-            codes.append(error.exit_code)
-        else:
-            codes.append(0)
     return exit_code_of_inputs(codes)
 
 
@@ -283,18 +274,12 @@ def run_report(arguments: argparse.Namespace) -> int:
     pages += [OutputFile("--index", arguments.index)] * bool(arguments.index)
     reads = [("the result", name) for name in results]
     refuse_overwriting(arguments, pages, [*reads, ("the DBC", setup.bus_map.name)])
-    codes, written = [], []
-    with counting_bar(len(results), "reports") as count:
-        for name in results:
-            try:
-                written.append(
-                    (_write_report(arguments, Path(name), levels), _page_path_of(Path(name)))
-                )
-            except EhadiagError as error:
-                print_status(str(error))
-                codes.append(error.exit_code)
-            else:
-                codes.append(0)
+    codes: list[int] = []
+    written = []
+    with counting_bar(len(results), "report") as count:
+        for path in map(Path, results):
+            with report_failure(codes, EhadiagError):
+                written.append((_write_report(arguments, path, levels), _page_path_of(path)))
             count()
     if arguments.index:
         page = index_html_page(written, Path(arguments.index), levels, history_path(arguments))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import math
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ehadiag.cli.options import positive_number
 from firmware_iface.errors import ConfigurationError, InputOutputError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def add_usage_options(
     for name, what in (("hours", "operating hours"), ("cycles", "cycles")):
         parser.add_argument(
             f"--{name}",
-            type=_nonnegative_number,
+            type=partial(positive_number, or_zero=True),
             metavar="N",
             help=f"{what} of the unit {when}",
         )
@@ -104,6 +105,21 @@ def named_actuator(history: History, serial: int, named: str | None) -> str | No
     return named or next(iter(known), None)
 
 
+def append_result(
+    place: Path, result: Result, usage: Usage, *, simulated: bool = False, create: bool = True
+) -> None:
+    """Append a result to a history; InputOutputError where it cannot be, and nothing of it is."""
+    from ehadiag.history.records import history_entry  # noqa: PLC0415
+    from ehadiag.history.store import History  # noqa: PLC0415
+
+    entry = history_entry(result, usage, simulated=simulated)
+    try:
+        with History(place, create=create) as history:
+            history.append(entry)
+    except ConfigurationError as error:  # exchanged since the call began
+        raise InputOutputError(str(error)) from None
+
+
 class HistoryWriter:
     """Appends the diagnoses of one call to the history, where there is one.
 
@@ -129,15 +145,9 @@ class HistoryWriter:
         """Append a result; InputOutputError where it cannot be, and then nothing of it is."""
         if self.place is None:
             return
-        from ehadiag.history.records import history_entry  # noqa: PLC0415
-
-        usage = usage_from_options(self._arguments)
-        entry = history_entry(result, usage, simulated=self._simulated)
-        try:
-            with self._open() as history:
-                history.append(entry)
-        except ConfigurationError as error:  # exchanged since the call began
-            raise InputOutputError(str(error)) from None
+        append_result(
+            self.place, result, usage_from_options(self._arguments), simulated=self._simulated
+        )
 
     def snapshot(self) -> HistorySnapshot | None:
         """Return the history as it is now; None where there is none."""
@@ -191,13 +201,3 @@ class HistoryWriter:
 
 def _line_digest(line: str) -> bytes:
     return hashlib.sha256(line.encode()).digest()
-
-
-def _nonnegative_number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r}: need a number of at least 0")
-    return value

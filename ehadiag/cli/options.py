@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ehadiag.core.conventions import SIGNAL_FILE_KINDS
@@ -18,47 +19,39 @@ MAX_HISTORY_SERIAL = (1 << 63) - 1
 """Largest serial number that a history can hold, 1."""
 
 
-def positive_number(text: str) -> float:
-    """Read a number above zero."""
+def positive_number(text: str, *, or_zero: bool = False) -> float:
+    """Read a number above zero, or zero where that will do."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r}: need a number above 0")
-    return value
+    if 0.0 < value < math.inf or (or_zero and value == 0.0):
+        return value
+    needed = "of at least 0" if or_zero else "above 0"
+    raise argparse.ArgumentTypeError(f"{text!r}: need a number {needed}")
 
 
-def positive_count(text: str) -> int:
-    """Read a whole number above zero."""
-    if not (text.isascii() and text.isdigit()) or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: need a whole number above 0")
-    return int(text)
+def integer_number(text: str, needed: str, least: int, largest: int = MAX_HISTORY_SERIAL) -> int:
+    """Read a whole number between two; `needed` says in words which one will do."""
+    digits = text.isascii() and text.isdigit() and len(text) <= len(str(MAX_HISTORY_SERIAL))
+    if digits and least <= int(text) <= largest:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r}: {needed}")
+
+
+positive_count = partial(integer_number, needed="need a whole number above 0", least=1)
+port_number = partial(integer_number, needed="need a port, 0 … 65535", least=0, largest=65535)
+seed_number = partial(
+    integer_number, needed="a seed is a whole number, 0 … 4294967295", least=0, largest=4294967295
+)
 
 
 def unit_number(text: str) -> int:
     """Read a serial number of a unit, as far as buses and histories carry them."""
     if text in ("hours", "cycles"):
         raise argparse.ArgumentTypeError(f"{text!r}: the unit of the answer is --in {text} now")
-    if not (text.isascii() and text.isdigit()) or len(text) > 19 or int(text) > MAX_HISTORY_SERIAL:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: a serial number is a whole number, 0 … {MAX_HISTORY_SERIAL}"
-        )
-    return int(text)
-
-
-def port_number(text: str) -> int:
-    """Read the number of a TCP port."""
-    if text.isdecimal() and text.isascii() and len(text) < 6 and int(text) < 1 << 16:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r}: need a port, 0 … 65535")
-
-
-def seed_number(text: str) -> int:
-    """Read a seed of random numbers."""
-    if not (text.isascii() and text.isdigit()) or int(text) >= 1 << 32:
-        raise argparse.ArgumentTypeError(f"{text!r}: a seed is a whole number, 0 … 4294967295")
-    return int(text)
+    needed = f"a serial number is a whole number, 0 … {MAX_HISTORY_SERIAL}"
+    return integer_number(text, needed, least=0)
 
 
 BUS = ("mapping", "dbc", "id_offset")

@@ -90,7 +90,7 @@ def run_rul(arguments: argparse.Namespace) -> int:
         if arguments.all:
             both = (levels.advisory, levels.limit)
             found = []
-            with counting_bar(len(history.units()), "units") as count:
+            with counting_bar(len(history.units()), "unit") as count:
                 for item in all_prognoses(history, both, arguments.in_unit, arguments.seed):
                     found.append(item)
                     count()

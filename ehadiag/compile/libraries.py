@@ -138,7 +138,7 @@ def build(folder: Path, levels: Collection[tuple[str, str]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [(name, level) for name in SHIPPED for level in levels]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        made = list(pool.map(lambda job: _made(*job), jobs))
+        made = list(pool.map(lambda job: _compiled(*job), jobs))
     digests = {}
     for (name, level), content in zip(jobs, made, strict=True):
         file = f"{name}-{'-'.join(level)}.so"
@@ -230,7 +230,14 @@ def _file(library: str) -> str:
 @cache
 def _content(library: str) -> bytes:
     """A library, wherever it comes from."""
-    return _prebuilt(library) or cached(_file(library), lambda: _made(library, processor_level()))
+    return _prebuilt(library) or _compiled(library, processor_level())
+
+
+def _compiled(library: str, level: tuple[str, str]) -> bytes:
+    """Compile a library; one for this processor is kept in the cache folder."""
+    if level != processor_level():
+        return _made(library, level)
+    return cached(_file(library), lambda: _made(library, level))
 
 
 def _made(library: str, level: tuple[str, str]) -> bytes:

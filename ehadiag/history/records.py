@@ -21,7 +21,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.core.conventions import utc_text
-from ehadiag.estimate import FREE_MOTION, Effect, Severity
+from ehadiag.estimate import Effect, Severity
+from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, valid_text
 
 if TYPE_CHECKING:

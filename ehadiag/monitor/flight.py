@@ -13,9 +13,10 @@ from typing import Final
 import numpy as np
 
 from ehadiag.compile.jit import Array, Array2
-from ehadiag.estimate import AT_BOUND, FREE_MOTION, INTERVAL_STDS, NOT_SHOWN, Severity
+from ehadiag.estimate import AT_BOUND, INTERVAL_STDS, NOT_SHOWN, Severity
 from ehadiag.model.registry import FAULTS
 from ehadiag.monitor.score_bank import BLOCK_S, REST, BlockScore, ScoreBank
+from firmware_iface import FREE_MOTION
 
 PART_BLOCKS: Final = 20
 """Blocks of a part, 1: 10 s, longer than what a motion repeats."""

@@ -16,7 +16,6 @@ from msgspec import structs
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
-from ehadiag.estimate import FREE_MOTION
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
@@ -36,6 +35,7 @@ from ehadiag.report.prognosis_tables import named_levels, remaining_text
 from ehadiag.report.trend_bus_pictures import first_to_the_limit, trend_column
 from ehadiag.result import Result
 from ehadiag.serve.server import Page
+from firmware_iface import FREE_MOTION
 from firmware_iface.errors import EhadiagError, printable
 from firmware_iface.files import read_small_file
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TextIO, cast
 
 from firmware_iface.errors import (
     ConfigurationError,
+    EhadiagError,
     InputOutputError,
     printable,
     printable_lines,
@@ -89,13 +90,15 @@ def write_output(text: str) -> None:
 
 
 @contextmanager
-def report_failure(codes: list[int]) -> Iterator[None]:
-    """Print an InputOutputError of the block and add its exit code; the block ends there."""
+def report_failure(codes: list[int], of: type[EhadiagError] = InputOutputError) -> Iterator[None]:
+    """Print an error of the block, which ends there; add its exit code, or 0 without an error."""
     try:
         yield
-    except InputOutputError as error:
-        codes.append(error.exit_code)
+    except of as error:
         print_status(str(error))
+        codes.append(error.exit_code)
+    else:
+        codes.append(0)
 
 
 def discard_stream(stream: TextIO) -> None:
@@ -203,11 +206,11 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[str, float], None]
 
 
 @contextmanager
-def counting_bar(total: int, what: str = "recordings") -> Iterator[Callable[[], None]]:
+def counting_bar(total: int, what: str = "recording") -> Iterator[Callable[[], None]]:
     """Show how many of so many are done, and how fast, on standard error, in a log as lines."""
     if not sys.stderr.isatty():
         lines, done = _ProgressLines(), itertools.count(1)
-        yield lambda: lines.update(f"{total} {what}:", next(done) / total)
+        yield lambda: lines.update(f"{total} {what}{'s' * (total != 1)}:", next(done) / total)
         return
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import (  # noqa: PLC0415
@@ -230,7 +233,7 @@ def counting_bar(total: int, what: str = "recordings") -> Iterator[Callable[[], 
 
         def advance() -> None:
             speed = display.tasks[0].speed
-            rate = "" if speed is None else f"{speed:.1f} {what}/s"
+            rate = "" if speed is None else f"{speed:.1f} {what}s/s"
             display.update(task, advance=1, rate=rate)
 
         yield advance

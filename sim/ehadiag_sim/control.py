@@ -6,6 +6,7 @@ All three make the same `Change`; the emulated computer applies them between two
 from __future__ import annotations
 
 import socketserver
+import struct
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,15 +28,9 @@ from ehadiag_sim.conditions import (
     check_within,
     condition_options,
 )
-from ehadiag_sim.faulty_bus import (
-    BitFlips,
-    DuplicateFrames,
-    FrameLoss,
-    FrameMoment,
-    SecondSender,
-)
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import read_toml
+from firmware_iface.protection import crc8
 from firmware_iface.transport.frames import Frame
 
 MAX_LINE_BYTES = 1 << 16
@@ -52,6 +47,80 @@ BUS_KEYS: Mapping[str, tuple[float, float]] = {
     "bus_off_s": (0.0, 3600.0),
 }
 """Damage to the bus with its range: shares of the frames, 1, and a time without any frame, s."""
+COUNTER_BYTE_INDEX, CRC_BYTE_INDEX = 6, 7
+"""Places in a payload of the default bus."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameMoment:
+    """When a frame passes, s since the first one, and the chance that strikes it."""
+
+    since: float
+    rng: np.random.Generator
+
+
+@dataclass(slots=True)
+class FrameLoss:
+    """Single frames vanish; `only` names the identifier it strikes."""
+
+    share: float
+    only: int | None = None
+
+    def __call__(self, frame: Frame, at: FrameMoment) -> Iterable[Frame]:
+        """Drop a frame by chance."""
+        hit = self.only in (None, frame.can_id) and at.rng.random() < self.share
+        return () if hit else (frame,)
+
+
+@dataclass(slots=True)
+class DuplicateFrames:
+    """Frames come twice."""
+
+    share: float
+
+    def __call__(self, frame: Frame, at: FrameMoment) -> Iterable[Frame]:
+        """Repeat a frame by chance."""
+        return (frame, frame) if at.rng.random() < self.share else (frame,)
+
+
+@dataclass(slots=True)
+class BitFlips:
+    """One bit of a payload changes; `mended` gives it a valid check sum."""
+
+    share: float
+    mended: bool = False
+
+    def __call__(self, frame: Frame, at: FrameMoment) -> Iterable[Frame]:
+        """Flip a bit by chance."""
+        if not frame.data or at.rng.random() >= self.share:
+            return (frame,)
+        bit = int(at.rng.integers(8 * (CRC_BYTE_INDEX if self.mended else len(frame.data))))
+        data = bytearray(frame.data)
+        data[bit // 8] ^= 1 << bit % 8
+        damaged = msgspec.structs.replace(frame, data=bytes(data))
+        return (with_valid_crc(damaged) if self.mended else damaged,)
+
+
+@dataclass(slots=True)
+class SecondSender:
+    """Another device sends the same messages, with counters of its own and valid check sums."""
+
+    share: float
+
+    def __call__(self, frame: Frame, at: FrameMoment) -> Iterable[Frame]:
+        """Add its frame by chance."""
+        if len(frame.data) <= CRC_BYTE_INDEX or at.rng.random() >= self.share:
+            return (frame,)
+        data = bytearray(frame.data)
+        data[COUNTER_BYTE_INDEX] = (data[COUNTER_BYTE_INDEX] + 128) % 256
+        return (frame, with_valid_crc(msgspec.structs.replace(frame, data=bytes(data))))
+
+
+def with_valid_crc(frame: Frame) -> Frame:
+    """Return the frame with a valid check sum of the default bus."""
+    header = struct.pack("<H", frame.can_id & 0xFFFF)
+    body = frame.data[:CRC_BYTE_INDEX]
+    return msgspec.structs.replace(frame, data=body + bytes((crc8(header + body),)))
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.export.targets import find_target
-from ehadiag_tools.onboard.emulators import BARE, EMULATED, FIRMWARE, WARNINGS
+from ehadiag_tools.onboard.replay import BARE, EMULATED, FIRMWARE, WARNINGS
 from firmware_iface.bus_map import default_map
 from firmware_iface.recording import Recording
 

@@ -14,7 +14,7 @@ from ehadiag.assess.verdict import Verdict
 from ehadiag.core.actuator import default_actuator
 from ehadiag.identify.experiment import build_experiment
 from ehadiag_sim.conditions import Faults
-from ehadiag_tools.accuracy import pictures, units, verdicts
+from ehadiag_tools.accuracy import cases, pictures, verdicts
 from ehadiag_tools.accuracy.cases import PAPER, Case, experiments_of, perform, random_faults
 from ehadiag_tools.accuracy.figures import (
     accuracy_table,
@@ -88,7 +88,7 @@ def test_more_unknowns_have_a_larger_bound() -> None:
     experiment = build_experiment(
         recording.samples, recording.environment, test, default_actuator()
     )
-    few, many = cramer_rao([experiment], faults), units.bound_of(experiment, faults)
+    few, many = cramer_rao([experiment], faults), cases.bound_of(experiment, faults)
     assert np.all(many > 0.8 * few)  # noise as measured, and as specified
     assert many[1] > 2.0 * few[1]  # spool friction and hysteresis do nearly the same
 
@@ -109,13 +109,13 @@ def test_a_basin_in_which_the_model_must_be_put_back_is_left() -> None:
 
 
 def test_a_unit_is_the_same_each_time_and_a_group_changes_no_other_effect() -> None:
-    case = units.UnitCase("open", 3, 1, data="calibrated")
-    first, second = units.draw_unit(case), units.draw_unit(case)
+    case = cases.UnitCase("open", 3, 1, data="calibrated")
+    first, second = cases.draw_unit(case), cases.draw_unit(case)
     assert first == second
     assert first[0].serial == 3
-    other = units.draw_unit(dataclasses.replace(case, case=4))
+    other = cases.draw_unit(dataclasses.replace(case, case=4))
     assert other[0].effects != first[0].effects
-    sensed = units.draw_unit(dataclasses.replace(case, groups=("sensing",)))
+    sensed = cases.draw_unit(dataclasses.replace(case, groups=("sensing",)))
     assert sensed[0].effects == first[0].effects
     assert sensed[1] == first[1]
     assert sensed[0].sensors.filter_time > 0.0

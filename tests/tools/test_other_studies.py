@@ -23,8 +23,7 @@ from ehadiag_tools.free_motion.motion import (
     perform,
     random_command,
 )
-from ehadiag_tools.prognosis.laws import LAWS
-from ehadiag_tools.prognosis.units import LIMIT, TABLE, read_noise, simulate_unit
+from ehadiag_tools.prognosis.units import LAWS, LIMIT, TABLE, read_noise, simulate_unit
 from firmware_iface.logs.reader import read_frames
 from firmware_iface.recording import CommandMode
 

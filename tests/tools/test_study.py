@@ -198,7 +198,7 @@ def test_a_longer_study_makes_its_table(
         (["paper", "--recordings", "nowhere"], "nowhere/truth.csv: No such file"),
         (["recorded-units", "--recordings", "nowhere"], "nowhere/truth.csv: No such file"),
         (["foreign-buses", "nowhere"], "nowhere/truth.csv: No such file"),
-        (["recorded-units", "--recordings", str(LOGS), "--unit", "X"], "--unit X: no recording"),
+        (["recorded-units", "--recordings", str(LOGS)], "truth.csv: no recording of a unit as new"),
     ],
 )
 def test_wrong_use_is_one_plain_line(

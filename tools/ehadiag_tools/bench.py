@@ -71,7 +71,7 @@ Figure = tuple[str, float | None, str, str]
 
 @dataclass(frozen=True, slots=True)
 class BenchCase:
-    """A section, runs of a median, seconds of pushes in time with a bus, sizes of what is read."""
+    """A section, and the options of the study, see `_options`."""
 
     section: str
     repeats: int
@@ -579,14 +579,12 @@ def _cases(options: Options) -> list[BenchCase]:
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     yield f"{records[0]['machine']}\n"
-    yield from markdown(
-        ("section", "figure", "value", "unit", "remark"),
-        (
-            (record["section"], name, "–" if value is None else f"{value:.4g}", unit, remark)
-            for record in records
-            for name, value, unit, remark in record["figures"]
-        ),
+    rows = (
+        (record["section"], name, "–" if value is None else f"{value:.4g}", unit, remark)
+        for record in records
+        for name, value, unit, remark in record["figures"]
     )
+    yield from markdown(("section", "figure", "value", "unit", "remark"), rows)
 
 
 BENCH = Study(

@@ -6,18 +6,14 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from ehadiag_tools.accuracy.cases import CUBE, PAPER_CASES
+from ehadiag_tools.accuracy.cases import CUBE, PAPER_CASES, UNITS
 from ehadiag_tools.accuracy.pictures import PICTURES
-from ehadiag_tools.accuracy.recorded import RECORDED_UNITS
-from ehadiag_tools.accuracy.units import UNITS
-from ehadiag_tools.accuracy.valves import VALVES
-from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE
+from ehadiag_tools.accuracy.verdicts import ALARMS, HARDWARE, RECORDED_UNITS, VALVES
 from ehadiag_tools.bench import BENCH
 from ehadiag_tools.free_motion.motion import FREE_MOTION
 from ehadiag_tools.onboard.study import ONBOARD, ONBOARD_UNITS
 from ehadiag_tools.prognosis.units import PROGNOSIS
-from ehadiag_tools.rigs.daq import DAQ_RECORDINGS
-from ehadiag_tools.rigs.replay import FOREIGN_BUSES
+from ehadiag_tools.rigs.replay import DAQ_RECORDINGS, FOREIGN_BUSES
 from ehadiag_tools.simulator.compare_logs import RECORDINGS
 from ehadiag_tools.soak import SOAK
 from ehadiag_tools.study import Study, run_study

@@ -51,17 +51,25 @@ OWN_LOAD = 2e9 / PERIOD_NS * FRAME_S
 """Load of the bus by telemetry and command, 1."""
 AGE_STEP_US, AGE_BINS = 10, 1_000_000
 """Step of the histogram of ages, µs, and its length; older ones than ten seconds count as such."""
-SETTINGS = ("interface", "channel", "seconds", "load", "diagnose")
 SILENCE_S, START_S = 1.0, 120.0
 """Silence after which the bus is empty, s, and longest time until the first frame."""
 FAULTS = (0.3, 0.3, 0.3)
 """Severities of the simulated unit, 1."""
 
 
-def soak(
-    options: BusOptions, seconds: float, load: float, folder: Path, *, diagnose: bool = False
-) -> Record:
-    """Load a bus up to a share of 1 Mbit/s and read it for a while, recording into a folder.
+@dataclass(frozen=True, slots=True)
+class SoakCase:
+    """Bus as python-can names it, length in s, load as a share, whether diagnoses run."""
+
+    interface: str
+    channel: str | None
+    seconds: float
+    load: float
+    diagnose: bool = False
+
+
+def soak(case: SoakCase) -> Record:
+    """Load a bus up to a share of 1 Mbit/s and read it for a while, recording it.
 
     Frames sent, received (all senders together), lost, and of them those that the socket had no
     room for (None if it cannot say) or the reader was too slow for; memory of the reader after a
@@ -69,41 +77,42 @@ def soak(
     the monitor ticks pushed, lost on the way, alarms, rms of the residuals over the noise, and
     times of a push and of all work of the receive thread on a tick: p50, p99, p99.9, largest.
     """
-    if not (OWN_LOAD < load <= 1.0 and seconds >= 1.0):
+    if not (OWN_LOAD < case.load <= 1.0 and case.seconds >= 1.0):
         raise ConfigurationError(
-            f"soak of {seconds:g} s at load {load:g}: need at least 1 s, and a load between "
-            f"{OWN_LOAD:.2f} (our own frames) and 1"
+            f"soak of {case.seconds:g} s at load {case.load:g}: need at least 1 s, and a load "
+            f"between {OWN_LOAD:.2f} (our own frames) and 1"
         )
+    options = BusOptions(case.interface, channel=case.channel)
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     own, foreign = (context.Value("q", 0, lock=False) for _ in range(2))
-    rate = (load - OWN_LOAD) / FRAME_S
+    rate = (case.load - OWN_LOAD) / FRAME_S
     senders = [
         context.Process(target=send_actuator, args=(options, stop, own)),
         context.Process(target=send_foreign, args=(options, stop, foreign, rate)),
     ]
-    recorder = Recorder(folder / "soak.blf", max_bytes=64 << 20)
-    sink = _Sink(recorder, seconds)
     with (
+        tempfile.TemporaryDirectory() as folder,
         PythonCanTransport(options) as bus,
-        recorder,
-        Receiver(bus, sink=sink.take, idle=recorder.idle) as source,
+        Recorder(Path(folder) / "soak.blf", max_bytes=64 << 20) as recorder,
     ):
-        reader = _Reader(source)
-        for item in senders:
-            item.start()
-        try:
-            reader.read(seconds, diagnose)
-        finally:
-            stop.set()
+        sink = _Sink(recorder, case.seconds)
+        with Receiver(bus, sink=sink.take, idle=recorder.idle) as source:
+            reader = _Reader(source)
             for item in senders:
-                item.join()
-        while reader.take_all(SILENCE_S):
-            pass
+                item.start()
+            try:
+                reader.read(case.seconds, case.diagnose)
+            finally:
+                stop.set()
+                for item in senders:
+                    item.join()
+            while reader.take_all(SILENCE_S):
+                pass
         dropped, overflow = bus.dropped, source.overflow
     sent = own.value + foreign.value
     return {
-        "seconds": reader.elapsed,
+        "elapsed": reader.elapsed,
         "bus_load": (sent - reader.before) * FRAME_S / reader.elapsed,
         "sent": sent,
         "received": reader.own + reader.foreign,
@@ -114,9 +123,7 @@ def soak(
         "recorded": recorder.frames,
         "rss_warm": reader.rss_warm,
         "rss_end": _resident(),
-        "age_p50": reader.age(0.5),
-        "age_p99": reader.age(0.99),
-        "age_max": reader.oldest_us * 1e-6,
+        **reader.ages(),
         "diagnoses": reader.diagnoses,
         **sink.result(),
     }
@@ -200,10 +207,14 @@ class _Reader:
             if not self.rss_warm and self.elapsed >= warm:
                 self.rss_warm = _resident()
 
-    def age(self, share: float) -> float:
-        """Age that this share of the foreign frames does not exceed, s."""
+    def ages(self) -> Record:
+        """Ages that half and 99 % of the foreign frames do not exceed, and the largest, s."""
         total = np.cumsum(self._ages)
-        return float((np.searchsorted(total, share * total[-1]) + 1) * AGE_STEP_US * 1e-6)
+        p50, p99 = (
+            float((np.searchsorted(total, share * total[-1]) + 1) * AGE_STEP_US * 1e-6)
+            for share in (0.5, 0.99)
+        )
+        return {"age_p50": p50, "age_p99": p99, "age_max": self.oldest_us * 1e-6}
 
     def take_all(self, timeout: float) -> bool:
         """Wait for a frame, then take those that are there; false after a silence."""
@@ -278,24 +289,6 @@ def _ticks(stop: Event) -> Iterator[int]:
         tick += 1
 
 
-@dataclass(frozen=True, slots=True)
-class SoakCase:
-    """Bus as python-can names it, length in s, load as a share, whether diagnoses run."""
-
-    interface: str
-    channel: str | None
-    seconds: float
-    load: float
-    diagnose: bool
-
-
-def perform(case: SoakCase) -> Record:
-    """Soak a bus."""
-    bus = BusOptions(case.interface, channel=case.channel)
-    with tempfile.TemporaryDirectory() as folder:
-        return soak(bus, case.seconds, case.load, Path(folder), diagnose=case.diagnose)
-
-
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("-i", "--interface", required=True, help="as python-can names it")
@@ -306,17 +299,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _cases(options: Options) -> list[SoakCase]:
-    seconds = options.minutes * 60.0
     bus = options.interface, options.channel
-    return [SoakCase(*bus, seconds, options.load, options.diagnose)]
+    return [SoakCase(*bus, options.minutes * 60.0, options.load, options.diagnose)]
 
 
 def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     """Figures of each bus; percentiles are p50, p99, p99.9 and the largest."""
     for item in records:
         yield f"{item['interface']}, {item['seconds']:.0f} s at {item['load']:.0%} of 1 Mbit/s\n"
-        figures = {name: value for name, value in item.items() if name not in SETTINGS}
-        yield from markdown(("figure", "value"), ((k, _text(v)) for k, v in figures.items()))
+        settings = SoakCase.__dataclass_fields__
+        rows = ((key, _text(value)) for key, value in item.items() if key not in settings)
+        yield from markdown(("figure", "value"), rows)
 
 
 def _text(value: object) -> str:
@@ -332,5 +325,5 @@ def _any_lost(records: Sequence[Record]) -> bool:
 SOAK = Study(
     "soak",
     "Minutes on a loaded bus: frames lost, memory, age of samples, time of the monitor's push.",
-    _cases, perform, _report, _options, count=None, failed=_any_lost, measures_time=True,
+    _cases, soak, _report, _options, count=None, failed=_any_lost, measures_time=True,
 )  # fmt: skip

@@ -14,6 +14,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError, reason_of
 
@@ -124,17 +125,22 @@ def perform_cases(
     pending = {key: case for key, case in zip(keys, cases, strict=True) if key not in done}
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
-    with open(kept or os.devnull, "a", encoding="utf-8") as file, _progress() as progress:
+    # On stderr, so that reports can be redirected; only where someone sees it.
+    console = Console(file=sys.stderr)
+    performed = track(
+        _performed(study.perform, pending, jobs), study.name, total=len(cases),
+        completed=len(cases) - len(pending), console=console, transient=True,
+        disable=not console.is_terminal,
+    )  # fmt: skip
+    with open(kept or os.devnull, "a", encoding="utf-8") as file:
         # A line cut short must not swallow the next one.
         file.write("\n" if done else "")
-        bar = progress.add_task(study.name, total=len(cases), completed=len(cases) - len(pending))
-        for key, found in _performed(study.perform, pending, jobs):
+        for key, found in performed:
             # Through JSON, so that a record is the same before and after a resumption.
-            line = json.dumps({"key": key, **asdict(pending[key]), **found})
-            done[key] = _without_key(json.loads(line))
-            file.write(line + "\n")
+            line = json.dumps({**asdict(pending[key]), **found})
+            done[key] = json.loads(line)
+            file.write(f'{{"key": "{key}", {line[1:]}\n')
             file.flush()
-            progress.advance(bar)
     return [done[key] for key in keys]
 
 
@@ -176,33 +182,12 @@ def _source_digest() -> str:
 
 def _read(path: Path) -> dict[str, Record]:
     found: dict[str, Record] = {}
-    if not path.exists():
-        return found
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            record = json.loads(line)
-            found[record["key"]] = _without_key(record)
-        except (ValueError, KeyError, AttributeError, TypeError):
-            continue
+    if path.exists():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError, KeyError, AttributeError, TypeError):
+                record = json.loads(line)
+                found[record.pop("key")] = record
     return found
-
-
-def _without_key(record: Record) -> Record:
-    return {name: value for name, value in record.items() if name != "key"}
-
-
-def _progress() -> Progress:
-    """On stderr, so that reports can be redirected; only where someone sees it."""
-    console = Console(file=sys.stderr)
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
 
 
 def grouped(records: Iterable[Record], *names: str) -> dict[tuple[Any, ...], list[Record]]:

@@ -16,6 +16,7 @@ from places import LOGS
 
 import ehadiag
 from ehadiag.history.store import History
+from ehadiag.terminal import output
 
 HEALTHY = LOGS / "healthy-open.blf"
 WORN = LOGS / "paper-open-4.blf"
@@ -62,7 +63,16 @@ def test_many_reports_show_how_many_are_done(run: Run, monkeypatch: pytest.Monke
     monkeypatch.setattr("ehadiag.cli.diagnose_commands.counting_bar", bar)
     run("diagnose", "--no-picture", "--out", "o", HEALTHY, WORN)
     run("report", "o/healthy-open.json", "o/paper-open-4.json", "o/none.json")
-    assert counted == 3 * [(3, "reports")]
+    assert counted == 3 * [(3, "report")]
+
+
+def test_one_of_them_is_no_plural(monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = []
+    monkeypatch.setattr(output._ProgressLines, "update", lambda _, stage, __: stages.append(stage))
+    for total in (1, 2):
+        with output.counting_bar(total, "report") as count:
+            count()
+    assert stages == ["1 report:", "2 reports:"]
 
 
 def test_a_trend_where_there_is_a_history(run: Run) -> None:

@@ -22,8 +22,15 @@ from ehadiag.monitor.monitor_memory import MODEL, MONITOR, MONITOR_SIZE
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.c_interface import ERRORS, HEALTH
 from ehadiag.onboard.onboard_memory import ONBOARD
-from ehadiag_tools.onboard.emulators import EMULATED, missing, run_program
-from ehadiag_tools.onboard.replay import identified, replayed, ticks_of, unit_of
+from ehadiag_tools.onboard.replay import (
+    EMULATED,
+    identified,
+    missing,
+    replayed,
+    run_program,
+    ticks_of,
+    unit_of,
+)
 from ehadiag_tools.onboard.study import REFERENCE
 from firmware_iface.logs.reader import read_recording
 

@@ -18,7 +18,7 @@ from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS, parameter
 from ehadiag_sim.broken_hardware import simulate_broken
 from ehadiag_sim.conditions import Effects, Faults
 from ehadiag_sim.simulation import simulate
-from ehadiag_tools.accuracy.units import UnitCase, perform_unit
+from ehadiag_tools.accuracy.cases import UnitCase, perform_unit
 from firmware_iface.stored_test import resolve_test
 
 MOST_RUNS = {"open": 1200, "closed": 3300}

@@ -12,7 +12,7 @@ import ehadiag
 from ehadiag.identify.experiment import build_experiment, share_offsets
 from ehadiag_sim.conditions import Effects, Faults, Sensors
 from ehadiag_sim.simulation import Plant, SimulatedRun, bus_command, simulate
-from ehadiag_tools.accuracy.units import UnitCase, draw_unit, perform_unit
+from ehadiag_tools.accuracy.cases import UnitCase, draw_unit, perform_unit
 from ehadiag_tools.simulator.units import COARSE_STEP, Unit, record
 from firmware_iface.recording import CommandMode, Environment, Recording
 

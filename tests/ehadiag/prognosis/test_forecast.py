@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from history_cases import an_entry, an_event
 
-from ehadiag.estimate import FREE_MOTION
 from ehadiag.prognosis.averaging import AVERAGING_RULES, learn_fleet
 from ehadiag.prognosis.forecast import Forecast, forecast
 from ehadiag.prognosis.lives import Life, lives_of
 from ehadiag.prognosis.units import prognosis_of
+from firmware_iface import FREE_MOTION
 
 RATE = 2.5e-4
 NOISE = 2e-4

@@ -24,7 +24,6 @@ from places import LOGS
 import ehadiag
 from ehadiag import CommandMode, Samples
 from ehadiag.core.conversion import Conversion
-from ehadiag.estimate import FREE_MOTION
 from ehadiag.history.records import Usage
 from ehadiag.prognosis.units import prognosis_of
 from ehadiag.report.bokeh_plots import plot_column
@@ -32,6 +31,7 @@ from ehadiag.report.matplotlib_figures import draw_picture, picture_png
 from ehadiag.report.picture import BAND_COLOURS, Curve, Panel, thin_to_extremes
 from ehadiag.report.response_signals import motion_events
 from ehadiag.report.trend_bus_pictures import bus_picture, history_picture, trend_column
+from firmware_iface import FREE_MOTION
 from firmware_iface.recording import CHANNELS
 
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from page_sessions import fail, talk
 
 from ehadiag import ConfigurationError, Levels
-from ehadiag.estimate import FREE_MOTION, Severity
+from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, Usage
 from ehadiag.history.store import History
 from ehadiag.prognosis.forecast import RemainingLife, forecast, learn_fleet
@@ -26,6 +26,7 @@ from ehadiag.report.fleet_table import FleetUnit, fleet_table
 from ehadiag.serve.pages import Pages
 from ehadiag.serve.server import LOOPBACK_ADDRESS, Site, serve
 from ehadiag.serve.sessions import Session, SessionRunner
+from firmware_iface import FREE_MOTION
 
 HOSTILE = "</td><script>alert(1)</script>\x1b[31m"
 TOKEN = "right"

@@ -18,8 +18,7 @@ from places import LOGS
 
 from ehadiag import diagnose
 from ehadiag.cli.main import main
-from ehadiag_tools.onboard.emulators import EMULATED, missing
-from ehadiag_tools.onboard.replay import identified, surrounded, ticks_of
+from ehadiag_tools.onboard.replay import EMULATED, identified, missing, surrounded, ticks_of
 from firmware_iface import tester
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import OnboardState

@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import damaged_bus as bf
 import numpy as np
+from damaged_bus import FaultyTransport
 
 from ehadiag import Recording, StoredTest, default_actuator
-from ehadiag_sim import faulty_bus as bf
 from ehadiag_sim.conditions import Effects, Faults
+from ehadiag_sim.control import BitFlips, DuplicateFrames, FrameLoss
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
-from ehadiag_sim.faulty_bus import FaultyTransport
 from firmware_iface import tester
 from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
@@ -162,120 +163,126 @@ def foreign_status() -> Frame:
 LOST = ("lost",)
 CASES = (
     Case("sound bus"),
-    Case("loss of 1 %", lambda _: [bf.FrameLoss(0.01)], least=0.97, counts=LOST),
-    Case("loss of 5 %", lambda _: [bf.FrameLoss(0.05)], least=0.92, counts=LOST),
-    Case("loss of 10 %", lambda _: [bf.FrameLoss(0.1)], least=0.86, counts=LOST),
-    Case("loss of 20 %", lambda _: [bf.FrameLoss(0.2)], least=0.74, counts=LOST),
-    Case("loss of telemetry alone, 10 %", lambda _: [bf.FrameLoss(0.1, TELEMETRY)], least=0.86),
+    Case("loss of 1 %", lambda _: [FrameLoss(0.01)], least=0.97, counts=LOST),
+    Case("loss of 5 %", lambda _: [FrameLoss(0.05)], least=0.92, counts=LOST),
+    Case("loss of 10 %", lambda _: [FrameLoss(0.1)], least=0.86, counts=LOST),
+    Case("loss of 20 %", lambda _: [FrameLoss(0.2)], least=0.74, counts=LOST),
+    Case("loss of telemetry alone, 10 %", lambda _: [FrameLoss(0.1, TELEMETRY)], least=0.86),
     Case(
-        "loss in bursts of 20 frames", lambda _: [bf.LossBursts(20, 300.0)], least=0.85, counts=LOST
+        "loss in bursts of 20 frames",
+        lambda _: [bf.loss_bursts(20, 300.0)],
+        least=0.85,
+        counts=LOST,
     ),
     Case(
         "loss in bursts of 200 frames",
-        lambda _: [bf.LossBursts(200, 400.0)],
+        lambda _: [bf.loss_bursts(200, 400.0)],
         least=0.4,
         counts=LOST,
         unfit="samples are missing",
     ),
-    Case("frames twice, 10 %", lambda _: [bf.DuplicateFrames(0.1)], counts=("repeated",)),
-    Case("all frames twice", lambda _: [bf.DuplicateFrames(1.0)], counts=("repeated",)),
-    Case("frames 4 places late, 5 %", lambda _: [bf.Reordering(0.05, 4)], counts=("out_of_order",)),
-    Case("frames 40 places late, 5 %", lambda _: [bf.Reordering(0.05, 40)], least=0.9),
-    Case("bit flips, 1 %", lambda _: [bf.BitFlips(0.01)], least=0.97, counts=("crc_errors",)),
-    Case("bit flips, 20 %", lambda _: [bf.BitFlips(0.2)], least=0.74, counts=("crc_errors",)),
+    Case("frames twice, 10 %", lambda _: [DuplicateFrames(0.1)], counts=("repeated",)),
+    Case("all frames twice", lambda _: [DuplicateFrames(1.0)], counts=("repeated",)),
+    Case("frames 4 places late, 5 %", lambda _: [bf.reordering(0.05, 4)], counts=("out_of_order",)),
+    Case("frames 40 places late, 5 %", lambda _: [bf.reordering(0.05, 40)], least=0.9),
+    Case("bit flips, 1 %", lambda _: [BitFlips(0.01)], least=0.97, counts=("crc_errors",)),
+    Case("bit flips, 20 %", lambda _: [BitFlips(0.2)], least=0.74, counts=("crc_errors",)),
     Case(
         "bit flips with a valid CRC, 1 %",
-        lambda _: [bf.BitFlips(0.01, True)],
+        lambda _: [BitFlips(0.01, True)],
         least=0.9,
         wrong=0.05,
         unfit="the command differs from test",
     ),
     Case(
-        "wrong length, 5 %", lambda _: [bf.WrongLength(0.05)], least=0.92, counts=("length_errors",)
+        "wrong length, 5 %",
+        lambda _: [bf.wrong_length(0.05)],
+        least=0.92,
+        counts=("length_errors",),
     ),
-    Case("foreign frames, 5 beside each of ours", lambda _: [bf.ForeignFrames(5)]),
-    Case("foreign frames at full load, 50 beside each of ours", lambda _: [bf.ForeignFrames(50)]),
+    Case("foreign frames, 5 beside each of ours", lambda _: [bf.foreign_frames(5)]),
+    Case("foreign frames at full load, 50 beside each of ours", lambda _: [bf.foreign_frames(50)]),
     Case(
         "foreign frames and loss of 5 %",
-        lambda _: [bf.FrameLoss(0.05), bf.ForeignFrames(3)],
+        lambda _: [FrameLoss(0.05), bf.foreign_frames(3)],
         least=0.92,
     ),
     Case(
         "noise under our identifiers, 5 beside each of ours",
-        lambda _: [bf.NoiseFrames(5)],
+        lambda _: [bf.noise_frames(5)],
         counts=("crc_errors",),
     ),
-    Case("error frames, 10 %", lambda _: [bf.ErrorFrames(0.1)]),
+    Case("error frames, 10 %", lambda _: [bf.error_frames(0.1)]),
     Case(
         "telemetry counter stuck",
-        lambda at: [bf.StuckCounter(TELEMETRY, at)],
+        lambda at: [bf.stuck_counter(TELEMETRY, at)],
         least=0.3,
         counts=LOST,
         unfit="samples are missing",
     ),
     Case(
         "telemetry counter stuck for 0.1 s",
-        lambda at: [bf.StuckCounter(TELEMETRY, at, at + 0.1)],
+        lambda at: [bf.stuck_counter(TELEMETRY, at, at + 0.1)],
         least=0.7,
         counts=LOST,
     ),
     Case(
         "counters of telemetry and command stuck",
-        lambda at: [bf.StuckCounter(TELEMETRY, at), bf.StuckCounter(COMMAND, at)],
+        lambda at: [bf.stuck_counter(TELEMETRY, at), bf.stuck_counter(COMMAND, at)],
         least=0.3,
         unfit="samples are missing",
     ),
-    Case("status counter stuck", lambda _: [bf.StuckCounter(STATUS, 0.0)]),
-    Case("host clock set back by 2 s", lambda at: [bf.ClockStep(at, -2.0)]),
-    Case("host clock set forward by 2 s", lambda at: [bf.ClockStep(at, 2.0)]),
-    Case("host clock set back by 0.1 s", lambda at: [bf.ClockStep(at, -0.1)]),
-    Case("stamps late by up to 50 ms", lambda _: [bf.StampJitter(50e-3)]),
-    Case("stamps late by up to 5 ms", lambda _: [bf.StampJitter(5e-3)]),
-    Case("pause of 0.1 s, frames lost", lambda at: [bf.BusPause(at, 0.1)], least=0.7, counts=LOST),
-    Case("pause of 0.1 s, frames in a burst", lambda at: [bf.BusPause(at, 0.1, True)]),
-    Case("pause of 0.3 s", lambda _: [bf.BusPause(0.2, 0.3)], why="telemetry lost for 0.25 s"),
-    Case("pause of 1 s", lambda at: [bf.BusPause(at, 1.0)], why="telemetry lost for 0.25 s"),
+    Case("status counter stuck", lambda _: [bf.stuck_counter(STATUS, 0.0)]),
+    Case("host clock set back by 2 s", lambda at: [bf.clock_step(at, -2.0)]),
+    Case("host clock set forward by 2 s", lambda at: [bf.clock_step(at, 2.0)]),
+    Case("host clock set back by 0.1 s", lambda at: [bf.clock_step(at, -0.1)]),
+    Case("stamps late by up to 50 ms", lambda _: [bf.stamp_jitter(50e-3)]),
+    Case("stamps late by up to 5 ms", lambda _: [bf.stamp_jitter(5e-3)]),
+    Case("pause of 0.1 s, frames lost", lambda at: [bf.bus_pause(at, 0.1)], least=0.7, counts=LOST),
+    Case("pause of 0.1 s, frames in a burst", lambda at: [bf.bus_pause(at, 0.1, True)]),
+    Case("pause of 0.3 s", lambda _: [bf.bus_pause(0.2, 0.3)], why="telemetry lost for 0.25 s"),
+    Case("pause of 1 s", lambda at: [bf.bus_pause(at, 1.0)], why="telemetry lost for 0.25 s"),
     Case(
         "pause of 0.3 s, frames in a burst",
-        lambda _: [bf.BusPause(0.2, 0.3, True)],
+        lambda _: [bf.bus_pause(0.2, 0.3, True)],
         why="telemetry lost for 0.25 s",
     ),
-    Case("pause of 5 s", lambda at: [bf.BusPause(at, 5.0)], why="telemetry lost for 0.25 s"),
-    Case("telemetry never comes", lambda _: [bf.MessageSilence(TELEMETRY)], why="telemetry lost"),
-    Case("telemetry without command", lambda _: [bf.MessageSilence(COMMAND)]),
-    Case("no environment", lambda _: [bf.MessageSilence(ENVIRONMENT)]),
-    Case("status never comes", lambda _: [bf.MessageSilence(STATUS)], why="no answer within 1 s"),
+    Case("pause of 5 s", lambda at: [bf.bus_pause(at, 5.0)], why="telemetry lost for 0.25 s"),
+    Case("telemetry never comes", lambda _: [bf.message_silence(TELEMETRY)], why="telemetry lost"),
+    Case("telemetry without command", lambda _: [bf.message_silence(COMMAND)]),
+    Case("no environment", lambda _: [bf.message_silence(ENVIRONMENT)]),
+    Case("status never comes", lambda _: [bf.message_silence(STATUS)], why="no answer within 1 s"),
     Case(
         "status ends while running",
-        lambda at: [bf.MessageSilence(STATUS, at)],
+        lambda at: [bf.message_silence(STATUS, at)],
         why="not complete 1 s",
     ),
-    Case("bus off", lambda at: [bf.BusFailure(at, "bus off")], why="bus lost: .*bus off"),
+    Case("bus off", lambda at: [bf.bus_failure(at, "bus off")], why="bus lost: .*bus off"),
     Case(
         "adapter unplugged",
-        lambda _: [bf.BusFailure(0.02, "unplugged")],
+        lambda _: [bf.bus_failure(0.02, "unplugged")],
         why="bus lost: .*unplugged",
     ),
-    Case("request lost", sent=lambda _: [bf.FrameLoss(1.0)], why="no answer within 1 s"),
+    Case("request lost", sent=lambda _: [FrameLoss(1.0)], why="no answer within 1 s"),
     Case(
         "first abort lost",
-        sent=lambda _: [bf.BusPause(0.1, 0.3)],
+        sent=lambda _: [bf.bus_pause(0.1, 0.3)],
         limits=ChannelLimits(current=1.5e-3),
         why="current .*beyond its limit .*mA$",
     ),
     Case(
         "second tester before the request",
-        lambda _: [bf.InsertedFrames(0.02, [foreign_request()])],
+        lambda _: [bf.inserted_frames(0.02, [foreign_request()])],
         why="another tester is on the bus",
     ),
     Case(
         "second tester while the test runs",
-        lambda at: [bf.InsertedFrames(at, [foreign_request()])],
+        lambda at: [bf.inserted_frames(at, [foreign_request()])],
         why="another tester is on the bus",
     ),
     Case(
         "status of another test",
-        lambda at: [bf.InsertedFrames(at, [foreign_status()])],
+        lambda at: [bf.inserted_frames(at, [foreign_status()])],
         why="changed to test 3",
     ),
     Case("computer restarts", restart=True, why="fell back to idle"),

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from damaged_bus import foreign_frames
 from msgspec.structs import replace
 
 from ehadiag import Recording
-from ehadiag_sim.faulty_bus import ForeignFrames, FrameMoment
+from ehadiag_sim.control import FrameMoment
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.logs.recorder import Recorder
 from firmware_iface.tester import Assembler
@@ -68,7 +69,7 @@ def collected(frames: Iterator[Frame], kept: int = 4_000_000) -> Recording:
 
 def noise(count: int, time_ns: int) -> Iterator[Frame]:
     """Foreign frames without end, none of them kept here."""
-    foreign, at = ForeignFrames(1), FrameMoment(0.0, np.random.default_rng(7))
+    foreign, at = foreign_frames(1), FrameMoment(0.0, np.random.default_rng(7))
     carrier = Frame(time_ns, 0x110, bytes(8))
     for _ in range(count):
         yield next(iter(foreign(carrier, at)))

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damaged_bus import FaultyTransport, bus_failure
 from live_ends import LOADED_MACHINE, computer_on
 
 from ehadiag import CommandMode, ConfigurationError, InputOutputError, StoredTest
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
-from ehadiag_sim.faulty_bus import BusFailure, FaultyTransport
 from firmware_iface import tester
 from firmware_iface.alignment.align import assemble
 from firmware_iface.bus_map import default_map
@@ -169,7 +169,7 @@ def test_a_lost_bus_is_an_outcome_and_closes_the_recording(
     make_core: CoreFactory, tmp_path: Path
 ) -> None:
     inner = EmulatorTransport(make_core())
-    with FaultyTransport(inner, [BusFailure(0.3, "adapter unplugged")]) as transport:
+    with FaultyTransport(inner, [bus_failure(0.3, "adapter unplugged")]) as transport:
         outcome = run_test(
             transport, test_id=9, duration=0.4, transmit=True, recorder=Recorder(tmp_path / "x.blf")
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from damaged_bus import FaultyTransport, message_silence
 from fault_cases import DURATION, NUMBER
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +18,6 @@ from test_live_session_limits import SharedBus
 
 from ehadiag import ConfigurationError, default_actuator
 from ehadiag_sim.emulator import EmulatorTransport, FccCore, Preconditions
-from ehadiag_sim.faulty_bus import FaultyTransport, MessageSilence
 from ehadiag_sim.uds_server import UdsServer
 from firmware_iface.bus_map import default_map
 from firmware_iface.handshake import ChannelLimits, Phase, TimeLimits
@@ -285,7 +285,7 @@ def test_a_stop_is_repeated_until_the_computer_is_quiet(make_core: CoreFactory) 
 
 def test_lost_telemetry_ends_in_a_stop(make_core: CoreFactory) -> None:
     core = make_core(protocol="uds")
-    gap = MessageSilence(0x110, 0.25)
+    gap = message_silence(0x110, 0.25)
     with FaultyTransport(EmulatorTransport(core), [gap]) as bus:
         outcome = outcome_of(bus, duration=5.0)
     assert outcome.why.startswith("telemetry lost")

@@ -12,7 +12,7 @@ import pytest
 
 from ehadiag import bundled_tests, default_actuator
 from ehadiag.identify.experiment import build_experiment
-from ehadiag_tools.rigs.daq import SETTLING_S, DaqCase, perform, recorded_columns
+from ehadiag_tools.rigs.replay import SETTLING_S, DaqCase, perform_daq, recorded_columns
 from firmware_iface.bus_map import default_map
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.signals.recordings import Interpretation, recorded_tests
@@ -116,7 +116,7 @@ STUCK = case(
     ],
 )
 def test_a_verdict_that_holds_the_truth(this):
-    found = perform(this)
+    found = perform_daq(this)
     assert found["verdict"] == ("FAULT" if max(this.faults) > 0.75 else "DEGRADED"), found
     ends = zip(found["value"], found["interval95"], this.faults, strict=True)
     for value, (low, high), truth in ends:
@@ -126,7 +126,7 @@ def test_a_verdict_that_holds_the_truth(this):
 
 
 def test_a_refusal_names_a_rate_that_is_too_low():
-    found = perform(case("open", 500.0, bits=16))
+    found = perform_daq(case("open", 500.0, bits=16))
     assert found["verdict"] == "NOT_TESTED"
     assert "took 500 samples a second, and the computer makes 1000 ticks" in " ".join(
         found["reasons"]

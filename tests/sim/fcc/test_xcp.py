@@ -12,14 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damaged_bus import FaultyTransport, HarnessFault
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from places import ROOT
 
 from ehadiag import Recording, StoredTest, default_actuator
+from ehadiag_sim.control import FrameMoment
 from ehadiag_sim.emulator import EmulatorTransport, FccCore
-from ehadiag_sim.faulty_bus import FaultyTransport, FrameMoment, HarnessFault
 from ehadiag_sim.simulation import scales_of
 from ehadiag_sim.xcp_slave import XcpSlave
 from firmware_iface.alignment.align import assemble

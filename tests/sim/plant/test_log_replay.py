@@ -74,8 +74,6 @@ def test_environment_becomes_effects():
     ("text", "code", "words"),
     [
         (None, 3, "truth.csv"),
-        ("file,test,Kintas,FSS,FDJ\na.blf,open,x,0,0\n", 2, "line 2"),
-        ("file,test,Kintas,FSS\na.blf,open,0,0\n", 2, "FDJ"),
         ("file,test,Kintas,FSS,FDJ\na.blf,open,1.5,0,0\n", 2, "Kintas"),
         ("file,test,Kintas,FSS,FDJ\na.blf,open,0,0,0\n", 3, "a.blf"),
     ],

@@ -1,4 +1,7 @@
-"""Studies of severities alone: the paper's cases, and random cases of the unit cube."""
+"""Studies of severities: alone, by the paper's cases and in the unit cube, or beside effects.
+
+Effects of random units are unknown, or calibrated.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +17,45 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import default_actuator
-from ehadiag.identify.experiment import Experiment, build_experiment
+from ehadiag.assess.acceptance import objections_to_estimate
+from ehadiag.calibration.calibrate_unit import calibrate
+from ehadiag.core.actuator import Actuator, default_actuator, with_tolerance
+from ehadiag.identify.experiment import (
+    Experiment,
+    build_experiment,
+    lay_out_spans,
+    share_offsets,
+    unknowns_of,
+)
 from ehadiag.identify.identification_result import Identification
 from ehadiag.identify.identification_session import (
     EarlierEstimate,
     IdentificationSession,
+    NuisanceMode,
     identify,
 )
-from ehadiag.model.registry import FAULT_NAMES
-from ehadiag.model.residual_models import model_response
+from ehadiag.identify.linearisation import Derivatives
+from ehadiag.identify.prior import basic_nuisances_of, prior_information, unit_prior
+from ehadiag.model.registry import FAULT_NAMES, FAULTS, SENSOR_OFFSETS
+from ehadiag.model.residual_models import SimdModel, model_response
 from ehadiag_sim.conditions import Effects, Faults, Sensors
+from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S
 from ehadiag_sim.simulation import simulate
-from ehadiag_tools.accuracy.figures import accuracy_table, cramer_rao, percent_errors
+from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, cramer_rao, percent_errors
 from ehadiag_tools.simulator.compare_logs import read_truth
-from ehadiag_tools.simulator.units import damaged_unit
+from ehadiag_tools.simulator.units import (
+    COARSE_STEP,
+    Unit,
+    add_group,
+    damaged_unit,
+    record,
+    unit_with,
+)
 from ehadiag_tools.study import Options, Record, Study, grouped, markdown
 from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import CHANNELS, Environment, Samples
-from firmware_iface.stored_test import resolve_test
+from firmware_iface.recording import CHANNELS, Environment, Recording, Samples
+from firmware_iface.stored_test import bundled_tests, resolve_test
 
 Severities = tuple[float, float, float]
 """Kintas, FSS, FDJ, each 0 … 1."""
@@ -225,7 +247,6 @@ def _monitoring(test: str, faults: Severities, seed: int) -> tuple[Samples, Envi
     return replace(samples, spool=measured[0], pressure=measured[1]), environment
 
 
-STAGES = {"first": "first approximation", "search": "genetic search", "value": "final"}
 TITLES = {"open": "Table 1, open loop", "closed": "Table 2, closed loop"}
 
 
@@ -243,83 +264,55 @@ def _paper_cases(options: Options) -> list[Case]:
             for case in PAPER
             for seed in seeds
         ]
-    found = _recorded_cases(options.recordings)
+    truth = options.recordings / "truth.csv"
+    found = [
+        Case(row.test, (row.faults.Kintas, row.faults.FSS, row.faults.FDJ),
+             recordings=(str(options.recordings / row.file),))
+        for row in read_truth(truth)
+        if row.test in TITLES
+    ]  # fmt: skip
     if not found:
-        raise ConfigurationError(
-            f"{options.recordings / 'truth.csv'}: no recording of {', '.join(TITLES)}"
-        )
+        raise ConfigurationError(f"{truth}: no recording of {', '.join(TITLES)}")
     return found
 
 
-def _recorded_cases(folder: Path) -> list[Case]:
-    cases = []
-    for row in read_truth(folder / "truth.csv"):
-        if row.test in TITLES:
-            faults = (row.faults.Kintas, row.faults.FSS, row.faults.FDJ)
-            cases.append(Case(row.test, faults, recordings=(str(folder / row.file),)))
-    return cases
-
-
 def _paper_report(records: Sequence[Record], options: Options) -> Iterator[str]:
-    source = options.recordings or f"plant {options.plant}"
+    """Mean errors of each case after two stages beside the paper's, then all errors."""
+    published = {(case.test, case.faults): case for case in PAPER}
     for (test,), part in grouped(records, "test").items():
+        source = options.recordings or f"plant {options.plant}"
         yield f"{TITLES[test]}: mean absolute error in percent, {source}\n"
-        yield from _stage_table(test, part)
+        rows, shared = [], []
+        for (faults,), runs in grouped(part, "faults").items():
+            case = published.get((test, faults))
+            means = [
+                float(np.abs(percent_errors(runs, item)).mean()) for item in ("first", "value")
+            ]
+            paper = [case.first, case.final] if case else [np.nan, np.nan]
+            label = ", ".join(f"{value:g}" for value in faults)
+            rows.append((label, len(runs), *(f"{value:.4f}" for value in means + paper)))
+            shared += [means + paper] * bool(case)
+        if shared:
+            cells = [f"{value:.4f}" for value in np.mean(shared, axis=0)]
+            rows.append(("mean of the paper's", "", *cells))
+        yield from markdown(
+            ("case (Kintas, FSS, FDJ)", "runs", "first approximation", "final", "the paper's first",
+             "the paper's final"),
+            rows,
+        )  # fmt: skip
         yield ""
     yield from accuracy_table(records, "test", "faults")
     yield ""
     yield from accuracy_table(records, "test")
 
 
-def _stage_table(test: str, records: Sequence[Record]) -> Iterator[str]:
-    """Errors of each constant after each stage, and the paper's."""
-    rows = []
-    for (faults,), part in grouped(records, "faults").items():
-        published = _paper_case(test, faults)
-        for stage, name in STAGES.items():
-            cell = "–"
-            if published is not None and stage != "search":
-                cell = f"{published.first if stage == 'first' else published.final:.4f}"
-            error = np.abs(percent_errors(part, stage))
-            rows.append((_label(faults), len(part), name, *_cells(error), cell))
-    shared = [item for item in records if _paper_case(test, tuple(item["faults"])) is not None]
-    error = np.abs(percent_errors(shared)) if shared else np.full((1, 3), np.nan)
-    paper = float(np.mean([case.final for case in PAPER if case.test == test]))
-    rows.append(("the paper's cases", len(shared), "final", *_cells(error), f"{paper:.4f}"))
-    yield from markdown(
-        ("case (Kintas, FSS, FDJ)", "runs", "stage", *FAULT_NAMES, "mean", "worst run",
-         "the paper's mean"),
-        rows,
-    )  # fmt: skip
-    yield f"\nThe paper's final mean is {paper / error.mean():.0f} times ours."
-
-
-def _label(faults: Sequence[float]) -> str:
-    return ", ".join(f"{value:g}" for value in faults)
-
-
-def _cells(error: NDArray[np.float64]) -> list[str]:
-    """Mean of each constant, of all, and the largest mean of one run."""
-    case = error.mean(axis=1)
-    return [f"{value:.4f}" for value in (*error.mean(axis=0), case.mean(), case.max())]
-
-
-def _paper_case(test: str, faults: Sequence[float]) -> PaperCase | None:
-    return next((c for c in PAPER if c.test == test and c.faults == tuple(faults)), None)
-
-
 def _cube_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
-    add("--plant", choices=PLANTS, default=PLANTS[0], help="what is simulated (%(default)s)")
     add("--conditions", action="store_true", help="oil of -20 to 100 degC, supply ±10 %%")
-    add(
-        "--wear",
-        action="append",
-        type=float,
-        metavar="K",
-        help="also begin from a diagnosis with severities that differ by so much; may be repeated",
-    )
+    add("--wear", action="append", type=float, metavar="K",
+        help="also begin from a diagnosis with severities that differ by so much; may be repeated"
+    )  # fmt: skip
 
 
 def _cube_cases(options: Options) -> list[Case]:
@@ -329,7 +322,7 @@ def _cube_cases(options: Options) -> list[Case]:
         low, high = zip(OIL_RANGE, (0.9 * supply, 1.1 * supply), strict=True)
         days = [(float(a), float(b)) for a, b in rng.uniform(low, high, (options.cases, 2))]
     return [
-        Case(test, faults, noise_seed=index, plant=options.plant, conditions=day, wear=wear)
+        Case(test, faults, noise_seed=index, conditions=day, wear=wear)
         for test in options.test or ("open", "closed")
         for index, (faults, day) in enumerate(
             zip(random_faults(options.cases, options.seed), days, strict=True)
@@ -339,21 +332,25 @@ def _cube_cases(options: Options) -> list[Case]:
 
 
 def _cube_report(records: Sequence[Record], options: Options) -> Iterator[str]:
-    yield f"Random cases, plant {options.plant}, seed {options.seed}, errors in percent\n"
+    yield f"Random cases, seed {options.seed}, errors in percent\n"
     yield from accuracy_table(records, "test")
     if options.conditions:
         yield "\nBy the temperature of the oil, degC:\n"
         yield from accuracy_table([{**item, "oil": _band(item)} for item in records], "test", "oil")
     if options.wear:
         yield "\nFrom an earlier diagnosis, beside a search:\n"
-        yield from markdown(WEAR_HEADINGS, _wear_rows(records))
+        yield from markdown(
+            ("test", "wear", "cases", "begun there", "apart, median", "95 %", "most",
+             "time, median"),
+            _wear_rows(records),
+        )  # fmt: skip
     for (test,), part in grouped(records, "test").items():
         first = np.abs(percent_errors(part, "first")).mean()
-        outliers = max(record["outliers"] for record in part)
+        outliers = max(item["outliers"] for item in part)
         yield (
             f"\n{test}: mean after the first approximation {first:.3f}, sent back to the whole cube"
-            f" {sum(bool(record['rescued']) for record in part)}, not converged"
-            f" {sum(not record['converged'] for record in part)}, largest share of outliers"
+            f" {sum(bool(item['rescued']) for item in part)}, not converged"
+            f" {sum(not item['converged'] for item in part)}, largest share of outliers"
             f" {outliers:.2%}"
         )
 
@@ -362,11 +359,6 @@ def _band(record: Record) -> str:
     oil = record["conditions"][0]
     bands = itertools.pairwise(OIL_BANDS)
     return next(f"{low:g} … {high:g}" for low, high in bands if low <= oil <= high)
-
-
-WEAR_HEADINGS = (
-    "test", "wear", "cases", "begun there", "apart, median", "95 %", "most", "time, median",
-)  # fmt: skip
 
 
 def _wear_rows(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
@@ -392,4 +384,157 @@ CUBE = Study(
     "cube",
     "Random severities of the unit cube, its corners, edges and faces among them.",
     _cube_cases, perform, _cube_report, _cube_options,
+)  # fmt: skip
+
+
+DATA = ("known", "tolerance", "calibrated", "textbook")
+"""The unit's data are those of its file; differ by a tolerance; are learned from it as new; are
+those of its file and there is no effect, so that the Cramér–Rao bound is known."""
+TOLERANCE = 0.05
+"""Tolerance of the data sheet, 1; that of the units' ten values."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnitCase:
+    """Settings of one identification: unit `case` of a seed; what is known of it, see `DATA`.
+
+    Nuisances: auto, all or none; groups of effects: see `random_unit`.
+    """
+
+    test: str
+    case: int
+    seed: int
+    nuisances: str = "auto"
+    data: str = "known"
+    groups: tuple[str, ...] = ()
+
+
+def perform_unit(case: UnitCase) -> Record:
+    """Draw a unit, record it, identify, and compare with the truth; fractions of 1."""
+    unit, faults = draw_unit(case)
+    actuator, reasons = _knowledge(case)
+    experiments = []
+    for name in TESTS[case.test]:
+        recording = record_worn(case, unit, name, faults)
+        experiments.append(_experiment(recording, name, actuator))
+    begin = time.process_time()
+    result = identify(
+        experiments, nuisances=NuisanceMode(case.nuisances), prior=unit_prior(actuator)
+    )
+    spent = time.process_time() - begin
+    objections = objections_to_estimate(result, actuator.calibration)
+    textbook = case.data == "textbook" and len(experiments) == 1
+    return {
+        "faults": faults,
+        "value": [item.value for item in result.estimates],
+        "interval95": [list(item.interval95) for item in result.estimates],
+        "verdict": NOT_TESTED if reasons or objections else "answered",
+        "refused": list(reasons),
+        "attempts": result.attempts,
+        "evaluations": result.evaluations,
+        "processor_s": spent,
+        "bound": bound_of(experiments[0], faults).tolist() if textbook else None,
+    }
+
+
+def _experiment(recording: Recording, name: str, actuator: Actuator) -> Experiment:
+    assert recording.samples is not None
+    return build_experiment(recording.samples, recording.environment, resolve_test(name), actuator)
+
+
+def draw_unit(case: UnitCase) -> tuple[Unit, list[float]]:
+    """Unit and severities of a case."""
+    rng = np.random.default_rng([case.seed, case.case])
+    unit = Unit()
+    if case.data != "textbook":
+        unit = unit_with(rng, case.groups, case.case, data=case.data != "known")
+    return unit, rng.uniform(0.0, 1.0, 3).tolist()
+
+
+def record_worn(case: UnitCase, unit: Unit, name: str, faults: Sequence[float]) -> Recording:
+    """Record a stored test of a unit with severities."""
+    place = ("open", "closed").index(name)
+    sheet = case.data in ("tolerance", "calibrated")
+    noise = _noise(case.seed, case.case, *([0] if sheet else []), place)
+    step = COARSE_STEP if sheet else DEFAULT_STEP_S
+    return record(unit, resolve_test(name), Faults(*faults), seed=noise, step=step)
+
+
+def _noise(*key: int) -> int:
+    return int(np.random.SeedSequence(key).generate_state(1)[0])
+
+
+def _knowledge(case: UnitCase) -> tuple[Actuator, tuple[str, ...]]:
+    """What the identification is given of a unit, and why its calibration was refused."""
+    if case.data in ("known", "textbook") or case.nuisances == NuisanceMode.NONE.value:
+        return default_actuator(), ()
+    if case.data == "tolerance":
+        return with_tolerance(default_actuator(), TOLERANCE), ()
+    return _calibrated(case.seed, case.case, case.groups)
+
+
+@lru_cache(maxsize=64)
+def _calibrated(seed: int, case: int, groups: tuple[str, ...]) -> tuple[Actuator, tuple[str, ...]]:
+    """Return the unit's own data, or those of its type and why it was refused."""
+    unit, _ = draw_unit(UnitCase("open", case, seed, data="calibrated", groups=groups))
+    new = [
+        record(unit, resolve_test(name), seed=_noise(seed, case, 1, place), step=COARSE_STEP)
+        for place, name in enumerate(("open", "closed"))
+    ]
+    found = calibrate(new, default_actuator(), bundled_tests().values())
+    return found.actuator or default_actuator(), found.reasons
+
+
+def _unit_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--test", action="append", choices=list(TESTS), help="may be repeated (open and closed)")
+    add("--data", action="append", choices=DATA, help="what is known; may be repeated (known)")
+    kinds = [item.value for item in NuisanceMode]
+    add("--nuisances", action="append", choices=kinds, help="may be repeated (auto)")
+    add_group(parser)
+
+
+def _unit_cases(options: Options) -> list[UnitCase]:
+    groups = tuple(sorted(set(options.group)))
+    return [
+        UnitCase(test, case, options.seed, nuisances, data, groups)
+        for data in options.data or ["known"]
+        for test in options.test or ["open", "closed"]
+        for nuisances in options.nuisances or ["auto"]
+        for case in range(options.cases)
+    ]
+
+
+def _unit_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
+    yield from accuracy_table(records, "test", "data", "nuisances", of_all=True)
+    yield "\nModel runs and processor time of an identification, mean:\n"
+    for key, part in grouped(records, "test", "data", "nuisances").items():
+        runs, spent = (
+            np.mean([item[name] for item in part]) for name in ("evaluations", "processor_s")
+        )
+        yield f"- {', '.join(key)}: {runs:.0f}, {1e3 * spent:.0f} ms"
+
+
+def bound_of(experiment: Experiment, faults: Sequence[float]) -> NDArray[np.float64]:
+    """Least deviation of each severity that an unbiased estimate with all unknowns can have.
+
+    Ticks where a break-away moves within the differences have no derivative and are left out.
+    """
+    experiments = share_offsets([experiment])
+    basic = basic_nuisances_of(experiment.constants.OIL)
+    unknowns = unknowns_of(experiments, (*FAULTS, *SENSOR_OFFSETS, *basic))
+    model = Derivatives(SimdModel(lay_out_spans(experiments), unknowns), experiment.noise)
+    truth = dict(zip(FAULT_NAMES, faults, strict=True))
+    x = np.array([truth.get(item.name, 0.0) for item in model.estimated]) / model.scale
+    slope = model.trusted_slope(x)
+    rows = (slope.jacobian * slope.smooth).reshape(len(x), -1)
+    spread = np.linalg.inv(rows @ rows.T + prior_information(model, {}))
+    return np.asarray((np.sqrt(np.diag(spread)) * model.scale)[: len(FAULTS)])
+
+
+UNITS = Study(
+    "units",
+    "Random units: offsets, gain, null bias, hysteresis, backlash unknown; data known, with a"
+    " tolerance, or calibrated.",
+    _unit_cases, perform_unit, _unit_report, _unit_options, counted="units of each row",
 )  # fmt: skip

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -50,34 +49,24 @@ def draw_method(case: PictureCase) -> Record:
     return {"path": str(path)}
 
 
-class _Plot(NamedTuple):
-    """A part of the open-loop test, ticks, one quantity over another."""
-
-    horizontal: str
-    vertical: str
-    title: str
-    ticks: slice
-    marker: str = ""
-
-
 TIME, CURRENT, SPOOL, JACK = "time, s", "current, mA", "spool position, mm", "jack position, mm"
 PRESSURE = "differential pressure, MPa"
-RAMPS = slice(0, 2300)
+RAMPS, STEP = slice(0, 2300), slice(2395, 2440)
 EFFECTS = {
     "FSS": (
-        _Plot(TIME, SPOOL, "slow ramps of current", RAMPS),
-        _Plot(CURRENT, SPOOL, "the same over the current", RAMPS),
+        (TIME, SPOOL, "slow ramps of current", RAMPS, ""),
+        (CURRENT, SPOOL, "the same over the current", RAMPS, ""),
     ),
     "Kintas": (
-        _Plot(TIME, SPOOL, "step of current at 2.4 s", slice(2395, 2440), "."),
-        _Plot(TIME, JACK, "what the jack makes of it", slice(2350, 3000)),
+        (TIME, SPOOL, "step of current at 2.4 s", STEP, "."),
+        (TIME, JACK, "what the jack makes of it", slice(2350, 3000), ""),
     ),
     "FDJ": (
-        _Plot(TIME, PRESSURE, "slow ramps of current", RAMPS),
-        _Plot(TIME, JACK, "the jack meanwhile", RAMPS),
+        (TIME, PRESSURE, "slow ramps of current", RAMPS, ""),
+        (TIME, JACK, "the jack meanwhile", RAMPS, ""),
     ),
 }
-"""What a fault alone does, by its name."""
+"""What a fault alone does: a quantity over another in ticks of the open-loop test."""
 
 
 def _effects(figure: Figure, name: str) -> None:
@@ -89,12 +78,10 @@ def _effects(figure: Figure, name: str) -> None:
             TIME: np.arange(s.ticks) * 1e-3, CURRENT: 1e3 * s.current, SPOOL: 1e3 * s.spool,
             PRESSURE: 1e-6 * s.pressure, JACK: 1e3 * s.position,
         }  # fmt: skip
-        for axis, plot in zip(axes, EFFECTS[name], strict=True):
-            axis.plot(
-                seen[plot.horizontal][plot.ticks], seen[plot.vertical][plot.ticks],
-                color=colour, ls=dash, lw=1.3, marker=plot.marker, label=f"{value:g}",
-            )  # fmt: skip
-            axis.set(xlabel=plot.horizontal, ylabel=plot.vertical, title=plot.title)
+        for axis, (x, y, title, ticks, marker) in zip(axes, EFFECTS[name], strict=True):
+            style = {"color": colour, "ls": dash, "lw": 1.3, "marker": marker}
+            axis.plot(seen[x][ticks], seen[y][ticks], label=f"{value:g}", **style)
+            axis.set(xlabel=x, ylabel=y, title=title)
     axes[0].legend(title=name)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ehadiag.core.actuator import default_actuator, load_actuator
+from ehadiag.core.actuator import default_actuator
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.criteria import NORMAL_HALF_WIDTH_95
 from ehadiag.export.library import (
@@ -33,15 +33,21 @@ from ehadiag.identify.identification_session import NuisanceMode, identify
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard.onboard_memory import ONBOARD as PLACES
 from ehadiag.onboard.onboard_memory import OnboardOutcome
+from ehadiag_tools.accuracy.cases import UnitCase, draw_unit, record_worn
 from ehadiag_tools.accuracy.figures import NOT_TESTED, accuracy_table, is_answered
-from ehadiag_tools.accuracy.units import UnitCase, draw_unit, record_worn
-from ehadiag_tools.onboard.emulators import EMULATED, Emulator, missing
-from ehadiag_tools.onboard.replay import identified, replayed, surrounded, ticks_of, unit_of
+from ehadiag_tools.onboard.replay import (
+    EMULATED,
+    identified,
+    missing,
+    replayed,
+    surrounded,
+    ticks_of,
+    unit_of,
+)
 from ehadiag_tools.study import Options, Record, Study, markdown
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.files import RESULT_MODE, Folder
 from firmware_iface.logs.reader import read_recording
-from firmware_iface.recording import Recording
 from firmware_iface.stored_test import resolve_test
 
 SEVERITIES = (0.3, 0.4, 0.2)
@@ -56,14 +62,12 @@ CLOCK_MHZ = 400.0
 class OnboardCase:
     """One recording on one target, replayed through the monitor or identified.
 
-    Folder of an export: empty for one that is made here. Actuator: path of a file, empty for the
-    reference actuator.
+    Folder of an export: empty for one that is made here.
     """
 
     log: str
     target: str
     export: str
-    actuator: str
     identify: bool
 
 
@@ -74,13 +78,12 @@ def _work() -> tempfile.TemporaryDirectory[str]:
 
 
 @cache
-def _export(name: str, actuator: str) -> Path:
-    """Export for a target."""
+def _export(name: str) -> Path:
+    """Export of the reference actuator for a target."""
     out = Path(_work().name) / name
     out.mkdir()
-    unit = load_actuator(Path(actuator)) if actuator else default_actuator()
     with Folder.at(out, RESULT_MODE) as folder:
-        export_library(unit, find_target(name), folder)
+        export_library(default_actuator(), find_target(name), folder)
     return out
 
 
@@ -90,30 +93,28 @@ def _reference(name: str) -> str:
 
 def perform(case: OnboardCase) -> Record:
     """Run a recording through the export of a target and of its reference."""
-    export = Path(case.export) if case.export else _export(case.target, case.actuator)
-    other = _export(_reference(case.target), case.actuator)
-    if _manifest(export)["plan"] != _manifest(other)["plan"]:
-        raise ConfigurationError("--into: an export of another actuator than the recordings' own")
-    found = _run(_emulator(case.target), export, case)
-    reference = _digits(replace(case, target=_reference(case.target), export=""))
-    pairs = zip(found.pop("digits"), reference, strict=True)
+    export = Path(case.export) if case.export else _export(case.target)
+    reference = replace(case, target=_reference(case.target), export="")
+    if _manifest(export)["plan"] != _manifest(_export(reference.target))["plan"]:
+        raise ConfigurationError("--into: an export of another actuator than the reference")
+    found = _run(export, case)
+    pairs = zip(found.pop("digits"), _digits(reference), strict=True)
     size = (export / STATIC_LIBRARY_FILE).stat().st_size
     return {**found, "differing": sum(a != b for a, b in pairs), "bytes": size}
 
 
 @cache
 def _digits(case: OnboardCase) -> list[str]:
-    export = _export(case.target, case.actuator)
-    digits: list[str] = _run(_emulator(case.target), export, case)["digits"]
+    digits: list[str] = _run(_export(case.target), case)["digits"]
     return digits
 
 
-def _run(emulator: Emulator, export: Path, case: OnboardCase) -> Record:
+def _run(export: Path, case: OnboardCase) -> Record:
     recording, work = read_recording(Path(case.log)), Path(_work().name)
-    actuator = load_actuator(Path(case.actuator)) if case.actuator else default_actuator()
+    emulator = next(item for item in EMULATED if item.target == case.target)
     ticks = ticks_of(recording)
     if case.identify:
-        done = identified(emulator, export, surrounded(recording, actuator), ticks, work)
+        done = identified(emulator, export, surrounded(recording), ticks, work)
         outcome = done.outcome
         severities = [float(outcome.Kintas), float(outcome.FSS), float(outcome.FDJ)]
         return {
@@ -121,15 +122,11 @@ def _run(emulator: Emulator, export: Path, case: OnboardCase) -> Record:
             "millions": done.millions, "longest": done.longest, "runs": int(outcome.runs),
             "severities": severities,
         }  # fmt: skip
-    replay = replayed(emulator, export, unit_of(recording, SEVERITIES, actuator), ticks, work)
+    replay = replayed(emulator, export, unit_of(recording, SEVERITIES), ticks, work)
     return {
         "digits": replay.lines, "done": len(ticks), "stack": replay.push_stack,
         "init_stack": replay.init_stack, "mean": replay.mean_push, "worst": replay.worst_push,
     }  # fmt: skip
-
-
-def _emulator(name: str) -> Emulator:
-    return next(item for item in EMULATED if item.target == name)
 
 
 def _manifest(export: Path) -> dict[str, Any]:
@@ -141,33 +138,25 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("logs", nargs="+", type=Path, help="recordings, or folders of them")
     add("--identify", action="store_true", help="identify them as a whole")
-    add("--target", action="append", help="only this one; may be repeated")
-    add("--actuator", type=Path, metavar="FILE", help="of the unit that was recorded")
     add("--into", type=Path, metavar="FOLDER",
         help="measure this export, and write the results into its manifest")  # fmt: skip
 
 
 def _cases(options: Options) -> list[OnboardCase]:
     given = options.into.resolve() if options.into else None
-    names = [str(_manifest(given)["target"])] if given else options.target
-    chosen = [_emulator(name) for name in names] if names else EMULATED
-    present = [item.target for item in chosen if not missing(item)]
+    targets = [item.target for item in EMULATED if not missing(item)]
+    if given:
+        targets = [name for name in targets if name == _manifest(given)["target"]]
+    logs: list[Path] = []
+    for path in options.logs:
+        inside = [log for end in ("blf", "asc") for log in sorted(path.glob(f"*.{end}"))]
+        logs += inside if path.is_dir() else [path]
     return [
-        OnboardCase(
-            str(log), name, str(given or ""), str(options.actuator or ""), options.identify,
-        )
-        for log in _logs(options.logs)
-        for name in present
-    ]  # fmt: skip
-
-
-def _logs(paths: Sequence[Path]) -> Iterator[Path]:
-    """Recordings with samples."""
-    for path in paths:
-        logs = [path]
-        if path.is_dir():
-            logs = sorted(p for p in path.iterdir() if p.suffix in (".blf", ".asc"))
-        yield from (log for log in logs if read_recording(log).samples is not None)
+        OnboardCase(str(log), name, str(given or ""), options.identify)
+        for log in logs
+        if read_recording(log).samples is not None
+        for name in targets
+    ]
 
 
 def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
@@ -176,41 +165,27 @@ def _report(records: Sequence[Record], options: Options) -> Iterator[str]:
     for emulator in EMULATED if options.into is None else ():
         if missing(emulator):
             yield f"{emulator.target}: not installed: {', '.join(missing(emulator))}\n"
-    rows = (_identified_row if options.identify else _replayed_row)(records)
-    headings = ("recording", "target", "library, bytes", "ticks")
+    headings = ["recording", "target", "library, bytes", "ticks"]
+    rows: list[list[object]] = [
+        [Path(item["log"]).name, item["target"], item["bytes"], item["done"]] for item in records
+    ]
     if options.identify:
-        yield from markdown(
-            (*headings, "digits", "Kintas, FSS, FDJ", "model runs", "stack, bytes",
-             "million instructions", "most in a slice", f"s at {CLOCK_MHZ:g} MHz"),
-            rows,
-        )  # fmt: skip
+        headings += ["digits", "Kintas, FSS, FDJ", "model runs", "stack, bytes"]
+        headings += ["million instructions", "most in a slice", f"s at {CLOCK_MHZ:g} MHz"]
+        for row, item in zip(rows, records, strict=True):
+            severities = ", ".join(f"{value:.6f}" for value in item["severities"])
+            row.extend(["DIFFERENT" if item["differing"] else "same", severities, item["runs"]])
+            millions = item["millions"]
+            effort = millions, item["longest"], f"{millions / CLOCK_MHZ:.1f}"
+            row.extend([item["stack"], *(effort if millions else "–––")])
     else:
-        yield from markdown(
-            (*headings, "ticks that differ", "stack of init, bytes", "stack of push, bytes",
-             "instructions of push", "at most"),
-            rows,
-        )  # fmt: skip
-
-
-def _label(item: Record) -> tuple[object, ...]:
-    return Path(item["log"]).name, item["target"], item["bytes"], item["done"]
-
-
-def _identified_row(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for item in records:
-        digits = "DIFFERENT" if item["differing"] else "same"
-        severities = ", ".join(f"{value:.6f}" for value in item["severities"])
-        millions = item["millions"]
-        effort = ("–", "–", "–")
-        if millions:
-            effort = (millions, item["longest"], f"{millions / CLOCK_MHZ:.1f}")
-        yield *_label(item), digits, severities, item["runs"], item["stack"], *effort
-
-
-def _replayed_row(records: Sequence[Record]) -> Iterator[tuple[object, ...]]:
-    for item in records:
-        effort = (item["mean"], item["worst"]) if item["worst"] else ("–", "–")
-        yield *_label(item), item["differing"], item["init_stack"], item["stack"], *effort
+        headings += ["ticks that differ", "stack of init, bytes", "stack of push, bytes"]
+        headings += ["instructions of push", "at most"]
+        for row, item in zip(rows, records, strict=True):
+            instructions = item["mean"], item["worst"]
+            row.extend([item["differing"], item["init_stack"], item["stack"]])
+            row.extend(instructions if item["worst"] else "––")
+    yield from markdown(headings, rows)
 
 
 def _write_manifest(manifest: Path, records: Sequence[Record]) -> None:
@@ -264,77 +239,62 @@ PLAN = library_plan(
 
 @dataclass(frozen=True, slots=True)
 class OnboardUnit:
-    """Unit `case` of a seed, recorded in a stored test of which a share (0 … 1) is there."""
+    """Unit `case` of a seed, recorded in a stored test."""
 
     test: str
     case: int
     seed: int
-    share: float = 1.0
-
-
-class SharedLibrary:
-    """An exported shared library of this computer."""
-
-    def __init__(self, path: Path) -> None:
-        self._library = ctypes.CDLL(str(path))
-
-    def call(self, name: str, *arguments: NDArray[np.float64]) -> int:
-        """Call a function with pointers to these numbers."""
-        pointers = [ctypes.c_void_p(item.ctypes.data) for item in arguments]
-        return int(getattr(self._library, name)(*pointers))
-
-    def identified(self, unit: Sequence[float], ticks: NDArray[np.float64]) -> OnboardOutcome:
-        """Identify ticks, shape (n, 5), to the end."""
-        memory, given = np.zeros(PLACES.end), exported_unit(unit, PLAN)
-        told, slices = np.ascontiguousarray(ticks), np.array([len(ticks), SLICE])
-        assert self.call("eha_identify_begin", memory, given) == 0
-        while self.call("eha_identify_run", memory, told, slices) == GOES_ON:
-            pass
-        return OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
 
 
 @cache
-def _library() -> SharedLibrary:
+def _library() -> ctypes.CDLL:
     """Export of the reference actuator, one for each process."""
     with tempfile.TemporaryDirectory(prefix="ehadiag-onboard-") as place:
         with Folder.at(Path(place), RESULT_MODE) as folder:
             export_library(default_actuator(), find_target("host"), folder)
-        return SharedLibrary(Path(place, SHARED_LIBRARY_FILE))
+        return ctypes.CDLL(str(Path(place, SHARED_LIBRARY_FILE)))
 
 
-@cache
-def _recorded(test: str, case: int, seed: int) -> tuple[Recording, tuple[float, ...]]:
-    """Recording of a random textbook unit, and its severities."""
-    drawn = UnitCase(test, case, seed, data="textbook")
-    unit, severities = draw_unit(drawn)
-    return record_worn(drawn, unit, test, severities), tuple(severities)
+def _call(name: str, *arguments: NDArray[np.float64]) -> int:
+    """Call a function of the library with pointers to these numbers."""
+    pointers = [ctypes.c_void_p(item.ctypes.data) for item in arguments]
+    return int(getattr(_library(), name)(*pointers))
+
+
+def _identified(unit: Sequence[float], ticks: NDArray[np.float64]) -> OnboardOutcome:
+    """Identify ticks, shape (n, 5), by the library."""
+    memory, given = np.zeros(PLACES.end), exported_unit(unit, PLAN)
+    rows, slices = np.ascontiguousarray(ticks), np.array([len(ticks), SLICE])
+    assert _call("eha_identify_begin", memory, given) == 0
+    while _call("eha_identify_run", memory, rows, slices) == GOES_ON:
+        pass
+    return OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
 
 
 def perform_random(case: OnboardUnit) -> Record:
-    """Identify a recording on board and by the package; plain numbers."""
-    recording, severities = _recorded(case.test, case.case, case.seed)
-    ticks = ticks_of(recording)
+    """Identify a recording of a random textbook unit on board and by the package."""
+    drawn = UnitCase(case.test, case.case, case.seed, data="textbook")
+    unit, severities = draw_unit(drawn)
+    recording = record_worn(drawn, unit, case.test, severities)
     begin = time.process_time()
-    found = _library().identified(surrounded(recording), ticks[: round(case.share * len(ticks))])
+    found = _identified(surrounded(recording), ticks_of(recording))
     spent = time.process_time() - begin
     std = [found.std_Kintas, found.std_FSS, found.std_FDJ]
     ends = [
         (v - NORMAL_HALF_WIDTH_95 * s, v + NORMAL_HALF_WIDTH_95 * s)
         for v, s in zip(found[:3], std, strict=True)
     ]
+    assert recording.samples is not None
+    experiment = build_experiment(
+        recording.samples, recording.environment, resolve_test(case.test), default_actuator()
+    )
+    host = identify([experiment], nuisances=NuisanceMode.NONE).estimates
     out = {
         "faults": severities, "processor_s": spent, "value": found[:3], "std": std,
         "interval95": ends, "runs": found.runs, "outliers": found.outliers,
         "verdict": NOT_TESTED if found.verdict == UNTESTED else "answered",
+        "host": [item.value for item in host], "host_std": [item.std for item in host],
     }  # fmt: skip
-    if case.share == 1.0:
-        assert recording.samples is not None
-        experiment = build_experiment(
-            recording.samples, recording.environment, resolve_test(case.test), default_actuator()
-        )
-        host = identify([experiment], nuisances=NuisanceMode.NONE)
-        out["host"] = [item.value for item in host.estimates]
-        out["host_std"] = [item.std for item in host.estimates]
     return {name: _plain(value) for name, value in out.items()}
 
 
@@ -346,53 +306,40 @@ def _plain(value: object) -> object:
 
 
 def _random_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--test", action="append", choices=TESTS, help="may be repeated (both)")
-    add("--cuts", type=int, default=0, help="ends of each test, drawn at random, instead of it (0)")
+    parser.add_argument("--test", action="append", choices=TESTS, help="may be repeated (both)")
 
 
 def _random_cases(options: Options) -> list[OnboardUnit]:
-    out = []
-    for case in range(options.cases):
-        cuts = np.random.default_rng([options.seed, case, 1]).uniform(0.02, 0.999, options.cuts)
-        for test in options.test or TESTS:
-            shares = cuts.tolist() if options.cuts else [1.0]
-            out += [OnboardUnit(test, case, options.seed, share) for share in shares]
-    return out
+    return [
+        OnboardUnit(test, case, options.seed)
+        for case in range(options.cases)
+        for test in options.test or TESTS
+    ]
 
 
 def _random_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
     yield from accuracy_table(records, "test")
-    host = [_distance(item).max() for item in records if "host" in item and is_answered(item)]
-    effort = [(item["runs"], item["processor_s"]) for item in records]
-    runs, spent = np.mean(effort, axis=0)
+    answered = [item for item in records if is_answered(item)]
+    host = [_deviations(item, "host", "host_std").max() for item in answered]
+    runs, spent = np.mean([(item["runs"], item["processor_s"]) for item in records], axis=0)
     yield f"\n{runs:.0f} model runs and {spent:.2f} s of processor a test"
     if host:
         yield f"from the package, deviations: median {np.median(host):.2f}, most {max(host):.2f}"
-    wrong = [item for item in records if _is_far(item) or _is_refused(item)]
-    if wrong:
-        yield f"\nNOT TESTED, or beyond {FAR_OFF:g} deviations:\n"
-        yield from markdown(
-            ("test", "case", "share of the test", "truth", "estimate", "outliers"),
-            ((i["test"], i["case"], f"{i['share']:.3f}", _text(i["faults"]), _text(i["value"]),
-              i["outliers"]) for i in wrong),
-        )  # fmt: skip
-
-
-def _is_refused(item: Record) -> bool:
-    """Whether a whole test is NOT TESTED."""
-    return item["share"] == 1.0 and not is_answered(item)
+    yield f"\nNOT TESTED, or beyond {FAR_OFF:g} deviations:\n"
+    yield from markdown(
+        ("test", "case", "truth", "estimate", "outliers"),
+        ((i["test"], i["case"], _text(i["faults"]), _text(i["value"]), i["outliers"])
+         for i in records if not is_answered(i) or _is_far(i)),
+    )  # fmt: skip
 
 
 def _is_far(item: Record) -> bool:
-    if not is_answered(item):
-        return False
-    errors = np.abs(np.array(item["value"]) - item["faults"])
-    return bool((errors > FAR_OFF * np.array(item["std"])).any())
+    return is_answered(item) and bool((_deviations(item, "faults", "std") > FAR_OFF).any())
 
 
-def _distance(item: Record) -> NDArray[np.float64]:
-    return np.asarray(np.abs(np.array(item["value"]) - item["host"]) / np.array(item["host_std"]))
+def _deviations(item: Record, other: str, std: str) -> NDArray[np.float64]:
+    """Distance of the estimates from others, in deviations."""
+    return np.asarray(np.abs(np.array(item["value"]) - item[other]) / np.array(item[std]))
 
 
 def _text(values: Sequence[float | None]) -> str:

@@ -1,21 +1,33 @@
-"""Study of recordings played again on foreign buses, beside the default one."""
+"""Studies of recordings played again on foreign buses, and taken by a data acquisition.
+
+The acquisition has converters and a clock of its own. The plant is sampled at 50 kHz, and read
+between two samples by a local cubic. The control computer reads it once a tick through its own
+converters and acts on what these say; the acquisition never sees their codes.
+"""
 
 from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
 
 from ehadiag.assess.diagnosis import diagnose
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag_tools.accuracy.figures import accuracy_table, outcome
+from ehadiag_sim.conditions import Faults, Sensors, UnmodelledEffects
+from ehadiag_sim.plant_dynamics import PlantDynamics
+from ehadiag_sim.plant_laws import PositionController
+from ehadiag_sim.sensing import SimulatedConverters
+from ehadiag_sim.simulation import bus_command
+from ehadiag_tools.accuracy.figures import accuracy_table, is_answered, outcome
 from ehadiag_tools.rigs.rerecord import (
     BUSES,
     TESTS,
@@ -32,8 +44,8 @@ from firmware_iface.alignment.align import windowed_recordings
 from firmware_iface.errors import EhadiagError
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.logs.reader import choose_recording, read_recording
-from firmware_iface.recording import Recording, Samples
-from firmware_iface.stored_test import StoredTest
+from firmware_iface.recording import CHANNELS, CommandMode, Recording, Samples
+from firmware_iface.stored_test import StoredTest, bundled_tests
 
 DAQ = "daq"
 """Name of the decoded signals."""
@@ -63,11 +75,14 @@ class BusReplay:
 def perform(case: BusReplay) -> Record:
     """Play, read, diagnose: verdict, estimates, why."""
     actuator, recording = _actuator(case.actuator), read_recording(Path(case.recording))
+    return _judged(lambda: _played(case, recording, actuator), actuator)
+
+
+def _judged(read: Callable[[], Recording], actuator: Actuator) -> Record:
     try:
-        found = diagnose([_played(case, recording, actuator)], actuator, TESTS)
+        return outcome(diagnose([read()], actuator, TESTS))
     except EhadiagError as error:
         return outcome(error)
-    return outcome(found)
 
 
 def _played(case: BusReplay, recording: Recording, actuator: Actuator) -> Recording:
@@ -201,4 +216,139 @@ FOREIGN_BUSES = Study(
     "Recordings played again on foreign buses: verdicts and errors beside the default bus.",
     _cases, perform, _report, _options, count=100_000,
     counted="those on the default bus, then a sample of the others",
+)  # fmt: skip
+
+
+PLANT_RATE = 50_000.0
+"""Samples of the plant a second, Hz; a whole number of them makes a control tick."""
+SETTLING_S, AFTER_S = 0.2, 0.3
+"""Rest before and after each test, s; the recording begins within the first."""
+OFFSET_SHARE = 0.01
+"""Largest offset of a converter of the acquisition, of its range, 1: PHY-34."""
+RANGE_SHARE = 1.25
+"""Range of the acquisition's converters, of the computer's, 1."""
+NOISE_STEPS = {12: 0.5, 16: 2.0}
+"""Noise before conversion by the acquisition's bits, its own steps rms."""
+RATES = (1000.0, 2000.0, 5000.0, 10_000.0)
+
+
+@dataclass(frozen=True, slots=True)
+class DaqCase:
+    """One recording: test, severities, and how it was acquired.
+
+    Rate: of the acquisition, Hz; phase: of its first sample, of its interval; drift: of its clock
+    against the computer's, ppm; lead_in: from the recording's beginning to the test's, s.
+    """
+
+    test: str
+    faults: tuple[float, float, float]
+    rate: float
+    bits: int
+    with_command: bool
+    lead_in_s: float
+    phase: float
+    drift_ppm: float
+    seed: int
+
+
+def recorded_columns(case: DaqCase) -> dict[str, NDArray[np.float64]]:
+    """Columns that the acquisition writes: SI, times in s."""
+    test, actuator = bundled_tests()[case.test], default_actuator()
+    rng = np.random.default_rng(case.seed)
+    mode = CommandMode.POSITION if test.closed_loop else CommandMode.CURRENT
+    rest = round((SETTLING_S + case.lead_in_s) * test.rate)
+    after = round(AFTER_S * test.rate)
+    command = np.concatenate([np.zeros(rest), bus_command(test), np.zeros(after)])
+    # Advances by one sample at a time.
+    controller = replace(actuator.controller, rate=PLANT_RATE)
+    plant = PlantDynamics(replace(actuator, controller=controller), Faults(*case.faults))
+    # Half a step at most: a larger offset of the computer moves the rest, and nothing else.
+    own = Sensors(offsets_lsb=tuple(rng.uniform(-0.5, 0.5, len(CHANNELS)).tolist()))
+    computer = SimulatedConverters(
+        actuator, own, UnmodelledEffects(), int(rng.integers(1 << 31)), channels=CHANNELS
+    )
+    law = PositionController(actuator.controller)
+    parts = round(PLANT_RATE / test.rate)
+    seen = np.empty((len(CHANNELS), len(command) * parts))
+    measured = 0.0
+    for tick, asked in enumerate(command.tolist()):
+        current = law.current(asked, mode, measured)
+        for part in range(parts):
+            plant.advance(current)
+            state = (current, plant.spool, plant.pressure, plant.position)
+            seen[:, tick * parts + part] = state
+        codes = computer.digitise(state)
+        measured = float(CHANNELS.position.decode(codes[3:])[0])
+    return _acquired(case, seen, np.repeat(command, parts), mode, rng)
+
+
+def _acquired(
+    case: DaqCase,
+    seen: NDArray[np.float64],
+    command: NDArray[np.float64],
+    mode: CommandMode,
+    rng: np.random.Generator,
+) -> dict[str, NDArray[np.float64]]:
+    """What the acquisition makes of the plant's samples, each of the end of its span."""
+    step = (1.0 + case.drift_ppm * 1e-6) / case.rate
+    begin = SETTLING_S + case.phase / case.rate
+    last = (seen.shape[1] - 1) / PLANT_RATE
+    instants = begin + step * np.arange(int((last - begin) / step))
+    # A current is held from the beginning of its span on.
+    held = np.floor(instants * PLANT_RATE + 1e-6).astype(np.int64)
+    ends = (np.arange(seen.shape[1]) + 1.0) / PLANT_RATE
+    columns, levels = {"time": np.arange(len(instants)) / case.rate}, float(1 << case.bits)
+    for index, channel in enumerate(CHANNELS):
+        own = replace(channel, full_scale=RANGE_SHARE * channel.full_scale, levels=levels)
+        value = seen[0][held] if index == 0 else Akima1DInterpolator(ends, seen[index])(instants)
+        offset = rng.uniform(-OFFSET_SHARE, OFFSET_SHARE) * own.full_scale
+        noise = NOISE_STEPS[case.bits] * own.lsb * rng.standard_normal(len(value))
+        columns[channel.name] = own.decode(own.encode(value + offset + noise))
+    for name, value in (
+        ("supply_pressure", 20.7e6), ("return_pressure", 0.7e6), ("oil_temperature", 40.0)
+    ):  # fmt: skip
+        columns[name] = np.full(len(instants), value)
+    if case.with_command:
+        columns[f"{mode.name.lower()}_command"] = command[held]
+    return columns
+
+
+def perform_daq(case: DaqCase) -> Record:
+    """Record, read, diagnose: verdict, estimates, why."""
+    return _judged(lambda: read_columns(recorded_columns(case)), default_actuator())
+
+
+def _daq_cases(options: Options) -> list[DaqCase]:
+    """Each kind of recording in turn, with severities, phase and clock of its own."""
+    kinds = [
+        (test, rate, bits, with_command)
+        for test in ("closed", "open")
+        for rate in RATES
+        for bits in NOISE_STEPS
+        for with_command in (False, True)
+    ]
+    out = []
+    for number in range(options.cases):
+        test, rate, bits, with_command = kinds[number % len(kinds)]
+        rng = np.random.default_rng([options.seed, number])
+        a, b, c = rng.uniform(0.0, 0.9, 3).round(3).tolist()
+        lead_in, phase, drift = rng.uniform((0.0, 0.0, -100.0), (1.5, 1.0, 100.0)).round(3).tolist()
+        seed = int(rng.integers(1 << 31))
+        out.append(DaqCase(test, (a, b, c), rate, bits, with_command, lead_in, phase, drift, seed))
+    return out
+
+
+def _daq_report(records: Sequence[Record], _options: Options) -> Iterator[str]:
+    yield from accuracy_table(records, "test", "rate", "bits")
+    for item in records:
+        if not is_answered(item):
+            command = "with" if item["with_command"] else "without"
+            yield f"\n{item['test']} {item['rate']:g} Hz, {item['bits']} bit, {command} command:"
+            yield f"{'; '.join(item['reasons'])}"
+
+
+DAQ_RECORDINGS = Study(
+    "daq-recordings",
+    "Recordings by a data acquisition with its own converters: verdicts and errors.",
+    _daq_cases, perform_daq, _daq_report, count=64, counted="recordings, each kind in turn",
 )  # fmt: skip

@@ -47,19 +47,14 @@ class ForeignBus:
 
     def schedule(self) -> dict[str, tuple[int, float]]:
         """Ticks between two messages of a name, and the instant within the tick, both 1 ms."""
-        database = self._database()
+        database, name, out = self._database(), "GenMsgStartDelayTime", {}
         assert database.dbc is not None
-        usual = {
-            name: item.default_value for name, item in database.dbc.attribute_definitions.items()
-        }
-        out = {}
+        usual = database.dbc.attribute_definitions[name].default_value
         for message in database.messages:
             assert message.dbc is not None
-            own: dict[str, Any] = {k: item.value for k, item in message.dbc.attributes.items()}
-            every, at = (
-                float({**usual, **own}[f"GenMsg{key}Time"]) for key in ("Cycle", "StartDelay")
-            )
-            out[message.name] = int(every), at
+            own = message.dbc.attributes.get(name)
+            at = float((usual if own is None else own.value) or 0.0)
+            out[message.name] = message.cycle_time or 1, at
         return out
 
     def _database(self) -> Database:
@@ -181,13 +176,11 @@ class _Encoder:
 
     def tick(self, this: Played, tick: int) -> dict[str, bytes]:
         """Payload of each message."""
-        inside = this.begin <= tick < this.end
         values = this.channels[:, tick]
-        if not np.isnan(values).any():
-            codes = [
-                int(channel.encode(value)) for channel, value in zip(CHANNELS, values, strict=True)
-            ]
-            self._encoder.telemetry(codes, 0)
+        lost = bool(np.isnan(values).any())
+        if not lost:
+            pairs = zip(CHANNELS, values, strict=True)
+            self._encoder.telemetry([int(item.encode(value)) for item, value in pairs], 0)
         if self._has["command"]:
             self._encoder.command(this.mode, float(this.command[tick]), 0, 0)
         if self._has["environment"]:
@@ -196,22 +189,16 @@ class _Encoder:
             supply, back, oil = (value or 0.0 for value in probes)
             self._encoder.environment(supply, back, oil, 0)
         if self._has["status"]:
-            state = BitState.RUNNING if inside else BitState.IDLE
-            elapsed = (tick - this.begin) * 1e-3 if inside else 0.0
-            number = (self._recording.test_id or 0) if inside else 0
-            if tick >= this.end:
-                state, number = BitState.COMPLETE, self._recording.test_id or 0
-                elapsed = (this.end - this.begin) * 1e-3
-            serial = self._recording.serial or 0
-            self._encoder.status(state, 0, number, elapsed, serial, 0)
+            begun = BitState.COMPLETE if tick >= this.end else BitState.RUNNING
+            state = begun if tick >= this.begin else BitState.IDLE
+            number = (self._recording.test_id or 0) * (tick >= this.begin)
+            elapsed = max(min(tick, this.end) - this.begin, 0) * 1e-3
+            self._encoder.status(state, 0, number, elapsed, self._recording.serial or 0, 0)
         frames = self._encoder.frames(0)
         out = {self._names[frame.can_id, frame.extended]: frame.data for frame in frames}
-        if np.isnan(values).any():
-            # Lost: with a sample that shares its message a command is lost too.
-            out = {
-                name: data for name, data in out.items() if not self._map.messages[name].measures
-            }
-        return out
+        # With a lost sample that shares its message a command is lost too.
+        gone = {name for name in out if lost and self._map.messages[name].measures}
+        return {name: data for name, data in out.items() if name not in gone}
 
 
 def logged(

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator, default_actuator
+from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import DataErrors, Effects, Faults, Sensors
 from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S, PlantDynamics
 from ehadiag_sim.plant_laws import PositionController
@@ -27,7 +28,7 @@ from ehadiag_sim.sensing import SimulatedConverters
 from ehadiag_sim.simulation import bus_command
 from ehadiag_tools.simulator.units import Unit
 from ehadiag_tools.study import Options, Record, Study, markdown
-from firmware_iface.errors import ConfigurationError, InputOutputError, reason_of
+from firmware_iface.errors import ConfigurationError, InputOutputError
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
 from firmware_iface.stored_test import resolve_test
@@ -57,16 +58,9 @@ class RecordedCase:
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "folder",
-        type=Path,
-        help="recordings, truth.csv and, for units with effects, truth-effects.csv",
-    )
-    parser.add_argument(
-        "--exact-command",
-        action="store_true",
-        help="do not round the command to the bus's resolution",
-    )
+    add = parser.add_argument
+    add("folder", type=Path, help="recordings, truth.csv; with effects truth-effects.csv, too")
+    add("--exact-command", action="store_true", help="do not round it to the bus's resolution")
 
 
 def _cases(options: Options) -> list[RecordedCase]:
@@ -117,16 +111,13 @@ def _report(records: Sequence[Record], _options: Options) -> Iterator[str]:
 
 def read_truth(path: Path) -> list[Truth]:
     """Read file names, tests and severities of truth.csv."""
-    found = []
-    for number, row in enumerate(read_rows(path), start=2):
-        try:
-            faults = Faults(*(float(row[name]) for name in ("Kintas", "FSS", "FDJ")))
-            found.append(Truth(row["file"], row["test"], faults, row.get("unit", "")))
-        except KeyError as error:
-            raise ConfigurationError(f"{path}: column {error} is missing") from None
-        except (TypeError, ValueError, ConfigurationError) as error:
-            raise ConfigurationError(f"{path} line {number}: {error}") from None
-    return found
+    return [
+        Truth(
+            row["file"], row["test"], Faults(*(float(row[name]) for name in FAULT_NAMES)),
+            row.get("unit", ""),
+        )
+        for row in read_rows(path)
+    ]  # fmt: skip
 
 
 def effects_of(environment: Environment, effects: Effects | None = None) -> Effects:
@@ -206,38 +197,22 @@ def _missing(law: PositionController, command: float, current: float, simulated:
 
 def read_rows(path: Path) -> list[dict[str, str]]:
     """Read a table of comma-separated text with a head line."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
-    except OSError as error:
-        raise InputOutputError(f"{path}: {reason_of(error)}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigurationError(f"{path}: not a table of comma-separated text: {error}") from None
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def read_units(path: Path, actuator: Actuator) -> dict[str, Unit]:
     """Read `truth-effects.csv`, columns unit, effect, value: units of an actuator by name."""
     units: dict[str, Unit] = {}
-    for number, row in enumerate(read_rows(path), start=2):
-        where = f"{path} line {number}"
-        try:
-            name, effect, value = row["unit"], row["effect"], float(row["value"])
-        except KeyError as error:
-            raise ConfigurationError(f"{path}: column {error} is missing") from None
-        except (TypeError, ValueError):
-            raise ConfigurationError(f"{where}: {row['value']!r} is not a number") from None
-        if not math.isfinite(value):
-            raise ConfigurationError(f"{where}: {value} is not a finite number")
-        changed = _with_effect(units.get(name, Unit(actuator)), effect, value)
-        if changed is None:
-            raise ConfigurationError(f"{where}: effect {effect!r} is not known")
-        units[name] = changed
+    for row in read_rows(path):
+        name = row["unit"]
+        units[name] = _with_effect(units.get(name, Unit(actuator)), row["effect"], row["value"])
     return units
 
 
-def _with_effect(unit: Unit, effect: str, value: float) -> Unit | None:
-    """Give a unit one effect of the table; None where it is not known."""
-    effects, sensors, actuator = unit.effects, unit.sensors, unit.actuator
+def _with_effect(unit: Unit, effect: str, text: str) -> Unit:
+    """Give a unit one effect of the table."""
+    effects, sensors, actuator, value = unit.effects, unit.sensors, unit.actuator, float(text)
     changes: dict[str, dict[str, Any]] = {
         "torque motor gain": {"gain_change": value - 1.0},
         "hysteresis": {"hysteresis": value},
@@ -268,7 +243,7 @@ def _with_effect(unit: Unit, effect: str, value: float) -> Unit | None:
         return replace(unit, sensors=replace(sensors, offsets_lsb=(a, b, c, d)))
     if effect == "analogue filter time constant":
         return replace(unit, sensors=replace(sensors, filter_time=value))
-    return None
+    raise ConfigurationError(f"effect {effect!r} is not known")
 
 
 RECORDINGS = Study(
