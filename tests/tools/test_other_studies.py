@@ -14,7 +14,7 @@ from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults
 from ehadiag_tools.bench import prepare, tiled
 from ehadiag_tools.free_motion.motion import (
-    KINDS,
+    ALL_KINDS,
     Motion,
     MotionCase,
     changed,
@@ -47,7 +47,7 @@ def test_motion_is_that_of_its_seed_and_moves_everything(mode: CommandMode) -> N
     assert (np.ptp(rows[0], axis=0) > 0.0).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_commands_of_a_kind_stay_in_range_and_move(kind: str) -> None:
     commands = random_command(np.random.default_rng(0), kind, 60_000, 1e3, 10e-3)
     assert np.abs(commands).max() <= 10e-3
