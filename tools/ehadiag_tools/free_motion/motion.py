@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, gumbel_r
+from scipy.stats import chi2
 
 from ehadiag.compile.jit import Array, Array2, kernel
 from ehadiag.compile.vector import unpacker
@@ -243,6 +243,8 @@ GROWN = 0.05
 """Largest growth of a severity since its diagnosis in the study of severities, 1."""
 SPREAD_SHARE = 0.97
 """Share of healthy values below a cause's spread."""
+TAIL_SHARE = 0.05
+"""Share of the largest values of pieces that makes their tail."""
 LEAST_VOTE_SPREAD = 0.75
 """Least spread of a sum of votes: a strong block adds 0.6, and one block is no change."""
 
@@ -467,8 +469,8 @@ def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
     ]
     yield from markdown(("cause", *(f"{span * BLOCK_S:g} s" for span in SPANS), "votes"), rows)
     largest = _largest(values, spans, votes)
-    location, scale = gumbel_r.fit(largest)
-    yield f"\nlargest of each of {len(largest)} pieces: Gumbel's law, {location:.2f}, {scale:.2f}"
+    location, scale = _tail(largest)
+    yield f"\nlargest of each of {len(largest)} pieces: tail of {location:.2f}, {scale:.2f}"
     yield "largest of all: " + ", ".join(f"{value:.2f}" for value in np.sort(largest)[::-1][:10])
     seen = sum(item["motion"]["seconds"] for item in records) / 3600.0
     for stated in (hours / 20.0, hours / 5.0, hours):
@@ -477,7 +479,7 @@ def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
             others = [item for item, other in zip(values, kinds, strict=True) if other != kind]
             mine = [item for item, other in zip(values, kinds, strict=True) if other == kind]
             bounds = _spreads(others)
-            threshold = alarm_threshold(stated, gumbel_r.fit(_largest(others, *bounds)))
+            threshold = alarm_threshold(stated, _tail(_largest(others, *bounds)))
             alarms += int(np.sum(_largest(mine, *bounds) > threshold))
         low, high = garwood(alarms)
         yield (
@@ -488,10 +490,7 @@ def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
 
 
 def _spreads(values: Sequence[Array]) -> tuple[Array, Array]:
-    """Of the values over spans, shape (spans, causes), and of the sums of votes, shape (causes,).
-
-    Votes are seldom: of them a spread is that of the largest value of a piece.
-    """
+    """By span and cause, and by cause of the largest sums of votes in a piece."""
     spans = np.quantile(np.concatenate(values)[:, : len(SPANS)], SPREAD_SHARE, axis=0)
     votes = [item[:, len(SPANS) :].max(axis=(0, 1)) for item in values]
     votes = np.maximum(np.quantile(votes, SPREAD_SHARE, axis=0), LEAST_VOTE_SPREAD)
@@ -501,6 +500,16 @@ def _spreads(values: Sequence[Array]) -> tuple[Array, Array]:
 def _largest(values: Sequence[Array], spans: Array, votes: Array) -> Array:
     spreads = np.concatenate((spans, np.broadcast_to(votes, (2, len(CAUSES)))))
     return np.array([(item / spreads).max() for item in values])
+
+
+def _tail(largest: Array) -> tuple[float, float]:
+    """Location and scale of Gumbel's law with the tail of these values.
+
+    By their mean excess: the bulk of them says little of the few pieces in which the model errs.
+    """
+    least = float(np.quantile(largest, 1.0 - TAIL_SHARE))
+    scale = float(np.mean(largest[largest > least] - least))
+    return least + scale * math.log(TAIL_SHARE), scale
 
 
 FREE_MOTION = Study(
