@@ -77,6 +77,8 @@ constant of the sums of votes, so that those of a piece owe little to the time b
 GUMBEL: Final = (-1.2, 0.9)
 """Location and scale of the law of those values: the tail of 30 h of 22 kinds of motion, of which
 it holds the scatter from kind to kind. Above 1.8 were 12 of 356 pieces, 0.95 in the mean."""
+TAIL_H: Final = 2.0
+"""Mean time between values at which that tail begins, h."""
 TRIAL_BLOCKS: Final = 40
 """Blocks in which causes are tried, 1: 20 s, or since votes began."""
 TRIAL_STEPS: Final = (0.3, 1.0, 3.0, 9.0)
@@ -149,13 +151,14 @@ def alarm_threshold(hours: float, law: tuple[float, float] = GUMBEL) -> float:
     """Value of the test that healthy motion exceeds once in so many hours.
 
     The pieces of motion are exchangeable, whatever the correlation within one; expected numbers of
-    alarms add up even where pieces are not independent. Beyond the hours of the study Gumbel's law
-    of their largest values is extrapolated. Hours out of range raise ConfigurationError.
+    alarms add up even where pieces are not independent. Beyond the hours of the study the tail of
+    their largest values is extrapolated; before it begins the threshold is that of its beginning.
+    Hours out of range raise ConfigurationError.
     """
     if not FALSE_ALARM_HOURS_RANGE[0] <= hours <= FALSE_ALARM_HOURS_RANGE[1]:
         low, high = FALSE_ALARM_HOURS_RANGE
         raise ConfigurationError(f"hours between false alarms {hours:g}: need {low:g} … {high:g}")
-    share = -math.expm1(-PIECE_H / hours)
+    share = -math.expm1(-PIECE_H / max(hours, TAIL_H))
     return law[0] - law[1] * math.log(-math.log1p(-share))
 
 

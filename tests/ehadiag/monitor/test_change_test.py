@@ -13,6 +13,7 @@ from ehadiag.monitor.change_test import (
     CAUSES,
     GUMBEL,
     PIECE_H,
+    TAIL_H,
     VOTE_CAP,
     Cause,
     Change,
@@ -29,11 +30,15 @@ WORN = (0.3, 0.3, 0.3)
 STEADY = np.array([item.steady / item.step for item in BANK])
 
 
-@pytest.mark.parametrize("hours", [1.0, 10.0, 100.0])
+@pytest.mark.parametrize("hours", [2.0, 10.0, 100.0])
 def test_the_threshold_is_exceeded_once_in_its_hours(hours: float) -> None:
     """By Gumbel's law of the largest value of a piece."""
     above = -math.expm1(-math.exp((GUMBEL[0] - alarm_threshold(hours)) / GUMBEL[1]))
     assert above == pytest.approx(-math.expm1(-PIECE_H / hours), rel=1e-9)
+
+
+def test_the_threshold_of_few_hours_is_that_where_the_tail_begins() -> None:
+    assert alarm_threshold(0.1) == alarm_threshold(TAIL_H) > 1.0
 
 
 @pytest.mark.parametrize("hours", [0.0, math.nan, 1e9])

@@ -473,7 +473,7 @@ def _calibration(records: Sequence[Record], hours: float) -> Iterator[str]:
     yield f"\nlargest of each of {len(largest)} pieces: tail of {location:.2f}, {scale:.2f}"
     yield "largest of all: " + ", ".join(f"{value:.2f}" for value in np.sort(largest)[::-1][:10])
     seen = sum(item["motion"]["seconds"] for item in records) / 3600.0
-    for stated in (hours / 20.0, hours / 5.0, hours):
+    for stated in (hours / 5.0, hours):
         alarms = 0
         for kind in set(kinds):
             others = [item for item, other in zip(values, kinds, strict=True) if other != kind]
