@@ -14,7 +14,7 @@ from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults
 from ehadiag_tools.bench import prepare, tiled
 from ehadiag_tools.free_motion.motion import (
-    KINDS,
+    ALL_KINDS,
     Motion,
     MotionCase,
     changed,
@@ -46,7 +46,7 @@ def test_motion_is_that_of_its_seed_and_moves_everything(mode: CommandMode) -> N
     assert (np.ptp(rows[0], axis=0) > 0.0).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_commands_of_a_kind_stay_in_range_and_move(kind: str) -> None:
     commands = random_command(np.random.default_rng(0), kind, 60_000, 1e3, 10e-3)
     assert np.abs(commands).max() <= 10e-3
@@ -57,7 +57,7 @@ def test_commands_of_a_kind_stay_in_range_and_move(kind: str) -> None:
 def test_a_growth_raises_an_alarm_with_its_name_and_none_before() -> None:
     motion = changed(Motion("gusts", "position", 90.0, (0.3, 0.3, 0.3), 1), "FSS", 0.1, 45.0)
     (when, causes), *_ = perform(MotionCase(motion, 10.0))["alarms"]
-    assert 45.0 < when < 75.0
+    assert 45.0 < when < 85.0
     assert causes[0][0] == "FSS"
     assert causes[0][1] == pytest.approx(0.1, abs=0.03)
 

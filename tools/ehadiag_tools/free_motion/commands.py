@@ -1,7 +1,7 @@
 """Random commands of many kinds of motion.
 
-The monitor's thresholds come from `KINDS`; `HELD_OUT` were written after them, and no threshold was
-ever set on them.
+The monitor's threshold comes from `KINDS`; `HELD_OUT` were written after them, and nothing of the
+monitor was ever set on them.
 """
 
 from __future__ import annotations
@@ -12,12 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-KINDS = (
-    "hold", "steps", "ramps", "sines", "chirps", "noise", "triangles", "doublets", "stairs",
-    "manoeuvres", "gusts", "dither",
-)  # fmt: skip
-"""Kinds of motion; a piece has one, broken by holds."""
 Array = NDArray[np.float64]
 CORNER_HZ = 2.0
 """Frequency beyond which amplitudes fall, Hz."""
@@ -42,7 +38,7 @@ def random_command(
         count = int(rng.uniform(0.5, 6.0) * rate)
         chosen = "hold" if rng.uniform() < 0.2 else kind
         segment = Segment(count, rate, last, largest)
-        make = HELD_OUT.get(chosen)
+        make = (FURTHER | HELD_OUT).get(chosen)
         drawn = make(rng, segment) if make else _segment(rng, chosen, *segment)
         piece = np.clip(drawn, -largest, largest)
         out.append(piece)
@@ -187,9 +183,106 @@ def _hops(rng: np.random.Generator, s: Segment) -> Array:
     return out
 
 
-HELD_OUT: dict[str, Callable[[np.random.Generator, Segment], Array]] = {
+FURTHER: dict[str, Callable[[np.random.Generator, Segment], Array]] = {
     "multisine": _multisine, "binary": _binary, "walk": _walk, "sawtooth": _sawtooth,
     "approach": _approach, "trapezoid": _trapezoid, "creep": _creep, "taps": _taps,
     "beats": _beats, "hops": _hops,
 }  # fmt: skip
-"""Further kinds of motion, by name."""
+KINDS = (
+    "hold", "steps", "ramps", "sines", "chirps", "noise", "triangles", "doublets", "stairs",
+    "manoeuvres", "gusts", "dither", *FURTHER,
+)  # fmt: skip
+"""Kinds of motion; a piece has one, broken by holds."""
+
+
+def _turbulence(rng: np.random.Generator, s: Segment) -> Array:
+    """What answers gusts of Dryden's lateral spectrum, through a lag of 30 ms."""
+    lag = even_in_octaves(rng, (0.03, 1.0)) * s.rate
+    noise = lfilter([1.0 + 1.7 * lag, -1.7 * lag], [1.0], rng.standard_normal(s.ticks))
+    slow, answer = np.exp(-1.0 / np.array([lag, 0.03 * s.rate]))
+    gusts = lfilter([1.0], np.poly([slow, slow, answer]), noise)
+    wave: Array = gusts * (rng.uniform(0.03, 0.3) * s.largest / gusts.std())
+    return s.last + wave - wave[0]
+
+
+def _multistep(rng: np.random.Generator, s: Segment) -> Array:
+    """A pilot's 3-2-1-1 through the lag of the stick, and rest."""
+    unit, lag = rng.uniform(0.05, 0.6) * s.rate, math.exp(-1.0 / (rng.uniform(0.01, 0.1) * s.rate))
+    turn = np.searchsorted([3.0, 5.0, 6.0, 7.0], np.arange(s.ticks) / unit, side="right")
+    steps = np.array([1.0, -1.0, 1.0, -1.0, 0.0])[turn] * rng.uniform(-0.5, 0.5) * s.largest
+    return s.last + lfilter([1.0 - lag], [1.0, -lag], steps)
+
+
+def _sampled(rng: np.random.Generator, s: Segment) -> Array:
+    """A slower computer's commands: a smooth wave, held between its samples."""
+    width = int(rng.uniform(0.02, 0.25) * s.rate)
+    hertz = even_in_octaves(rng, (0.1, 1.5))
+    time = np.arange(s.ticks) // width * width / s.rate
+    return s.last + rng.uniform(-0.6, 0.6) * s.largest * np.sin(2 * np.pi * hertz * time)
+
+
+def _trim(rng: np.random.Generator, s: Segment) -> Array:
+    """Slow short ways of a trim, far between."""
+    speed = even_in_octaves(rng, (0.01, 0.2)) * s.largest / s.rate
+    on = np.arange(s.ticks) % int(rng.uniform(1.0, 4.0) * s.rate) < rng.uniform(0.1, 0.8) * s.rate
+    return s.last + np.cumsum(on) * speed * rng.choice((-1.0, 1.0))
+
+
+def _bursts(rng: np.random.Generator, s: Segment) -> Array:
+    """Oscillations that die away, as of flutter."""
+    hertz = even_in_octaves(rng, (2.0, 20.0))
+    time = np.arange(s.ticks) % int(rng.uniform(0.5, 3.0) * s.rate) / s.rate
+    size = rng.uniform(0.1, 0.9) * s.largest / (1.0 + hertz / CORNER_HZ)
+    return s.last + size * np.exp(-time * rng.uniform(1.0, 8.0)) * np.sin(2 * np.pi * hertz * time)
+
+
+def _landing(rng: np.random.Generator, s: Segment) -> Array:
+    """A slow change with ever busier corrections, a flare, and the surface back in the middle."""
+    share = np.arange(s.ticks) / s.ticks
+    busy = 0.15 * share * np.sin(2 * np.pi * s.ticks / s.rate * rng.uniform(0.5, 2.0) * share**1.5)
+    flare = rng.uniform(0.1, 0.6) * np.exp(-(((share - 0.7) / 0.06) ** 2))
+    path = s.last + s.largest * (rng.uniform(-0.3, 0.3) * share + busy + flare)
+    return np.where(share < 0.85, path, path * np.maximum(0.0, 1.0 - (share - 0.85) * 10.0))
+
+
+def _levels(rng: np.random.Generator, s: Segment) -> Array:
+    """One of some levels at a time, left at a limited rate, as by a switch."""
+    dwell = int(even_in_octaves(rng, (0.1, 1.5)) * s.rate)
+    levels = rng.integers(-2, 3, s.ticks // dwell + 1).repeat(dwell)[: s.ticks]
+    width = int(rng.uniform(0.01, 0.3) * s.rate)
+    ways: Array = np.convolve(levels, np.full(width, 1.0 / width))[: s.ticks]
+    return s.last + rng.uniform(0.05, 0.4) * s.largest * ways
+
+
+def _sweeps(rng: np.random.Generator, s: Segment) -> Array:
+    """A frequency that rises evenly and falls again, with pauses."""
+    time = np.arange(s.ticks) / s.rate
+    hertz = rng.uniform(2.0, 20.0) * np.abs(np.sin(np.pi * time / rng.uniform(2.0, 8.0)))
+    on = np.sin(2 * np.pi * time / rng.uniform(1.0, 4.0)) > -0.3
+    wave = np.sin(2 * np.pi * np.cumsum(hertz) / s.rate) / (1.0 + hertz / CORNER_HZ)
+    return s.last + rng.uniform(0.1, 0.9) * s.largest * on * wave
+
+
+def _deadband(rng: np.random.Generator, s: Segment) -> Array:
+    """A wave of which the small part is left out: rests, and moves to either side."""
+    wave = np.sin(2 * np.pi * even_in_octaves(rng, (0.1, 5.0)) * np.arange(s.ticks) / s.rate)
+    left = np.sign(wave) * np.maximum(0.0, np.abs(wave) - rng.uniform(0.2, 0.8))
+    return s.last + rng.uniform(-0.8, 0.8) * s.largest * left
+
+
+def _ringing(rng: np.random.Generator, s: Segment) -> Array:
+    """Steps through a lightly damped loop."""
+    turn, damping = 2 * np.pi * even_in_octaves(rng, (0.5, 6.0)) / s.rate, rng.uniform(0.1, 0.7)
+    radius = math.exp(-damping * turn)
+    poles = [1.0, -2.0 * radius * math.cos(turn * math.sqrt(1.0 - damping**2)), radius**2]
+    dwell = int(rng.uniform(0.5, 3.0) * s.rate)
+    steps = rng.uniform(-0.4, 0.4, s.ticks // dwell + 1).repeat(dwell)[: s.ticks]
+    return s.last + s.largest * lfilter([sum(poles)], poles, steps)
+
+
+HELD_OUT: dict[str, Callable[[np.random.Generator, Segment], Array]] = {
+    "turbulence": _turbulence, "multistep": _multistep, "sampled": _sampled, "trim": _trim,
+    "bursts": _bursts, "landing": _landing, "levels": _levels, "sweeps": _sweeps,
+    "deadband": _deadband, "ringing": _ringing,
+}  # fmt: skip
+"""Kinds of motion that nothing was set on."""
