@@ -216,16 +216,15 @@ def build_experiment(
     constants = unit_constants(actuator, environment)
     if acquired is not None:
         constants = constants._replace(DLY=constants.DLY + acquired.lead)
-    spool_offset, rest_pressure = _mean(spool[:rest]), _mean(pressure[:rest])
-    # What the jack's load or displaced lands ask for is no offset.
-    least, most = _rest_pressure_bounds(constants)
-    pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
-    origin, origin_read = 0.0, False
-    if _is_displaced(pressure_offset, pressure, test, channels.pressure):
-        # So much pressure is that of a spool that friction holds off the middle.
-        origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
-        origin = min(max(origin, -constants.XSM), constants.XSM)
-        spool_offset, pressure_offset = spool_offset - origin, 0.0
+    spool_offset, pressure_offset, origin = _offsets_at_rest(
+        spool, pressure, rest, constants, test, channels.pressure
+    )
+    origin_read = origin != 0.0 and _slides(position[:rest], channels.position)
+    if origin_read:
+        # The pressure is that of the jack's friction, and nothing shows the sensors' offsets.
+        origin = spool_offset + origin
+        spool[:rest] = pressure[:rest] = np.nan
+        rest, spool_offset, pressure_offset = 0, 0.0, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset
     rested = rest >= ESTIMATION.min_rest_samples
     # A motion to and fro leaves the sensor's offset.
@@ -378,6 +377,27 @@ def _held_ticks(pressure: Array, test: StoredTest, channel: Channel) -> tuple[in
         stands = end > quiet + round(REST.breakaway_s * test.rate)  # a sensor, not an actuator
         return (0, 0) if stands else (begin, end)
     return 0, 0
+
+
+def _offsets_at_rest(
+    spool: Array,
+    pressure: Array,
+    rest: int,
+    constants: PlantConstants,
+    test: StoredTest,
+    channel: Channel,
+) -> tuple[float, float, float]:
+    """Offsets of spool and pressure sensor by the ticks at rest, SI, and the spool's place, m."""
+    spool_offset, rest_pressure = _mean(spool[:rest]), _mean(pressure[:rest])
+    # What the jack's load or displaced lands ask for is no offset.
+    least, most = _rest_pressure_bounds(constants)
+    pressure_offset = rest_pressure - min(max(rest_pressure, least), most)
+    if not _is_displaced(pressure_offset, pressure, test, channel):
+        return spool_offset, pressure_offset, 0.0
+    # So much pressure is that of a spool that friction holds off the middle.
+    origin = rest_pressure / _rise_with_spool(constants) + constants.XLD
+    origin = min(max(origin, -constants.XSM), constants.XSM)
+    return spool_offset - origin, 0.0, origin
 
 
 def _is_displaced(offset: float, pressure: Array, test: StoredTest, channel: Channel) -> bool:

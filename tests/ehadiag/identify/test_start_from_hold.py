@@ -131,6 +131,35 @@ def test_friction_and_hysteresis_do_not_trade_by_a_wrong_origin(
     assert abs(found.value - faults[1]) < 4.0 * found.std < 0.03
 
 
+@pytest.fixture(scope="module")
+def sliding() -> UnitCase:
+    """A null bias holds the spool open, and the jack slides from the first tick on."""
+    return UnitCase("open", 17, seed=151)
+
+
+def test_a_jack_that_slides_at_rest_shows_no_offset(sliding: UnitCase) -> None:
+    test = ehadiag.bundled_tests()["open"]
+    unit, faults = draw_unit(sliding)
+    samples = record(unit, test, Faults(*faults), seed=5, step=COARSE_STEP).samples
+    assert samples is not None
+    begun = build_experiment(samples, ENVIRONMENT, test, ehadiag.default_actuator())
+    assert begun.origin_read
+    assert not begun.rested
+    assert begun.spool_offset == begun.pressure_offset == 0.0
+    offset = unit.sensors.offsets_lsb[1] * begun.channels.spool.lsb
+    assert begun.with_origin(offset).origin == pytest.approx(-6.9e-6, abs=2e-7)
+    assert not np.isfinite(begun.pressure[:200]).any()
+
+
+@pytest.mark.slow
+def test_friction_of_a_unit_whose_jack_slides_at_rest(sliding: UnitCase) -> None:
+    """It was 6 deviations off once, and sure."""
+    found = perform_unit(sliding)
+    assert found["verdict"] == "answered"
+    for truth, (low, high) in zip(found["faults"], found["interval95"], strict=True):
+        assert low < truth < high
+
+
 def test_what_creeps_before_the_motion_is_left_out(
     biased: tuple[Unit, list[float], Recording],
 ) -> None:
