@@ -219,7 +219,8 @@ def build_experiment(
     spool_offset, pressure_offset, origin = _offsets_at_rest(
         spool, pressure, rest, constants, test, channels.pressure
     )
-    origin_read = origin != 0.0 and _slides(position[:rest], channels.position)
+    slides = _slides(position[:rest], channels.position)
+    origin_read = origin != 0.0 and slides and constants.OIL == 0.0
     if origin_read:
         # The pressure is that of the jack's friction, and nothing shows the sensors' offsets.
         origin = spool_offset + origin
@@ -233,7 +234,7 @@ def build_experiment(
     if held:
         # Friction keeps spool and jack where they came to rest, and the pressure with them.
         place = float(np.nanmedian(centred[slips:held]))
-        origin = place / _rise_with_spool(constants) + constants.XLD
+        origin, origin_read = place / _rise_with_spool(constants) + constants.XLD, False
         seen, far = _mean(spool[slips:held]), REST.settling_lsb * channels.spool.lsb
         slides = _slides(position[slips:held], channels.position)
         if slides and abs(seen - origin) > far:

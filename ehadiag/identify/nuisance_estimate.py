@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
 from ehadiag.core.conventions import FRICTION_NAME
-from ehadiag.core.criteria import FIT, GIVE_UP
+from ehadiag.core.criteria import FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.estimates import (
     estimate_covariance,
     excess_cost,
@@ -347,6 +347,13 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
+def _likelihood_cost(residuals: Array) -> float:
+    """Twice the negative logarithm of the likelihood of residuals, shape (signals, N), by Cauchy's
+    cost over that of noise, and a constant."""
+    counts = np.count_nonzero(residuals, axis=1)
+    return float(np.dot(signal_excess_costs(residuals), counts))
+
+
 def _explains_far_more(excess: float, before: float) -> bool:
     """Whether an estimate leaves at most half of what another one leaves beside the noise."""
     return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
@@ -466,22 +473,13 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         since it stands in for what that law leaves out. Where neither end leaves half of what the
         other one does, the recording shows `FSS / k^m` alone (PHY-45): 0 is not believed then,
         which a file says that does not say anything. Where the model explains the unit to the
-        noise, as new and now, 0 is believed if the recording is likelier with it, or if the file
-        says that the laws of the faults are exact.
+        noise, as new and now, 0 is believed if the recording is likelier with it, or if the other
+        end's friction is within the law's discrepancy: a file may say that its laws are exact.
         """
         low, stated = self.prior.exponents
         before, own = (
             float(signal_excess_costs(item.refined.residuals)[SPOOL_ROW]) for item in (found, loose)
         )
-        shows = before > FIT.max_explained_excess
-        likely = False
-        if stated == 0.0:
-            likely = not shows and self.prior.explains_unit_as_new
-            shows = not likely or any(self.prior.discrepancy.values())
-        elif found.explained:
-            shows = False
-        if low < stated or not shows:
-            return None, False
         other = 0.0 if stated > MAX_CLOGGING_EXPONENT / 2.0 else MAX_CLOGGING_EXPONENT
         c, values = experiments[0].constants, found.refined.values
         bridge = self.prior.bridge if other > 0.0 else 0.0
@@ -492,14 +490,24 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
         new = c.FSS / (c.FSS1 - c.FSS)
         friction = (values[FRICTION_NAME] + new) * share ** (other - stated) - new
+        shows = before > FIT.max_explained_excess
+        to_noise = stated == 0.0 and not shows and self.prior.explains_unit_as_new
+        if stated == 0.0:
+            law = self.prior.discrepancy.get(FRICTION_NAME, 0.0) * values[FRICTION_NAME]
+            apart = abs(friction - values[FRICTION_NAME])
+            shows = not to_noise or apart > NORMAL_HALF_WIDTH_95 * law > 0.0
+        elif found.explained:
+            shows = False
+        if low < stated or not shows:
+            return None, False
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
         settings, _ = self._search(others, self.prior.loosened(), hint, budget=1)
-        residuals = search_in_stages(others, settings).found.residuals
-        if likely:
-            more = sum(signal_excess_costs(residuals)) - sum(
-                signal_excess_costs(found.refined.residuals)
-            )
-            return None, more * residuals.shape[1] < 2.0 * math.log(FIT.min_likelihood_ratio)
+        staged = search_in_stages(others, settings)
+        if to_noise:
+            there = estimate_about(others, settings, staged).refined.residuals
+            more = _likelihood_cost(there) - _likelihood_cost(found.refined.residuals)
+            return None, more < 2.0 * math.log(FIT.min_likelihood_ratio)
+        residuals = staged.found.residuals
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
         least = min(own, before)
         if least > FIT.max_explained_excess and _explains_far_more(left, least):
