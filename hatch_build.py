@@ -3,7 +3,6 @@
 An editable installation has none, and compiles at first use.
 """
 
-import os
 import subprocess
 import sys
 import sysconfig
@@ -31,7 +30,6 @@ class KernelHook(BuildHookInterface):
             return
         self._folder = tempfile.TemporaryDirectory()
         made = Path(self._folder.name) / "kernels"
-        environment = {"EHADIAG_CACHE_DIR": str(Path(self._folder.name) / "cache")} | os.environ
         # No PYTHONPATH: pip's own start-up drops from it what an editable installation names.
         begin = (
             "import runpy, sys;"
@@ -39,8 +37,7 @@ class KernelHook(BuildHookInterface):
             f"sys.argv[1:] = [{str(made)!r}, '--here'];"
             "runpy.run_module('ehadiag.compile', run_name='__main__')"
         )
-        command = [sys.executable, "-c", begin]
-        subprocess.run(command, env=environment, cwd=self._folder.name, check=True)
+        subprocess.run([sys.executable, "-c", begin], check=True)
         build_data["force_include"][str(made)] = "ehadiag/_kernels"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{machine}"

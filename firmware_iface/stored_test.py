@@ -211,7 +211,9 @@ def resolve_test(name: str) -> StoredTest:
 
 def _checked(test: StoredTest, where: str) -> StoredTest:
     if test.name == FREE_MOTION:
-        raise ConfigurationError(f"{where}: the name {test.name!r} is of what no test shows")
+        raise ConfigurationError(
+            f"{where}: the name {test.name!r} is kept for severities by the monitor: choose another"
+        )
     if test.unit not in COMMAND_UNITS[test.mode]:
         choice = " or ".join(COMMAND_UNITS[test.mode])
         raise ConfigurationError(

@@ -281,7 +281,8 @@ def inflated_size(packed: bytes | mmap.mmap, begin: int, end: int, limit: int) -
 
 def _open_mf4(path: Path) -> Any:
     try:
-        return mf4_library().MF4Reader(str(path))
+        with path.open("rb") as file:  # of a path, a reader that fails would leave it open
+            return mf4_library().MF4Reader(file)
     except NotImplementedError:
         raise InputOutputError(f"log {path}: MF4 needs asammdf: {install_command('mf4')}") from None
 

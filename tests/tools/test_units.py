@@ -162,5 +162,19 @@ def test_compare_logs_leaves_out_units_without_effects(tmp_path, capsys):
     assert "d.blf" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("study", "table"),
+    [("paper --recordings", "truth"), ("recorded-units --recordings", "truth"),
+     ("foreign-buses", "truth"), ("recordings", "truth"), ("recordings", "truth-effects")],
+)  # fmt: skip
+def test_a_table_without_a_column_ends_in_one_line(tmp_path, capsys, study, table):
+    (tmp_path / "truth.csv").write_text("file,test,Kintas,FSS,FDJ\n")
+    (tmp_path / f"{table}.csv").write_text("file,test,unit,effect,FSS,FDJ\n")
+    assert main([*study.split(), str(tmp_path)]) == ConfigurationError.exit_code
+    lacking = "Kintas" if table == "truth" else "value"
+    said = f"{study.split()[0]}: {tmp_path / table}.csv: without column {lacking}\n"
+    assert capsys.readouterr().err == said
+
+
 def test_default_unit_is_the_textbooks():
     assert Unit() == Unit(ACTUATOR, Effects())

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -121,6 +124,27 @@ def test_one_compilation_serves_all_values_of_a_table(
         (second,) = libraries.object_files(replace(blank, tables={"plan": two}))
     assert struct.pack(">171d", *two) in second
     assert second == first.replace(struct.pack(">171d", *one), struct.pack(">171d", *two))
+
+
+RANDOM_COMPILER = """
+import os, runpy
+from ehadiag.compile import libraries
+libraries.SHIPPED = ("simulator",)
+libraries._made = lambda *_: os.urandom(8)
+runpy.run_module("ehadiag.compile", run_name="__main__")
+"""
+
+
+@needs_levels
+@pytest.mark.parametrize("named", ["", "kernels"])
+def test_only_a_named_cache_spares_a_build_the_compiler(named: str, tmp_path: Path) -> None:
+    """What two builds make is compared before a release."""
+    where = {"HOME": str(tmp_path), "XDG_CACHE_HOME": "", "EHADIAG_CACHE_DIR": named}
+    for folder in ("once", "again"):
+        command = [sys.executable, "-c", RANDOM_COMPILER, folder, "--here"]
+        subprocess.run(command, env=os.environ | where, cwd=tmp_path, check=True)
+    once, again = (tmp_path / folder / libraries.MANIFEST for folder in ("once", "again"))
+    assert (once.read_bytes() == again.read_bytes()) is bool(named)
 
 
 def test_what_is_no_object_file_of_this_kind_is_refused() -> None:

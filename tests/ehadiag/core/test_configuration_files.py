@@ -134,7 +134,7 @@ TESTS = {
     "a great amplitude": ("amplitude = 8.0", "amplitude = 1e308", "amplitude"),
     "a great command": ("amplitude = 8.0", "amplitude = 9e4", "need at most 10 A"),
     "a great frequency": ("frequency = ", "frequency = 1e308 #", "beyond half the rate"),
-    "a name of none": ('name = "open"', 'name = "free motion"', "is of what no test shows"),
+    "a name of none": ('name = "open"', 'name = "free motion"', "by the monitor: choose another"),
     "a fast sine": ("frequency = ", "frequency = 501 #", "beyond half the rate"),
 }
 

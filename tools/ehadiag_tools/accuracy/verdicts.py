@@ -236,7 +236,7 @@ def perform_recorded(case: RecordedUnit) -> Record:
     sheet = folder / f"sheet-{case.unit}.toml"
     new: list[Recording] = []
     worn: list[Worn] = []
-    for row in read_rows(folder / "truth.csv"):
+    for row in read_rows(folder / "truth.csv", "file", *FAULT_NAMES):
         if row["file"].startswith(f"{case.unit}-"):
             recording = read_recording(folder / row["file"])
             truth = [float(row[name]) for name in FAULT_NAMES]
@@ -261,12 +261,11 @@ def _recorded_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _recorded_cases(options: Options) -> list[RecordedUnit]:
-    files = [row["file"] for row in read_rows(options.recordings / "truth.csv")]
+    truth = options.recordings / "truth.csv"
+    files = [row["file"] for row in read_rows(truth, "file", *FAULT_NAMES)]
     names = dict.fromkeys(file.partition("-")[0] for file in files if "-new-" in file)
     if not names:
-        raise ConfigurationError(
-            f"{options.recordings / 'truth.csv'}: no recording of a unit as new"
-        )
+        raise ConfigurationError(f"{truth}: no recording of a unit as new")
     stated = tuple(tuple(given) if given[1:] else given[0] for given in options.exponent)
     return [RecordedUnit(str(options.recordings), name, options.new, stated) for name in names]
 

@@ -170,7 +170,7 @@ def _cases(options: Options) -> list[BusReplay]:
 
 def _usual_cases(folder: Path, options: Options) -> Iterator[BusReplay]:
     """Recordings of a folder as they are; without those of units that are not calibrated."""
-    for row in read_rows(folder / "truth.csv"):
+    for row in read_rows(folder / "truth.csv", "file", *FAULT_NAMES):
         path, actuator = folder / row["file"], ""
         if options.only and path.stem not in options.only:
             continue

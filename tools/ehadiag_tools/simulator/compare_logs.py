@@ -116,7 +116,7 @@ def read_truth(path: Path) -> list[Truth]:
             row["file"], row["test"], Faults(*(float(row[name]) for name in FAULT_NAMES)),
             row.get("unit", ""),
         )
-        for row in read_rows(path)
+        for row in read_rows(path, "file", "test", *FAULT_NAMES)
     ]  # fmt: skip
 
 
@@ -195,16 +195,19 @@ def _missing(law: PositionController, command: float, current: float, simulated:
     return min(codes, key=misfit) * CHANNELS.position.lsb
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Read a table of comma-separated text with a head line."""
+def read_rows(path: Path, *columns: str) -> list[dict[str, str]]:
+    """Read a table of comma-separated text; ConfigurationError: it has not all these columns."""
     with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+        table = csv.DictReader(file)
+        if lacking := [name for name in columns if name not in (table.fieldnames or ())]:
+            raise ConfigurationError(f"{path}: without column {', '.join(lacking)}")
+        return list(table)
 
 
 def read_units(path: Path, actuator: Actuator) -> dict[str, Unit]:
     """Read `truth-effects.csv`, columns unit, effect, value: units of an actuator by name."""
     units: dict[str, Unit] = {}
-    for row in read_rows(path):
+    for row in read_rows(path, "unit", "effect", "value"):
         name = row["unit"]
         units[name] = _with_effect(units.get(name, Unit(actuator)), row["effect"], row["value"])
     return units
