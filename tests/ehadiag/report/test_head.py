@@ -30,6 +30,8 @@ from ehadiag.report.response_signals import result_picture
 from ehadiag.report.result_tables import NAMED_COLUMNS, diagnosis_html, print_result
 from ehadiag.report.signal_files import signal_file
 from ehadiag.result import Onboard, OnboardFault
+from ehadiag.session.bit_session import BitView
+from ehadiag.terminal.screen import _severities_text
 
 
 @pytest.fixture(scope="module")
@@ -268,6 +270,11 @@ def properties_of(result: ehadiag.Result) -> str:
     return "".join(re.findall(r"<common_properties>.*?</common_properties>", text, re.DOTALL))
 
 
+def live_at_the_end(result: ehadiag.Result) -> str:
+    session: Any = SimpleNamespace(_result=result)
+    return _severities_text(BitView._severities(session))
+
+
 @pytest.mark.parametrize(
     ("shown", "deviations"),
     [
@@ -278,8 +285,9 @@ def properties_of(result: ehadiag.Result) -> str:
         (listed, ["{value:.4f} ±"]),
         (row_of, ["{low}", "{std}", "0.000123"]),
         (properties_of, ["{low}", "{std}"]),
+        (live_at_the_end, ["± {std:.4f}"]),
     ],
-    ids=["terminal", "page", "notebook", "picture", "history", "row", "properties"],
+    ids=["terminal", "page", "notebook", "picture", "history", "row", "properties", "live"],
 )  # fmt: skip
 def test_no_surface_shows_an_interval_of_a_best_fit(
     worn: ehadiag.Result,
