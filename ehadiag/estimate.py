@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import msgspec
 
@@ -108,6 +109,14 @@ class Effect(msgspec.Struct, frozen=True, kw_only=True):
         """Whether its 95 % interval leaves 0 out."""
         low, high = self.interval95 or (0.0, 0.0)
         return low > 0.0 or high < 0.0
+
+
+Estimate = TypeVar("Estimate", Severity, Effect)
+
+
+def without_interval(item: Estimate) -> Estimate:
+    """Return an estimate without deviation and interval: the best fit of what is unexplained."""
+    return msgspec.structs.replace(item, std=None, interval95=None)
 
 
 class Suspect(msgspec.Struct, frozen=True, kw_only=True):

@@ -14,7 +14,7 @@ from msgspec import Meta, field
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
-from ehadiag.estimate import Culprit, Effect, Severity
+from ehadiag.estimate import Culprit, Effect, Severity, without_interval
 from ehadiag.request import MOST_SEED, Request
 from firmware_iface import FREE_MOTION
 from firmware_iface.errors import ConfigurationError, NotTestedError
@@ -339,6 +339,23 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def estimated(self) -> bool:
         """Whether there are estimates, of a test or of free motion."""
         return self.identified or self.test == FREE_MOTION
+
+    @property
+    def relied_on(self) -> bool:
+        """Whether stated intervals hold: not those of a test that its best fit does not explain."""
+        return not (self.identified and self.verdict is Verdict.NOT_TESTED)
+
+    @property
+    def as_shown(self) -> Result:
+        """The result as people see it: intervals that do not hold are left out."""
+        if self.relied_on:
+            return self
+        return msgspec.structs.replace(
+            self,
+            severities={name: without_interval(item) for name, item in self.severities.items()},
+            other=tuple(map(without_interval, self.other)),
+            effects=tuple(map(without_interval, self.effects)),
+        )
 
     @property
     def exit_code(self) -> int:

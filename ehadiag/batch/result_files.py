@@ -90,9 +90,10 @@ def result_row(result: Result) -> dict[str, Cell]:
     """
     row: dict[str, Cell] = dict.fromkeys(result_columns())
     row |= {name: _value(result, path) for name, (path, _) in PATHS.items()}
-    for name, severity in result.severities.items():
+    shown = result.as_shown
+    for name, severity in shown.severities.items():
         row |= {f"{name}{end}": of(severity) for end, of in OF_SEVERITY.items()}
-    for effect in result.effects:
+    for effect in shown.effects:
         row |= {f"{effect.name}{end}": of_effect(effect) for end, of_effect in OF_EFFECT.items()}
     return row
 

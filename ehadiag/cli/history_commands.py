@@ -244,7 +244,7 @@ def _plot(arguments: argparse.Namespace) -> None:
         whole, changes = history.alike(arguments.unit)
     entries = counted_entries([item for item in whole if item.serial == arguments.unit])
     events = [item for item in changes if item.serial == arguments.unit]
-    if not any(entry.severities for entry in entries):
+    if not any(entry.severities and entry.relied_on for entry in entries):
         raise ConfigurationError(f"serial {arguments.unit}: no diagnosis with severities to draw")
     future = prognosis_of(arguments.unit, whole, changes, (levels.advisory, levels.limit))
     picture = history_picture(entries, events, future)
@@ -311,7 +311,7 @@ def _read(arguments: argparse.Namespace) -> tuple[list[Entry], list[MaintenanceE
 
 def _entry_row(entry: Entry) -> tuple[str, ...]:
     severities = ", ".join(
-        f"{item.name} {item.estimate:.4f} ± {INTERVAL_STDS * item.std:.4f}"
+        f"{item.name} {item.estimate:.4f}" + f" ± {INTERVAL_STDS * item.std:.4f}" * entry.relied_on
         for item in entry.severities
         if item.estimate is not None and item.std is not None
     )

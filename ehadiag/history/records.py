@@ -153,6 +153,11 @@ class Entry(msgspec.Struct, frozen=True):
         """Whether it is of a test; else of a monitor, which gives no verdict."""
         return self.test != FREE_MOTION
 
+    @property
+    def relied_on(self) -> bool:
+        """Whether stated intervals hold: not those of a test that its best fit does not explain."""
+        return self.verdict != "NOT_TESTED" or not self.by_test
+
 
 class MaintenanceEvent(msgspec.Struct, frozen=True):
     """What was done to a unit."""

@@ -73,8 +73,7 @@ def lives_of(
     dated: dict[int, list[tuple[str, float]]] = {}
     for entry in entries:
         at = usage_of(entry, unit)
-        untested = entry.verdict == "NOT_TESTED" and entry.by_test
-        if entry.serial is None or at is None or untested:
+        if entry.serial is None or at is None or not entry.relied_on:
             continue
         dated.setdefault(entry.serial, []).append((entry.when, at))
         for item in entry.severities:

@@ -39,7 +39,7 @@ class Bar(msgspec.Struct, frozen=True):
     value: float | None
     """Severity, 0 … 1; None: not known."""
     interval: tuple[float, float] | None
-    """95 % interval."""
+    """95 % interval; None: not known, or it does not hold."""
     state: str
     """Name of the verdict that this severity alone gives; empty: not known."""
     standing: str
@@ -83,9 +83,10 @@ class Head(msgspec.Struct, frozen=True):
         return self.bars if self.verdict != Verdict.NOT_TESTED.name else ()
 
     @property
-    def relied_on(self) -> bool:
-        """Whether the stated intervals hold: no best fit of a test that it does not explain."""
-        return self.word != INCONCLUSIVE
+    def best_fit(self) -> str:
+        """Severities of a test that they do not explain, as a line."""
+        fits = (f"{bar.symbol} {bar.value:.2f}" for bar in self.bars if bar.value is not None)
+        return f"best fit, not to be relied on: {', '.join(fits)}"
 
     @property
     def title(self) -> str:
@@ -147,7 +148,7 @@ def head_of(result: Result, levels: Levels, prognosis: Prognosis | None = None) 
     """Return the content of a result's head."""
     untested = result.verdict is Verdict.NOT_TESTED
     bars = sorted(
-        (_bar(item, levels, untested) for item in result.severities.values()),
+        (_bar(item, levels, untested) for item in result.as_shown.severities.values()),
         key=lambda bar: -1.0 if bar.value is None else bar.value,
         reverse=True,
     )

@@ -60,12 +60,12 @@ def diagnosis_page(
     plots: dict[str, LayoutDOM] = {}
     columns = response_columns(result.diagnosis) if result.at_hand else ()
     responses = _draw_responses((column for _, column in columns), plots)
-    if trend is not None and any(entry.severities for entry in trend.entries):
+    if trend is not None and any(entry.severities and entry.relied_on for entry in trend.entries):
         plots["trend"] = plot_column(trend_column(trend.entries, trend.events, trend.prognosis))
     verdict = result.verdict.name
     future = trend.prognosis if trend else None
     head = head_of(result, levels, future)
-    faults = [_fault(bar, head.relied_on) for bar in head.bars]
+    faults = [_fault(bar) for bar in head.bars]
     dated = [f"{label} {date}" for label, date in head.facts if label in ("tested", "recorded")]
     return render_template(
         "report.html.j2",
@@ -80,7 +80,7 @@ def diagnosis_page(
         made=made,
         levels=levels,
         faults=faults,
-        effects=_effects(result, head.relied_on),
+        effects=_effects(result),
         quality=_quality(result),
         notes=result.notes,
         origin=_origin(result, version),
@@ -121,16 +121,16 @@ def _draw_responses(
     return out
 
 
-def _fault(bar: Bar, relied_on: bool) -> dict[str, Any]:
+def _fault(bar: Bar) -> dict[str, Any]:
     return {
         "name": bar.name if bar.name == bar.symbol else f"{bar.name} ({bar.symbol})",
         "estimate": bar.value,
-        "interval": bar.interval if relied_on else None,
+        "interval": bar.interval,
         "standing": bar.standing,
     }
 
 
-def _effects(result: Result, relied_on: bool) -> list[dict[str, str]]:
+def _effects(result: Result) -> list[dict[str, str]]:
     out = []
     for item in result.effects:
         if item.value is None or item.std is None:
@@ -138,7 +138,7 @@ def _effects(result: Result, relied_on: bool) -> list[dict[str, str]]:
         factor, unit = display_unit(item.unit, item.value)
         value, std = to_precision(factor * item.std, factor * item.value, factor * item.std)
         value += " (at its bound)" * item.at_bound
-        std = std if relied_on else "none"
+        std = std if result.relied_on else "none"
         out.append({"name": item.meaning or item.name, "value": value, "std": std, "unit": unit})
     return out
 

@@ -300,7 +300,9 @@ def _title(result: Result, columns: int) -> list[str]:
     lines = [head.title]
     for text in head.lines:
         lines += textwrap.wrap(printable(text), 110 * columns)
-    if result.identified:
+    if not result.relied_on:
+        lines.append(head.best_fit)
+    elif result.identified:
         faults = (
             f"{item.name} {item.value:.5f} ({item.interval[0]:.5f} … {item.interval[1]:.5f})"
             for item in result.severities.values()

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ehadiag.assess.verdict import Levels
+from ehadiag.assess.verdict import Levels, Verdict
 from ehadiag.core.conventions import display_unit, to_precision
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
@@ -61,7 +61,7 @@ def diagnosis_html(result: Result) -> str:
 
     head = head_of(result, Levels(result.request.advisory, result.request.limit))
     template = templates_of("ehadiag.report").get_template("notebook.html.j2")
-    severities = [result.severities[bar.symbol] for bar in head.bars]
+    severities = [result.as_shown.severities[bar.symbol] for bar in head.bars]
     return template.render(head=head, severities=severities, percent=percent)
 
 
@@ -79,10 +79,9 @@ def print_result(
     if verbose:
         for reason in result.reasons:
             _line(console, f"- {reason}")
-    relied_on = verbose or head.relied_on
+    relied_on = verbose or result.relied_on
     if not relied_on:
-        fits = (f"{bar.symbol} {_number(bar.value, 2)}" for bar in head.bars)
-        _line(console, f"best fit, not to be relied on: {', '.join(fits)}")
+        _line(console, head.best_fit)
     elif result.estimated:
         console.print(_severities(head, result, console), crop=False)
     if result.identified and verbose:
@@ -91,7 +90,8 @@ def print_result(
             _line(console, f"after the {name}: {', '.join(values)}")
     onboard = result.origins[0].onboard if len(result.origins) == 1 else None
     if onboard is not None:
-        _line(console, _on_board(onboard, result))
+        unexplained = onboard.verdict == Verdict.NOT_TESTED.name
+        _line(console, _on_board(onboard, result, verbose or (relied_on and not unexplained)))
     if result.other and relied_on:
         console.print(_limited(result), crop=False)
     effects = [item for item in result.effects if verbose or _is_shown(item)]
@@ -240,11 +240,11 @@ def _size(item: Effect) -> str:
     return f"{item.meaning} {' ± '.join(to_precision(std, value, std))} {item.shown_unit}"
 
 
-def _on_board(found: Onboard, result: Result) -> str:
+def _on_board(found: Onboard, result: Result, relied_on: bool) -> str:
     """What the flight-control computer found, beside what was found here."""
     parts = [f"on board: {(found.verdict or 'no verdict').replace('_', ' ')}"]
     parts += [
-        f"{name} {_known(item.estimate):.7f} ± {_known(item.std):.7f}"
+        f"{name} {_known(item.estimate):.7f}" + f" ± {_known(item.std):.7f}" * relied_on
         for name, item in found.faults.items()
     ]
     if found.evaluations is not None:
@@ -255,7 +255,7 @@ def _on_board(found: Onboard, result: Result) -> str:
         if item.estimate is not None and item.std
         if (own := result.severities.get(name)) is not None and own.estimate is not None
     ]
-    if apart:
+    if apart and relied_on:
         parts.append(f"at most {max(apart):.2f} of its deviations from what was found here")
     return ", ".join(parts)
 

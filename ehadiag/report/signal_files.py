@@ -163,7 +163,7 @@ def _properties(result: Result) -> dict[str, str]:
         "date": result.date,
         "source": result.source,
     }
-    for name, item in result.severities.items():
+    for name, item in result.as_shown.severities.items():
         low, high = item.interval95 or (None, None)
         out |= {name: item.estimate, f"{name}_std": item.std}
         out |= {f"{name}_low95": low, f"{name}_high95": high}

@@ -39,7 +39,7 @@ def history_picture(
 ) -> Picture:
     """Describe one unit's history over the prognosis' unit, else over time.
 
-    At least one of the entries has severities.
+    At least one of the entries has severities that are relied on.
     """
     column = trend_column(entries, events, prognosis, numbered=False)
     last = entries[-1]
@@ -74,9 +74,10 @@ def trend_column(
 ) -> PictureColumn:
     """Describe a unit's severities over hours or cycles, where the prognosis uses them, else time.
 
-    Entries without hours (or cycles) are left out. Both levels are drawn, and of each forecast the
-    median and the 80 % interval, up to some time after the first severity reaches the limit. Curves
-    are broken at events, which are marked by their numbers from 1, or by their texts.
+    Entries without hours (or cycles) are left out, and so are best fits of unexplained tests. Both
+    levels are drawn, and of each forecast the median and the 80 % interval, up to some time after
+    the first severity reaches the limit. Curves are broken at events, which are marked by their
+    numbers from 1, or by their texts.
     """
     unit = prognosis.unit if prognosis.used else None
     levels = prognosis.levels
@@ -89,6 +90,7 @@ def trend_column(
         rows = [
             (at, item.estimate, *item.interval95)
             for at, entry in placed
+            if entry.relied_on
             for item in entry.severities
             if item.name == name and item.estimate is not None and item.interval95 is not None
         ]

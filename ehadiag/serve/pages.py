@@ -185,7 +185,7 @@ class Pages:
         own = [item for item in events if item.serial == serial]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
         plots = {}
-        if any(entry.severities for entry in used):
+        if any(entry.severities and entry.relied_on for entry in used):
             plots["trend"] = plot_column(trend_column(used, own, future))
         return self._list(
             f"Unit {serial}",

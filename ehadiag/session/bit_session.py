@@ -237,7 +237,7 @@ class BitView:
 
     def _severities(self) -> tuple[Severity, ...]:
         if self._result is not None and self._result.identified:
-            return tuple(self._result.severities.values())
+            return tuple(self._result.as_shown.severities.values())
         so_far = self._session.so_far
         if so_far is None or self._result is not None:
             return ()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import json
 import re
+from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,10 +18,20 @@ from rich.console import Console
 
 import ehadiag
 from ehadiag import Levels
-from ehadiag.estimate import Culprit
+from ehadiag.batch.result_files import csv_table
+from ehadiag.cli.history_options import append_result
+from ehadiag.cli.main import main
+from ehadiag.estimate import Culprit, Effect
+from ehadiag.history.records import Usage
 from ehadiag.prognosis.forecast import RemainingLife
 from ehadiag.report.head import head_of, percent, remaining_sentences, stored_test_name
+from ehadiag.report.report_pages import diagnosis_page
+from ehadiag.report.response_signals import result_picture
 from ehadiag.report.result_tables import NAMED_COLUMNS, diagnosis_html, print_result
+from ehadiag.report.signal_files import signal_file
+from ehadiag.result import Onboard, OnboardFault
+from ehadiag.session.bit_session import BitView
+from ehadiag.terminal.screen import _severities_text
 
 
 @pytest.fixture(scope="module")
@@ -231,6 +245,84 @@ def test_an_unexplained_test_is_inconclusive_and_has_the_exit_code_of_not_tested
     assert not any("interval" in line for line in lines)
     assert len(lines) < 24
     assert "learn its normal behaviour" in head.actions[0]
+
+
+def page_of(result: ehadiag.Result) -> str:
+    return diagnosis_page(result, Levels(), "1.2.3", "2026-03-01T12:00:00.000Z")
+
+
+def listed(result: ehadiag.Result) -> str:
+    append_result(Path("h.sqlite"), result, Usage())
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        assert main(["history", "list", "--history", "h.sqlite"]) == 0
+    return out.getvalue()
+
+
+def row_of(result: ehadiag.Result) -> str:
+    with csv_table("r.csv") as take:
+        take(result)
+    return Path("r.csv").read_text()
+
+
+def properties_of(result: ehadiag.Result) -> str:
+    text = signal_file(result, "mf4").decode("latin-1")
+    return "".join(re.findall(r"<common_properties>.*?</common_properties>", text, re.DOTALL))
+
+
+def live_at_the_end(result: ehadiag.Result) -> str:
+    session: Any = SimpleNamespace(_result=result)
+    return _severities_text(BitView._severities(session))
+
+
+@pytest.mark.parametrize(
+    ("shown", "deviations"),
+    [
+        (lambda result: "\n".join(printed(result, 200)), ["{low:.5f}", "{std:.5f}", "±"]),
+        (page_of, ["{low:.5f}", "interval {percent:.3f}", ">0.012<"]),
+        (diagnosis_html, ["{low:.5f}", "{std:.5f}", "interval {percent:.3f}"]),
+        (lambda result: result_picture(result).title, ["({low:.5f} …"]),
+        (listed, ["{value:.4f} ±"]),
+        (row_of, ["{low}", "{std}", "0.000123"]),
+        (properties_of, ["{low}", "{std}"]),
+        (live_at_the_end, ["± {std:.4f}"]),
+    ],
+    ids=["terminal", "page", "notebook", "picture", "history", "row", "properties", "live"],
+)  # fmt: skip
+def test_no_surface_shows_an_interval_of_a_best_fit(
+    worn: ehadiag.Result,
+    shown: Callable[[ehadiag.Result], str],
+    deviations: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdj = worn.severities["FDJ"]
+    low, std = fdj.interval[0], fdj.std
+    found = OnboardFault(estimate=fdj.estimate, std=0.01)
+    onboard = Onboard(verdict="DEGRADED", test_id=2, evaluations=9, faults={"FDJ": found})
+    bias = Effect(
+        name="null_bias",
+        meaning="null bias",
+        value=0.5,
+        unit="1",
+        std=0.000123,
+        interval95=(0.4, 0.6),
+    )
+    explained = msgspec.structs.replace(
+        worn, effects=(bias,), origins=(msgspec.structs.replace(worn.origins[0], onboard=onboard),)
+    )
+    reason = "the model does not explain the recording: 9.0% of the residuals beyond three times"
+    texts = [
+        item.format(value=fdj.value, low=low, std=std, percent=100.0 * low) for item in deviations
+    ]
+    text = shown(explained.with_diagnosis(worn.diagnosis))
+    assert [item for item in texts if item not in text] == []
+    unexplained = untested(explained, reason, fit=worn.fit)
+    text = shown(unexplained.with_diagnosis(worn.diagnosis))
+    assert [item for item in texts if item in text] == []
+    assert f"{fdj.value:.2f}"[:3] in text
+    assert json.loads(unexplained.to_json())["faults"]["FDJ"]["std"] == std
 
 
 def test_a_sound_unit_needs_nothing(worn: ehadiag.Result) -> None:

@@ -181,6 +181,15 @@ def test_the_last_test_of_a_trend_is_no_free_motion():
     assert panel.curves[0].x[-1] == 450.0
 
 
+def test_a_trend_leaves_out_what_no_test_explains():
+    worn = [an_entry(1, 100.0 * n, (0.02 * n, 0.02 * n, 0.01 * n)) for n in range(1, 5)]
+    unexplained = structs.replace(worn[-1], usage=Usage(450.0), verdict="NOT_TESTED")
+    entries = [*worn, unexplained]
+    (panel,) = trend_column(entries, [], future(entries)).panels
+    assert [line.at for line in panel.lines if line.label == "last test"] == [450.0]
+    assert panel.curves[0].x[-1] == 400.0
+
+
 def test_a_slow_severity_does_not_squeeze_the_trend_of_a_fast_one():
     """The picture ends some time after the first limit, not with the longest forecast."""
     worn = [an_entry(1, 100.0 * n, (0.002 * n, 0.05 * n, 0.003 * n)) for n in range(1, 13)]
