@@ -84,7 +84,7 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
         type=options.positive_number,
         default=FALSE_ALARM_INTERVAL_H,
         metavar="H",
-        help="mean time between false alarms (default %(default)g)",
+        help="mean time between false alarms (default %(default)g; between tests at least 2)",
     )
     group.add_argument(
         "--least",

@@ -210,7 +210,7 @@ def watch(
     find : Callable[[int], UnitState | None] | None
         Looks up the state of a unit once the bus has its serial number; None: nothing is looked up.
     hours : float
-        Mean time between false alarms, h.
+        Mean time between false alarms, h; between tests at least 2.
     least : float | None
         Least change of a severity worth an alarm, 1; None: `ehadiag.monitor.change_test.LEAST`.
     duration_s : float | None

@@ -69,7 +69,7 @@ class BusMonitor:
     actuator: its data; bus_map: which message and signal plays which role; unit: its state before;
     `take_over` exchanges it; tests: tests that the computer may run; hours: mean time between false
     alarms, h; least: least change of a severity worth an alarm, 1; None: free motion is not tested
-    for changes; on_alarm: called for the first of several alarms that follow each other closely.
+    for changes; on_alarm: called for each alarm that repeats none.
     ConfigurationError: the bus's ticks cannot be told from single frames; hours, least or
     severities out of range.
     """
@@ -124,7 +124,7 @@ class BusMonitor:
         self.alarms = 0
         """Number of alarms, without repeated ones."""
         self.repeated = 0
-        """Number of alarms that closely followed one of the same sum."""
+        """Number of alarms that repeat one of the same sum or change."""
         self._build()
 
     @property

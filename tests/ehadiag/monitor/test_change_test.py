@@ -137,20 +137,26 @@ def test_a_filter_that_clogs_is_found_by_the_votes_of_the_blocks_that_show_it() 
 
 
 class VotingBank(ScoreBank):
-    """A bank whose blocks show of the filter what the command says, and of all else nothing."""
+    """A bank whose blocks show of a cause what the command says, and of all else nothing."""
+
+    cause, size = "Kintas", 1.0
+    """What explains the blocks, and its size in steps."""
 
     def settle(self, rows: Array2) -> None:
         """Run no model."""
 
     def push(self, rows: Array2) -> BlockScore:
         gain = np.zeros((2, len(BANK)))
-        gain[:, BANK_NAMES.index("Kintas")] = rows[0, 0]
+        gain[int(self.size < 0.0), BANK_NAMES.index(self.cause)] = rows[0, 0]
         return BlockScore(np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK))), gain, len(rows))
 
     def gains(
         self, blocks: list[tuple[Array2, Environment]], trials: list[tuple[int, float]]
     ) -> list[float]:
-        return [100.0 * len(blocks) * (BANK_NAMES[place] == "Kintas") for place, _ in trials]
+        return [
+            100.0 * len(blocks) * (BANK_NAMES[place] == self.cause) / (1.0 + abs(size - self.size))
+            for place, size in trials
+        ]
 
 
 def votes_of(test: ChangeTest, gain: float, count: int) -> list[Change]:
@@ -170,13 +176,56 @@ def test_a_voted_change_that_comes_and_goes_leaves_the_next_one_to_be_found() ->
     assert [item.repeated for item in votes_of(test, 1000.0, 60)][:1] == [False]
 
 
-def test_a_change_found_anew_within_an_hour_repeats_its_alarm() -> None:
-    test = ChangeTest(VotingBank(ACTUATOR, WORN), 2.0, 100.0)
-    assert [item.repeated for item in votes_of(test, 1000.0, 60)][:1] == [False]
+def repeats(bank: VotingBank, test: ChangeTest, size: float) -> bool:
+    """Whether a change of so many steps, found after three minutes without one, is a repeat."""
     votes_of(test, -20.0, 360)
-    (again, *_) = votes_of(test, 1000.0, 60)
-    assert again.causes[0].name == "Kintas"
-    assert again.repeated
+    bank.size = size
+    first = next(item for item in votes_of(test, 1000.0, 60) if item.causes)
+    assert first.causes[0].name == bank.cause
+    return first.repeated
+
+
+def voting() -> tuple[VotingBank, ChangeTest]:
+    bank = VotingBank(ACTUATOR, WORN)
+    return bank, ChangeTest(bank, 2.0, 100.0)
+
+
+def test_a_change_found_anew_within_an_hour_repeats_its_alarm() -> None:
+    bank, test = voting()
+    found = [repeats(bank, test, size) for size in (3.0, 3.0, 2.5, 3.5)]
+    assert found == [False, True, True, True]
+
+
+def test_a_change_that_has_grown_is_another_alarm() -> None:
+    """One that grew fourfold within three minutes was a repeat."""
+    bank, test = voting()
+    assert [repeats(bank, test, size) for size in (1.0, 4.0, 4.0)] == [False, False, True]
+
+
+def test_a_change_that_grows_while_it_goes_on_is_another_alarm() -> None:
+    bank, test = voting()
+    assert [item.repeated for item in votes_of(test, 1000.0, 120)].count(False) == 1
+    bank.size = 4.0
+    assert [item.repeated for item in votes_of(test, 1000.0, 240)].count(False) == 1
+
+
+def test_a_change_in_the_other_direction_is_another_alarm() -> None:
+    bank, test = voting()
+    bank.cause = "load"
+    found = [repeats(bank, test, size) for size in (3.0, -3.0, 3.0, -3.0)]
+    assert found == [False, False, True, True]
+
+
+def test_an_alarm_is_repeated_for_an_hour_of_motion_whatever_repeats_it() -> None:
+    """Each turn has four minutes of motion, and a silence, which does not count."""
+    bank, test = voting()
+    found = []
+    for _ in range(18):
+        found.append(repeats(bank, test, 1.0))
+        votes_of(test, -20.0, 60)
+        test.reset()
+    assert found[:14] == [False] + [True] * 13
+    assert found[14:].count(False) == 1
 
 
 def test_a_cause_that_wins_two_votes_in_three_is_no_change() -> None:
