@@ -68,15 +68,20 @@ class AveragingRules(msgspec.Struct, frozen=True):
     """Lives that the experts' own statement of their misses stands for."""
     early: float = 1.4
     """Lower half of that statement over the upper one, 1: what speeds up is commoner."""
-    early_alone: float = 0.8
-    """The same without a fleet, 1: there `unseen` and `later_alone` hold."""
+    stated_alone: float = 0.6
+    """Both halves of it without a fleet, 1: there the other rules named `alone` hold."""
     unseen: float = 0.75
     """Least lower half of an interval over the logarithm of the way that few lives have passed, 1:
     growth may be faster there."""
     unseen_quantile: float = 0.25
     """Quantile of the highest severities of the lives up to which the way counts as passed, 1."""
-    later_alone: float = 0.3
+    later_alone: float = 0.35
     """Least logarithm of the upper half of an interval without a fleet: growth may slow down."""
+    swing_alone: float = 0.7
+    """Least logarithm of each half without a fleet over the swing of the life's rate, 1: what rose
+    and fell will do so again, as by the season."""
+    swing_parts: int = 6
+    """Number of parts of a life whose rates are compared for it."""
     max_widening: float = 1.1
     """Largest ratio of the calibrated chances' distance from the median to the asked one, 1."""
     law_power: float = 0.3
@@ -284,16 +289,19 @@ def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     off = truth - median[past]
     miss = off / np.where(off > 0.0, high[past] - median[past], median[past] - low[past])
     alone = len(fleet.seen) < rules.min_lives
-    early = rules.early_alone if alone else rules.early
-    calibrated = _calibrated(miss, counted[past], early)
+    halves = (rules.stated_alone, rules.stated_alone) if alone else (rules.early, 1.0)
+    calibrated = _calibrated(miss, counted[past], halves)
     middle, lower, upper = float(median[-1]), float(low[-1]), float(high[-1])
     logs = middle + np.where(calibrated > 0.0, upper - middle, middle - lower) * calibrated
     passed = [MIN_SEVERITY, float(life.value.max())]
     if not alone:
         tops = [float(item.value.max()) for item in fleet.seen]
         passed.append(float(np.quantile(tops, rules.unseen_quantile)))
-    earlier = rules.unseen * max(math.log(level / max(passed)), 0.0)
-    least = np.where(CHANCES < 0.5, earlier, rules.later_alone if alone else 0.0)
+    earlier, later = rules.unseen * max(math.log(level / max(passed)), 0.0), 0.0
+    if alone:
+        swing = rules.swing_alone * _swing(life)
+        earlier, later = max(earlier, swing), max(rules.later_alone, swing)
+    least = np.where(CHANCES < 0.5, earlier, later)
     least *= _normal_score(CHANCES) / _normal_score(np.array(0.9))
     apart = logs - np.median(logs)
     logs += np.where(np.abs(apart) < np.abs(least), least - apart, 0.0)
@@ -301,6 +309,16 @@ def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     quantiles = np.where(never, np.inf, np.exp(np.minimum(logs, rules.max_log_time)))
     found = {name: float(weight) for name, weight in zip(names, weights[:, -1], strict=True)}
     return Passage(quantiles * float(life.age[-1]), found, float(counted[past].sum()))
+
+
+def _swing(life: Life) -> float:
+    """Lesser of the largest rise and the largest fall of a life's rate, as logarithms."""
+    ends = np.linspace(0.0, life.age[-1], AVERAGING_RULES.swing_parts + 1)
+    top = np.maximum.accumulate(np.r_[0.0, life.value])
+    grown = np.diff(np.interp(ends, np.r_[0.0, life.age], top))
+    rate = np.log(np.maximum(grown, life.std.max()))  # less is noise
+    rise = np.max(rate - np.minimum.accumulate(rate))
+    return float(min(rise, np.max(np.maximum.accumulate(rate) - rate)))
 
 
 def filter_own(life: Life, fleet: Fleet) -> OwnLife:
@@ -516,14 +534,14 @@ def _middle(drawn: Array, weights: Array) -> tuple[Array, Array, Array]:
     return median, np.minimum(low, median - 0.02), np.maximum(high, median + 0.02)
 
 
-def _calibrated(miss: Array, counted: Array, early: float) -> Array:
+def _calibrated(miss: Array, counted: Array, halves: tuple[float, float]) -> Array:
     """Quantiles of the misses at `CHANCES`, in half intervals, beside those that were stated.
 
-    early: lower half of those over the upper one, 1.
+    halves: lower and upper half of those, 1.
     """
     rules = AVERAGING_RULES
     stated = _normal_score((np.arange(99) + 0.5) / 99) / _normal_score(np.array(0.9))
-    stated = np.where(stated < 0.0, early * stated, stated)
+    stated *= np.where(stated < 0.0, *halves)
     every = np.r_[miss, stated]
     weight = np.r_[counted, np.full(99, rules.even_misses / 99)]
     order = np.argsort(every)

@@ -203,6 +203,21 @@ def test_a_way_that_few_lives_have_passed_may_be_passed_faster() -> None:
             assert np.log(left.high / left.median) > 0.99 * AVERAGING_RULES.later_alone
 
 
+def test_a_rate_that_rose_and_fell_may_do_so_again() -> None:
+    """Without a fleet each half of the interval has a share of the swing, else it has not."""
+    age = 100.0 * np.arange(1.0, 25.0)
+    for fast, slow in ((4e-4, 4e-5), (2.2e-4, 2.2e-4)):
+        growth = 100.0 * np.where(np.arange(24) // 4 % 2, slow, fast)
+        life = Life(1, age, np.cumsum(growth), np.full(24, NOISE), 0)
+        left = of(life, ALONE, (0.75,)).remaining[0]
+        assert left.median is not None
+        assert left.low is not None
+        assert left.high is not None
+        least = AVERAGING_RULES.swing_alone * np.log(10.0)
+        for half in (np.log(left.median / left.low), np.log(left.high / left.median)):
+            assert (half > 0.99 * least) == (fast > slow)
+
+
 def test_severities_by_free_motion_count_and_a_refused_test_does_not() -> None:
     rows = [an_entry(7, 100.0 * n, (0.03 * n, 0.1, 0.1)) for n in range(1, 5)]
     untested = {"verdict": "NOT_TESTED"}
