@@ -237,14 +237,14 @@ def _plot(arguments: argparse.Namespace) -> None:
     from ehadiag.history.records import counted_entries  # noqa: PLC0415
     from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415 - slow
     from ehadiag.report.rendering import isolated_png  # noqa: PLC0415
-    from ehadiag.report.trend_bus_pictures import history_picture  # noqa: PLC0415
+    from ehadiag.report.trend_bus_pictures import has_trend, history_picture  # noqa: PLC0415
 
     levels = Levels()
     with open_named_history(arguments) as history:
         whole, changes = history.alike(arguments.unit)
     entries = counted_entries([item for item in whole if item.serial == arguments.unit])
     events = [item for item in changes if item.serial == arguments.unit]
-    if not any(entry.severities and entry.relied_on for entry in entries):
+    if not has_trend(entries):
         raise ConfigurationError(f"serial {arguments.unit}: no diagnosis with severities to draw")
     future = prognosis_of(arguments.unit, whole, changes, (levels.advisory, levels.limit))
     picture = history_picture(entries, events, future)

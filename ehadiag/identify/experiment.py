@@ -219,11 +219,11 @@ def build_experiment(
     spool_offset, pressure_offset, origin = _offsets_at_rest(
         spool, pressure, rest, constants, test, channels.pressure
     )
-    slides = _slides(position[:rest], channels.position)
-    origin_read = origin != 0.0 and slides and constants.OIL == 0.0
+    displaced = origin != 0.0 and constants.OIL == 0.0
+    origin_read = displaced and _slides(position[:rest], channels.position)
     if origin_read:
         # The pressure is that of the jack's friction, and nothing shows the sensors' offsets.
-        origin = spool_offset + origin
+        origin = _mean(spool[:rest])
         spool[:rest] = pressure[:rest] = np.nan
         rest, spool_offset, pressure_offset = 0, 0.0, 0.0
     spool, pressure = spool - spool_offset, pressure - pressure_offset

@@ -385,11 +385,11 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         if not found.explained and any(item.origin_read for item in experiments):
             found = self._from_origin(experiments, found, hint, before)
         shortened = any(one is not other for one, other in zip(whole, experiments, strict=True))
-        most = GIVE_UP.third_start_outliers[1]
-        outliers = residual_outlier_share(found.refined.residuals)
-        if not found.explained and shortened and outliers <= most:
-            # What creeps leads a search, though it may end it in a wrong place.
-            found = _better_of(found, self._with(whole, self.prior, hint, before))
+        if not found.explained and shortened:
+            most = GIVE_UP.third_start_outliers[1]
+            if residual_outlier_share(found.refined.residuals) <= most:
+                # What creeps leads a search, though it may end it in a wrong place.
+                found = _better_of(found, self._with(whole, self.prior, hint, before))
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
@@ -482,11 +482,6 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         )
         other = 0.0 if stated > MAX_CLOGGING_EXPONENT / 2.0 else MAX_CLOGGING_EXPONENT
         c, values = experiments[0].constants, found.refined.values
-        bridge = self.prior.bridge if other > 0.0 else 0.0
-        others = [
-            replace(item, constants=item.constants._replace(CLE=other, BRG=bridge))
-            for item in experiments
-        ]
         share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
         new = c.FSS / (c.FSS1 - c.FSS)
         friction = (values[FRICTION_NAME] + new) * share ** (other - stated) - new
@@ -500,14 +495,18 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             shows = False
         if low < stated or not shows:
             return None, False
+        bridge = self.prior.bridge if other > 0.0 else 0.0
+        others = [
+            replace(item, constants=item.constants._replace(CLE=other, BRG=bridge))
+            for item in experiments
+        ]
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
         settings, _ = self._search(others, self.prior.loosened(), hint, budget=1)
-        staged = search_in_stages(others, settings)
         if to_noise:
-            there = estimate_about(others, settings, staged).refined.residuals
+            there = estimate_nuisances(others, settings).refined.residuals
             more = _likelihood_cost(there) - _likelihood_cost(found.refined.residuals)
             return None, more < 2.0 * math.log(FIT.min_likelihood_ratio)
-        residuals = staged.found.residuals
+        residuals = search_in_stages(others, settings).found.residuals
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
         least = min(own, before)
         if least > FIT.max_explained_excess and _explains_far_more(left, least):

@@ -21,7 +21,7 @@ from ehadiag.report.head import full_name, head_of, percent
 from ehadiag.report.page_parts import render_template
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
 from ehadiag.report.response_signals import calibration_columns, response_columns
-from ehadiag.report.trend_bus_pictures import trend_column
+from ehadiag.report.trend_bus_pictures import has_trend, trend_column
 
 if TYPE_CHECKING:
     from bokeh.models import LayoutDOM
@@ -60,7 +60,7 @@ def diagnosis_page(
     plots: dict[str, LayoutDOM] = {}
     columns = response_columns(result.diagnosis) if result.at_hand else ()
     responses = _draw_responses((column for _, column in columns), plots)
-    if trend is not None and any(entry.severities and entry.relied_on for entry in trend.entries):
+    if trend is not None and has_trend(trend.entries):
         plots["trend"] = plot_column(trend_column(trend.entries, trend.events, trend.prognosis))
     verdict = result.verdict.name
     future = trend.prognosis if trend else None

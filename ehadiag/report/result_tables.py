@@ -61,7 +61,8 @@ def diagnosis_html(result: Result) -> str:
 
     head = head_of(result, Levels(result.request.advisory, result.request.limit))
     template = templates_of("ehadiag.report").get_template("notebook.html.j2")
-    severities = [result.as_shown.severities[bar.symbol] for bar in head.bars]
+    shown = result.as_shown.severities
+    severities = [shown[bar.symbol] for bar in head.bars]
     return template.render(head=head, severities=severities, percent=percent)
 
 

@@ -39,7 +39,7 @@ def history_picture(
 ) -> Picture:
     """Describe one unit's history over the prognosis' unit, else over time.
 
-    At least one of the entries has severities that are relied on.
+    There is a trend, see `has_trend`.
     """
     column = trend_column(entries, events, prognosis, numbered=False)
     last = entries[-1]
@@ -63,6 +63,11 @@ def first_to_the_limit(prognosis: Prognosis, advice: Mapping[str, str]) -> list[
     said = [f"{text[0].upper()}{text[1:]}" for text in said]
     action = advised(advice.get(item.name, ""), at_once=value >= limit)
     return [*said, action] if said and action and value >= advisory else said
+
+
+def has_trend(entries: Sequence[Entry]) -> bool:
+    """Whether any entry has severities that are relied on, which `trend_column` draws."""
+    return any(entry.severities and entry.relied_on for entry in entries)
 
 
 def trend_column(

@@ -32,7 +32,7 @@ from ehadiag.report.head import (
 )
 from ehadiag.report.page_parts import embed_plots, script_sources, templates_of
 from ehadiag.report.prognosis_tables import named_levels, remaining_text
-from ehadiag.report.trend_bus_pictures import first_to_the_limit, trend_column
+from ehadiag.report.trend_bus_pictures import first_to_the_limit, has_trend, trend_column
 from ehadiag.result import Result
 from ehadiag.serve.server import Page
 from firmware_iface import FREE_MOTION
@@ -185,7 +185,7 @@ class Pages:
         own = [item for item in events if item.serial == serial]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
         plots = {}
-        if any(entry.severities and entry.relied_on for entry in used):
+        if has_trend(used):
             plots["trend"] = plot_column(trend_column(used, own, future))
         return self._list(
             f"Unit {serial}",

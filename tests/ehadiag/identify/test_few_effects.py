@@ -6,9 +6,8 @@ units whose data differ from their file by its tolerance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -81,7 +80,6 @@ def test_two_effects_of_a_healthy_unit_in_closed_loop():
 class Answer:
     excess: float
     explained: bool = False
-    refined: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(residuals=np.zeros(0)))
 
 
 CALIBRATED = UnitPrior(joint=JointPrior(("null_bias",), np.zeros(1), np.array([[1e-16]])))
@@ -104,7 +102,6 @@ def test_effects_are_loosened_only_where_that_explains_what_the_calibration_does
 
     monkeypatch.setattr(nuisance_estimate, "estimate_nuisances", answer)
     monkeypatch.setattr(nuisance_estimate, "considered_parameters", lambda *_: ())
-    monkeypatch.setattr(nuisance_estimate, "residual_outlier_share", lambda _residuals: 0.0)
     known = replace(CALIBRATED, aliases=(object(),))
     freeing = nuisance_estimate.NuisanceEstimator(known, effects=(), progress=lambda _share: None)
     found = freeing.estimated([], None, 9.0)
