@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import copysign, exp, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ REVERSAL = 1e-9
 equations; a root at zero would find the solver's rounding and let it stick."""
 
 Vector = NDArray[np.float64]
+State = list[float]
+"""Plain numbers: numpy takes many times as long for one."""
 
 
 @dataclass(slots=True)
@@ -50,14 +53,16 @@ class _Mass:
         """Friction at a speed, N."""
         if self.stribeck == 0.0:
             return self.dynamic
-        return float(
-            self.dynamic + (self.static - self.dynamic) * np.exp(-abs(speed) / self.stribeck)
-        )
+        return self.dynamic + (self.static - self.dynamic) * exp(-abs(speed) / self.stribeck)
+
+
+def _clipped(value: float, least: float, most: float) -> float:
+    return min(max(value, least), most)
 
 
 @dataclass(frozen=True, slots=True)
 class _Event:
-    value: Callable[[Vector], float]
+    value: Callable[[State], float]
     direction: int
     action: Callable[[], None]
 
@@ -90,7 +95,7 @@ class StiffReference:
             _Mass(2, 3, valve.MS, valve.XSM, spool, spool / 2.0, self._effects.spool_stribeck),
             _Mass(4, 5, jack.MJ, jack.XJM, 2.0 * rod, rod, self._effects.jack_stribeck),
         )
-        self._y = np.zeros(7)
+        self._y: State = [0.0] * 7
         self._ball = 0.0
         self._plays = [0.0] * int(self._effects.plays)
         self._torque = 0.0
@@ -113,7 +118,7 @@ class StiffReference:
             solution = solve_ivp(
                 self._rate,
                 (time, self._period),
-                self._y,
+                np.array(self._y),
                 method="LSODA",
                 rtol=TOLERANCE,
                 atol=ABSOLUTE,
@@ -122,13 +127,13 @@ class StiffReference:
             if not solution.success:
                 raise RuntimeError(solution.message)
             time = float(solution.t[-1])
-            self._y = solution.y[:, -1].copy()
+            self._y = solution.y[:, -1].tolist()
             self._ball = self._feedback(self._y)
             for times, event in zip(solution.t_events, table, strict=True):
                 if len(times):
                     event.action()
             self._break_away()
-        return float(self._y[2]), self._pressure(self._y), float(self._y[4])
+        return self._y[2], self._pressure(self._y), self._y[4]
 
     def _inside(self, current: float) -> float:
         """Current behind null bias and hysteresis, A."""
@@ -136,56 +141,54 @@ class StiffReference:
         value = current + effects.null_bias
         for i, held in enumerate(self._plays):
             radius = effects.hysteresis * self._rated * (i + 0.5) / count
-            self._plays[i] = float(np.clip(held, value - radius, value + radius))
+            self._plays[i] = _clipped(held, value - radius, value + radius)
         return sum(self._plays) / count
 
-    def _feedback(self, y: Vector) -> float:
+    def _feedback(self, y: State) -> float:
         """Where the ball is that KSF feels, m; the spool moves one way between two events."""
         play = self._effects.backlash
-        return float(np.clip(self._ball, y[2] - play, y[2] + play))
+        return _clipped(self._ball, y[2] - play, y[2] + play)
 
-    def _pressure(self, y: Vector) -> float:
+    def _pressure(self, y: State) -> float:
         if self._stage.kind == "orifice":
-            return float(y[6])
+            return y[6]
         valve = self._valve
         if abs(valve.GP * y[2]) < valve.PSR:
             source, resistance = valve.GP * y[2], valve.GP / valve.GQ
         else:
-            source, resistance = np.sign(y[2]) * valve.PSR, valve.PSR / (valve.GQ * abs(y[2]))
+            source, resistance = copysign(valve.PSR, y[2]), valve.PSR / (valve.GQ * abs(y[2]))
         # P12 = PS - R (AJ DXJ + CLK P12), solved for P12.
         pressure = (source - resistance * self._jack.AJ * y[5]) / (1.0 + resistance * valve.CLK)
-        return float(np.clip(pressure, -valve.PSR, valve.PSR))
+        return _clipped(pressure, -valve.PSR, valve.PSR)
 
-    def _act(self, index: int, y: Vector) -> float:
+    def _act(self, index: int, y: State) -> float:
         """Sum of all forces on a mass but dry friction, N (flapper: torque, N m)."""
         valve, jack = self._valve, self._jack
         if index == 0:
-            return float(
-                self._torque - valve.KSF * self._feedback(y) - valve.KF * y[0] - valve.CF * y[1]
-            )
+            return self._torque - valve.KSF * self._feedback(y) - valve.KF * y[0] - valve.CF * y[1]
         if index == 1:
             flow = valve.AS * y[3]
             pressure = valve.GPF * y[0] - valve.GPF / self._flow_gain * flow
-            return float(valve.AS * pressure - valve.CS * y[3])
-        return float(jack.AJ * self._pressure(y) - jack.CJ * y[5] - self._load(y))
+            return valve.AS * pressure - valve.CS * y[3]
+        return jack.AJ * self._pressure(y) - jack.CJ * y[5] - self._load(y)
 
-    def _load(self, y: Vector) -> float:
-        return float(self._jack.FR + self._effects.load + self._effects.load_spring * y[4])
+    def _load(self, y: State) -> float:
+        return self._jack.FR + self._effects.load + self._effects.load_spring * y[4]
 
-    def _rises(self, y: Vector) -> float:
+    def _rises(self, y: State) -> float:
         """Rate of the pressure behind orifices, Pa/s."""
         valve = self._valve
         underlap = 2.0 * valve.PSR / valve.GP
         ahead, behind = 1.0 - y[6] / valve.PSR, 1.0 + y[6] / valve.PSR
         flow = valve.GQ * (
-            max(y[2] + underlap, 0.0) * np.sign(ahead) * np.sqrt(abs(ahead))
-            - max(underlap - y[2], 0.0) * np.sign(behind) * np.sqrt(abs(behind))
+            max(y[2] + underlap, 0.0) * copysign(sqrt(abs(ahead)), ahead)
+            - max(underlap - y[2], 0.0) * copysign(sqrt(abs(behind)), behind)
         )
         net = flow - self._jack.AJ * y[5] - valve.CLK * y[6]
-        return float(2.0 * self._stage.beta / self._stage.volume_of_one_chamber * net)
+        return 2.0 * self._stage.beta / self._stage.volume_of_one_chamber * net
 
-    def _rate(self, _time: float, y: Vector) -> list[float]:
-        rate = [0.0] * 7
+    def _rate(self, _time: float, state: Vector) -> State:
+        y, rate = state.tolist(), [0.0] * 7
         if self._stage.kind == "orifice":
             rate[6] = self._rises(y)
         for index, mass in enumerate(self._masses):
@@ -194,7 +197,7 @@ class StiffReference:
                 rate[mass.v] = self._acceleration(index, y)
         return rate
 
-    def _acceleration(self, index: int, y: Vector) -> float:
+    def _acceleration(self, index: int, y: State) -> float:
         mass = self._masses[index]
         return (self._act(index, y) - mass.sliding(y[mass.v]) * mass.motion) / mass.inertia
 
@@ -253,7 +256,7 @@ def _terminal(event: _Event) -> Callable[[float, Vector], float]:
         terminal = True
         direction = event.direction
 
-        def __call__(self, _time: float, y: Vector) -> float:
-            return event.value(y)
+        def __call__(self, _time: float, state: Vector) -> float:
+            return event.value(state.tolist())
 
     return Function()

@@ -7,11 +7,8 @@ from pathlib import Path
 
 import pytest
 from cli_result import Result, Run
-from coarse_simulation import coarse_step
 
 from ehadiag.cli.main import main
-
-__all__ = ["coarse_step"]
 
 
 @pytest.fixture(scope="session", autouse=True)

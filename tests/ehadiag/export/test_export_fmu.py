@@ -37,6 +37,11 @@ pytestmark = [
 ]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse_step():
+    """Not here: a unit has the simulator's own step."""
+
+
 @pytest.fixture(scope="module")
 def units(tmp_path_factory):
     out = tmp_path_factory.mktemp("units")

@@ -1,4 +1,4 @@
-"""Kernels that fuse nothing have the same bits for blocks of any width."""
+"""Kernels that fuse nothing have the same bits for blocks of either width."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from ehadiag.model.residual_models import SimdModel
 from ehadiag.model.simd_residuals import block_scratch, run_blocks
 from firmware_iface.recording import CHANNELS
 
-WIDTHS = (1, 8, 16)
+WIDTHS = (1, 16)
+"""Those in use: one candidate, and the blocks of a search."""
 CURRENT = np.concatenate(
     [
         4e-3 * np.sin(np.arange(300) * 0.05) + 0.4e-3 * np.sin(np.arange(300) * 1.1),
@@ -92,4 +93,4 @@ def test_each_width_has_the_same_bits(kernels, effects, kind):
         found[width] = out.tobytes(), anchored.tolist()
     assert sum(found[1][1]) > 0
     assert np.frombuffer(found[1][0]).std() > 1.0
-    assert found[1] == found[8] == found[16]
+    assert found[1] == found[16]

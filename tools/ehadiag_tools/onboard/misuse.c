@@ -53,11 +53,12 @@ static void state_set(uint32_t value)
 #if defined(__ARM_FP) && !(__ARM_FP & 8) /* doubles in software */
 #define SMALL float
 #define SMALLEST FLT_MIN
-#define SLICES 4 /* of a job: an hour of emulation for all of it */
 #else
 #define SMALL double
 #define SMALLEST DBL_MIN
-#define SLICES 100
+#endif
+#ifndef SLICES
+#define SLICES 100 /* of a job, all of it; an emulator may be too slow for that */
 #endif
 #define TICKS 3000
 #define TEST_TICKS EHA_TEST_TICKS_CURRENT
