@@ -14,7 +14,7 @@ from places import LOGS
 from ehadiag import Recording, StoredTest, default_actuator
 from ehadiag.assess.acceptance import is_complete_recording
 from ehadiag.assess.diagnosis import DiagnosisSession
-from ehadiag.session.bit_session import EarlyIdentification, early_identification
+from ehadiag.session.bit_run import EarlyIdentification, early_identification
 from ehadiag.setup import Deadline
 from firmware_iface.handshake import Phase
 from firmware_iface.logs.reader import read_frames

@@ -23,8 +23,7 @@ from ehadiag.core.interruption import (
     signals_restored,
     stop_on_signals,
 )
-from ehadiag.session.bit_run import STOPPED_TWICE_REASON
-from ehadiag.session.bit_session import EarlyIdentification
+from ehadiag.session.bit_run import STOPPED_TWICE_REASON, EarlyIdentification
 from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import BitState
 

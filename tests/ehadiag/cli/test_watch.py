@@ -27,7 +27,7 @@ from ehadiag import (
 from ehadiag.estimate import Severity
 from ehadiag.request import Request
 from ehadiag.session.alarm_outlets import AlarmLog
-from ehadiag.session.bit_session import BitView
+from ehadiag.session.bit_run import BitView
 from ehadiag.session.bus_monitor import BusMonitor, MonitorAlarm
 from ehadiag.session.monitor_session import BitMonitor
 from ehadiag.session.unit_state import UnitState, new_unit_state

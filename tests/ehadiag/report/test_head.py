@@ -30,7 +30,7 @@ from ehadiag.report.response_signals import result_picture
 from ehadiag.report.result_tables import NAMED_COLUMNS, diagnosis_html, print_result
 from ehadiag.report.signal_files import signal_file
 from ehadiag.result import Onboard, OnboardFault
-from ehadiag.session.bit_session import BitView
+from ehadiag.session.bit_run import BitView
 from ehadiag.terminal.screen import _severities_text
 
 
