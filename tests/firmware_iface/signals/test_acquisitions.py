@@ -13,7 +13,6 @@ import pytest
 from ehadiag import bundled_tests, default_actuator
 from ehadiag.identify.experiment import build_experiment
 from ehadiag_tools.rigs.replay import SETTLING_S, DaqCase, perform_daq, recorded_columns
-from ehadiag_tools.simulator.units import COARSE_STEP
 from firmware_iface.bus_map import default_map
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.signals.recordings import Interpretation, recorded_tests
@@ -25,7 +24,6 @@ def case(test: str, rate: float, **changes: object) -> DaqCase:
     usual = {
         "test": test, "faults": (0.484, 0.841, 0.611), "rate": rate, "bits": 12,
         "with_command": False, "lead_in_s": 0.357, "phase": 0.3, "drift_ppm": 55.0, "seed": 11,
-        "step": COARSE_STEP,
     }  # fmt: skip
     return DaqCase(**(usual | changes))
 

@@ -23,7 +23,7 @@ from ehadiag.assess.diagnosis import diagnose
 from ehadiag.core.actuator import Actuator, default_actuator, load_actuator
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag_sim.conditions import Faults, Sensors, UnmodelledEffects
-from ehadiag_sim.plant_dynamics import DEFAULT_STEP_S, PlantDynamics
+from ehadiag_sim.plant_dynamics import PlantDynamics
 from ehadiag_sim.plant_laws import PositionController
 from ehadiag_sim.sensing import SimulatedConverters
 from ehadiag_sim.simulation import bus_command
@@ -237,8 +237,7 @@ class DaqCase:
     """One recording: test, severities, and how it was acquired.
 
     Rate: of the acquisition, Hz; phase: of its first sample, of its interval; drift: of its clock
-    against the computer's, ppm; lead_in: from the recording's beginning to the test's, s; step: of
-    the plant's integration, s.
+    against the computer's, ppm; lead_in: from the recording's beginning to the test's, s.
     """
 
     test: str
@@ -250,7 +249,6 @@ class DaqCase:
     phase: float
     drift_ppm: float
     seed: int
-    step: float = DEFAULT_STEP_S
 
 
 def recorded_columns(case: DaqCase) -> dict[str, NDArray[np.float64]]:
@@ -263,8 +261,7 @@ def recorded_columns(case: DaqCase) -> dict[str, NDArray[np.float64]]:
     command = np.concatenate([np.zeros(rest), bus_command(test), np.zeros(after)])
     # Advances by one sample at a time.
     controller = replace(actuator.controller, rate=PLANT_RATE)
-    fast = replace(actuator, controller=controller)
-    plant = PlantDynamics(fast, Faults(*case.faults), step=case.step)
+    plant = PlantDynamics(replace(actuator, controller=controller), Faults(*case.faults))
     # Half a step at most: a larger offset of the computer moves the rest, and nothing else.
     own = Sensors(offsets_lsb=tuple(rng.uniform(-0.5, 0.5, len(CHANNELS)).tolist()))
     computer = SimulatedConverters(
