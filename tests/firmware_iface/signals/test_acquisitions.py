@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,12 +12,24 @@ import pytest
 
 from ehadiag import bundled_tests, default_actuator
 from ehadiag.identify.experiment import build_experiment
+from ehadiag_sim.plant_dynamics import PlantDynamics
+from ehadiag_tools.rigs import replay
 from ehadiag_tools.rigs.replay import SETTLING_S, DaqCase, perform_daq, recorded_columns
+from ehadiag_tools.simulator.units import COARSE_STEP
 from firmware_iface.bus_map import default_map
 from firmware_iface.find_test import CandidateTests
 from firmware_iface.signals.recordings import Interpretation, recorded_tests
 
 SOUGHT = CandidateTests(tuple(bundled_tests().values()), default_actuator().controller)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_plant():
+    """As much as a cubic between two samples needs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay, "PLANT_RATE", 20_000.0)
+        patch.setattr(replay, "PlantDynamics", partial(PlantDynamics, step=COARSE_STEP))
+        yield
 
 
 def case(test: str, rate: float, **changes: object) -> DaqCase:
