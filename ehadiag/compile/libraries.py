@@ -57,20 +57,13 @@ LIBRARIES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "ehadiag.identify.compact_ga": ("draw_generation", "update_state"),
     },
     "simulator": {"ehadiag_sim.plant_dynamics": ("advance_plant",)},
-    "onboard": {
-        "ehadiag.onboard.onboard_identification": (
-            "begin_identification",
-            "continue_identification",
-        ),
-        "ehadiag.onboard.onboard_memory": ("set_environment",),
-    },
 }
 """Kernels of each library by their modules, the one that takes longest to compile first. A kernel
 in none of them is a library of its own."""
 LANES_OF = {"search": GROUND_LANES}
 """Candidates side by side in a library's kernels, where they are more than one."""
 SHIPPED = ("search", "model", "simulator")
-"""Libraries that come with the package; `onboard` runs elsewhere, and here only in studies."""
+"""Libraries that come with the package: all of several kernels."""
 IDENTIFICATION, SIMULATION = ("search", "model"), ("simulator",)
 """Libraries that every identification and every simulation needs."""
 _X86, _ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"

@@ -3,6 +3,8 @@
 import ctypes
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import llvmlite.binding as llvm
@@ -95,3 +97,11 @@ class Loaded:
         """A function of so many pointers."""
         address = self._engine.get_function_address(name)
         return ctypes.CFUNCTYPE(ctypes.c_int32, *[ctypes.c_void_p] * arguments)(address)
+
+
+@cache
+def host_library():
+    """The export for this computer, of the reference actuator."""
+    with TemporaryDirectory() as place:
+        code = (_export("host", Path(place, "host")) / "libeha.a").read_bytes()
+    return Loaded(object_of(code))

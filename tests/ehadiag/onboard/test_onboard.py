@@ -8,6 +8,7 @@ import platform
 
 import numpy as np
 import pytest
+from exported import host_library
 from hypothesis import example, given
 from hypothesis import strategies as st
 from places import LOGS
@@ -22,14 +23,14 @@ from ehadiag.compile.elementary import (
     square_root,
 )
 from ehadiag.compile.jit import brief_kernel
-from ehadiag.export.library import library_plan
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.export.library import exported_unit, library_plan
 from ehadiag.monitor.plan import design_cusum
-from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
 from ehadiag.onboard.onboard_memory import ONBOARD, REASONS, OnboardOutcome
 from ehadiag_tools.onboard.replay import surrounded, ticks_of
 from firmware_iface.logs.reader import read_recording
 
-PLAN = library_plan(default_actuator(), design_cusum(100.0, 1e-3))
+PLAN = library_plan(default_actuator(), design_cusum(FALSE_ALARM_INTERVAL_H, 1e-3))
 NOT_TESTED = 30.0
 FE_OVERFLOW, FE_ALL_EXCEPT = 0x08, 0x3D
 """Of an x86-64's <fenv.h>."""
@@ -43,17 +44,17 @@ with (LOGS / "truth.csv").open() as file:
 def begun(log):
     """Ticks of a recording, and the memory of an identification that was begun for it."""
     recording = read_recording(LOGS / log)
-    unit = np.array(surrounded(recording), dtype=np.float64)
-    memory = np.zeros(ONBOARD.end)
-    assert begin_identification(memory.ctypes.data, PLAN.ctypes.data, unit.ctypes.data) == 0
+    unit, memory = exported_unit(surrounded(recording), PLAN), np.zeros(ONBOARD.end)
+    begin = host_library().function("eha_identify_begin", 2)
+    assert begin(memory.ctypes.data, unit.ctypes.data) == 0
     return np.ascontiguousarray(ticks_of(recording)), memory
 
 
 def run(memory, ticks, work=1e9):
     """One slice of an identification; whether it goes on."""
-    amounts = float(len(ticks)), float(work)
-    places = memory.ctypes.data, PLAN.ctypes.data, ticks.ctypes.data
-    return continue_identification(*places, amounts) == 1
+    going = host_library().function("eha_identify_run", 3)
+    amounts = np.array([len(ticks), work])
+    return going(memory.ctypes.data, ticks.ctypes.data, amounts.ctypes.data) == 1
 
 
 def outcome_of(memory):
@@ -140,22 +141,6 @@ def test_another_length_between_calls_is_noticed():
     assert run(memory, ticks, 60_000.0)
     assert not run(memory, ticks[:-1])
     assert outcome_of(memory).reasons == REASONS.changed
-
-
-@pytest.mark.parametrize("amounts", [(0.0, 1.0), (2e6, 1.0), (500.0, 0.0), (math.nan, 1.0)])
-def test_an_amount_out_of_its_range_is_refused(amounts):
-    memory = np.zeros(ONBOARD.end)
-    assert (
-        continue_identification(memory.ctypes.data, PLAN.ctypes.data, memory.ctypes.data, amounts)
-        == 2
-    )
-
-
-def test_a_unit_that_cannot_be_is_refused():
-    memory, unit = np.full(ONBOARD.end, 3.0), np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 2e7, 0.0])
-    places = memory.ctypes.data, PLAN.ctypes.data, unit.ctypes.data
-    assert begin_identification(*places) == 1
-    assert (memory == 3.0).all()
 
 
 @pytest.mark.parametrize("x", [1e-16, 1e-3, 0.5, 0.999, 1.0, 1.7, 12345.6])

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exported import host_library
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -18,13 +19,13 @@ from places import LOGS
 from ehadiag import Verdict, bundled_tests, default_actuator
 from ehadiag.assess import acceptance, verdict
 from ehadiag.assess.diagnosis import diagnose
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.criteria import ESTIMATION, FIT
-from ehadiag.export.library import library_plan
+from ehadiag.export.library import exported_unit, library_plan
 from ehadiag.identify.identification_session import NuisanceMode
 from ehadiag.model.plant import relative_viscosity
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard import onboard_optimum
-from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
 from ehadiag.onboard.onboard_memory import (
     ONBOARD,
     ONBOARD_GENES,
@@ -43,7 +44,7 @@ from firmware_iface.recording import CHANNELS
 
 LEVELS = verdict.Levels()
 ACTUATOR = default_actuator()
-PLAN = library_plan(ACTUATOR, design_cusum(100.0, 1e-3))
+PLAN = library_plan(ACTUATOR, design_cusum(FALSE_ALARM_INTERVAL_H, 1e-3))
 EDGE = 1e-5
 """Of a chance: the normal distribution on board is one to 1e-7."""
 NOT_TESTED = 30.0
@@ -197,13 +198,20 @@ def damaged(damage):
 
 def carried(ticks, supply=2e7):
     """Whether ticks of the reference unit carry a verdict on board."""
-    memory, ticks = np.zeros(ONBOARD.end), np.ascontiguousarray(ticks)
     unit = np.array(surrounded(RECORDING))
     unit[UNIT_SUPPLY] = supply
-    places = memory.ctypes.data, PLAN.ctypes.data
-    assert begin_identification(*places, unit.ctypes.data) == 0
-    continue_identification(*places, ticks.ctypes.data, (float(len(ticks)), 1.5 * len(ticks)))
+    _, memory = run(unit, ticks, 1.5 * len(ticks))
     return bool(memory[PROGRESS.phase] == PHASES.grids)
+
+
+def run(unit, ticks, work):
+    """Code of the first slice of an identification on board, and its memory."""
+    memory, start = np.zeros(ONBOARD.end), exported_unit(unit, PLAN)
+    ticks, amounts = np.ascontiguousarray(ticks), np.array([len(ticks), work])
+    begin = host_library().function("eha_identify_begin", 2)
+    assert begin(memory.ctypes.data, start.ctypes.data) == 0
+    going = host_library().function("eha_identify_run", 3)
+    return going(memory.ctypes.data, ticks.ctypes.data, amounts.ctypes.data), memory
 
 
 def test_a_sound_recording_carries_a_verdict():
@@ -234,9 +242,6 @@ def test_what_the_host_does_not_test_the_board_does_not_either(name):
     recording = damaged(DAMAGES[name])
     found = diagnose([recording], ACTUATOR, bundled_tests().values(), nuisances=NuisanceMode.NONE)
     assert found.verdict is Verdict.NOT_TESTED
-    ticks = np.ascontiguousarray(ticks_of(recording))
-    memory, unit = np.zeros(ONBOARD.end), np.array(surrounded(recording), dtype=np.float64)
-    places = memory.ctypes.data, PLAN.ctypes.data
-    assert begin_identification(*places, unit.ctypes.data) == 0
-    assert continue_identification(*places, ticks.ctypes.data, (float(len(ticks)), 1e9)) == 0
+    code, memory = run(surrounded(recording), ticks_of(recording), 1e9)
+    assert code == 0
     assert memory[ONBOARD_VERDICT] == NOT_TESTED
