@@ -25,6 +25,7 @@ def run(place: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_pytest(tmp_path: Path) -> None:
     """One unit within its limits, the same beyond tighter ones, severities in the report."""
     words = ("-m", "pytest", *PLUGIN, "-p", "no:cacheprovider", "-c", "/dev/null")
@@ -46,6 +47,7 @@ def test_a_unit_without_a_bus_is_skipped(tmp_path: Path) -> None:
     assert "1 skipped" in done.stdout
 
 
+@pytest.mark.slow
 def test_openhtf(tmp_path: Path) -> None:
     pytest.importorskip("openhtf")
     done = run(tmp_path, str(FOLDER / "openhtf_station.py"))
@@ -54,6 +56,7 @@ def test_openhtf(tmp_path: Path) -> None:
     assert (tmp_path / "openhtf.blf").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_robot_framework(tmp_path: Path) -> None:
     pytest.importorskip("robot")
     words = ("-m", "robot", "--pythonpath", str(FOLDER), str(FOLDER / "unit.robot"))
