@@ -249,10 +249,7 @@ class OnboardUnit:
 @cache
 def _library() -> ctypes.CDLL:
     """Export of the reference actuator, one for each process."""
-    with tempfile.TemporaryDirectory(prefix="ehadiag-onboard-") as place:
-        with Folder.at(Path(place), RESULT_MODE) as folder:
-            export_library(default_actuator(), find_target("host"), folder)
-        return ctypes.CDLL(str(Path(place, SHARED_LIBRARY_FILE)))
+    return ctypes.CDLL(str(_export("host") / SHARED_LIBRARY_FILE))
 
 
 def _call(name: str, *arguments: NDArray[np.float64]) -> int:
