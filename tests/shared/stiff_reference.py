@@ -21,9 +21,9 @@ from ehadiag_sim.conditions import Effects
 
 __all__ = ["StiffReference"]
 
-TOLERANCE = 1e-9
-ABSOLUTE = np.array([1e-13, 1e-10] * 3 + [1e-2])
-"""m, m/s and Pa: a millionth of a converter's step and less."""
+TOLERANCE = 1e-8
+ABSOLUTE = np.array([1e-12, 1e-9] * 3 + [1e-1])
+"""m, m/s and Pa. With it responses are a thousandth of a converter's step off at most."""
 REVERSAL = 1e-9
 """m/s. A mass that creeps towards its equilibrium under dynamic friction never stops by the
 equations; a root at zero would find the solver's rounding and let it stick."""
