@@ -23,6 +23,11 @@ SLOW_LIMIT = 1800.0
 """Time limit of a test that is marked slow, s; that of others is in pyproject.toml."""
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than processors: some tests wait for a bus that keeps time."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give slow tests more time."""
     for item in items:
