@@ -197,7 +197,7 @@ def test_a_way_that_few_lives_have_passed_may_be_passed_faster() -> None:
         assert left.high is not None
         tops = [0.0] if fleet is ALONE else [float(item.value.max()) for item in fleet.seen]
         passed = max(life.value.max(), np.quantile(tops, AVERAGING_RULES.unseen_quantile))
-        least = AVERAGING_RULES.unseen * np.log(level / passed)
+        least = np.log(level / passed)
         assert np.log(left.median / left.low) > 0.99 * least
         if fleet is ALONE:
             assert np.log(left.high / left.median) > 0.99 * AVERAGING_RULES.later_alone
