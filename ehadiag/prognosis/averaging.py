@@ -64,11 +64,11 @@ class AveragingRules(msgspec.Struct, frozen=True):
     """Lives that an even prior over the parameter sets stands for."""
     even_questions: float = 0.6
     """Questions that even weights of the experts stand for."""
-    even_misses: float = 2.0
+    even_misses: float = 3.0
     """Lives that the experts' own statement of their misses stands for."""
     early: float = 1.4
     """Lower half of that statement over the upper one, 1: what speeds up is commoner."""
-    stated_alone: float = 0.75
+    stated_alone: float = 0.7
     """Both halves of it without a fleet, 1: there the other rules named `alone` hold."""
     unseen_quantile: float = 0.25
     """Quantile of the highest severities of the lives up to which the way counts as passed, 1."""
