@@ -72,8 +72,9 @@ class AveragingRules(msgspec.Struct, frozen=True):
     """Both halves of it without a fleet, 1: there the other rules named `alone` hold."""
     unseen_quantile: float = 0.25
     """Quantile of the highest severities of the lives up to which the way counts as passed, 1."""
-    later_alone: float = 0.35
-    """Least logarithm of the upper half of an interval without a fleet: growth may slow down."""
+    later: float = 0.35
+    """Least logarithm of the upper half of an interval without a fleet, and that over the logarithm
+    of the way that few lives have passed with one, 1: growth may slow down."""
     swing_alone: float = 0.7
     """Least logarithm of each half without a fleet over the swing of the life's rate, 1: what rose
     and fell will do so again, as by the season."""
@@ -290,15 +291,16 @@ def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     calibrated = _calibrated(miss, counted[past], halves)
     middle, lower, upper = float(median[-1]), float(low[-1]), float(high[-1])
     logs = middle + np.where(calibrated > 0.0, upper - middle, middle - lower) * calibrated
-    # Where few lives have passed, growth may speed up in proportion to the severity.
-    passed, swing, later = [MIN_SEVERITY, float(life.value.max())], 0.0, 0.0
-    if alone:
-        swing = rules.swing_alone * _swing(life)
-        later = max(rules.later_alone, swing)
-    else:
+    passed = [MIN_SEVERITY, float(life.value.max())]
+    if not alone:
         tops = [float(item.value.max()) for item in fleet.seen]
         passed.append(float(np.quantile(tops, rules.unseen_quantile)))
-    earlier = max(math.log(level / max(passed)), swing, 0.0)
+    # Where few lives have passed, growth may speed up in proportion to the severity.
+    earlier = max(math.log(level / max(passed)), 0.0)
+    later = rules.later * (1.0 if alone else earlier)
+    if alone:
+        swing = rules.swing_alone * _swing(life)
+        earlier, later = max(earlier, swing), max(later, swing)
     least = np.where(CHANCES < 0.5, earlier, later)
     least *= _normal_score(CHANCES) / _normal_score(np.array(0.9))
     apart = logs - np.median(logs)
