@@ -62,28 +62,24 @@ class AveragingRules(msgspec.Struct, frozen=True):
     """Power of the density of a life's diagnoses: laws are wrong, so their evidence counts less."""
     even_lives: float = 2.0
     """Lives that an even prior over the parameter sets stands for."""
-    even_questions: float = 2.0
+    even_questions: float = 0.6
     """Questions that even weights of the experts stand for."""
-    even_misses: float = 2.0
+    even_misses: float = 3.0
     """Lives that the experts' own statement of their misses stands for."""
     early: float = 1.4
     """Lower half of that statement over the upper one, 1: what speeds up is commoner."""
-    stated_alone: float = 0.6
+    stated_alone: float = 0.7
     """Both halves of it without a fleet, 1: there the other rules named `alone` hold."""
-    unseen: float = 0.75
-    """Least lower half of an interval over the logarithm of the way that few lives have passed, 1:
-    growth may be faster there."""
     unseen_quantile: float = 0.25
     """Quantile of the highest severities of the lives up to which the way counts as passed, 1."""
-    later_alone: float = 0.35
-    """Least logarithm of the upper half of an interval without a fleet: growth may slow down."""
+    later: float = 0.35
+    """Least logarithm of the upper half of an interval without a fleet, and that over the logarithm
+    of the way that few lives have passed with one, 1: growth may slow down."""
     swing_alone: float = 0.7
     """Least logarithm of each half without a fleet over the swing of the life's rate, 1: what rose
     and fell will do so again, as by the season."""
     swing_parts: int = 6
     """Number of parts of a life whose rates are compared for it."""
-    max_widening: float = 1.1
-    """Largest ratio of the calibrated chances' distance from the median to the asked one, 1."""
     law_power: float = 0.3
     """Power of a law's evidence in its weight, 1: the laws' disagreement stays in the interval."""
     level_shares: tuple[float, ...] = (1.0, 0.75, 0.5)
@@ -94,8 +90,8 @@ class AveragingRules(msgspec.Struct, frozen=True):
     """Severity over the asked level from which a life that ended is run on to it, 1."""
     run_on_powers: tuple[float, float] = (-1.0, 3.0)
     """Least and largest power of the severity by which it is run on."""
-    outlier_density: float = 0.02
-    """Density per unit of the logarithm that each expert is given for what it never draws."""
+    max_miss: float = 2.0
+    """Half intervals that a past answer is off at most, 1; a normal deviate passes them in 1 %."""
     max_log_time: float = 8.0
     """Largest logarithm of remaining time over age, 1; a factor of 3000 stands for never."""
 
@@ -135,6 +131,8 @@ class Passage(msgspec.Struct, frozen=True):
 
 
 CHANCES = np.linspace(0.01, 0.99, 99)
+SCORE_TIMES = np.geomspace(0.01, 6.0, 28)
+"""Times over a life's length, 1, at which a past answer is scored; later ones count as the last."""
 SCORE_STEP, LEAST_SCORE = 0.005, -37.0
 SCORES = np.arange(LEAST_SCORE, 8.0, SCORE_STEP)
 """Normal deviates, 1, at which their chance is tabulated."""
@@ -297,10 +295,12 @@ def passage_of(own: OwnLife, fleet: Fleet, level: float, seed: int) -> Passage:
     if not alone:
         tops = [float(item.value.max()) for item in fleet.seen]
         passed.append(float(np.quantile(tops, rules.unseen_quantile)))
-    earlier, later = rules.unseen * max(math.log(level / max(passed)), 0.0), 0.0
+    # Where few lives have passed, growth may speed up in proportion to the severity.
+    earlier = max(math.log(level / max(passed)), 0.0)
+    later = rules.later * (1.0 if alone else earlier)
     if alone:
         swing = rules.swing_alone * _swing(life)
-        earlier, later = max(earlier, swing), max(rules.later_alone, swing)
+        earlier, later = max(earlier, swing), max(later, swing)
     least = np.where(CHANCES < 0.5, earlier, later)
     least *= _normal_score(CHANCES) / _normal_score(np.array(0.9))
     apart = logs - np.median(logs)
@@ -500,21 +500,24 @@ def _crossed(value: Array, ages: Array, levels: Array) -> Array:
 
 
 def _stacked(drawn: Array, likely: Array, truth: Array, counted: Array) -> Array:
-    """Weights of the experts that give the answers the highest density together."""
-    experts, number = len(drawn), len(truth)
-    even = np.full(experts, 1.0 / experts)
-    if not number:
-        return even
-    spread = np.diff(np.quantile(drawn, (0.16, 0.84), axis=2), axis=0)[0] / 2.0
-    width = np.maximum(0.6 * spread, 0.03)[..., None]  # about Silverman's for 48 draws
-    kernel = np.exp(-0.5 * ((truth[:, None] - drawn) / width) ** 2) / width
-    density = kernel.mean(axis=2) / np.sqrt(2.0 * np.pi) + AVERAGING_RULES.outlier_density
-    weights, prior = even, AVERAGING_RULES.even_questions * even
-    for _ in range(60):
+    """Weights of the experts that give the answers the least score together.
+
+    That is the continuous ranked probability score over a life's length, over that of even weights.
+    """
+    rules, experts = AVERAGING_RULES, len(drawn)
+    even = weights = np.full(experts, 1.0 / experts)
+    times = np.log(SCORE_TIMES) + np.logaddexp(0.0, truth)[:, None]
+    reached = np.array([np.mean(item[..., None] <= times[:, None], axis=1) for item in drawn])
+    steps, usual = np.gradient(SCORE_TIMES), 0.0
+    for _ in range(30 if len(truth) else 0):
         mixed = weights[:, None] * likely
-        share = mixed / mixed.sum(axis=0) * density
-        share /= share.sum(axis=0)
-        weights = (share * counted).sum(axis=1) + prior
+        mixed /= mixed.sum(axis=0)
+        off = np.einsum("en,ent->nt", mixed, reached) - (truth[:, None] <= times)
+        usual = usual or max(float(np.average(off**2 @ steps, weights=counted)), 1e-9)
+        slope = np.einsum("nt,ent->en", 2.0 * off * steps, reached)
+        slope = mixed * (slope - np.sum(mixed * slope, axis=0)) @ counted / usual
+        slope += rules.even_questions * (weights - even)
+        weights = weights * np.exp(-10.0 * slope / (counted.sum() + rules.even_questions))
         weights /= weights.sum()
     return np.asarray(weights)
 
@@ -542,15 +545,11 @@ def _calibrated(miss: Array, counted: Array, halves: tuple[float, float]) -> Arr
     rules = AVERAGING_RULES
     stated = _normal_score((np.arange(99) + 0.5) / 99) / _normal_score(np.array(0.9))
     stated *= np.where(stated < 0.0, *halves)
-    every = np.r_[miss, stated]
+    every = np.r_[np.clip(miss, -rules.max_miss, rules.max_miss), stated]
     weight = np.r_[counted, np.full(99, rules.even_misses / 99)]
     order = np.argsort(every)
     at = np.cumsum(weight[order]) - 0.5 * weight[order]
-    total = weight.sum()
-    # A future life is one more beside those that were seen: a little further out.
-    wider = min((total + 1.0) / total, rules.max_widening)
-    chances = np.clip(0.5 + (CHANCES - 0.5) * wider, 0.0, 1.0)
-    return np.interp(chances, at / total, every[order])
+    return np.interp(CHANCES, at / weight.sum(), every[order])
 
 
 def surprises(own: OwnLife, fleet: Fleet) -> tuple[Array, Array]:

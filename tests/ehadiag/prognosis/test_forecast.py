@@ -186,8 +186,8 @@ def test_what_no_life_has_shown_is_called_extrapolated() -> None:
     assert of(worn(1, 6)).note == ""
 
 
-def test_a_way_that_few_lives_have_passed_may_be_passed_faster() -> None:
-    """The lower half of the interval grows with it; without a fleet the upper one has a floor."""
+def test_a_way_that_few_lives_have_passed_may_be_passed_faster_or_slower() -> None:
+    """Both halves of the interval grow with it; without a fleet the upper one has a floor."""
     young = learn_fleet([worn(serial, 8) for serial in range(10, 22)], 2000.0)
     for fleet, level in ((young, 0.6), (ALONE, 0.6), (ALONE, 0.2)):
         life = worn(1, 6)
@@ -197,10 +197,10 @@ def test_a_way_that_few_lives_have_passed_may_be_passed_faster() -> None:
         assert left.high is not None
         tops = [0.0] if fleet is ALONE else [float(item.value.max()) for item in fleet.seen]
         passed = max(life.value.max(), np.quantile(tops, AVERAGING_RULES.unseen_quantile))
-        least = AVERAGING_RULES.unseen * np.log(level / passed)
+        least = np.log(level / passed)
         assert np.log(left.median / left.low) > 0.99 * least
-        if fleet is ALONE:
-            assert np.log(left.high / left.median) > 0.99 * AVERAGING_RULES.later_alone
+        later = AVERAGING_RULES.later * (1.0 if fleet is ALONE else least)
+        assert np.log(left.high / left.median) > 0.99 * later
 
 
 def test_a_rate_that_rose_and_fell_may_do_so_again() -> None:

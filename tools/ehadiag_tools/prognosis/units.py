@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ehadiag.estimate import Severity
 from ehadiag.history.records import Entry, MaintenanceEvent, SourceRecord, Usage
 from ehadiag.model.registry import FAULT_NAMES
-from ehadiag.prognosis.averaging import Fleet, learn_fleet
+from ehadiag.prognosis.averaging import CHANCES, Fleet, learn_fleet
 from ehadiag.prognosis.forecast import forecast
 from ehadiag.prognosis.lives import Life, lives_of
 from ehadiag_tools.study import Options, Record, Study, markdown
@@ -396,6 +396,8 @@ SHARES = (0.3, 0.5, 0.7, 0.9)
 SETS = {"tuned": tuple(TUNED), "held-out": tuple(HELD_OUT), "all": tuple(LAWS)}
 UNITS_PER_FLEET = 4
 """Number of units of a law that are forecast beside the same fleet."""
+LATEST = 10.0
+"""Remaining life over the life's length, 1, that later quantiles count as: some are infinite."""
 CENSORED_SHARE = (0.3, 0.8)
 """Shares of its last life at which a unit of a censored fleet is taken out, 1."""
 
@@ -429,8 +431,10 @@ def perform(case: LifeCase) -> Record:
         own = learn_fleet([*lives, *earlier], fleet.scale, case.seed) if earlier else fleet
         found = forecast(unit.name, "hours", life, own, (LIMIT,), case.seed)
         (left,) = found.remaining
-        ends = None if left.median is None else np.array([left.low, left.median, left.high])
-        numbers = None if ends is None else (ends / length).tolist()
+        numbers = None
+        if left.median is not None:
+            quantiles = np.array(left.quantiles or [0.0] * len(CHANCES))
+            numbers = np.minimum(quantiles / length, LATEST).tolist()
         true = (unit.end - life.born - life.age[-1]) / length
         asked.append((share, true, bool(found.alarm), numbers))
     return {"asked": asked}
@@ -496,8 +500,10 @@ def _cells(records: Sequence[Record], share: float | None = None) -> tuple[str, 
     given = [(true, np.array(found)) for _, true, _, found in asked if found is not None]
     if not given:
         return (str(len(asked)), "0.0%", "–", "–", "–", "–")
-    covered = np.mean([found[0] <= true <= found[2] for true, found in given])
-    late = np.mean([true < found[0] for true, found in given])
+    ends = np.array([np.interp((0.1, 0.9), CHANCES, found) for _, found in given])
+    truth = np.array([true for true, _ in given])
+    covered = np.mean((ends[:, 0] <= truth) & (truth <= ends[:, 1]))
+    late = np.mean(truth < ends[:, 0])
     score = np.mean([quantile_score(true, found) for true, found in given])
     alarms = np.mean([alarm for _, _, alarm, _ in asked])
     return (
@@ -507,9 +513,9 @@ def _cells(records: Sequence[Record], share: float | None = None) -> tuple[str, 
 
 
 def quantile_score(true: float, found: NDArray[np.float64]) -> float:
-    """Continuous ranked probability score by three quantiles: twice their mean pinball loss."""
-    levels = np.array((0.1, 0.5, 0.9))
-    return float(2.0 * np.mean(np.maximum(levels * (true - found), (levels - 1) * (true - found))))
+    """Continuous ranked probability score by the quantiles: twice their mean pinball loss."""
+    off = true - found
+    return float(2.0 * np.mean(np.maximum(CHANCES * off, (CHANCES - 1.0) * off)))
 
 
 PROGNOSIS = Study(
