@@ -45,13 +45,14 @@ def effects_of(identification: Identification | None, actuator: Actuator) -> tup
     """Return every effect that was estimated, in the order of the identification.
 
     identification: None where there is none; actuator: data of the unit, with its limits. Returns
-    values, limits, and what was known of them beforehand. None is beyond its limit where the
-    recording is explained by the discrepancy of the faults' laws alone.
+    values, limits, and what was known of them beforehand. None is beyond its limit where more is
+    left than noise: a calibrated effect stands for a wrong law of wear then, by up to 14 deviations
+    of a torque motor's gain.
     """
     if identification is None:
         return ()
     prior_of_unit, channels = unit_prior(actuator), actuator_channels(actuator)
-    doubtful = is_explained_by_discrepancy_alone(identification.fit, actuator.calibration)
+    doubtful = is_explained_by_discrepancy_alone(identification.fit)
     out = []
     for name, found in identification.nuisances.items():
         item = scaled_to_channels(parameter(name), channels)

@@ -139,6 +139,18 @@ def signal_excess_costs(residuals: Array) -> list[float]:
     return out
 
 
+def explains_far_more(excess: float, before: float) -> bool:
+    """Whether an estimate leaves at most half of what another one leaves beside the noise."""
+    return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
+
+
+def likelihood_cost(residuals: Array) -> float:
+    """Twice the negative logarithm of the likelihood of residuals, shape (signals, N), by Cauchy's
+    cost over that of noise, and a constant."""
+    counts = np.count_nonzero(residuals, axis=1)
+    return float(np.dot(signal_excess_costs(residuals), counts))
+
+
 def is_noise(residuals: Array) -> bool:
     """Whether the residuals are those of noise."""
     return (
@@ -250,6 +262,8 @@ def identification_result(
         evaluations=evaluations,
         generations=found.generations,
         cost=refined.cost,
+        likelihood_cost=likelihood_cost(refined.residuals),
+        excess=excess_cost(refined.residuals),
         converged=refined.converged,
         attempts=attempts,
         timing=timing,
@@ -381,6 +395,18 @@ EXPONENTS = 41
 FIRST_STAGE_STD = 0.02
 """Deviation of the clogging over the friction with the least exponent, 1, by the first stage's law
 that goes with an exponent: 0.018 to 0.032 on units of exponent 0 that were identified with 2."""
+
+
+def friction_by_exponent(
+    values: Mapping[str, float], constants: PlantConstants, change: float
+) -> float:
+    """`FSS` that a larger exponent of clogging makes of one that was found (PHY-45), 1.
+
+    values: severities, by name; constants: of the unit as new; change: of the exponent.
+    """
+    share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
+    new = constants.FSS / (constants.FSS1 - constants.FSS)
+    return float((values[FRICTION_NAME] + new) * share**change - new)
 
 
 def over_exponents(

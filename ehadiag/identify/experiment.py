@@ -141,6 +141,11 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         small, large = (value * self.spool_noise / ESTIMATION.noise_lsb for value in thresholds_lsb)
         return Anchor(ANCHORING.gain, small, large, JACK_ANCHOR_SHARE)
 
+    def with_exponent(self, exponent: float, bridge: float) -> Experiment:
+        """Return the same unit with another exponent of clogging; bridge: `BRG` above 0."""
+        bridge = bridge if exponent > 0.0 else 0.0
+        return replace(self, constants=self.constants._replace(CLE=exponent, BRG=bridge))
+
     def slip_speed(self, severity: float = 0.0) -> float:
         """Speed, m/s, below which a jack of a severity of `FDJ` slips in steps and rings on.
 

@@ -92,6 +92,9 @@ class Identification(msgspec.Struct, frozen=True, eq=False):
     """Runs of the model in all stages."""
     generations: int
     cost: float
+    likelihood_cost: float
+    excess: float
+    """Of the residuals, see `ehadiag.identify.estimates`."""
     converged: bool
     attempts: int
     """Searches that it took; more than one where the first did not explain the recording."""

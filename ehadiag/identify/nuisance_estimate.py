@@ -17,9 +17,12 @@ from ehadiag.core.criteria import FIT, GIVE_UP, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.estimates import (
     estimate_covariance,
     excess_cost,
+    explains_far_more,
+    friction_by_exponent,
     independent_covariance,
     is_pressure_misfit,
     is_unexplainable,
+    likelihood_cost,
     residual_outlier_share,
     signal_excess_costs,
 )
@@ -347,18 +350,6 @@ def _better_of(found: NuisanceEstimate, further: NuisanceEstimate) -> NuisanceEs
     )
 
 
-def _likelihood_cost(residuals: Array) -> float:
-    """Twice the negative logarithm of the likelihood of residuals, shape (signals, N), by Cauchy's
-    cost over that of noise, and a constant."""
-    counts = np.count_nonzero(residuals, axis=1)
-    return float(np.dot(signal_excess_costs(residuals), counts))
-
-
-def _explains_far_more(excess: float, before: float) -> bool:
-    """Whether an estimate leaves at most half of what another one leaves beside the noise."""
-    return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
-
-
 class NuisanceEstimator(msgspec.Struct, frozen=True):
     """Estimator of severities with other parameters free."""
 
@@ -419,7 +410,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
     ) -> NuisanceEstimate:  # fmt: skip
         """Estimate where effects may have changed since the calibration, if that explains more."""
         loose = self._with_changed_effects(experiments, found, hint)
-        return loose if _explains_far_more(loose.excess, found.excess) else found
+        return loose if explains_far_more(loose.excess, found.excess) else found
 
     def _with_changed_effects(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate,
@@ -452,7 +443,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         found = self._with(sliding, self.prior, values, before)
         loose = self._with_changed_effects(sliding, found, values, budget=1)
         better, doubted = self._other_exponent(sliding, found, loose)
-        if better is None and _explains_far_more(loose.excess, found.excess):
+        if better is None and explains_far_more(loose.excess, found.excess):
             found = loose
         return replace(
             found,
@@ -482,9 +473,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         )
         other = 0.0 if stated > MAX_CLOGGING_EXPONENT / 2.0 else MAX_CLOGGING_EXPONENT
         c, values = experiments[0].constants, found.refined.values
-        share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
-        new = c.FSS / (c.FSS1 - c.FSS)
-        friction = (values[FRICTION_NAME] + new) * share ** (other - stated) - new
+        friction = friction_by_exponent(values, c, other - stated)
         shows = before > FIT.max_explained_excess
         to_noise = stated == 0.0 and not shows and self.prior.explains_unit_as_new
         if stated == 0.0:
@@ -495,23 +484,26 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             shows = False
         if low < stated or not shows:
             return None, False
-        bridge = self.prior.bridge if other > 0.0 else 0.0
-        others = [
-            replace(item, constants=item.constants._replace(CLE=other, BRG=bridge))
-            for item in experiments
-        ]
+        others = [item.with_exponent(other, self.prior.bridge) for item in experiments]
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
-        settings, _ = self._search(others, self.prior.loosened(), hint, budget=1)
+        settings = self.one_start(others, hint)
         if to_noise:
             there = estimate_nuisances(others, settings).refined.residuals
-            more = _likelihood_cost(there) - _likelihood_cost(found.refined.residuals)
+            more = likelihood_cost(there) - likelihood_cost(found.refined.residuals)
             return None, more < 2.0 * math.log(FIT.min_likelihood_ratio)
         residuals = search_in_stages(others, settings).found.residuals
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
         least = min(own, before)
-        if least > FIT.max_explained_excess and _explains_far_more(left, least):
+        if least > FIT.max_explained_excess and explains_far_more(left, least):
             return other, False
-        return None, stated == 0.0 and not _explains_far_more(before, left)
+        return None, stated == 0.0 and not explains_far_more(before, left)
+
+    def one_start(
+        self, experiments: Sequence[Experiment], hint: Mapping[str, float]
+    ) -> NuisanceSearchSettings:
+        """Settings of one start from values, by name, with what may have changed since a
+        calibration."""
+        return self._search(experiments, self.prior.loosened(), hint, budget=1)[0]
 
     def _with_load(
         self, experiments: Sequence[Experiment], found: NuisanceEstimate
