@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +13,17 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from test_live_session_limits import outcome_of
 
+import ehadiag
 from ehadiag import default_actuator
+from ehadiag.session.alarm_outlets import AlarmLog
 from ehadiag.session.bus_monitor import BusMonitor
+from ehadiag.session.monitor_session import AlarmOutlets
 from ehadiag.session.unit_state import new_unit_state
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
+from firmware_iface.logs.recorder import ReplayTransport
 from firmware_iface.slow_values import SlowValueWatch, spread_conflict
-from firmware_iface.transport.frames import Frame
+from firmware_iface.transport.frames import ColumnBuilder, Frame
 
 BUS = default_map()
 TEST_TICKS = 5500
@@ -152,6 +158,22 @@ def test_a_monitor_believes_neither() -> None:
     assert monitor._environment_values == {}
 
 
+def test_a_monitor_says_what_it_did_not_believe(tmp_path: Path) -> None:
+    collected, snapshots = ColumnBuilder(), []
+    for frame in mixed(second(np.arange(50.0, 5400.0, 25.0), 90, 15.0, 20.7e6)):
+        collected.add_frame(frame)
+    found = ehadiag.watch(
+        ReplayTransport(collected.table(), "mixed"),
+        outlets=AlarmOutlets(AlarmLog(tmp_path / "a.jsonl")),
+        snapshots=snapshots.append,
+    )
+    assert 0.5 < found.disbelieved < 1.0
+    end = json.loads((tmp_path / "a.jsonl").read_text().splitlines()[-1])
+    assert end["disbelieved"] / end["told"] == found.disbelieved
+    said = f"{found.disbelieved:.0%} of the messages with oil and supply left out"
+    assert any(said in reason for reason in snapshots[-1].ending.reasons)
+
+
 @pytest.mark.parametrize(("paged", "found"), [(True, False), (False, True)])
 def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(paged: bool, found: bool) -> None:
     """As in `alignment.frame_faults.slow_values`: a page of 10 Hz beside one of 1 kHz."""
@@ -174,7 +196,7 @@ SUPPLY = "environment.supply_pressure"
 
 
 def told_conflicts(rows: list[tuple[float, float]], cycle_ms: float = 100.0) -> int:
-    """Frames of a watched environment, oil (degC) and supply (Pa), in which two senders are seen."""
+    """Frames with oil (degC) and supply (Pa) in which two senders are seen."""
     watch = SlowValueWatch(BUS.messages["Environment"])
     return sum(
         watch.take(
