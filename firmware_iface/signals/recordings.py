@@ -101,10 +101,10 @@ def decoded_items(
         for key in ("supply_pressure", "return_pressure", "oil_temperature")
         if (item := signals.get(f"environment.{key}")) is not None
     }
-    samples, last = whole.samples, Environment()
+    samples = whole.samples
 
     def items() -> Iterator[DecodedItem]:
-        nonlocal last
+        last = Environment()
         yield samples.mode
         for tick, row in enumerate(live_ticks(samples)):
             now = Environment(**{key: float(value[tick]) for key, value in told.items()})
