@@ -124,7 +124,7 @@ class Ending(msgspec.Struct, frozen=True, kw_only=True):
 
     verdict: str
     """`HEALTHY`, `DEGRADED`, `FAULT`, `INCONCLUSIVE`, `NOT TESTED`; of a monitor `ALARM`,
-    `NO ALARM` or `NOT MONITORED`."""
+    `NO ALARM` or, of too few ticks, `NOT MONITORED`."""
     reasons: tuple[str, ...] = ()
 
 

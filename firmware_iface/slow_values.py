@@ -30,6 +30,15 @@ class SlowValueLimits(msgspec.Struct, frozen=True):
     lie nearer use each other's within as many frames, and `conflicting` finds them."""
     outliers: float = 0.02
     """Share of values, 1, that may lie apart: what is borne of conflicts."""
+    scatters: float = 4.2
+    """Deviations of the values about two levels by which those are of two senders: 3.5 of any even
+    scatter or steady drift, at most 4.1 in a turn of the counter, 4.6 of two senders 8 K apart that
+    scatter by 3 K either way."""
+    chance: int = 8
+    """Values, 1, that may stand apart by chance or be a short dip, where the level may move."""
+    run: float = 3.0
+    """Values in a row, 1, in the mean, beyond which a level is one that the sender itself went to:
+    of two that send as often it has two."""
     watched: int = 256
     """Frames that the live watch looks back: one turn of eight bits."""
     repeat: float = 0.25
@@ -47,7 +56,7 @@ MAX_SPREADS = {
     "environment.return_pressure": (2e6, 1e-6, "MPa"),
     "environment.oil_temperature": (5.0, 1.0, "K"),
 }
-"""Role: largest spread within a test, SI, its factor to the unit, and that unit. Pressures: a
+"""Role: largest distance of two levels, SI, its factor to the unit, and that unit. Pressures: a
 tenth of the usual supply, twice what a pump's ripple and a moving jack take from it. Oil: its tank
 warms by less than 0.1 K in a test."""
 
@@ -72,25 +81,59 @@ def repeated_frames(
     return same
 
 
-def spread_conflict(role: str, values: FloatArray) -> str:
-    """Why values of one role are not those of one sender; empty if they stay together.
+def spread_conflict(role: str, values: FloatArray, *, steady: bool = True) -> str:
+    """Why values of one role are not those of one sender; empty if they may be.
 
-    role: such as `environment.oil_temperature`; values: SI values of one test; NaN is no value.
-    Returns one clause.
+    Values of two senders stand about two levels that are farther apart than the scatter about each,
+    whatever the level does meanwhile; noise about one level does not.
+
+    role: such as `environment.oil_temperature`; values: SI values in order of arrival; NaN is no
+    value; steady: they are of one test, in which a sender keeps its level too; else only levels in
+    turn are of two. Returns one clause.
     """
     limit, factor, unit = MAX_SPREADS[role]
-    found = np.sort(values[np.isfinite(values)])
+    found = values[np.isfinite(values)]
     # One damaged value is borne, the shortest span of all the others counts.
     kept = len(found) - max(math.floor(SLOW_VALUES.outliers * len(found)), 1)
-    if kept < 1:
+    if kept < 3:
         return ""
-    spread = float(np.min(found[kept - 1 :] - found[: len(found) - kept + 1]))
-    if spread <= limit:
+    order = np.argsort(found, kind="stable")
+    first = int(np.argmin(found[order[kept - 1 :]] - found[order[: len(found) - kept + 1]]))
+    found = found[np.sort(order[first : first + kept])]
+    place = np.arange(kept)
+    line = np.polyval(np.polyfit(place, found, 1), place)
+    rest = found - line
+    apart = max(_levels_apart(item, limit, steady=steady) for item in (found, rest))
+    moved = float(np.ptp(line))
+    if steady and moved > max(limit, SLOW_VALUES.scatters * float(np.std(rest))):
+        apart = max(apart, moved)
+    if not apart:
         return ""
     return (
-        f"{role} differs by {factor * spread:.3g} {unit} within the test"
+        f"values of {role} are {factor * apart:.3g} {unit} apart"
         f" ({factor * limit:.3g} {unit} are borne)"
     )
+
+
+def _levels_apart(values: FloatArray, limit: float, *, steady: bool) -> float:
+    """Distance of the two levels about which values stand; 0 where they do not.
+
+    The two are those with the least scatter about them (N. Otsu, IEEE Trans. SMC 9, 1979).
+    """
+    ascending = np.sort(values)
+    count = np.arange(1, len(values))
+    total = np.cumsum(ascending)
+    low, high = total[:-1] / count, (total[-1] - total[:-1]) / count[::-1]
+    distance = high - low
+    best = int(np.argmax(count * count[::-1] * distance**2))
+    above, fewer = values > ascending[best], min(best + 1, len(values) - best - 1)
+    runs = np.count_nonzero(np.diff(above)) / 2
+    if not steady and not SLOW_VALUES.chance < fewer <= SLOW_VALUES.run * runs:
+        return 0.0
+    left = values - np.where(above, high[best], low[best])
+    scatter = math.sqrt(float(left @ left) / (len(values) - 2))
+    apart = float(distance[best])
+    return apart if apart > max(limit, SLOW_VALUES.scatters * scatter) else 0.0
 
 
 def slow_value_conflict(
@@ -99,13 +142,15 @@ def slow_value_conflict(
     counter: IntArray | None,
     values: Mapping[str, FloatArray],
     span_ns: int,
+    *,
+    steady: bool = True,
 ) -> str:
     """Why frames of a slow message are not of one sender; empty if nothing says so.
 
     message: the message; time_ns: time stamps of its sound frames in order of arrival without
     repeats, shape (n,); counter: their counters, shape (n,); None where not each of them has one;
-    values: SI values by role, shape (n,); span_ns: time, ns, in which they were sent. Returns one
-    clause that names the message.
+    values: SI values by role, shape (n,); span_ns: time, ns, in which they were sent; steady: see
+    `spread_conflict`. Returns one clause that names the message.
     """
     who = f"a second sender of {message.name} ({message.can_id:#x})"
     cycle = message.cycle_ns if brings_slow_values(message) else 0
@@ -124,7 +169,7 @@ def slow_value_conflict(
         if leaps.sum() > CONFLICTS.chance:
             return f"{who}, two counters in turn: {leaps.sum()} of {len(step)} steps do not run on"
     for role, value in values.items():
-        if role in MAX_SPREADS and (apart := spread_conflict(role, value)):
+        if role in MAX_SPREADS and (apart := spread_conflict(role, value, steady=steady)):
             return f"{who}, or a broken sensor: {apart}"
     return ""
 
@@ -172,6 +217,7 @@ class SlowValueWatch:
             np.array([item.counter for item in frames]) if counts and counter is not None else None,
             {key: np.array([item.values[key] for item in frames]) for key in values},
             int(np.ptp(stamps)) + SLOW_VALUES.late_ns,
+            steady=False,
         )
         return self._found
 

@@ -94,10 +94,9 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--least-monitored",
-        type=options.positive_number,
-        default=0.5,
+        type=partial(options.positive_number, most=1.0),
         metavar="SHARE",
-        help="share of the ticks below which the exit code is 30 (default %(default)g)",
+        help="share of the ticks below which the exit code is 30 (default 0.5)",
     )
     group.add_argument(
         "--log-file", metavar="FILE", help="append alarms to this file, JSON lines with their time"
@@ -127,7 +126,9 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
         help="end after this time (default: at Ctrl-C)",
     )
     parser.add_argument(
-        "--log", metavar="LOG", help="watch a recording instead of a bus, as fast as it goes"
+        "--log",
+        metavar="LOG",
+        help="watch a recording, of decoded signals too, in place of a bus, as fast as it goes",
     )
     options.add_request_options(
         parser,
@@ -135,7 +136,7 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
         help="further test that the computer may run, to call it by its name; repeatable",
     )
     options.add_screen_options(parser)
-    options.add_request_options(parser, "actuator", *options.BUS, *options.READING)
+    options.add_request_options(parser, "actuator", *options.BUS, "columns", *options.READING)
     option_values.add_bus_options(parser)
     show_usual(
         parser,
@@ -191,6 +192,7 @@ def run_monitor(
             find=find,
             hours=arguments.hours,
             least=arguments.least,
+            least_monitored=arguments.least_monitored,
             duration_s=arguments.duration,
             stop=stop,
             bitrate=option_values.bitrate_from_options(arguments, bus_map),
@@ -219,8 +221,7 @@ def run_monitor(
         return 40
     if found.bus_lost:
         return INPUT_OUTPUT_EXIT_CODE
-    enough = found.monitored and found.share >= arguments.least_monitored
-    return codes[-1] or (0 if enough else 30)
+    return codes[-1] or (0 if found.enough else 30)
 
 
 def _initial_unit_state(
@@ -230,7 +231,7 @@ def _initial_unit_state(
     from ehadiag.session.unit_state import (  # noqa: PLC0415
         new_unit_state,
         unit_state_from_history,
-        unit_state_from_result,
+        unit_state_of,
     )
 
     if arguments.history and arguments.no_history:
@@ -242,7 +243,7 @@ def _initial_unit_state(
     if arguments.from_result:
         if arguments.history:
             raise ConfigurationError("--from and --history exclude each other: name one of them")
-        return unit_state_from_result(Path(arguments.from_result), actuator), None
+        return unit_state_of(arguments.from_result, actuator), None
     place = None if arguments.no_history else history_path(arguments)
     if place is None:
         if arguments.unit is not None:

@@ -19,15 +19,15 @@ MAX_HISTORY_SERIAL = (1 << 63) - 1
 """Largest serial number that a history can hold, 1."""
 
 
-def positive_number(text: str, *, or_zero: bool = False) -> float:
-    """Read a number above zero, or zero where that will do."""
+def positive_number(text: str, *, or_zero: bool = False, most: float = math.inf) -> float:
+    """Read a number above zero, or zero where that will do, and of at most so much."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if 0.0 < value < math.inf or (or_zero and value == 0.0):
+    if (0.0 < value < math.inf and value <= most) or (or_zero and value == 0.0):
         return value
-    needed = "of at least 0" if or_zero else "above 0"
+    needed = ("of at least 0" if or_zero else "above 0") + f", {most:g} at most" * (most < math.inf)
     raise argparse.ArgumentTypeError(f"{text!r}: need a number {needed}")
 
 

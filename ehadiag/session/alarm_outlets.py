@@ -181,9 +181,9 @@ class AlarmRecorder:
         """Record the seconds around an alarm at that time.
 
         time_ns: time stamp of the frame that led to it, ns. Returns name of the file; empty where
-        none is written. InputOutputError: it cannot be written.
+        none is written: decoded signals have no frames. InputOutputError: it cannot be written.
         """
-        if self._folder is None:
+        if self._folder is None or (self._recorder is None and not self._kept):
             return ""
         self._until_ns = time_ns + self._span_ns
         if self._recorder is not None:

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from ehadiag.api import PathLike, log_if_compiling, setup_for
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
-from firmware_iface.errors import valid_text
+from firmware_iface.errors import ConfigurationError, valid_text
 
 if TYPE_CHECKING:
     import can
@@ -30,18 +30,20 @@ if TYPE_CHECKING:
     from ehadiag.live import Alarm, Snapshot
     from ehadiag.request import Request
     from ehadiag.result import Result
-    from ehadiag.session.monitor_session import AlarmOutlets, MonitorSummary
-    from ehadiag.session.unit_state import UnitState
+    from ehadiag.session.monitor_session import AlarmOutlets, DecodedSource, MonitorSummary
+    from ehadiag.session.unit_state import KnownUnit, UnitState
+    from ehadiag.setup import Setup
     from firmware_iface.bus_map import BusMap
     from firmware_iface.bus_report import BusReport
     from firmware_iface.handshake import ChannelLimits
     from firmware_iface.logs.log_files import Budget
     from firmware_iface.logs.recorder import Recorder
     from firmware_iface.recording import Recording, Samples
+    from firmware_iface.signals.recordings import DecodedItem
     from firmware_iface.stored_test import StoredTest
     from firmware_iface.tester import RequestProtocol
     from firmware_iface.transport.adapters import BusOptions
-    from firmware_iface.transport.base import Transport
+    from firmware_iface.transport.base import FrameSource, Transport
     from firmware_iface.transport.frames import Frame, FrameTable
 
 Bus: TypeAlias = "can.BusABC | Transport | BusOptions | Callable[..., Transport]"
@@ -188,12 +190,13 @@ def run_test(
 
 
 def watch(
-    bus: Bus | PathLike,
+    bus: Bus | PathLike | Iterator[DecodedItem],
     *,
-    unit: UnitState | None = None,
-    find: Callable[[int], UnitState | None] | None = None,
+    unit: KnownUnit | None = None,
+    find: Callable[[int], KnownUnit | None] | None = None,
     hours: float = FALSE_ALARM_INTERVAL_H,
     least: float | None = None,
+    least_monitored: float | None = None,
     duration_s: float | None = None,
     stop: threading.Event | None = None,
     bitrate: float | None = None,
@@ -207,16 +210,22 @@ def watch(
 
     Parameters
     ----------
-    bus : Bus | PathLike
-        Open bus of python-can, transport, options of a bus, or a log.
-    unit : UnitState | None
-        State of the unit (`ehadiag.session.unit_state`); None: as new, or as calibrated.
-    find : Callable[[int], UnitState | None] | None
-        Looks up the state of a unit once the bus has its serial number; None: nothing is looked up.
+    bus : Bus | PathLike | Iterator[DecodedItem]
+        Open bus of python-can, transport, options of a bus, or a log, of decoded signals too. Or an
+        iterator of decoded signals: a `Tick` for each control tick; between them a `CommandMode`
+        says what commands are, an `Environment` what oil and supply are from there on.
+    unit : KnownUnit | None
+        Last result of the unit, or its JSON file; None: as new, or as calibrated.
+    find : Callable[[int], KnownUnit | None] | None
+        Looks up the last result of a unit once the bus has its serial number; None: nothing is
+        looked up.
     hours : float
         Mean time between false alarms, h; between tests at least 2.
     least : float | None
         Least change of a severity worth an alarm, 1; None: `ehadiag.monitor.change_test.LEAST`.
+    least_monitored : float | None
+        Share of the ticks, 0 … 1, below which too little was monitored; None:
+        `ehadiag.session.monitor_session.LEAST_MONITORED`.
     duration_s : float | None
         Longest duration, s; None: until `stop`, or the end of the log.
     stop : threading.Event | None
@@ -249,30 +258,40 @@ def watch(
     from ehadiag.live import publish  # noqa: PLC0415
     from ehadiag.monitor.change_test import LEAST  # noqa: PLC0415 - loads kernels
     from ehadiag.session.monitor_session import (  # noqa: PLC0415 - loads kernels
+        LEAST_MONITORED,
         AlarmOutlets,
         MonitorSession,
     )
-    from ehadiag.session.unit_state import new_unit_state  # noqa: PLC0415
-    from firmware_iface.transport.base import open_source  # noqa: PLC0415
+    from ehadiag.session.unit_state import new_unit_state, unit_state_of  # noqa: PLC0415
 
     setup = setup_for(request, options)
+    if duration_s is not None and not duration_s > 0.0:
+        raise ConfigurationError(f"duration_s {duration_s:g}: need more than 0 s")
+    share = LEAST_MONITORED if least_monitored is None else least_monitored
+    if not 0.0 <= share <= 1.0:
+        raise ConfigurationError(f"least_monitored {share:g}: need a share, 0 … 1")
+
+    def look_up(serial: int) -> UnitState | None:
+        known = find(serial) if find else None
+        return None if known is None else unit_state_of(known, setup.actuator)
+
     with outlets or AlarmOutlets() as places:
         session = MonitorSession(
             setup.actuator,
             setup.bus_map,
-            unit or new_unit_state(setup.actuator),
+            unit_state_of(unit or new_unit_state(setup.actuator), setup.actuator),
             setup.tests,
             places,
             hours=hours,
             least=LEAST if least is None else least,
             of_log=isinstance(bus, str | os.PathLike),
             bitrate=bitrate,
-            find=find,
+            find=None if find is None else look_up,
             on_alarm=on_alarm,
+            least_monitored=share,
         )
         with (
-            open_transport(bus, budget=setup.budget) as transport,
-            open_source(transport) as source,
+            _open_source(bus, setup, session.notes) as source,
             publish(session.look, snapshots) as refresh,
         ):
             found = session.run(source, stop or threading.Event(), duration_s, refresh)
@@ -280,6 +299,37 @@ def watch(
     place = os.fspath(bus) if isinstance(bus, str | os.PathLike) else source.name
     result = setup.monitored(place, found.begun, session.watcher.serial, severities, why)
     return msgspec.structs.replace(found, result=result)
+
+
+@contextmanager
+def _open_source(
+    bus: Bus | PathLike | Iterator[DecodedItem], setup: Setup, notes: list[str]
+) -> Iterator[FrameSource | DecodedSource]:
+    """Give what frames or decoded signals come from; notes: takes what there is to say of them."""
+    from ehadiag.session.monitor_session import DecodedSource  # noqa: PLC0415 - loads kernels
+    from firmware_iface.transport.base import open_source  # noqa: PLC0415
+
+    tick_ns = round(1e9 / setup.actuator.controller.rate)
+    if isinstance(bus, Iterator):
+        yield DecodedSource(bus, "decoded signals", tick_ns)
+        return
+    if isinstance(bus, str | os.PathLike):
+        from firmware_iface.logs.log_files import holds_signals  # noqa: PLC0415
+        from firmware_iface.signals.columns import ColumnMap  # noqa: PLC0415
+        from firmware_iface.signals.recordings import decoded_items  # noqa: PLC0415
+
+        name, columns = os.fspath(bus), setup.columns
+        if holds_signals(name, mapped=columns is not None):
+            columns = msgspec.structs.replace(columns or ColumnMap(), tick_ns=tick_ns)
+            whole, items = decoded_items(name, columns, setup.candidate_tests, setup.budget)
+            notes.extend(whole.quality.notes)
+            yield DecodedSource(items, f"replay of {name}", tick_ns, whole.start_ns or 0)
+            return
+    with (
+        open_transport(bus, budget=setup.budget) as transport,
+        open_source(transport) as source,
+    ):
+        yield source
 
 
 def record(

@@ -37,6 +37,7 @@ from firmware_iface.slow_values import SlowValueWatch
 from firmware_iface.stored_test import StoredTest
 
 if TYPE_CHECKING:
+    from firmware_iface.signals.recordings import DecodedItem
     from firmware_iface.transport.frames import Frame
 
 CUSUM_SIDES = (("spool", "above"), ("spool", "below"), ("pressure", "above"), ("pressure", "below"))
@@ -64,7 +65,8 @@ class MonitorAlarm(msgspec.Struct, frozen=True):
 class BusMonitor:
     """Follows one unit on one bus.
 
-    One thread hands over frames; another may look at what was found, without a lock.
+    One thread hands over frames, or decoded ticks; another may look at what was found, without a
+    lock.
 
     actuator: its data; bus_map: which message and signal plays which role; unit: its state before;
     `take_over` exchanges it; tests: tests that the computer may run; hours: mean time between false
@@ -96,7 +98,6 @@ class BusMonitor:
         self._environment_watches = {
             key: SlowValueWatch(item) for key, item in self._environment.items()
         }
-        self._environment_conflicts = 0
         self._averaged: dict[str, list[float]] = {}
         self._environment_span = round(0.5 * self._rate)
         self._made_for = Environment()
@@ -121,6 +122,10 @@ class BusMonitor:
         """Number of ticks since the beginning, lost ones too."""
         self.pushed = 0
         """Number of ticks with a spool position after the monitor had settled."""
+        self.told = 0
+        """Number of messages with oil or supply."""
+        self.disbelieved = 0
+        """Number of those in which two senders are seen: the file's values hold in their place."""
         self.alarms = 0
         """Number of alarms, without repeated ones."""
         self.repeated = 0
@@ -140,7 +145,7 @@ class BusMonitor:
     @property
     def conflicts(self) -> int:
         """Counter values with different payloads, and frames of an environment in conflict."""
-        return self._live.conflicts + self._environment_conflicts
+        return self._live.conflicts + self.disbelieved
 
     @property
     def mode(self) -> CommandMode:
@@ -172,6 +177,23 @@ class BusMonitor:
         for tick in self._live.take(frame):
             self._push(tick, frame.time_ns)
         self._time_ns = frame.time_ns
+
+    def take_decoded(self, item: DecodedItem, time_ns: int) -> None:
+        """Take a decoded tick, or what holds from the next one on, at this time (ns)."""
+        if isinstance(item, Environment):
+            self._believe(
+                {
+                    f"environment.{key}": value
+                    for key in ENVIRONMENT_KEYS
+                    if (value := getattr(item, key)) is not None
+                }
+            )
+        elif isinstance(item, CommandMode):
+            self._live.mode = item
+        else:
+            tick = LiveTick(*item)
+            self._live.lost += math.isnan(tick.spool)
+            self._push(tick, time_ns)
 
     def take_status(self, status: BitStatus) -> None:
         """Take the state of the test: of the bus's own messages, or as another protocol says it."""
@@ -240,11 +262,15 @@ class BusMonitor:
         key = (frame.can_id, frame.extended)
         message, watch = self._environment[key], self._environment_watches[key]
         count = counter_key(message, message.counter, frame.data)
+        self.told += 1
         if watch.take(frame.time_ns, count[0] if count else None, frame.data, values):
-            self._environment_conflicts += 1
+            self.disbelieved += 1
             self._environment_values.clear()
             self._averaged.clear()
             return
+        self._believe(values)
+
+    def _believe(self, values: Mapping[str, float]) -> None:
         self._environment_values |= values
         for name, value in values.items():
             self._averaged.setdefault(name, []).append(value)

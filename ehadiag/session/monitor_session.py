@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Self
 
 import msgspec
@@ -18,13 +18,17 @@ from ehadiag.session.unit_state import UnitState, new_unit_state
 from firmware_iface.bus_map import BusMap
 from firmware_iface.errors import BusLostError, EhadiagError
 from firmware_iface.stored_test import StoredTest
-from firmware_iface.transport.base import RECEIVE_POLL_S
+from firmware_iface.transport.base import RECEIVE_POLL_S, TransportState
+from firmware_iface.transport.frames import Frame
 
 if TYPE_CHECKING:
     from ehadiag.result import Result
     from firmware_iface.live_decode import BitStatus
+    from firmware_iface.signals.recordings import DecodedItem
     from firmware_iface.transport.base import FrameSource
-    from firmware_iface.transport.frames import Frame
+
+LEAST_MONITORED = 0.5
+"""Share of the ticks below which too little was monitored, 1: what is left is no majority."""
 
 
 class AlarmOutlets(msgspec.Struct, frozen=True):
@@ -62,6 +66,10 @@ class MonitorSummary(msgspec.Struct, frozen=True):
     """Why the bus failed; empty where it did not."""
     begun: str | None = None
     """Time of the first frame, UTC, ISO 8601; None: not known."""
+    disbelieved: float = 0.0
+    """Share of the messages with oil or supply that were left out for a second sender, 1."""
+    enough: bool = False
+    """Whether `least_monitored` of the ticks were monitored."""
     result: Result | None = None
     """Severities by free motion, without verdict; `reasons`: why some have no number."""
 
@@ -69,6 +77,33 @@ class MonitorSummary(msgspec.Struct, frozen=True):
     def share(self) -> float:
         """Share of the ticks that were monitored, 1."""
         return self.monitored / self.ticks if self.ticks else 0.0
+
+
+class DecodedSource:
+    """Decoded signals in the place of a bus: one item after another, as fast as they come.
+
+    items: see `firmware_iface.signals.recordings.DecodedItem`; name: of the source; tick_ns: length
+    of a tick, ns; begin_ns: time of the first one.
+    """
+
+    state, detail, overflow = TransportState.OPEN, "", 0
+
+    def __init__(
+        self, items: Iterator[DecodedItem], name: str, tick_ns: int, begin_ns: int = 0
+    ) -> None:
+        self._items, self.name, self._tick_ns, self._now = items, name, tick_ns, begin_ns
+        self.at_end = False
+
+    def receive(self, _timeout: float) -> DecodedItem | None:
+        """Return the next item, None at the end."""
+        item = next(self._items, None)
+        self.at_end = item is None
+        self._now += self._tick_ns * isinstance(item, tuple)
+        return item
+
+    def now_ns(self) -> int:
+        """Time of the latest tick's end, ns."""
+        return self._now
 
 
 class MonitorSession:
@@ -79,7 +114,8 @@ class MonitorSession:
     between false alarms, h; least: least change of a severity worth an alarm, 1; of_log: whether
     frames come from a log, whose times alarms then have; bitrate: of the bus, bit/s; None: unknown;
     find: looks up the state of a unit once the bus has its serial number; None: nothing is looked
-    up; on_alarm: called for each alarm. ConfigurationError: see `BusMonitor`.
+    up; on_alarm: called for each alarm; least_monitored: share of the ticks below which too little
+    was monitored. ConfigurationError: see `BusMonitor`.
     """
 
     def __init__(
@@ -96,14 +132,17 @@ class MonitorSession:
         bitrate: float | None = None,
         find: Callable[[int], UnitState | None] | None = None,
         on_alarm: Callable[[Alarm], None] | None = None,
+        least_monitored: float = LEAST_MONITORED,
     ) -> None:
+        self._least_monitored = least_monitored
         self._actuator_name, self._outlets = actuator.name, outlets
         self._traffic = BusTraffic(bitrate)
         self._find, self._on_alarm, self._of_log = find, on_alarm, of_log
         self._alarms: tuple[int, tuple[Alarm, ...]] = 0, ()
         self._bus = BusState(name="", state="connecting")
-        self._source: FrameSource | None = None
-        self._notes: list[str] = []
+        self._source: FrameSource | DecodedSource | None = None
+        self.notes: list[str] = []
+        """What the reader of snapshots should know else."""
         self._ended = False
         self._bus_lost = ""
         self._begun: str | None = None
@@ -157,16 +196,17 @@ class MonitorSession:
 
     def run(
         self,
-        source: FrameSource,
+        source: FrameSource | DecodedSource,
         stop: threading.Event,
         end_s: float | None = None,
         refresh: Callable[[], None] | None = None,
     ) -> MonitorSummary:
         """Watch until stopped, until the time is up, or until the bus or log ends.
 
-        source: where frames come from; stop: ends the session; end_s: longest duration, s; None: no
-        limit; refresh: called after each alarm: readers of snapshots should see it at once. Returns
-        alarms and numbers of ticks. InputOutputError: log or recording cannot be written.
+        source: where frames or decoded signals come from; stop: ends the session; end_s: longest
+        duration, s; None: no limit; refresh: called after each alarm: readers of snapshots should
+        see it at once. Returns alarms and numbers of ticks. InputOutputError: log or recording
+        cannot be written.
         """
         watcher, outlets, self._source = self.watcher, self._outlets, source
         self._refresh = refresh
@@ -185,9 +225,12 @@ class MonitorSession:
                     outlets.surroundings.idle()
                     if source.at_end:
                         break
+                elif not isinstance(frame, Frame):
+                    self._begin_at(source.now_ns())
+                    self._traffic.take(0)
+                    watcher.take_decoded(frame, source.now_ns())
                 else:
-                    if not self._traffic.frames:
-                        self._begun = date_text(frame.time_ns) if self._of_log else utc_now_text()
+                    self._begin_at(frame.time_ns)
                     self._traffic.take(len(frame.data), extended=frame.extended)
                     outlets.surroundings.take(frame)
                     watcher.take(frame)
@@ -209,6 +252,8 @@ class MonitorSession:
             lost=watcher.lost,
             breaks=watcher.breaks,
             conflicts=watcher.conflicts,
+            told=watcher.told,
+            disbelieved=watcher.disbelieved,
             frames=self._traffic.frames,
             dropped=source.overflow,
             bus_lost=self._bus_lost or None,
@@ -225,8 +270,26 @@ class MonitorSession:
         count, newest = self._alarms
         return MonitorSummary(
             newest, count, watcher.repeated, watcher.ticks, watcher.pushed, watcher.lost,
-            self._bus_lost, self._begun,
+            self._bus_lost, self._begun, self._disbelieved, self._enough,
         )  # fmt: skip
+
+    def _begin_at(self, time_ns: int) -> None:
+        if not self._traffic.frames:
+            self._begun = date_text(time_ns) if self._of_log else utc_now_text()
+
+    @property
+    def _disbelieved(self) -> float:
+        """Share of the messages with oil or supply that were left out, 1."""
+        return self.watcher.disbelieved / max(self.watcher.told, 1)
+
+    @property
+    def _share(self) -> float:
+        """Share of the ticks that were monitored, 1."""
+        return self.watcher.pushed / max(self.watcher.ticks, 1)
+
+    @property
+    def _enough(self) -> bool:
+        return self.watcher.pushed > 0 and self._share >= self._least_monitored
 
     def look(self, number: int) -> Snapshot:
         """Return a snapshot; another thread may call it."""
@@ -247,7 +310,7 @@ class MonitorSession:
             severities=watcher.unit.severities,
             working="" if self._ended else f"watching; severities: {watcher.unit.source}",
             ending=self._ending() if self._ended else None,
-            notes=tuple(self._notes),
+            notes=tuple(self.notes),
         )
 
     def _look_up(self, serial: int) -> None:
@@ -255,7 +318,7 @@ class MonitorSession:
         find, self._find = self._find, None
         watcher, unit = self.watcher, find(serial) if find else None
         if unit is None:
-            self._notes.append(f"the history has no diagnosis of serial number {serial}")
+            self.notes.append(f"the history has no diagnosis of serial number {serial}")
             self._outlets.log.write("unit", serial=serial, known=None)
             return
         watcher.take_over(unit)
@@ -291,6 +354,11 @@ class MonitorSession:
     def _ending(self) -> Ending:
         watcher = self.watcher
         reasons = [self._bus_lost] if self._bus_lost else []
+        if watcher.disbelieved:
+            reasons.append(
+                f"{self._disbelieved:.0%} of the messages with oil and supply left out for a second"
+                " sender: the values of the actuator's file hold"
+            )
         if watcher.alarms:
             reasons.append(f"{watcher.alarms} alarms: the unit is not as it was")
             return Ending(verdict="ALARM", reasons=tuple(reasons))
@@ -298,6 +366,11 @@ class MonitorSession:
             return Ending(
                 verdict="NOT MONITORED", reasons=(*reasons, not_monitored_reason(self._traffic))
             )
+        if not self._enough:
+            reasons.append(
+                f"{self._share:.0%} of the ticks only, {self._least_monitored:.0%} are needed"
+            )
+            return Ending(verdict="NOT MONITORED", reasons=tuple(reasons))
         return Ending(verdict="NO ALARM", reasons=tuple(reasons))
 
 

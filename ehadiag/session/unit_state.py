@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeAlias
 
 import msgspec
 from msgspec.structs import replace
@@ -70,13 +72,22 @@ def new_unit_state(actuator: Actuator) -> UnitState:
     return UnitState(source, severities, serial=serial, known=calibration is not None)
 
 
-def unit_state_from_result(path: Path, actuator: Actuator) -> UnitState:
-    """Read the JSON result of a diagnosis.
+KnownUnit: TypeAlias = UnitState | Result | str | os.PathLike[str]
+"""State of a unit, the result of its diagnosis, or that one's JSON file."""
 
-    path: the file; of several lines the last counts; actuator: the one that is watched. Returns
-    state by the result. ConfigurationError: it is no result, holds no severities, or is one of
-    another actuator; InputOutputError: it cannot be read.
+
+def unit_state_of(given: KnownUnit, actuator: Actuator) -> UnitState:
+    """Return the state of a unit by the result of a diagnosis.
+
+    given: the state itself, the result, or its JSON file: of several lines the last counts;
+    actuator: the one that is watched. Returns state by the result. ConfigurationError: it is no
+    result, holds no severities, or is one of another actuator; InputOutputError: it cannot be read.
     """
+    if isinstance(given, UnitState):
+        return given
+    if isinstance(given, Result):
+        return _of_result(given, actuator, f"result of {given.source}")
+    path = Path(given)
     where = f"result {path}"
     lines = read_small_file(path, MAX_RESULT_BYTES, "result").splitlines()
     line = next((line for line in reversed(lines) if line.strip()), b"")

@@ -275,10 +275,15 @@ class StretchTicks:
         self.breaks += 1
         self.conflicts += sum(item.count for item in conflicts.values())
         self.lost += int(np.isnan(samples.spool).sum())
-        columns = (samples.current, samples.spool, samples.pressure, samples.position)
-        seen = np.where(samples.saturated, np.nan, np.stack(columns))
-        rows = np.column_stack((_commands(samples), *seen))
-        return [LiveTick(*row) for row in rows.tolist()]
+        return live_ticks(samples)
+
+
+def live_ticks(samples: Samples) -> list[LiveTick]:
+    """Ticks as `firmware_iface.live_decode.LiveTicks` gives them, of samples on the tick grid."""
+    columns = (samples.current, samples.spool, samples.pressure, samples.position)
+    seen = np.where(samples.saturated, np.nan, np.stack(columns))
+    rows = np.column_stack((_commands(samples), *seen))
+    return [LiveTick(*row) for row in rows.tolist()]
 
 
 def _commands(samples: Samples) -> FloatArray:

@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from firmware_iface.alignment.align import windowed_recordings
+from firmware_iface.alignment.grid import live_ticks
 from firmware_iface.bus_map import BusMap
 from firmware_iface.errors import ConfigurationError
 from firmware_iface.find_test import (
@@ -65,6 +67,59 @@ def recordings_of_signals(
     least one; without a test number where no stored test was found. InputOutputError: a file cannot
     be read; ConfigurationError: a column is missing, or has a unit that is none of its quantity.
     """
+    signals, start, readings = _read_signals(paths, columns, candidates, budget)
+    source = ", ".join(str(path) for path in paths)
+    found = [
+        extract_tests(_on_ticks(signals, item, columns.tick_ns, start, source), candidates)
+        for item in readings
+    ]
+    if len(found) == 1 or len(found[0]) != len(found[1]):
+        return found[0]
+    return tuple(replace(first, as_measured=other) for first, other in zip(*found, strict=True))
+
+
+DecodedItem: TypeAlias = tuple[float, float, float, float, float] | Environment | CommandMode
+"""A control tick, as `LiveTick`; or oil and supply, or what commands are, from the next one on."""
+
+
+def decoded_items(
+    path: Path | str, columns: ColumnMap, candidates: CandidateTests, budget: Budget
+) -> tuple[Recording, Iterator[DecodedItem]]:
+    """Read a whole recording of decoded signals, tests and the time between them, tick by tick.
+
+    Arguments and errors: see `recordings_of_signals`. Returns all of it on ticks, and what comes
+    one after another.
+    """
+    # What comes near a test in other motion would set a wrong clock.
+    search = replace(candidates, tests=())
+    signals, start, readings = _read_signals([path], columns, search, budget)
+    clock = readings[0].clock
+    whole = _on_ticks(signals, readings[0], columns.tick_ns, start, str(path))
+    assert whole.samples is not None
+    told = {
+        key: item.value[np.maximum(np.searchsorted(item.time, clock.begin, side="right") - 1, 0)]
+        for key in ("supply_pressure", "return_pressure", "oil_temperature")
+        if (item := signals.get(f"environment.{key}")) is not None
+    }
+    samples = whole.samples
+
+    def items() -> Iterator[DecodedItem]:
+        last = Environment()
+        yield samples.mode
+        for tick, row in enumerate(live_ticks(samples)):
+            now = Environment(**{key: float(value[tick]) for key, value in told.items()})
+            if now != last:
+                last = now
+                yield now
+            yield row
+
+    return whole, items()
+
+
+def _read_signals(
+    paths: Sequence[Path | str], columns: ColumnMap, candidates: CandidateTests, budget: Budget
+) -> tuple[dict[str, RecordedSignal], float, list[TickReading]]:
+    """Signals by role, when the first begins, and the ways to put them on ticks."""
     alone = len(paths) == 1
     signals = join_tables(read_signals(path, columns, budget, complete=alone) for path in paths)
     source = ", ".join(str(path) for path in paths)
@@ -81,13 +136,7 @@ def recordings_of_signals(
         readings = [TickReading(clock, rows, None, note)]
     else:
         readings = _readings(signals, period, candidates, start)
-    found = [
-        extract_tests(_on_ticks(signals, item, columns.tick_ns, start, source), candidates)
-        for item in readings
-    ]
-    if len(found) == 1 or len(found[0]) != len(found[1]):
-        return found[0]
-    return tuple(replace(first, as_measured=other) for first, other in zip(*found, strict=True))
+    return signals, start, readings
 
 
 class TickReading(msgspec.Struct, frozen=True):

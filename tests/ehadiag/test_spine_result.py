@@ -41,7 +41,7 @@ from ehadiag.monitor.monitor_memory import MONITOR_UNIT_FIELDS
 from ehadiag.records import result_of
 from ehadiag.report.result_tables import diagnosis_text
 from ehadiag.result import Result, result_schema
-from ehadiag.session.unit_state import unit_state_from_history, unit_state_from_result
+from ehadiag.session.unit_state import unit_state_from_history, unit_state_of
 from ehadiag_sim.conditions import Effects, Faults, Sensors, condition_options
 from ehadiag_sim.plant_laws import UnitCondition, plant_coefficients
 from ehadiag_sim.simulation import Plant
@@ -238,7 +238,7 @@ def test_every_parameter_reaches_every_output(everything: Result, tmp_path: Path
         item.name: item.value for item in everything.effects
     }
     (tmp_path / "r.json").write_text(everything.to_json())
-    known = unit_state_from_result(tmp_path / "r.json", everything.diagnosis.actuator)
+    known = unit_state_of(tmp_path / "r.json", everything.diagnosis.actuator)
     assert {item.name for item in known.severities} == severities
     assert set(known.effects) == effects - {item.name for item in SENSOR_OFFSETS}
 
@@ -301,7 +301,7 @@ def test_result_and_history_are_watched_with_the_same_model(
     (tmp_path / "r.json").write_text(everything.to_json())
     with History(tmp_path / "h.sqlite", create=True) as history:
         history.append(history_entry(everything, Usage(), simulated=False))
-    one = unit_state_from_result(tmp_path / "r.json", actuator)
+    one = unit_state_of(tmp_path / "r.json", actuator)
     other = unit_state_from_history(tmp_path / "h.sqlite", everything.serial or 0, actuator)
     assert other is not None
     assert (one.faults, one.offsets, one.noise) == (other.faults, other.offsets, other.noise)

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from places import LOGS
 from stored_results import former_result
 
+import ehadiag
 from ehadiag import bundled_tests, default_actuator
 from ehadiag.history.records import counted_entries
 from ehadiag.history.store import History
@@ -186,6 +187,7 @@ def test_what_is_no_result_is_refused(run: Run, tmp_path: Path, content: str, sa
         (("--log", HEALTHY, "--unit-hours", 5), "no health history to keep them in"),
         (("--log", HEALTHY, "--unit", "3"), "no health history"),
         (("--log", HEALTHY, "--hours", "1e9"), "hours between false alarms"),
+        (("--log", HEALTHY, "--least-monitored", "2"), "need a number above 0, 1 at most"),
         (("--log", HEALTHY, "--on-alarm", "'open"), "--on-alarm"),
         (("--log", HEALTHY, "--history", "missing.sqlite"), "no history"),
     ],
@@ -247,6 +249,27 @@ def test_too_few_monitored_ticks_are_an_exit_code(run: Run) -> None:
     found = run("monitor", "--log", HEALTHY, "--least-monitored", "0.999")
     assert found.code == 30
     assert "ticks monitored" in found.err
+    assert "NOT MONITORED: 9" in found.err
+    assert "% of the ticks only, 100% are needed" in found.err
+    assert "NO ALARM" not in found.err
+
+
+def test_a_column_of_decoded_signals_is_named_as_for_a_diagnosis(run: Run, tmp_path: Path) -> None:
+    """A stored test, which an unknown unit's sums would alarm at, is motion like any other."""
+    (recording,) = ehadiag.read(HEALTHY)
+    table = recording.to_frame().rename(columns={"command": "cmd", "position": "Stroke"})
+    table["Stroke"] *= 1e3
+    table.to_csv(tmp_path / "rig.csv")
+    columns = ("--column", "current_command=cmd", "--column", "position=Stroke:mm")
+    found = run("monitor", "--log", "rig.csv", *columns, "--log-file", "a.jsonl")
+    assert (found.code, "NO ALARM" in found.err) == (0, True), found.err
+    _, end = events(tmp_path / "a.jsonl")
+    # A second for oil and supply, which may come, and 300 ticks to settle.
+    assert end["monitored"] > 0.75 * end["ticks"] > 4000
+    assert end["lost"] < 5
+    unnamed = run("monitor", "--log", "rig.csv", "--column", "current_command=cmd")
+    assert unnamed.code == 2
+    assert "no column for channels.position" in unnamed.err
 
 
 def test_ctrl_c_ends_it_in_order(tmp_path: Path, environment: dict[str, str]) -> None:

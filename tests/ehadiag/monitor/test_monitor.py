@@ -365,7 +365,7 @@ def test_the_page_has_its_examples():
     assert len(EXAMPLES) == 2
 
 
-@pytest.mark.parametrize(("example", "expected"), EXAMPLES, ids=["pushed", "received"])
+@pytest.mark.parametrize(("example", "expected"), EXAMPLES, ids=["pushed", "decoded"])
 def test_example_prints_what_the_page_says(example, expected, capsys):
     exec(compile(example, str(PAGE), "exec"), {})
     assert capsys.readouterr().out == expected

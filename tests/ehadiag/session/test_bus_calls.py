@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -20,7 +22,7 @@ from ehadiag_sim.emulator import EmulatorTransport, emulated_computer
 from firmware_iface.bus_map import default_map
 from firmware_iface.live_decode import BitRequest, LiveDecoder
 from firmware_iface.logs.reader import read_frames, read_recording
-from firmware_iface.recording import BitState
+from firmware_iface.recording import BitState, Environment
 from firmware_iface.stored_test import bundled_tests
 from firmware_iface.transport.adapters import BusOptions
 from firmware_iface.transport.frames import Frame
@@ -254,6 +256,39 @@ def test_watching_a_log_raises_alarms() -> None:
     assert found.alarm_count == len(alarms) > 0
     assert set(alarms) <= {"spool", "pressure"}
     assert found.monitored > 1000
+
+
+def decoded_ticks(samples: ehadiag.Samples) -> Iterator[Any]:
+    yield samples.mode
+    yield Environment(20.7e6, 0.7e6, 40.0)
+    for row in samples.to_frame().to_numpy().tolist():
+        yield ehadiag.Tick(*row)
+
+
+def test_decoded_signals_are_watched_live_as_the_frames_are(tmp_path: Path) -> None:
+    """The unit as its own diagnosis says: a file of it, or the result itself."""
+    log = LOGS / "paper-closed-4.blf"
+    (recording,) = ehadiag.read(log)
+    assert recording.samples is not None
+    result = ehadiag.diagnose(recording)
+    (tmp_path / "r.json").write_text(result.to_json())
+    for unit in (result, tmp_path / "r.json", str(tmp_path / "r.json")):
+        found = ehadiag.watch(decoded_ticks(recording.samples), unit=unit)
+        assert (found.ticks, found.alarm_count) == (recording.samples.ticks, 0)
+        assert found.monitored > 0.9 * found.ticks
+        assert found.enough
+
+
+def test_what_cannot_be_watched_is_said() -> None:
+    log = LOGS / "paper-closed-4.blf"
+    for wrong, said in (
+        ({"duration_s": -1.0}, "duration_s -1: need more than 0 s"),
+        ({"duration_s": math.nan}, "duration_s nan"),
+        ({"least_monitored": 2.0}, "least_monitored 2: need a share"),
+        ({"unit": "missing.json"}, "missing.json"),
+    ):
+        with pytest.raises(ehadiag.EhadiagError, match=said):
+            ehadiag.watch(log, **wrong)
 
 
 def test_watching_a_bus_sends_nothing_and_ends_in_time(computer: None, channel: str) -> None:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from bus_synth import ENVIRONMENT, START, TICK, make_truth, one, play
 from msgspec.structs import replace
+from numpy.typing import NDArray
 from test_live_session_limits import outcome_of
 
+import ehadiag
 from ehadiag import default_actuator
+from ehadiag.session.alarm_outlets import AlarmLog
 from ehadiag.session.bus_monitor import BusMonitor
+from ehadiag.session.monitor_session import AlarmOutlets
 from ehadiag.session.unit_state import new_unit_state
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
-from firmware_iface.slow_values import SlowValueWatch
-from firmware_iface.transport.frames import Frame
+from firmware_iface.logs.recorder import ReplayTransport
+from firmware_iface.slow_values import SlowValueWatch, spread_conflict
+from firmware_iface.transport.frames import ColumnBuilder, Frame
 
 BUS = default_map()
 TEST_TICKS = 5500
@@ -151,6 +158,22 @@ def test_a_monitor_believes_neither() -> None:
     assert monitor._environment_values == {}
 
 
+def test_a_monitor_says_what_it_did_not_believe(tmp_path: Path) -> None:
+    collected, snapshots = ColumnBuilder(), []
+    for frame in mixed(second(np.arange(50.0, 5400.0, 25.0), 90, 15.0, 20.7e6)):
+        collected.add_frame(frame)
+    found = ehadiag.watch(
+        ReplayTransport(collected.table(), "mixed"),
+        outlets=AlarmOutlets(AlarmLog(tmp_path / "a.jsonl")),
+        snapshots=snapshots.append,
+    )
+    assert 0.5 < found.disbelieved < 1.0
+    end = json.loads((tmp_path / "a.jsonl").read_text().splitlines()[-1])
+    assert end["disbelieved"] / end["told"] == found.disbelieved
+    said = f"{found.disbelieved:.0%} of the messages with oil and supply left out"
+    assert any(said in reason for reason in snapshots[-1].ending.reasons)
+
+
 @pytest.mark.parametrize(("paged", "found"), [(True, False), (False, True)])
 def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(paged: bool, found: bool) -> None:
     """As in `alignment.frame_faults.slow_values`: a page of 10 Hz beside one of 1 kHz."""
@@ -166,3 +189,76 @@ def test_the_counter_of_a_slow_page_goes_on_with_the_fast_ones(paged: bool, foun
             fast = bytes((number % 256, tick, 0))
             why = why or watch.take(at + tick, tick, fast, {"channels.spool": 0.0})
     assert bool(why) is found
+
+
+OIL = "environment.oil_temperature"
+SUPPLY = "environment.supply_pressure"
+
+
+def told_conflicts(rows: list[tuple[float, float]], cycle_ms: float = 100.0) -> int:
+    """Frames with oil (degC) and supply (Pa) in which two senders are seen."""
+    watch = SlowValueWatch(BUS.messages["Environment"])
+    return sum(
+        watch.take(
+            round(number * cycle_ms * 1e6),
+            number % 256,
+            number.to_bytes(4, "little"),
+            {OIL: degc, SUPPLY: supply},
+        )
+        != ""
+        for number, (degc, supply) in enumerate(rows)
+    )
+
+
+def noise(rng: np.random.Generator, how: str, count: int) -> NDArray[np.float64]:
+    """Noise of a told oil temperature, K."""
+    if how == "normal":
+        return rng.normal(0.0, 1.5, count)
+    return rng.uniform(-3.0, 3.0, count) + rng.normal(0.0, 0.5, count)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("how", ["uniform", "normal"])
+@pytest.mark.parametrize("path", ["80 degC", "-20 to 80 degC in 140 s", "a step of 20 K"])
+def test_noise_about_one_value_that_moves_is_no_second_sender(
+    seed: int, how: str, path: str
+) -> None:
+    rng, count = np.random.default_rng(seed), 400
+    level = {
+        "80 degC": np.full(count, 80.0),
+        "-20 to 80 degC in 140 s": -20.0 + np.arange(count) * 0.1 * 100.0 / 140.0,
+        "a step of 20 K": np.where(np.arange(count) < 200, 40.0, 60.0),
+    }[path]
+    supply = 20.7e6 - 4e6 * (np.arange(count) > 250) + rng.uniform(-0.3e6, 0.3e6, count)
+    oil = level + noise(rng, how, count)
+    assert told_conflicts(list(zip(oil.tolist(), supply.tolist(), strict=True))) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("how", ["uniform", "normal"])
+@pytest.mark.parametrize(("other", "drift"), [(8.0, 0.0), (-25.0, 0.0), (25.0, 0.7)])
+@pytest.mark.parametrize("share", [0.5, 0.25])
+def test_two_senders_farther_apart_than_their_noise_are_seen(
+    seed: int, how: str, other: float, drift: float, share: float
+) -> None:
+    rng, count = np.random.default_rng(seed), 400
+    theirs = rng.permutation(np.arange(count) < share * count)
+    oil = 40.0 + drift * 0.1 * np.arange(count) + other * theirs + noise(rng, how, count)
+    conflicts = told_conflicts([(value, 20.7e6) for value in oil.tolist()])
+    assert conflicts > (0.5 if share == 0.5 else 0.3) * count
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_senders_within_their_noise_say_nothing(seed: int) -> None:
+    rng, count = np.random.default_rng(seed), 400
+    oil = 40.0 + 3.0 * (np.arange(count) % 2) + noise(rng, "normal", count)
+    assert told_conflicts([(value, 20.7e6) for value in oil.tolist()]) == 0
+
+
+@pytest.mark.parametrize(("moved", "refused"), [(3.0, False), (12.0, True)])
+def test_a_value_that_moves_within_a_test_is_refused(moved: float, refused: bool) -> None:
+    """One value stands for the whole test."""
+    rng = np.random.default_rng(4)
+    for shape in (np.linspace(0.0, moved, 55), moved * (np.arange(55) > 30)):
+        found = spread_conflict(OIL, 40.0 + shape + rng.normal(0.0, 0.5, 55))
+        assert bool(found) is refused
