@@ -90,12 +90,11 @@ TRIAL_RATIO: Final = 2.0
 TRIAL_SIZES: Final = 11
 """Largest number of these: a current offset's."""
 TRIAL_ROUNDS: Final = 5
-"""Rounds of closer sizes, 1: to 2 %. Of changes with tens of units the likeliest size by 10 % took
-more off than another cause did."""
+"""Rounds of closer sizes, 1: to 2 %. A cause a tenth off its size explained less than others."""
 REFINED_CAUSES: Final = 5
 """Causes whose sizes are tried more closely, 1."""
 LEAST_GAIN: Final = 0.5
-"""Least gain of the likeliest cause, see `ScoreBank.gains`."""
+"""Least gain of the likeliest cause, see `ScoreBank.gains`: of changes from 0.8, mostly tens."""
 LEAST_TRIAL: Final = 1.5
 """Least size that is tried, over what is no change, 1."""
 LIKELY_SHARE: Final = 0.5
@@ -107,8 +106,7 @@ REPEAT_S: Final = 60.0
 SAME_CAUSE_S: Final = 3600.0
 """Time of motion after an alarm within which the same cause, no larger, repeats it, s."""
 GROWTH: Final = 1.5
-"""Size, over that of its alarm, above which a cause is another alarm, 1: half again, since the
-study's changes were found at 0.66 to 1.6 of their size, which no standard error of theirs tells."""
+"""Size, over that of its alarm, above which a cause may be another alarm, 1: half again."""
 LEAST: Final = 0.02
 """Least change of a severity worth an alarm, 1, by default: some errors of a diagnosis."""
 
@@ -302,24 +300,36 @@ class ChangeTest:
         length = TRIAL_BLOCKS
         if row >= len(SPANS):
             length = min(int(self._voting[row - len(SPANS), column]) + 1, TRIAL_BLOCKS)
-        causes = self._causes(deviates, list(self._kept)[-length:])
+        blocks = list(self._kept)[-length:]
+        causes = self._causes(deviates, blocks)
         if not causes or (causes[0].name in FAULT_NAMES and abs(causes[0].size) < self._least):
             self._ignored = self._looks + max(SPANS)
             self._clear_votes()
             return None
         self._clear_votes()
         self._tried = self._elapsed
-        size = abs(causes[0].size)
         side = causes[0].name, causes[0].size > 0.0
         when, alarmed = self._alarmed.get(side, (-math.inf, 0.0))
-        again = self._elapsed - when < SAME_CAUSE_S and size <= GROWTH * alarmed
+        again = self._elapsed - when < SAME_CAUSE_S and not self._has_grown(
+            causes[0], alarmed, blocks
+        )
         # What else has changed is not what holds the nuisances.
         others = [item for item in causes if item.name not in FAULT_NAMES]
         if others or not again:
             self.flight.begin_anew(f"an alarm named {others[0]}" if others else "")
         if not again:
-            self._alarmed[side] = self._elapsed, size
+            self._alarmed[side] = self._elapsed, causes[0].size
         return Change(causes, self.value, repeated=again)
+
+    def _has_grown(
+        self, cause: Cause, alarmed: float, blocks: list[tuple[Array2, Environment]]
+    ) -> bool:
+        """Whether a cause is larger than at its alarm, and blocks tell one size from the other."""
+        if abs(cause.size) <= GROWTH * abs(alarmed):
+            return False
+        place = BANK_NAMES.index(cause.name)
+        sizes = np.array([alarmed, cause.size]) / self._bank.steps[place]
+        return _is_less(*self._bank.gains(blocks, [(place, size) for size in sizes.tolist()]))
 
     def _causes(self, values: Array, blocks: list[tuple[Array2, Environment]]) -> tuple[Cause, ...]:
         """Try all causes in all sizes, the best ones closer and closer, and order them by what they

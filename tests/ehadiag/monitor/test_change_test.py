@@ -151,6 +151,8 @@ class VotingBank(ScoreBank):
     """What explains the blocks, and its size in steps."""
     rival, rival_gain = "", 1.0
     """What explains them, too, and how much of each."""
+    telling = 1000
+    """Number of the last blocks that tell one size from another."""
 
     def settle(self, rows: Array2) -> None:
         """Run no model."""
@@ -168,7 +170,9 @@ class VotingBank(ScoreBank):
             share.get(BANK_NAMES[place], 0.0) / (1.0 + abs(size - self.size))
             for place, size in trials
         ]
-        return np.outer(each, np.ones(len(blocks)))
+        out = np.outer(each, np.ones(len(blocks)))
+        out[:, : -self.telling] = out[:, : -self.telling] > 0.0
+        return out
 
 
 def votes_of(test: ChangeTest, gain: float, count: int) -> list[Change]:
@@ -235,6 +239,17 @@ def test_a_change_that_grows_while_it_goes_on_is_another_alarm() -> None:
     assert [item.repeated for item in votes_of(test, 1000.0, 120)].count(False) == 1
     bank.size = 4.0
     assert [item.repeated for item in votes_of(test, 1000.0, 240)].count(False) == 1
+
+
+def test_a_change_that_one_block_shows_larger_has_not_grown() -> None:
+    """A friction that went on was found at twice its size once in eight minutes."""
+    bank, test = voting()
+    votes_of(test, 1000.0, 120)
+    bank.size, bank.telling = 4.0, 1
+    later = [item for item in votes_of(test, 1000.0, 240) if item.causes]
+    assert [item.causes[0].size > 0.3 for item in later] == [True] * len(later)
+    assert later
+    assert all(item.repeated for item in later)
 
 
 def test_a_change_in_the_other_direction_is_another_alarm() -> None:
