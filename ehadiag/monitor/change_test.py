@@ -93,8 +93,10 @@ TRIAL_ROUNDS: Final = 5
 """Rounds of closer sizes, 1: to 2 %. A cause a tenth off its size explained less than others."""
 REFINED_CAUSES: Final = 5
 """Causes whose sizes are tried more closely, 1."""
-LEAST_GAIN: Final = 0.5
-"""Least gain of the likeliest cause, see `ScoreBank.gains`: of changes from 0.8, mostly tens."""
+LEAST_GAIN: Final = 2.5
+"""Least gain of the likeliest cause, see `ScoreBank.gains`: that of changes in the kinds of motion
+that the threshold comes from is 3.0 and more, mostly tens, that of one false alarm in two 1 to 2.3.
+"""
 LEAST_TRIAL: Final = 1.5
 """Least size that is tried, over what is no change, 1."""
 LIKELY_SHARE: Final = 0.5
