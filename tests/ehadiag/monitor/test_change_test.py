@@ -299,6 +299,17 @@ def test_blocks_vote_for_the_step_that_their_ticks_show() -> None:
     assert (down <= 0.0).mean() > 0.8
 
 
+def test_a_cause_is_tried_up_to_the_bounds_of_its_effect() -> None:
+    """A unit whose diagnosis had a null bias ended in an error."""
+    bank = ScoreBank(ACTUATOR, WORN, effects={"null_bias": 5e-4})
+    rows = free_motion(ACTUATOR, Motion("steps", "current", 2.0, WORN, 1)).rows
+    blocks = [(part, Environment()) for part in rows.reshape(-1, 500, 5)]
+    trials = [(BANK_NAMES.index("null_bias"), size) for size in (-5.0, 20.0)]
+    less, more = bank.gains(blocks, trials)
+    assert less.any()
+    assert not more.any()
+
+
 def test_supply_that_is_not_stated_is_no_cause_of_small_changes() -> None:
     bank = ScoreBank(ACTUATOR, WORN)
     place = BANK_NAMES.index("supply")
