@@ -85,26 +85,30 @@ TAIL_H: Final = 2.0
 """Mean time between values at which that tail begins, h."""
 TRIAL_BLOCKS: Final = 40
 """Blocks in which causes are tried, 1: 20 s, or since votes began."""
-TRIAL_STEPS: Final = (0.3, 1.0, 3.0, 9.0)
-"""Sizes in which each cause is tried first, steps of the bank."""
-LEAST_GAIN: Final = 100.0
-"""Least gain of the likeliest cause, squares of deviations: that of changes is in the thousands,
-that of a vote that chance has won 8."""
+TRIAL_RATIO: Final = 2.0
+"""Ratio of the sizes in which each cause is tried first."""
+TRIAL_SIZES: Final = 11
+"""Largest number of these: a current offset's."""
+TRIAL_ROUNDS: Final = 5
+"""Rounds of closer sizes, 1: to 2 %. A cause a tenth off its size explained less than others."""
+REFINED_CAUSES: Final = 5
+"""Causes whose sizes are tried more closely, 1."""
+LEAST_GAIN: Final = 2.5
+"""Least gain of the likeliest cause, see `ScoreBank.gains`: that of changes in the kinds of motion
+that the threshold comes from is 3.0 and more, mostly tens, that of one false alarm in two 1 to 2.3.
+"""
 LEAST_TRIAL: Final = 1.5
 """Least size that is tried, over what is no change, 1."""
-REFINED_CAUSES: Final = 3
-"""Causes whose sizes are tried more closely, 1."""
-TRIAL_FACTORS: Final = ((0.6, 1.6), (0.8, 1.25), (0.9, 1.1))
-"""Factors of the best sizes by which it is done."""
-LIKELY_SHARE: Final = 0.8
+LIKELY_SHARE: Final = 0.5
 """Share of the best cause's gain from which another one is named, too."""
+LIKELY_DEVIATIONS: Final = 2.0
+"""Deviations of its difference from the best cause up to which it is."""
 REPEAT_S: Final = 60.0
 """Time after a change was named in which none is named, s: so is one that goes on once a minute."""
 SAME_CAUSE_S: Final = 3600.0
 """Time of motion after an alarm within which the same cause, no larger, repeats it, s."""
 GROWTH: Final = 1.5
-"""Size, over that of its alarm, above which a cause is another alarm, 1: half again, since the
-study's changes were found at 0.66 to 1.6 of their size, which no standard error of theirs tells."""
+"""Size, over that of its alarm, above which a cause may be another alarm, 1: half again."""
 LEAST: Final = 0.02
 """Least change of a severity worth an alarm, 1, by default: some errors of a diagnosis."""
 
@@ -190,7 +194,7 @@ class ChangeTest:
         kept = 2 * max(SPANS)
         self._scores: deque[BlockScore] = deque(maxlen=kept)
         self._kept: deque[tuple[Array2, Environment]] = deque(maxlen=TRIAL_BLOCKS)
-        self._spans: deque[list[tuple[Array, Array] | None]] = deque(maxlen=kept // STRIDE)
+        self._spans: deque[list[Array | None]] = deque(maxlen=kept // STRIDE)
         self._elapsed = 0.0  # of motion, s
         self._tried = -math.inf
         self._alarmed: dict[tuple[str, bool], tuple[float, float]] = {}
@@ -271,14 +275,11 @@ class ChangeTest:
         self._spans.append(now)
         values = self.values.copy()
         values[: len(SPANS)] = 0.0
-        sizes = np.zeros_like(values)
-        sizes[len(SPANS) :] = [[1.0], [-1.0]]
         for place, (span, found) in enumerate(zip(SPANS, now, strict=True)):
             ago = span // STRIDE + 1
             before = self._spans[-ago][place] if len(self._spans) >= ago else None
             if found is not None and before is not None:
-                values[place] = _minmod(found[0], before[0])
-                sizes[place] = 0.5 * (found[1] + before[1])
+                values[place] = _minmod(found, before)
         self.values = values
         shares = np.abs(values) / self._threshold
         shares[: len(SPANS)] /= HEALTHY_SPREADS
@@ -301,54 +302,70 @@ class ChangeTest:
         length = TRIAL_BLOCKS
         if row >= len(SPANS):
             length = min(int(self._voting[row - len(SPANS), column]) + 1, TRIAL_BLOCKS)
-        causes = self._causes(deviates, sizes[best], list(self._kept)[-length:])
+        blocks = list(self._kept)[-length:]
+        causes = self._causes(deviates, blocks)
         if not causes or (causes[0].name in FAULT_NAMES and abs(causes[0].size) < self._least):
             self._ignored = self._looks + max(SPANS)
             self._clear_votes()
             return None
         self._clear_votes()
         self._tried = self._elapsed
-        size = abs(causes[0].size)
         side = causes[0].name, causes[0].size > 0.0
         when, alarmed = self._alarmed.get(side, (-math.inf, 0.0))
-        again = self._elapsed - when < SAME_CAUSE_S and size <= GROWTH * alarmed
+        again = self._elapsed - when < SAME_CAUSE_S and not self._has_grown(
+            causes[0], alarmed, blocks
+        )
         # What else has changed is not what holds the nuisances.
         others = [item for item in causes if item.name not in FAULT_NAMES]
         if others or not again:
             self.flight.begin_anew(f"an alarm named {others[0]}" if others else "")
         if not again:
-            self._alarmed[side] = self._elapsed, size
+            self._alarmed[side] = self._elapsed, causes[0].size
         return Change(causes, self.value, repeated=again)
 
-    def _causes(
-        self, values: Array, sizes: Array, blocks: list[tuple[Array2, Environment]]
-    ) -> tuple[Cause, ...]:
-        """Try all causes in some sizes, the best ones about theirs, and order them by the gain."""
-        found: dict[int, tuple[float, float]] = {}
+    def _has_grown(
+        self, cause: Cause, alarmed: float, blocks: list[tuple[Array2, Environment]]
+    ) -> bool:
+        """Whether a cause is larger than at its alarm, and blocks tell one size from the other."""
+        if abs(cause.size) <= GROWTH * abs(alarmed):
+            return False
+        place = BANK_NAMES.index(cause.name)
+        sizes = np.array([alarmed, cause.size]) / self._bank.steps[place]
+        return _is_less(*self._bank.gains(blocks, [(place, size) for size in sizes.tolist()]))
+
+    def _causes(self, values: Array, blocks: list[tuple[Array2, Environment]]) -> tuple[Cause, ...]:
+        """Try all causes in all sizes, the best ones closer and closer, and order them by what they
+        explain since the time from which they explain most.
+        """
+        found: dict[int, tuple[float, float, Array]] = {}
         least = LEAST_TRIAL * self._bank.steady[list(CAUSES)]
 
         def try_sizes(trials: list[tuple[int, float]]) -> list[int]:
-            gains = self._bank.gains(blocks, [(CAUSES[place], size) for place, size in trials])
-            for (place, size), gain in zip(trials, gains, strict=True):
-                if gain > found.get(place, (0.0, 0.0))[0]:
-                    found[place] = gain, size
-            return sorted(found, key=lambda place: -found[place][0])
+            within = [
+                item for item in trials if least[item[0]] <= abs(item[1]) <= MAX_SIZES[item[0]]
+            ]
+            gains = self._bank.gains(blocks, [(CAUSES[place], size) for place, size in within])
+            for (place, size), gain in zip(within, gains, strict=True):
+                since = np.cumsum(gain[::-1])
+                if since.max() > found.get(place, (0.0,))[0]:
+                    found[place] = float(since.max()), size, gain[-1 - int(since.argmax()) :]
+            return sorted(found, key=lambda place: -found[place][0])[:REFINED_CAUSES]
 
-        sides = np.where(sizes < 0.0, -1.0, 1.0)
         ordered = try_sizes(
-            [(place, float(sides[place] * size)) for place in range(len(CAUSES))
-             for size in (TRIAL_STEPS if least[place] <= TRIAL_STEPS[-1] else (least[place],))
-             if least[place] <= size <= MAX_SIZES[place]]
-        )[:REFINED_CAUSES]  # fmt: skip
-        for factors in TRIAL_FACTORS:
+            [(place, side * least[place] * TRIAL_RATIO**power) for place in range(len(CAUSES))
+             for power in range(TRIAL_SIZES) for side in (1.0, -1.0)]
+        )  # fmt: skip
+        for part in range(1, TRIAL_ROUNDS + 1):
+            factors = TRIAL_RATIO ** (0.5**part), TRIAL_RATIO ** -(0.5**part)
             ordered = try_sizes(
-                [(place, found[place][1] * factor) for place in ordered for factor in factors
-                 if least[place] <= abs(found[place][1] * factor) <= MAX_SIZES[place]]
-            )[:REFINED_CAUSES]  # fmt: skip
-        best = max((gain for gain, _ in found.values()), default=0.0)
-        likely = [
-            place for place in ordered if found[place][0] >= max(LEAST_GAIN, LIKELY_SHARE * best)
-        ]
+                [(place, found[place][1] * factor) for place in ordered for factor in factors]
+            )
+        best, _, shown = found[ordered[0]] if ordered else (0.0, 0.0, np.empty(0))
+        ordered = [
+            place for place in ordered
+            if found[place][0] >= max(LEAST_GAIN, LIKELY_SHARE * best)
+            and not _is_less(found[place][2], shown)
+        ]  # fmt: skip
         steps = self._bank.steps[list(CAUSES)]
         return tuple(
             Cause(
@@ -356,12 +373,23 @@ class ChangeTest:
                 float(found[place][1] * steps[place]),
                 float(abs(found[place][1] * steps[place]) / max(abs(values[place]), 1.0)),
             )
-            for place in likely
+            for place in ordered
         )
 
 
-def span_values(scores: list[BlockScore], steady: Array) -> tuple[Array, Array]:
-    """Value of each cause over a span of blocks, and its size in steps.
+def _is_less(gain: Array, best: Array) -> bool:
+    """Whether a cause explains the last blocks less than the best one beyond the scatter of blocks.
+
+    By Q. H. Vuong, Econometrica 57, 1989.
+    """
+    less = np.zeros(max(len(gain), len(best)))
+    less[-len(best) :] += best
+    less[-len(gain) :] -= gain
+    return bool(less.sum() > LIKELY_DEVIATIONS * math.sqrt(len(less)) * less.std())
+
+
+def span_values(scores: list[BlockScore], steady: Array) -> Array:
+    """Value of each cause over a span of blocks.
 
     steady: standard deviations of what is no change, steps. Values are normal deviates where blocks
     are alike.
@@ -388,7 +416,7 @@ def span_values(scores: list[BlockScore], steady: Array) -> tuple[Array, Array]:
         np.maximum(scatter, total) / total**2 + own**2 + MODEL_ERRORS**2 * ticks / total
     )
     shown = (total > MIN_INFORMATION) & (count >= MIN_BLOCKS)
-    return np.where(shown, size / spread, 0.0), size
+    return np.where(shown, size / spread, 0.0)
 
 
 MODEL_ERRORS: Final = np.array(

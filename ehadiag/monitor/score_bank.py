@@ -20,7 +20,7 @@ from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.model.laws import jack_law
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
-from ehadiag.model.registry import FAULT_NAMES
+from ehadiag.model.registry import FAULT_NAMES, parameter
 from ehadiag.monitor.plan import default_noise
 from ehadiag.monitor.streaming import Monitor, undecided_spool
 from firmware_iface.recording import Channels, CommandMode, Environment
@@ -147,7 +147,8 @@ class ScoreBank:
             )
             changed = dict(effects or {})
             if name not in (*FAULT_NAMES, *UNSTATED, "", "rest", "spool_offset", "pressure_offset"):
-                changed[name] = changed.get(name, 0.0) + step
+                item = parameter(name)
+                changed[name] = min(max(changed.get(name, 0.0) + step, item.lower), item.upper)
             return Monitor(
                 actuator, severities, mode=mode, noise=self._noise, offsets=errors,
                 effects=changed, channels=channels,
@@ -200,13 +201,13 @@ class ScoreBank:
 
     def settle(self, rows: Array2) -> None:
         """Push a block of ticks, and put the modelled spool where it is seen."""
-        self._put_where_seen(self._monitors[0].push_block(rows))
+        self._put_where_seen(self._monitors[0], self._monitors[0].push_block(rows))
 
-    def _put_where_seen(self, modelled: Array2) -> None:
+    def _put_where_seen(self, monitor: Monitor, modelled: Array2) -> None:
         errors = modelled[len(modelled) // 2 :, 3]
         errors = errors[np.isfinite(errors)]
         if len(errors):
-            self._monitors[0].nudge(float(errors.mean()) * self._noise[0])
+            monitor.nudge(float(errors.mean()) * self._noise[0])
 
     def push(self, rows: Array2) -> BlockScore:
         """Take a block of ticks, rows as of `Monitor.push`, shape (n, 5)."""
@@ -220,13 +221,13 @@ class ScoreBank:
             index = BANK_NAMES.index(name)
             self._monitors[1 + index].nudge(-float(self.steps[index]) * place)
         modelled = np.stack([item.push_block(rows) for item in self._monitors])
-        found = self._residuals(rows, modelled, self._gains)
+        found = np.concatenate(self._residuals(rows, modelled, self._gains), axis=1)
         # What holds in one and not in the other counts once, not in each block of the hold.
         grain, seen = self._channels.spool.grain, rows[np.isfinite(rows[:, 2]), 2]
         rested, held = self._held, len(seen) and seen.std() < grain
         self._held = bool(held and np.ptp(modelled[0, :, 0]) < grain)
         if self._held:
-            self._put_where_seen(modelled[0])
+            self._put_where_seen(first, modelled[0])
         residual, change = found[0], found[0] - found[1:]
         score, information = np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK)))
         steps = np.maximum(np.abs(change).max(axis=0), MAX_STEP_DEVIATIONS)
@@ -267,11 +268,14 @@ class ScoreBank:
 
     def gains(
         self, blocks: list[tuple[Array2, Environment]], trials: list[tuple[int, float]]
-    ) -> list[float]:
-        """By how much causes explain blocks better: squares of residuals, each of limited size.
+    ) -> Array2:
+        """By how much causes explain blocks better, shape (trials, blocks after the settling).
 
-        blocks: ticks with oil and supply; trials: places in the bank and sizes in steps. The bank's
-        own oil and supply are then those of the last block.
+        The scale of a model's errors in each channel of a block is not known: what is left of it
+        counts by the logarithm of one and its mean square, as in Student's law, so that neither one
+        bad block nor the channel with the most samples decides. blocks: ticks with oil and supply;
+        trials: places in the bank and sizes in steps. The bank's own oil and supply are then those
+        of the last block.
         """
         names = [("", 0.0)]
         names += [(BANK_NAMES[place], float(size * self.steps[place])) for place, size in trials]
@@ -279,8 +283,11 @@ class ScoreBank:
             self._make("" if name.startswith("current") else name, step) for name, step in names
         ]
         gains = 1.0 + np.array([item.constants.GXJ for item in monitors])
-        mode = self.mode
-        costs = np.zeros(len(names))
+        offset, slope = (
+            np.array([[step * (name == error)] for name, step in names])
+            for error in ("current_offset", "current_gain")
+        )
+        mode, costs = self.mode, []
         for number, (rows, environment) in enumerate(blocks):
             self.tune(environment)
             for (name, step), monitor in zip(names, monitors, strict=True):
@@ -289,22 +296,23 @@ class ScoreBank:
                     monitor.follow(mode)
                     monitor.reset(float(np.nan_to_num(rows[0, 2])) - self._offset)
             modelled = np.stack([item.push_block(rows) for item in monitors])
-            if number < TRIAL_SETTLING:
+            settling = number < TRIAL_SETTLING
+            if settling or rows[:, 2].std() < self._channels.spool.grain:
                 for monitor, block in zip(monitors, modelled, strict=True):
-                    error = float(np.nan_to_num(np.nanmean(block[len(rows) // 2 :, 3])))
-                    monitor.nudge(error * self._noise[0])
+                    self._put_where_seen(monitor, block)
+            if settling:
                 continue
-            found = self._residuals(rows, modelled, gains)
-            costs += np.minimum(found**2, MAX_SQUARE).sum(axis=1)
-            current, flowing = rows[:, 1], modelled[0, :, 2]
-            for place, (name, step) in enumerate(names):
-                slope = step * (name == "current_gain")
-                zero = step * (name == "current_offset")
-                deviation = (current - flowing * (1.0 + slope) - zero) / self._current_noise
-                costs[place] += np.nansum(np.minimum(deviation**2, MAX_SQUARE))
-        return (costs[0] - costs[1:]).tolist()
+            fine = np.isfinite(rows[:, 1])
+            current = rows[fine, 1] - modelled[0, fine, 2] * (1.0 + slope) - offset
+            channels = *self._residuals(rows, modelled, gains), current / self._current_noise
+            squares = [np.minimum(item**2, MAX_SQUARE) for item in channels]
+            costs.append(
+                sum(np.log1p(item.sum(axis=1) / max(item.shape[1], 1)) for item in squares)
+            )
+        found = np.array(costs).reshape(-1, len(names)).T
+        return found[:1] - found[1:]
 
-    def _residuals(self, rows: Array2, modelled: Array, gains: Array) -> Array2:
+    def _residuals(self, rows: Array2, modelled: Array, gains: Array) -> list[Array2]:
         """Residuals of spool, pressure and travel by each monitor, deviations; those all have."""
         path, jack = modelled[0, :, 0], self._jack
         near = (np.abs(rows[:, 2] - self._offset) < self._undecided) | (
@@ -318,8 +326,8 @@ class ScoreBank:
         places = slice(None, None, TRAVEL_TICKS)
         travel = np.diff(rows[places, 4] - gains[:, None] * modelled[:, places, 1], axis=1)
         travel /= TRAVEL_LSB * self._channels.position.grain
-        found = np.concatenate((modelled[:, :, 3], pressure, travel), axis=1)
-        return found[:, np.isfinite(found).all(axis=0)]
+        found = modelled[:, :, 3], pressure, travel
+        return [item[:, np.isfinite(item).all(axis=0)] for item in found]
 
 
 def _add(

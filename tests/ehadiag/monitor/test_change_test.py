@@ -59,31 +59,31 @@ def blocks(rng: np.random.Generator, shift: float, place: int, count: int = 20) 
 
 def test_values_of_noise_are_no_greater_than_normal_deviates() -> None:
     rng = np.random.default_rng(1)
-    values = np.array([span_values(blocks(rng, 0.0, 0), STEADY)[0] for _ in range(200)])
+    values = np.array([span_values(blocks(rng, 0.0, 0), STEADY) for _ in range(200)])
     assert np.all(values.std(axis=0) < 1.2)
     assert np.all(np.abs(values.mean(axis=0)) < 0.3)
 
 
 @pytest.mark.parametrize("cause", range(0, len(CAUSES), 3))
-def test_what_is_off_has_the_greatest_value_and_its_size(cause: int) -> None:
+def test_what_is_off_has_the_greatest_value(cause: int) -> None:
     rng = np.random.default_rng(cause)
-    values, sizes = span_values(blocks(rng, 1.0, CAUSES[cause]), STEADY)
+    values = span_values(blocks(rng, 1.0, CAUSES[cause]), STEADY)
     assert np.abs(values).argmax() == cause
-    assert sizes[cause] == pytest.approx(1.0, abs=0.1)
+    assert values[cause] > 0.0
 
 
 def test_one_block_however_large_is_no_change() -> None:
     rng = np.random.default_rng(3)
     made = blocks(rng, 0.0, 2)
     made[7] = blocks(rng, 50.0, 2, 1)[0]
-    assert np.abs(span_values(made, STEADY)[0]).max() < 4.0
+    assert np.abs(span_values(made, STEADY)).max() < 4.0
 
 
 def test_blocks_without_information_say_nothing() -> None:
     none = BlockScore(
         np.zeros(len(BANK)), np.zeros((len(BANK), len(BANK))), np.zeros((2, len(BANK))), 500
     )
-    assert not span_values([none] * 20, STEADY)[0].any()
+    assert not span_values([none] * 20, STEADY).any()
 
 
 def test_oil_and_supply_that_run_are_those_of_a_monitor_made_for_them() -> None:
@@ -128,6 +128,14 @@ def test_a_change_is_named_with_its_size_and_an_unchanged_unit_is_silent() -> No
     assert changes_in(motion, (0.3, 0.3, 0.2), least=0.2) == []
 
 
+def test_an_offset_of_the_spool_sensor_is_no_null_bias() -> None:
+    """Tried at some sizes only, a null bias explained two thirds of the residuals."""
+    change = Motion("multisine", "current", 24.0, WORN, 5, exact=True, change="spool_offset",
+                    size=2e-6, after=6.0)  # fmt: skip
+    cause = changes_in(change, WORN)[0]
+    assert (cause.name, cause.size) == ("spool_offset", pytest.approx(2e-6, rel=0.05))
+
+
 def test_a_filter_that_clogs_is_found_by_the_votes_of_the_blocks_that_show_it() -> None:
     """Its values over spans stay below the threshold: most blocks show nothing of it."""
     motion = Motion("stairs", "position", 26.0, WORN, 5, exact=True)
@@ -141,6 +149,10 @@ class VotingBank(ScoreBank):
 
     cause, size = "Kintas", 1.0
     """What explains the blocks, and its size in steps."""
+    rival, rival_gain = "", 1.0
+    """What explains them, too, and how much of each."""
+    telling = 1000
+    """Number of the last blocks that tell one size from another."""
 
     def settle(self, rows: Array2) -> None:
         """Run no model."""
@@ -152,11 +164,15 @@ class VotingBank(ScoreBank):
 
     def gains(
         self, blocks: list[tuple[Array2, Environment]], trials: list[tuple[int, float]]
-    ) -> list[float]:
-        return [
-            100.0 * len(blocks) * (BANK_NAMES[place] == self.cause) / (1.0 + abs(size - self.size))
+    ) -> Array2:
+        share = {self.rival: self.rival_gain, self.cause: 1.0}
+        each = [
+            share.get(BANK_NAMES[place], 0.0) / (1.0 + abs(size - self.size))
             for place, size in trials
         ]
+        out = np.outer(each, np.ones(len(blocks)))
+        out[:, : -self.telling] = out[:, : -self.telling] > 0.0
+        return out
 
 
 def votes_of(test: ChangeTest, gain: float, count: int) -> list[Change]:
@@ -174,6 +190,22 @@ def test_a_voted_change_that_comes_and_goes_leaves_the_next_one_to_be_found() ->
     votes_of(test, -20.0, 60)
     assert votes_of(test, -20.0, 300) == []
     assert [item.repeated for item in votes_of(test, 1000.0, 60)][:1] == [False]
+
+
+@pytest.mark.parametrize(("gain", "named"), [(1.0, {"Kintas", "load"}), (0.9, {"Kintas"})])
+def test_another_cause_is_named_where_the_blocks_cannot_tell(gain: float, named: set[str]) -> None:
+    """One that explains every block a little less is none, however little that is."""
+    bank, test = voting()
+    bank.rival, bank.rival_gain = "load", gain
+    found = next(item for item in votes_of(test, 1000.0, 60) if item.causes)
+    assert {item.name for item in found.causes} == named
+
+
+def test_the_size_of_a_change_is_found_closer_and_closer() -> None:
+    bank, test = voting()
+    bank.size = 2.3
+    found = next(item for item in votes_of(test, 1000.0, 60) if item.causes)
+    assert found.causes[0].size == pytest.approx(0.23, rel=0.025)
 
 
 def repeats(bank: VotingBank, test: ChangeTest, size: float) -> bool:
@@ -207,6 +239,17 @@ def test_a_change_that_grows_while_it_goes_on_is_another_alarm() -> None:
     assert [item.repeated for item in votes_of(test, 1000.0, 120)].count(False) == 1
     bank.size = 4.0
     assert [item.repeated for item in votes_of(test, 1000.0, 240)].count(False) == 1
+
+
+def test_a_change_that_one_block_shows_larger_has_not_grown() -> None:
+    """A friction that went on was found at twice its size once in eight minutes."""
+    bank, test = voting()
+    votes_of(test, 1000.0, 120)
+    bank.size, bank.telling = 4.0, 1
+    later = [item for item in votes_of(test, 1000.0, 240) if item.causes]
+    assert [item.causes[0].size > 0.3 for item in later] == [True] * len(later)
+    assert later
+    assert all(item.repeated for item in later)
 
 
 def test_a_change_in_the_other_direction_is_another_alarm() -> None:
@@ -254,6 +297,17 @@ def test_blocks_vote_for_the_step_that_their_ticks_show() -> None:
     assert up.max() > 70.0
     assert (up > 0.0).mean() > 0.4
     assert (down <= 0.0).mean() > 0.8
+
+
+def test_a_cause_is_tried_up_to_the_bounds_of_its_effect() -> None:
+    """A unit whose diagnosis had a null bias ended in an error."""
+    bank = ScoreBank(ACTUATOR, WORN, effects={"null_bias": 5e-4})
+    rows = free_motion(ACTUATOR, Motion("steps", "current", 2.0, WORN, 1)).rows
+    blocks = [(part, Environment()) for part in rows.reshape(-1, 500, 5)]
+    trials = [(BANK_NAMES.index("null_bias"), size) for size in (-5.0, 20.0)]
+    less, more = bank.gains(blocks, trials)
+    assert less.any()
+    assert not more.any()
 
 
 def test_supply_that_is_not_stated_is_no_cause_of_small_changes() -> None:
