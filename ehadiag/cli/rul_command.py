@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -19,10 +22,12 @@ from ehadiag.cli.history_options import (
     units_of,
     usage_from_options,
 )
+from ehadiag.core.interruption import ignore_interrupt_in_worker
 from ehadiag.terminal.output import counting_bar, print_text, render_for_terminal, write_output
-from firmware_iface.errors import ConfigurationError
+from firmware_iface.errors import ConfigurationError, InputOutputError
 
 if TYPE_CHECKING:
+    from ehadiag.history.store import History
     from ehadiag.prognosis.units import Prognosis
 
 MAX_TIME = 1e9
@@ -78,7 +83,7 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
 
 def run_rul(arguments: argparse.Namespace) -> int:
     """Print the forecasts; 0 also where there is no number."""
-    from ehadiag.prognosis.units import all_prognoses, forecast  # noqa: PLC0415 - numpy
+    from ehadiag.prognosis.units import forecast  # noqa: PLC0415 - numpy
     from ehadiag.report.prognosis_tables import (  # noqa: PLC0415
         print_prognosis,
         print_urgencies,
@@ -91,13 +96,7 @@ def run_rul(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("--hours, --cycles: of one unit, not of --all")
     with open_named_history(arguments) as history:
         if arguments.all:
-            both = (levels.advisory, levels.limit)
-            units, found = units_of(history, arguments.actuator), []
-            with counting_bar(len(units), "unit") as count:
-                for item in all_prognoses(history, units, both, arguments.in_unit, arguments.seed):
-                    found.append(item)
-                    count()
-            found.sort(key=_urgency)
+            found = sorted(_of_all(history, arguments, levels), key=_urgency)
         else:
             found = [
                 forecast(
@@ -121,6 +120,37 @@ def run_rul(arguments: argparse.Namespace) -> int:
             render_for_terminal(lambda console: print_prognosis(found[0], console, before))
         )
     return 0
+
+
+def _of_all(history: History, arguments: argparse.Namespace, levels: Levels) -> Iterator[Prognosis]:
+    """Forecast all units, on all processors where there are many."""
+    from ehadiag.batch.workers import Workers, worker_count  # noqa: PLC0415
+    from ehadiag.history.records import current_utc_text  # noqa: PLC0415
+    from ehadiag.prognosis.units import prognosis_in  # noqa: PLC0415
+
+    units = units_of(history, arguments.actuator)
+    both = (levels.advisory, levels.limit)
+    jobs = worker_count(len(units))
+    make = prognosis_in if jobs == 1 else _in_worker
+    work = partial(make, history.path, both, arguments.in_unit, arguments.seed, current_utc_text())
+    with Workers(jobs) as workers, counting_bar(len(units), "unit") as count:
+        for item in workers.over(work, units, _given_up) if jobs > 1 else map(work, units):
+            yield item
+            count()
+
+
+def _in_worker(
+    path: Path, levels: Sequence[float], unit: str | None, seed: int, now: str,
+    which: tuple[str, int],
+) -> Prognosis:  # fmt: skip
+    from ehadiag.prognosis.units import prognosis_in  # noqa: PLC0415
+
+    ignore_interrupt_in_worker()
+    return prognosis_in(path, levels, unit, seed, now, which)
+
+
+def _given_up(which: tuple[str, int]) -> Prognosis:
+    raise InputOutputError(f"serial {which[1]} of {which[0]}: the process that forecast it ended")
 
 
 def _urgency(item: Prognosis) -> tuple[float, str, int]:

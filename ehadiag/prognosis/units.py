@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from ehadiag.history.records import Entry, MaintenanceEvent
 
-__all__ = ["Prognosis", "all_prognoses", "forecast", "prognosis_of"]
+__all__ = ["Prognosis", "forecast", "prognosis_in", "prognosis_of"]
 
 MIN_DAYS_FOR_DATES = 7.0
 """Days between first and last diagnosis, from which on use a day is known well enough for dates."""
@@ -297,33 +297,37 @@ def forecast(
     )
 
 
-def all_prognoses(
-    history: History,
-    units: Sequence[tuple[str, int]],
+def prognosis_in(
+    path: Path,
     levels: Sequence[float],
-    unit: str | None = None,
-    seed: int = 0,
-) -> Iterator[Prognosis]:
-    """Forecast units of a history, one by one.
+    unit: str | None,
+    seed: int,
+    now: str,
+    which: tuple[str, int],
+) -> Prognosis:
+    """Forecast one unit of a history file, here or in another process.
 
     Parameters
     ----------
-    history : History
-        An open history.
-    units : Sequence[tuple[str, int]]
-        Actuator and serial number of each.
+    path : Path
+        Of the history.
     levels : Sequence[float]
         That are to be reached, 0 … 1, rising.
     unit : str | None
-        One of `USAGE_UNITS`; None: the one that more of a unit's diagnoses say.
+        One of `USAGE_UNITS`; None: the one that more of the unit's diagnoses say.
     seed : int
         Of the draws.
+    now : str
+        Day: UTC, ISO 8601; the same for all units.
+    which : tuple[str, int]
+        Actuator and serial number.
 
-    Yields
-    ------
+    Returns
+    -------
     Prognosis
-        Of each.
+        Of the unit.
     """
-    for actuator, serial in units:
+    actuator, serial = which
+    with History(path) as history:
         entries, events = history.alike(serial, actuator)
-        yield prognosis_of(serial, entries, events, levels, unit, seed, actuator=actuator)
+    return prognosis_of(serial, entries, events, levels, unit, seed, actuator=actuator, now=now)

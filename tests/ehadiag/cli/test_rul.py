@@ -38,7 +38,9 @@ def today(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def set_today(monkeypatch: pytest.MonkeyPatch, day: str) -> None:
-    monkeypatch.setattr("ehadiag.prognosis.units.current_utc_text", lambda: f"{day}T09:00:00.000Z")
+    for module in ("prognosis.units", "history.records"):
+        name = f"ehadiag.{module}.current_utc_text"
+        monkeypatch.setattr(name, lambda: f"{day}T09:00:00.000Z")
 
 
 def run(capsys: pytest.CaptureFixture[str], place: Path, *words: str) -> tuple[int, str, str]:
@@ -68,6 +70,15 @@ def test_all_units_by_urgency(place: Path, capsys: pytest.CaptureFixture[str]) -
     assert len(out.splitlines()) == 10
     assert "about (date)" in out
     assert "jack friction" in out
+
+
+def test_workers_say_the_same(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, alone, _ = run(capsys, place, "--all", "--json")
+    monkeypatch.setattr("ehadiag.batch.workers.worker_count", lambda _: 2)
+    code, out, _ = run(capsys, place, "--all", "--json")
+    assert (code, out) == (0, alone)
 
 
 def test_a_table_of_units_says_in_words_what_has_no_number(
