@@ -191,11 +191,14 @@ def _list(arguments: argparse.Namespace) -> None:
         return
     from rich.table import Table  # noqa: PLC0415 - only who prints tables needs it
 
-    table = Table(*HISTORY_COLUMNS, box=None, pad_edge=False)
+    # Of one type the name is in no need of a column.
+    kinds = {item.actuator for item in entries}
+    shown = [at for at, name in enumerate(HISTORY_COLUMNS) if len(kinds) > 1 or name != "actuator"]
+    table = Table(*(HISTORY_COLUMNS[at] for at in shown), box=None, pad_edge=False)
     rows = [(item.when, _entry_row(item)) for item in entries]
     rows += [(item.when, _event_row(item)) for item in events]
     for _, row in sorted(rows):
-        table.add_row(*(printable(cell) for cell in row))
+        table.add_row(*(printable(row[at]) for at in shown))
     write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
 
 

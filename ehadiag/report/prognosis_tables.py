@@ -74,7 +74,7 @@ def print_urgencies(
     heads = ["serial", "actuator", "first", "now", "to the limit (80 % interval)"]
     heads += ["about (date)"] * any(dates) + ["chance before"] * bool(before) + ["alarms"]
     for name in heads:
-        table.add_column(name, overflow="fold", no_wrap=name == "actuator")
+        table.add_column(name, overflow="fold", no_wrap=name in ("actuator", "about (date)"))
     for place, (item, first) in enumerate(zip(found, firsts, strict=True)):
         severity, left = ("-", _no_number(item)) if first is None else _urgency_texts(item, first)
         kind = printable(item.actuator or "unknown")

@@ -79,6 +79,9 @@ def test_tables_are_broken_between_words_on_a_narrow_terminal(
     run("history", "import", ROOT / "docs" / "examples" / "fleet.csv", "--history", "h.sqlite")
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "80")
+    day = "2026-08-18T08:00:00.000Z"
+    for module in ("prognosis.units", "history.records"):
+        monkeypatch.setattr(f"ehadiag.{module}.current_utc_text", lambda: day)
     for words, kept in (
         (("history", "list"), r"2026-08-20 08:00 .*FAULT"), (("rul", "--all"), "reference-31 "),
         (("rul", "--unit", "1"), r"710\s+to 2500 with 80 %\."),
