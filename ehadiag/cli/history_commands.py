@@ -15,8 +15,8 @@ from ehadiag.cli.command_parser import show_examples
 from ehadiag.cli.history_options import (
     add_history_option,
     add_usage_options,
-    named_actuator,
     open_named_history,
+    units_of,
     usage_from_options,
 )
 from ehadiag.cli.options import unit_number
@@ -49,6 +49,7 @@ HISTORY_COLUMNS = (
     "no.",
     "when",
     "serial",
+    "actuator",
     "hours",
     "cycles",
     "test",
@@ -120,12 +121,7 @@ def define_history(parser: argparse.ArgumentParser) -> None:
         default=[],
         choices=REPLACED_PARTS,
         help="part that was replaced, whose severities alone begin anew; `unit`: the actuator was"
-        " swapped for another one, all begin anew; repeatable",
-    )
-    event.add_argument(
-        "--actuator",
-        metavar="NAME",
-        help="of the unit, where its serial number is another actuator's too",
+        " swapped for another one, all begin anew, and so may its hours; repeatable",
     )
     event.add_argument("--when", metavar="TIME", help="ISO 8601; without a zone UTC (default: now)")
     add_usage_options(event)
@@ -141,6 +137,9 @@ def define_history(parser: argparse.ArgumentParser) -> None:
 def run_history(arguments: argparse.Namespace) -> int:
     """Do what the verb says."""
     if getattr(arguments, "out", None):
+        suffixes = (".png",) if arguments.verb == "plot" else (".csv", ".parquet")
+        if Path(arguments.out).suffix.lower() not in suffixes:
+            raise ConfigurationError(f"--out {arguments.out}: need {' or '.join(suffixes)}")
         refuse_overwriting(arguments, [OutputFile("--out", arguments.out)])
     arguments.verb_function(arguments)
     return 0
@@ -153,6 +152,11 @@ def _add_unit(parser: argparse.ArgumentParser, *, required: bool) -> None:
         metavar="N",
         required=required,
         help="serial number of the unit",
+    )
+    parser.add_argument(
+        "--actuator",
+        metavar="NAME",
+        help="of the unit, where its serial number is another actuator's too",
     )
 
 
@@ -187,11 +191,14 @@ def _list(arguments: argparse.Namespace) -> None:
         return
     from rich.table import Table  # noqa: PLC0415 - only who prints tables needs it
 
-    table = Table(*HISTORY_COLUMNS, box=None, pad_edge=False)
+    # Of one type the name is in no need of a column.
+    kinds = {item.actuator for item in entries}
+    shown = [at for at, name in enumerate(HISTORY_COLUMNS) if len(kinds) > 1 or name != "actuator"]
+    table = Table(*(HISTORY_COLUMNS[at] for at in shown), box=None, pad_edge=False)
     rows = [(item.when, _entry_row(item)) for item in entries]
     rows += [(item.when, _event_row(item)) for item in events]
     for _, row in sorted(rows):
-        table.add_row(*(printable(cell) for cell in row))
+        table.add_row(*(printable(row[at]) for at in shown))
     write_output(render_for_terminal(lambda console: console.print(table, crop=False)))
 
 
@@ -229,8 +236,10 @@ def _import(arguments: argparse.Namespace) -> None:
         raise ConfigurationError(f"{arguments.file}: is not UTF-8") from None
     entries = entries_from_csv(text, arguments.file, FAULT_NAMES)
     with open_named_history(arguments) as history:
-        history.append_all(entries)
-    print_text(f"{len(entries)} diagnoses of {arguments.file}")
+        number = history.append_new(entries)
+    there = len(entries) - number
+    more = f"; {there} more were there already" if there else ""
+    print_text(f"{number} diagnoses of {arguments.file}{more}")
 
 
 def _plot(arguments: argparse.Namespace) -> None:
@@ -241,12 +250,18 @@ def _plot(arguments: argparse.Namespace) -> None:
 
     levels = Levels()
     with open_named_history(arguments) as history:
-        whole, changes = history.alike(arguments.unit)
-    entries = counted_entries([item for item in whole if item.serial == arguments.unit])
-    events = [item for item in changes if item.serial == arguments.unit]
+        kind = history.actuator_of(arguments.unit, arguments.actuator)
+        whole, changes = history.alike(arguments.unit, kind)
+    own = [item for item in whole if (item.serial, item.actuator) == (arguments.unit, kind)]
+    entries = counted_entries(own)
+    events = [
+        item for item in changes
+        if item.serial == arguments.unit and item.actuator in (None, kind)
+    ]  # fmt: skip
     if not has_trend(entries):
         raise ConfigurationError(f"serial {arguments.unit}: no diagnosis with severities to draw")
-    future = prognosis_of(arguments.unit, whole, changes, (levels.advisory, levels.limit))
+    both = (levels.advisory, levels.limit)
+    future = prognosis_of(arguments.unit, whole, changes, both, actuator=kind)
     picture = history_picture(entries, events, future)
     write_file(Path(arguments.out), isolated_png(picture), "file")
     print_status(f"wrote {arguments.out}")
@@ -262,10 +277,15 @@ def _event(arguments: argparse.Namespace) -> None:
     strangers = [name for name in arguments.resets if name not in FAULT_NAMES]
     if strangers:
         raise ConfigurationError(f"--resets {strangers[0]}: there is {', '.join(FAULT_NAMES)}")
+    if not arguments.text.strip():
+        raise ConfigurationError("TEXT: is empty; say what was done")
+    when, now = arguments.when and _when(arguments.when), current_utc_text()
+    if when and when > now:
+        raise ConfigurationError(f"--when {arguments.when}: is in the future")
     renewed = {name for part in arguments.replaced for name in REPLACED_PARTS[part]}
     event = MaintenanceEvent(
-        appended=current_utc_text(),
-        when=_when(arguments.when) if arguments.when else current_utc_text(),
+        appended=now,
+        when=when or now,
         serial=arguments.unit,
         actuator=arguments.actuator,
         usage=usage_from_options(arguments),
@@ -273,7 +293,7 @@ def _event(arguments: argparse.Namespace) -> None:
         resets=tuple(name for name in FAULT_NAMES if name in renewed.union(arguments.resets)),
     )
     with open_named_history(arguments) as history:
-        event = replace(event, actuator=named_actuator(history, event.serial, event.actuator))
+        event = replace(event, actuator=history.actuator_of(event.serial, event.actuator))
         number = history.append_event(event)
     print_text(f"event {number} of serial {arguments.unit}: {event.text}")
 
@@ -302,10 +322,17 @@ def _read(arguments: argparse.Namespace) -> tuple[list[Entry], list[MaintenanceE
     """Read the unit that was named, or all; what counts, or all."""
     from ehadiag.history.records import counted_entries  # noqa: PLC0415
 
-    whole = arguments.all
+    whole, serial, kind = arguments.all, arguments.unit, arguments.actuator
     with open_named_history(arguments) as history:
-        entries = history.entries(arguments.unit, withdrawn=whole, brief=True)
-        events = history.events(arguments.unit, withdrawn=whole)
+        if serial is not None:
+            history.actuator_of(serial, kind or next((of for of, _ in history.units(serial)), None))
+        elif kind is not None:
+            units_of(history, kind)
+        entries = history.entries(serial, withdrawn=whole, brief=True)
+        events = history.events(serial, withdrawn=whole)
+    if kind is not None:
+        entries = [item for item in entries if item.actuator == kind]
+        events = [item for item in events if item.actuator in (None, kind)]
     return (entries if whole else counted_entries(entries)), events
 
 
@@ -319,6 +346,7 @@ def _entry_row(entry: Entry) -> tuple[str, ...]:
         str(entry.number),
         shown_date(entry.when),
         _cell(entry.serial),
+        entry.actuator,
         _cell(entry.usage.hours),
         _cell(entry.usage.cycles),
         _cell(entry.test),
@@ -331,7 +359,8 @@ def _event_row(event: MaintenanceEvent) -> tuple[str, ...]:
     resets = f" (begins anew: {', '.join(event.resets)})" if event.resets else ""
     usage = (_cell(event.usage.hours), _cell(event.usage.cycles))
     kind = f"event {event.number}{_withdrawn(event)}"
-    return ("", shown_date(event.when), str(event.serial), *usage, "", kind, event.text + resets)
+    unit = (str(event.serial), _cell(event.actuator))
+    return ("", shown_date(event.when), *unit, *usage, "", kind, event.text + resets)
 
 
 def _withdrawn(item: Entry | MaintenanceEvent) -> str:

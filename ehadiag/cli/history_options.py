@@ -88,21 +88,13 @@ def open_named_history(arguments: argparse.Namespace) -> History:
     return History(place)
 
 
-def named_actuator(history: History, serial: int, named: str | None) -> str | None:
-    """Return the actuator of a serial number; None where the history does not know the number.
-
-    history: an open history; serial: of the unit; named: the actuator that was named, if any.
-    Returns the one named, else the only one that has this serial number. ConfigurationError:
-    several have it and none was named, or the one named has not.
-    """
-    known = [actuator for actuator, _ in history.units(serial)]
-    if named is not None and known and named not in known:
-        raise ConfigurationError(f"--actuator {named}: serial {serial} is of {', '.join(known)}")
-    if named is None and len(known) > 1:
-        raise ConfigurationError(
-            f"serial {serial} is of {', '.join(known)}: name one by --actuator"
-        )
-    return named or next(iter(known), None)
+def units_of(history: History, actuator: str | None) -> list[tuple[str, int]]:
+    """Return actuator and serial number of all units, or of those of an actuator that was named."""
+    units = history.units()
+    if actuator is not None and all(kind != actuator for kind, _ in units):
+        known = ", ".join(dict.fromkeys(kind for kind, _ in units)) or "none"
+        raise ConfigurationError(f"--actuator {actuator}: there is {known}")
+    return [unit for unit in units if actuator in (None, unit[0])]
 
 
 def append_result(

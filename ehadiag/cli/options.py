@@ -8,15 +8,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from ehadiag.core.conventions import SIGNAL_FILE_KINDS
+from ehadiag.core.conventions import MAX_HISTORY_SERIAL, SIGNAL_FILE_KINDS
 from ehadiag.request import Option, Request, request_options
 from ehadiag.setup import Setup
 
 if TYPE_CHECKING:
     from firmware_iface.xcp import XcpIds
-
-MAX_HISTORY_SERIAL = (1 << 63) - 1
-"""Largest serial number that a history can hold, 1."""
 
 
 def positive_number(text: str, *, or_zero: bool = False, most: float = math.inf) -> float:

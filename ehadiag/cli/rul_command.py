@@ -5,7 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
 from ehadiag.cli import options
@@ -13,19 +18,20 @@ from ehadiag.cli.command_parser import show_usual
 from ehadiag.cli.history_options import (
     add_history_option,
     add_usage_options,
-    named_actuator,
     open_named_history,
+    units_of,
     usage_from_options,
 )
+from ehadiag.core.interruption import ignore_interrupt_in_worker
 from ehadiag.terminal.output import counting_bar, print_text, render_for_terminal, write_output
-from firmware_iface.errors import ConfigurationError
+from firmware_iface.errors import ConfigurationError, InputOutputError
 
 if TYPE_CHECKING:
     from ehadiag.history.store import History
     from ehadiag.prognosis.units import Prognosis
 
-MAX_LISTED_SERIALS = 20
-"""Number of serial numbers that an error lists."""
+MAX_TIME = 1e9
+"""Hours, cycles or days until an inspection, at most: no unit lasts as long."""
 
 
 def define_rul(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +47,9 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
     )
     which.add_argument("--all", action="store_true", help="all units, by urgency")
     parser.add_argument(
-        "--actuator", metavar="NAME", help="of the unit, where several have its serial number"
+        "--actuator",
+        metavar="NAME",
+        help="of the unit, where several have its serial number; with --all: only units of it",
     )
     parser.add_argument(
         "--in",
@@ -55,7 +63,7 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
         help="chance to reach the limit before the next inspection: a date, or hours (cycles, days)"
         " from now",
     )
-    add_usage_options(parser, "today (default: at its last diagnosis)")
+    add_usage_options(parser, "today (default: by its use a day since its last test)")
     add_history_option(parser)
     options.add_request_options(parser, *options.LEVELS)
     options.add_request_options(
@@ -75,7 +83,7 @@ def define_rul(parser: argparse.ArgumentParser) -> None:
 
 def run_rul(arguments: argparse.Namespace) -> int:
     """Print the forecasts; 0 also where there is no number."""
-    from ehadiag.prognosis.units import all_prognoses, forecast  # noqa: PLC0415 - numpy
+    from ehadiag.prognosis.units import forecast  # noqa: PLC0415 - numpy
     from ehadiag.report.prognosis_tables import (  # noqa: PLC0415
         print_prognosis,
         print_urgencies,
@@ -88,36 +96,61 @@ def run_rul(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("--hours, --cycles: of one unit, not of --all")
     with open_named_history(arguments) as history:
         if arguments.all:
-            both = (levels.advisory, levels.limit)
-            found = []
-            with counting_bar(len(history.units()), "unit") as count:
-                for item in all_prognoses(history, both, arguments.in_unit, arguments.seed):
-                    found.append(item)
-                    count()
-            found.sort(key=_urgency)
+            found = sorted(_of_all(history, arguments, levels), key=_urgency)
         else:
-            actuator = named_actuator(history, arguments.unit, arguments.actuator)
-            if actuator is None:
-                raise ConfigurationError(_unknown_serial(history, arguments.unit))
             found = [
                 forecast(
                     history, arguments.unit, advisory=levels.advisory, limit=levels.limit,
-                    unit=arguments.in_unit, today=usage, actuator=actuator, seed=arguments.seed,
+                    unit=arguments.in_unit, today=usage, actuator=arguments.actuator,
+                    seed=arguments.seed,
                 )
             ]  # fmt: skip
-    ahead = [_time_before(item, arguments.before) for item in found] if arguments.before else None
+    text, ahead = arguments.before, None
+    if text is not None:
+        ahead = [_time_before(item, text, alone=not arguments.all) for item in found]
     if arguments.json:
         for place, item in enumerate(found):
-            before = (arguments.before, ahead[place]) if ahead else None
+            before = (text, ahead[place]) if ahead else None
             print_text(json.dumps(prognosis_tree(item, before), allow_nan=False))
     elif arguments.all:
         write_output(render_for_terminal(lambda console: print_urgencies(found, console, ahead)))
     else:
-        before = (arguments.before, ahead[0]) if ahead else None
+        before = (text, ahead[0]) if ahead else None
         write_output(
             render_for_terminal(lambda console: print_prognosis(found[0], console, before))
         )
     return 0
+
+
+def _of_all(history: History, arguments: argparse.Namespace, levels: Levels) -> Iterator[Prognosis]:
+    """Forecast all units, on all processors where there are many."""
+    from ehadiag.batch.workers import Workers, worker_count  # noqa: PLC0415
+    from ehadiag.history.records import current_utc_text  # noqa: PLC0415
+    from ehadiag.prognosis.units import prognosis_in  # noqa: PLC0415
+
+    units = units_of(history, arguments.actuator)
+    both = (levels.advisory, levels.limit)
+    jobs = worker_count(len(units))
+    make = prognosis_in if jobs == 1 else _in_worker
+    work = partial(make, history.path, both, arguments.in_unit, arguments.seed, current_utc_text())
+    with Workers(jobs) as workers, counting_bar(len(units), "unit") as count:
+        for item in workers.over(work, units, _given_up) if jobs > 1 else map(work, units):
+            yield item
+            count()
+
+
+def _in_worker(
+    path: Path, levels: Sequence[float], unit: str | None, seed: int, now: str,
+    which: tuple[str, int],
+) -> Prognosis:  # fmt: skip
+    from ehadiag.prognosis.units import prognosis_in  # noqa: PLC0415
+
+    ignore_interrupt_in_worker()
+    return prognosis_in(path, levels, unit, seed, now, which)
+
+
+def _given_up(which: tuple[str, int]) -> Prognosis:
+    raise InputOutputError(f"serial {which[1]} of {which[0]}: the process that forecast it ended")
 
 
 def _urgency(item: Prognosis) -> tuple[float, str, int]:
@@ -126,19 +159,18 @@ def _urgency(item: Prognosis) -> tuple[float, str, int]:
     return left, item.actuator or "", item.serial
 
 
-def _time_before(item: Prognosis, text: str) -> float:
-    """Hours, cycles or days until the next inspection."""
+def _time_before(item: Prognosis, text: str, *, alone: bool) -> float | None:
+    """Hours, cycles or days until the next inspection; None: one of many has no use a day."""
     try:
         time = float(text)
     except ValueError:
-        return item.time_until(text)
-    if not 0.0 <= time < math.inf:
-        raise ConfigurationError(f"--before {text}: need a number of at least 0, or a date")
+        known = bool(item.per_day)
+        dated = item if known or alone else replace(item, per_day=1.0)
+        try:
+            time = dated.time_until(text)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"--before {error}") from None
+        return time if known else None
+    if not 0.0 <= time <= MAX_TIME:
+        raise ConfigurationError(f"--before {text}: need 0 … {MAX_TIME:g}, or a date")
     return time
-
-
-def _unknown_serial(history: History, serial: int) -> str:
-    known = sorted({number for _, number in history.units()})
-    named = ", ".join(map(str, known[:MAX_LISTED_SERIALS])) or "none"
-    more = f" and {len(known) - MAX_LISTED_SERIALS} more" if len(known) > MAX_LISTED_SERIALS else ""
-    return f"--unit {serial}: the history has no diagnosis of it; there are {named}{more}"

@@ -36,6 +36,7 @@ __all__ = [
     "MaintenanceEvent",
     "SourceRecord",
     "Usage",
+    "continued_usage",
     "counted_entries",
     "current_utc_text",
     "entry_object",
@@ -241,6 +242,56 @@ def counted_entries(entries: Sequence[Entry]) -> list[Entry]:
     return out[::-1]
 
 
+def continued_usage(
+    entries: Sequence[Entry], events: Sequence[MaintenanceEvent]
+) -> tuple[list[Entry], list[MaintenanceEvent], dict[int, Usage]]:
+    """Count hours and cycles on where those of a unit that was swapped begin anew.
+
+    Parameters
+    ----------
+    entries : Sequence[Entry]
+        Diagnoses of units of one actuator.
+    events : Sequence[MaintenanceEvent]
+        Their maintenance. After one that renews all severities fewer hours than before it are those
+        of the new unit.
+
+    Returns
+    -------
+    tuple[list[Entry], list[MaintenanceEvent], dict[int, Usage]]
+        Both in the same order, and what each serial number's usage was counted on by at last.
+    """
+    names = {item.name for entry in entries for item in entry.severities}
+    swaps = {id(item) for item in events if item.resets and names <= {*item.resets}}
+    if not swaps:
+        return list(entries), list(events), {}
+    pairs: list[Entry | MaintenanceEvent] = [*entries, *events]
+    usages = [item.usage for item in pairs]
+    state: dict[tuple[int | None, str], tuple[float, float, bool]] = {}
+    # A diagnosis at the very time of an event was made before the work.
+    for place in sorted(range(len(pairs)), key=lambda at: (pairs[at].when, at >= len(entries))):
+        item, amounts = pairs[place], dict[str, float]()
+        for unit in ("hours", "cycles"):
+            base, last, swapped = state.get((item.serial, unit), (0.0, 0.0, False))
+            swapped, amount = swapped or id(item) in swaps, item.usage.amount(unit)
+            if amount is not None:
+                if swapped and amount < last:
+                    base, swapped = base + last, False
+                last, swapped = amount, swapped and place >= len(entries)
+                amounts[unit] = base + amount
+            state[item.serial, unit] = base, last, swapped
+        usages[place] = Usage(**amounts)
+    bases = {
+        serial: Usage(*(state[serial, unit][0] for unit in ("hours", "cycles")))
+        for serial in {item.serial for item in events}
+    }
+    return (
+        [replace(item, usage=usage) for item, usage in zip(entries, usages, strict=False)],
+        [replace(item, usage=usage)
+         for item, usage in zip(events, usages[len(entries) :], strict=True)],
+        bases,
+    )  # fmt: skip
+
+
 def _merged_usage(first: Usage, second: Usage) -> Usage:
     return Usage(
         second.hours if first.hours is None else first.hours,
@@ -403,6 +454,7 @@ def event_object(event: MaintenanceEvent) -> dict[str, Any]:
         "appended": event.appended,
         "when": event.when,
         "serial": event.serial,
+        "actuator": event.actuator,
         "hours": event.usage.hours,
         "cycles": event.usage.cycles,
         "text": event.text,

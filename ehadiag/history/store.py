@@ -31,6 +31,8 @@ from ehadiag.result import Result
 from firmware_iface.errors import ConfigurationError, EhadiagError, InputOutputError, reason_of
 
 if TYPE_CHECKING:
+    from os import PathLike
+
     from firmware_iface.recording import Recording
 
 __all__ = [
@@ -44,6 +46,8 @@ WRITER_TIMEOUT_S = 30.0
 MIN_FLEET_UNITS, MAX_FLEET_UNITS = 10, 60
 """Number of other units that a forecast reads, whatever their diagnoses: a fleet, and half as many
 again as it learns from, since some show no growth."""
+MAX_LISTED_SERIALS = 20
+"""Number of serial numbers that an error lists."""
 MAX_FLEET_DIAGNOSES = 1200
 """Number of diagnoses that a forecast reads of other units, about: 0.05 s."""
 QUERY_TIMEOUT_S = 60.0
@@ -82,7 +86,7 @@ class History:
 
     Parameters
     ----------
-    path : Path
+    path : str | PathLike[str]
         The file.
     create : bool
         Make the file where there is none.
@@ -96,8 +100,8 @@ class History:
         beside it that SQLite takes as a part of it, or has done so; it is damaged.
     """
 
-    def __init__(self, path: Path, *, create: bool = False) -> None:
-        self.path = path
+    def __init__(self, path: str | PathLike[str], *, create: bool = False) -> None:
+        self.path = path = Path(path)
         try:
             link, exists = path.is_symlink(), path.exists()
             other = exists and not path.is_file()
@@ -165,6 +169,37 @@ class History:
         """
         with self._one_line_errors(), self._transaction():
             return [self._append(entry) for entry in entries]
+
+    def append_new(self, entries: Sequence[Entry]) -> int:
+        """Append those diagnoses that are not there yet, all or none.
+
+        Parameters
+        ----------
+        entries : Sequence[Entry]
+            What is kept of them; one of a time, actuator and serial number that count is there.
+
+        Returns
+        -------
+        int
+            Number of those appended.
+
+        Raises
+        ------
+        InputOutputError
+            They could not be written: nothing of them was.
+        """
+        with self._one_line_errors(), self._transaction():
+            withdrawn = self._withdrawn(DIAGNOSIS_TABLE)
+            rows = self._rows("SELECT id, tested, appended, actuator, serial FROM diagnosis")
+            there = {
+                (row["tested"] or row["appended"], row["actuator"], row["serial"])
+                for row in rows
+                if row["id"] not in withdrawn
+            }
+            new = [i for i in entries if (i.when, i.actuator, i.serial) not in there]
+            for entry in new:
+                self._append(entry)
+        return len(new)
 
     def _append(self, entry: Entry) -> int:
         usage, covariance = entry.usage, entry.covariance
@@ -309,7 +344,7 @@ class History:
             entry = self.entry(row["id"])
             if entry.withdrawn or any(item.samples in other_than for item in entry.sources):
                 continue
-            events = self.events(serial)
+            events = [i for i in self.events(serial) if i.actuator in (None, actuator)]
             return None if any(event.when >= entry.when for event in events) else entry
         return None
 
@@ -330,6 +365,43 @@ class History:
                 () if serial is None else (serial,),
             )
         return [(str(row["actuator"]), int(row["serial"])) for row in rows]
+
+    def actuator_of(self, serial: int, named: str | None = None) -> str:
+        """Return the actuator of a serial number.
+
+        Parameters
+        ----------
+        serial : int
+            Of the unit.
+        named : str | None
+            Its actuator, where several have this serial number.
+
+        Returns
+        -------
+        str
+            The one named, else the only one.
+
+        Raises
+        ------
+        ConfigurationError
+            There is no diagnosis of it, several have it and none was named, or not the one named.
+        """
+        known = [actuator for actuator, _ in self.units(serial)]
+        if not known:
+            serials = sorted({number for _, number in self.units()})
+            text = ", ".join(map(str, serials[:MAX_LISTED_SERIALS])) or "none"
+            more = len(serials) - MAX_LISTED_SERIALS
+            raise ConfigurationError(
+                f"serial {serial}: the history has no diagnosis of it; there are {text}"
+                + f" and {more} more" * (more > 0)
+            )
+        if named is not None and named not in known:
+            raise ConfigurationError(f"actuator {named}: serial {serial} is of {', '.join(known)}")
+        if named is None and len(known) > 1:
+            raise ConfigurationError(
+                f"serial {serial} is of {', '.join(known)}: name its actuator (--actuator)"
+            )
+        return named or known[0]
 
     def alike(
         self, serial: int, actuator: str | None = None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import json
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from ehadiag.core.conventions import utc_time_text
+from msgspec.structs import replace
+
+from ehadiag.core.conventions import MAX_HISTORY_SERIAL, utc_time_text
 from ehadiag.estimate import AT_BOUND, INTERVAL_STDS, NOT_SHOWN, Severity
 from ehadiag.history.records import Entry, SourceRecord, Usage, current_utc_text
 from firmware_iface.errors import ConfigurationError, install_command, valid_text
@@ -25,6 +26,11 @@ HISTORY_COLUMNS: dict[str, type] = {
 }  # fmt: skip
 """Columns with the kinds of their values."""
 NEEDED_COLUMNS = ("when", "actuator", "serial", "verdict", "severity", "estimate", "std")
+COLUMN_RANGES = {
+    "hours": (0.0, 1e9), "cycles": (0.0, 1e9), "estimate": (0.0, 1.0), "std": (0.0, 1e3),
+    "low95": (-1e4, 1e4), "high95": (-1e4, 1e4),
+}  # fmt: skip
+"""What is read; a severity that a test does not show has a wide interval."""
 FORMULA_PREFIXES = ("=", "+", "-", "@", "\t", "\r")
 IMPORT_SCHEMA = "ehadiag.history-import/1"
 KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
@@ -112,7 +118,7 @@ def entries_from_csv(text: str, name: str, severities: Sequence[str]) -> list[En
     Parameters
     ----------
     text : str
-        The file. Rows of one time, actuator and serial number in a row are one diagnosis.
+        The file. Rows of one number, time, actuator and serial number are one diagnosis.
     name : str
         Of the file, for errors.
     severities : Sequence[str]
@@ -132,36 +138,42 @@ def entries_from_csv(text: str, name: str, severities: Sequence[str]) -> list[En
     missing = [item for item in NEEDED_COLUMNS if item not in (reader.fieldnames or ())]
     if missing:
         raise ConfigurationError(f"{name}: has no column {missing[0]}; see ehadiag history export")
-    out = []
-    numbered = ((reader.line_num, row) for row in reader if not row.get("withdrawn"))
-    for _, group in itertools.groupby(
-        numbered, key=lambda pair: [pair[1].get(key) for key in ("number", *NEEDED_COLUMNS[:3])]
-    ):
-        lines = list(group)
-        try:
-            out.append(_entry_of([row for _, row in lines], severities))
-        except (ValueError, TypeError, ConfigurationError) as error:
-            raise ConfigurationError(f"{name}, line {lines[0][0]}: {error}") from None
-    return out
+    diagnoses: dict[tuple[str | None, ...], Entry] = {}
+    try:
+        for row in reader:
+            if row.get("withdrawn"):
+                continue
+            key = tuple(row.get(column) for column in ("number", *NEEDED_COLUMNS[:3]))
+            entry = _entry_of(row, severities)
+            if (before := diagnoses.get(key)) is not None:
+                both = before.severities + entry.severities
+                if len({item.name for item in both}) < len(both):
+                    raise ConfigurationError(f"severity {row['severity']}: twice in one diagnosis")
+                entry = replace(before, severities=both)
+            diagnoses[key] = entry
+    except (csv.Error, ConfigurationError) as error:
+        raise ConfigurationError(f"{name}, line {reader.line_num}: {error}") from None
+    return list(diagnoses.values())
 
 
-def _entry_of(rows: Sequence[dict[str, str]], severities: Sequence[str]) -> Entry:
-    first, now = rows[0], current_utc_text()
-    verdict = _text(first["verdict"])
+def _entry_of(row: dict[str, str], severities: Sequence[str]) -> Entry:
+    if (short := next((name for name in NEEDED_COLUMNS if row[name] is None), None)) is not None:
+        raise ConfigurationError(f"{short}: the row ends before it")
+    verdict = _text(row["verdict"])
     if verdict not in KNOWN_VERDICTS:
         raise ConfigurationError(f"verdict: there is {', '.join(KNOWN_VERDICTS)}")
-    found = [_severity_of(row, severities) for row in rows if row["severity"]]
-    path, sha256 = _text(first.get("recording") or ""), first.get("sha256") or None
-    origin = {"schema": IMPORT_SCHEMA, "number": first.get("number")}
+    found = [_severity_of(row, severities)] if row["severity"] else []
+    path, sha256 = _text(row.get("recording") or ""), row.get("sha256") or None
+    origin = {"schema": IMPORT_SCHEMA, "number": row.get("number")}
     return Entry(
-        appended=now,
-        tested=utc_time_text(first["when"]),
-        actuator=_text(first["actuator"]),
-        serial=int(first["serial"]),
-        test=_text(first.get("test") or "") or None,
+        appended=current_utc_text(),
+        tested=_time(row["when"]),
+        actuator=_text(row["actuator"]),
+        serial=_serial(row["serial"]),
+        test=_text(row.get("test") or "") or None,
         verdict=verdict,
         reasons=(),
-        usage=Usage(_number(first.get("hours")), _number(first.get("cycles"))),
+        usage=Usage(_number(row, "hours"), _number(row, "cycles")),
         sources=(SourceRecord(path, sha256, None),) if path else (),
         severities=tuple(found),
         covariance=None,
@@ -174,9 +186,9 @@ def _entry_of(rows: Sequence[dict[str, str]], severities: Sequence[str]) -> Entr
 
 def _severity_of(row: dict[str, str], severities: Sequence[str]) -> Severity:
     if row["severity"] not in severities:
-        raise ConfigurationError(f"severity: there is {', '.join(severities)}")
-    estimate, std = _number(row["estimate"]), _number(row["std"])
-    low, high = _number(row.get("low95")), _number(row.get("high95"))
+        raise ConfigurationError(f"severity {row['severity']}: there is {', '.join(severities)}")
+    estimate, std = _number(row, "estimate"), _number(row, "std")
+    low, high = _number(row, "low95"), _number(row, "high95")
     if estimate is not None and std is not None and None in (low, high):
         low, high = estimate - INTERVAL_STDS * std, estimate + INTERVAL_STDS * std
     return Severity(
@@ -189,13 +201,31 @@ def _severity_of(row: dict[str, str], severities: Sequence[str]) -> Severity:
     )
 
 
-def _number(text: str | None) -> float | None:
-    if not text:
+def _number(row: dict[str, str], name: str) -> float | None:
+    if not (text := row.get(name)):
         return None
-    value = float(text)
-    if not math.isfinite(value):
-        raise ConfigurationError("a number is not finite")
+    low, high = COLUMN_RANGES[name]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise ConfigurationError(f"{name} {text}: need a number, {low:g} … {high:g}")
     return value
+
+
+def _serial(text: str) -> int:
+    number = int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else -1
+    if not 0 <= number <= MAX_HISTORY_SERIAL:
+        raise ConfigurationError(f"serial {text}: need a whole number, 0 … {MAX_HISTORY_SERIAL}")
+    return number
+
+
+def _time(text: str) -> str:
+    try:
+        return utc_time_text(text)
+    except (ValueError, OverflowError):
+        raise ConfigurationError(f"when {text}: need ISO 8601, such as 2026-03-01T12:00") from None
 
 
 def _text(text: str) -> str:

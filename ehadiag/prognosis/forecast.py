@@ -55,7 +55,7 @@ class RemainingLife(msgspec.Struct, frozen=True):
 
     level: float
     low: float | None
-    """From now; 10 % quantile. None: no number."""
+    """From now, below 0 before it; 10 % quantile. None: no number."""
     median: float | None
     high: float | None
     """90 % quantile."""
@@ -64,8 +64,13 @@ class RemainingLife(msgspec.Struct, frozen=True):
     quantiles: tuple[float, ...] = ()
     """At 1, 2 … 99 %; infinite where the level may never be reached. Empty: no number."""
 
+    @property
+    def reached(self) -> bool:
+        """Whether the last diagnosis has reached the level."""
+        return self.high == 0.0 and not self.quantiles
+
     def chance_within(self, time: float) -> float | None:
-        """Chance that the level is reached within hours, cycles or days from now."""
+        """Chance that the level is reached within hours, cycles or days from now; 0: by now."""
         if self.median is None:
             return None
         if not self.quantiles:
@@ -97,6 +102,8 @@ class Forecast(msgspec.Struct, frozen=True):
     """What is extrapolated; empty where lives were seen that far."""
     alarm: str
     """A change that no wear explains; empty where there is none."""
+    elapsed: float = 0.0
+    """Hours, cycles or days since the last diagnosis."""
 
     @property
     def too_few(self) -> bool:
@@ -130,7 +137,7 @@ def forecast(
     seed : int
         Of the draws; the same seed gives the same digits.
     elapsed : float
-        Hours, cycles or days since the last diagnosis, in which no level was reached.
+        Hours, cycles or days since the last diagnosis; nobody knows what was reached in them.
 
     Returns
     -------
@@ -149,6 +156,7 @@ def forecast(
         remaining=(),
         note="",
         alarm="",
+        elapsed=elapsed,
     )
     if why := _objection_to_data(life, fleet, unit):
         return replace(found, remaining=_no_numbers(life, levels, why))
@@ -175,11 +183,7 @@ def forecast(
 def _remaining(
     quantiles: NDArray[np.float64], level: float, elapsed: float, unit: str
 ) -> RemainingLife:
-    """Number of a passage, given that it did not happen in the time elapsed."""
-    if elapsed > 0.0:
-        gone = float(np.interp(elapsed, quantiles, CHANCES, left=0.0, right=0.99))
-        chances = gone + (1.0 - gone) * CHANCES
-        quantiles = np.maximum(np.interp(chances, CHANCES, quantiles) - elapsed, 0.0)
+    """Number of a passage, a time after the diagnosis that it is forecast from."""
     low, median, high = (float(np.interp(q, CHANCES, quantiles)) for q in INTERVAL_CHANCES)
     if not math.isfinite(high):
         why = "the wear that was seen need not ever reach this level"
@@ -187,7 +191,8 @@ def _remaining(
     if high > RULES.max_interval_ratio * max(low, 1e-9):
         why = f"anything from {low:.0f} to {high:.0f} {unit}: too wide"
         return RemainingLife(level, None, None, None, why)
-    return RemainingLife(level, low, median, high, "", tuple(quantiles.tolist()))
+    low, median, high = low - elapsed, median - elapsed, high - elapsed
+    return RemainingLife(level, low, median, high, "", tuple((quantiles - elapsed).tolist()))
 
 
 def _no_numbers(life: Life, levels: Sequence[float], why: str) -> tuple[RemainingLife, ...]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
-from ehadiag.history.records import counted_entries, current_utc_text
+from ehadiag.assess.verdict import Levels
+from ehadiag.history.records import Usage, continued_usage, counted_entries, current_utc_text
 from ehadiag.history.store import History
 from ehadiag.prognosis.averaging import learn_fleet
 from ehadiag.prognosis.forecast import Forecast, RemainingLife
@@ -21,9 +23,9 @@ from firmware_iface.errors import ConfigurationError
 if TYPE_CHECKING:
     from os import PathLike
 
-    from ehadiag.history.records import Entry, MaintenanceEvent, Usage
+    from ehadiag.history.records import Entry, MaintenanceEvent
 
-__all__ = ["Prognosis", "all_prognoses", "forecast", "prognosis_of"]
+__all__ = ["Prognosis", "forecast", "prognosis_in", "prognosis_of"]
 
 MIN_DAYS_FOR_DATES = 7.0
 """Days between first and last diagnosis, from which on use a day is known well enough for dates."""
@@ -47,7 +49,16 @@ class Prognosis(msgspec.Struct, frozen=True):
     per_day: float | None
     """Hours or cycles a calendar day, between first and last diagnosis; None where not known."""
     now: str
-    """When it was made: UTC, ISO 8601."""
+    """Begin of the day that it was made: UTC, ISO 8601; the same digits all day."""
+    usage_now: float | None = None
+    """Hours or cycles by now, which times left are counted from: told, else by the use a day; None:
+    not known, they are counted from the last diagnosis."""
+    usage_told: bool = False
+    """Whether it was told."""
+    last_test: str | None = None
+    """Date of the last dated test; None without any."""
+    usage_before: float = 0.0
+    """Hours or cycles of units that were swapped before this one."""
 
     def first(self, place: int = -1) -> tuple[Forecast, RemainingLife] | None:
         """Return the severity whose median reaches a level first; None without a number."""
@@ -56,7 +67,7 @@ class Prognosis(msgspec.Struct, frozen=True):
             for item in self.forecasts
             if item.remaining[place].median is not None
         ]
-        return min(found, key=lambda pair: pair[1].median or 0.0, default=None)
+        return min(found, key=lambda i: (not i[1].reached, i[1].median or 0.0), default=None)
 
     def chance_within(self, time: float, place: int = -1) -> float | None:
         """Chance that any severity reaches a level within a time; those without a number apart."""
@@ -87,15 +98,19 @@ class Prognosis(msgspec.Struct, frozen=True):
         Raises
         ------
         ConfigurationError
-            It is no date, or the unit's use a day is not known.
+            It is no date, or past, or the unit's use a day is not known.
         """
         try:
             moment = datetime.fromisoformat(date)
         except ValueError:
             raise ConfigurationError(f"{date}: need a date, ISO 8601, or a number") from None
-        if not self.per_day:
-            raise ConfigurationError(f"{date}: the unit's use a day is not known; name {self.unit}")
         ahead = days_of((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).isoformat())
+        if ahead < days_of(self.now):
+            raise ConfigurationError(f"{date}: is past")
+        if not self.per_day:
+            raise ConfigurationError(
+                f"{date}: the use a day of serial {self.serial} is not known; name {self.unit}"
+            )
         return max(ahead - days_of(self.now), 0.0) * self.per_day
 
 
@@ -109,6 +124,7 @@ def prognosis_of(
     *,
     today: Usage | None = None,
     actuator: str | None = None,
+    now: str | None = None,
 ) -> Prognosis:
     """Forecast each severity of a unit.
 
@@ -128,15 +144,23 @@ def prognosis_of(
     seed : int
         Of the draws; the same seed gives the same digits.
     today : Usage | None
-        Hours and cycles of the unit by now; None: those at its last diagnosis.
+        Hours and cycles of the unit by now; None: by its use a day since its last dated test, where
+        that is known, else those at its last diagnosis.
     actuator : str | None
         Of the unit, where its serial number is another actuator's too; None: that of the last
         diagnosis.
+    now : str | None
+        Day: UTC, ISO 8601; None: today.
 
     Returns
     -------
     Prognosis
         One forecast for each severity, each with a number or why there is none.
+
+    Raises
+    ------
+    ConfigurationError
+        It is told to be used less today than at its last diagnosis, or in another unit of usage.
     """
     counted = counted_entries(entries)
     own = [i for i in counted if i.serial == serial and actuator in (None, i.actuator)]
@@ -147,11 +171,24 @@ def prognosis_of(
     last = own[-1] if own else None
     kind = (last.actuator, last.simulated) if last else (None, False)
     alike = [item for item in counted if (item.actuator, item.simulated) == kind]
-    now = current_utc_text()
-    at = days_of(now) if unit == "days" else today.amount(unit) if today else None
+    now = f"{(now or current_utc_text())[:10]}T00:00:00.000Z"
+    alike, changes, bases = continued_usage(
+        alike, [item for item in events if item.actuator in (None, kind[0])]
+    )
+    before = bases.get(serial, Usage()).amount(unit) or 0.0
+    same = [item for item in alike if item.serial == serial]
+    used = [item for item in same if usage_of(item, unit) is not None]
+    rate, dated = _use_a_day(used, unit)
+    last_at = max((usage_of(item, unit) or 0.0 for item in used), default=0.0)
+    told = _told(today, unit, last_at - before)
+    at = None
+    if told is not None:
+        at = before + told
+    elif rate and dated:
+        at = max(last_at, dated[1] + rate * max(days_of(now) - dated[0], 0.0))
     forecasts, none = [], np.empty(0)
     for name in dict.fromkeys(part.name for item in alike for part in item.severities):
-        lives = lives_of(alike, events, name, unit)
+        lives = lives_of(alike, changes, name, unit)
         mine = lives.pop(serial, [])
         present = mine[-1] if mine else Life(serial, none, none, none, 0.0)
         others = [*mine[:-1], *(life for several in lives.values() for life in several)]
@@ -160,26 +197,42 @@ def prognosis_of(
         elapsed = 0.0
         if at is not None and len(present.age):
             elapsed = max(at - present.born - float(present.age[-1]), 0.0)
+        present = replace(present, born=present.born - before)  # the swapped one's own hours
         forecasts.append(severity_forecast(name, unit, present, fleet, levels, seed, elapsed))
-    same = [item for item in own if (item.actuator, item.simulated) == kind]
-    used = [item for item in same if usage_of(item, unit) is not None]
     return Prognosis(
         serial, kind[0], unit, len(own), len(used), tuple(levels), tuple(forecasts), seed,
-        _use_a_day(used, unit), now,
+        rate, now, None if at is None else at - before, told is not None,
+        max((item.tested for item in used if item.tested), default=None), before,
     )  # fmt: skip
 
 
-def _use_a_day(entries: Sequence[Entry], unit: str) -> float | None:
-    """Hours or cycles a calendar day between first and last dated diagnosis."""
-    if unit == "days":
-        return 1.0
-    dated = sorted(
-        (days_of(item.tested), usage_of(item, unit) or 0.0) for item in entries if item.tested
-    )
-    if not dated or dated[-1][0] - dated[0][0] < MIN_DAYS_FOR_DATES:
+def _told(today: Usage | None, unit: str, least: float) -> float | None:
+    """Hours or cycles of today that were told; ConfigurationError where they cannot be."""
+    if today is None or not today.known:
         return None
-    rate = (dated[-1][1] - dated[0][1]) / (dated[-1][0] - dated[0][0])
-    return rate if rate > 0.0 else None
+    if (told := today.amount(unit) if unit != "days" else None) is None:
+        raise ConfigurationError(f"usage of today: not told in {unit}, those of the answer")
+    if told < least:
+        raise ConfigurationError(f"{unit} {told:g}: were {least:g} at the last diagnosis already")
+    return told
+
+
+def _use_a_day(
+    entries: Sequence[Entry], unit: str
+) -> tuple[float | None, tuple[float, float] | None]:
+    """Hours or cycles a calendar day by dated diagnoses; day and usage of the last one."""
+    dated = sorted(
+        (days_of(item.tested or item.when), usage_of(item, unit) or 0.0)
+        for item in entries
+        if item.tested or unit == "days"
+    )
+    if not dated:
+        return None, None
+    if unit == "days":
+        return 1.0, dated[-1]
+    apart = dated[-1][0] - dated[0][0]
+    rate = (dated[-1][1] - dated[0][1]) / apart if apart >= MIN_DAYS_FOR_DATES else 0.0
+    return (rate if rate > 0.0 else None), dated[-1]
 
 
 def forecast(
@@ -208,7 +261,8 @@ def forecast(
     unit : str | None
         `hours`, `cycles` or `days`; None: what more of the unit's diagnoses say.
     today : Usage | None
-        Hours and cycles of the unit by now; None: those at its last diagnosis.
+        Hours and cycles of the unit by now; None: by its use a day since its last dated test, where
+        that is known, else those at its last diagnosis.
     actuator : str | None
         Of the unit, where its serial number is another actuator's too.
     seed : int
@@ -222,43 +276,58 @@ def forecast(
     Raises
     ------
     ConfigurationError
-        The unit of usage is none.
+        The history does not know the unit, several actuators have its serial number, or a value is
+        none.
     """
     if unit not in (None, *USAGE_UNITS):
         raise ConfigurationError(f"unit {unit}: there is {', '.join(USAGE_UNITS)}")
+    if not (isinstance(seed, int) and seed >= 0):
+        raise ConfigurationError(f"seed {seed}: need a whole number of at least 0")
+    Levels(advisory, limit)
     if not isinstance(history, History):
         with History(Path(history)) as opened:
             return forecast(
                 opened, serial, advisory=advisory, limit=limit, unit=unit, today=today,
                 actuator=actuator, seed=seed,
             )  # fmt: skip
+    actuator = history.actuator_of(serial, actuator)
     entries, events = history.alike(serial, actuator)
     return prognosis_of(
         serial, entries, events, (advisory, limit), unit, seed, today=today, actuator=actuator
     )
 
 
-def all_prognoses(
-    history: History, levels: Sequence[float], unit: str | None = None, seed: int = 0
-) -> Iterator[Prognosis]:
-    """Forecast all units of a history, one by one.
+def prognosis_in(
+    path: Path,
+    levels: Sequence[float],
+    unit: str | None,
+    seed: int,
+    now: str,
+    which: tuple[str, int],
+) -> Prognosis:
+    """Forecast one unit of a history file, here or in another process.
 
     Parameters
     ----------
-    history : History
-        An open history.
+    path : Path
+        Of the history.
     levels : Sequence[float]
         That are to be reached, 0 … 1, rising.
     unit : str | None
-        One of `USAGE_UNITS`; None: the one that more of a unit's diagnoses say.
+        One of `USAGE_UNITS`; None: the one that more of the unit's diagnoses say.
     seed : int
         Of the draws.
+    now : str
+        Day: UTC, ISO 8601; the same for all units.
+    which : tuple[str, int]
+        Actuator and serial number.
 
-    Yields
-    ------
+    Returns
+    -------
     Prognosis
-        Of each serial number of each actuator.
+        Of the unit.
     """
-    for actuator, serial in history.units():
+    actuator, serial = which
+    with History(path) as history:
         entries, events = history.alike(serial, actuator)
-        yield prognosis_of(serial, entries, events, levels, unit, seed, actuator=actuator)
+    return prognosis_of(serial, entries, events, levels, unit, seed, actuator=actuator, now=now)

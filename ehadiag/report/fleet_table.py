@@ -120,13 +120,12 @@ def _left(prognosis: Prognosis | None) -> str:
     """Time until the first severity reaches the limit."""
     if prognosis is None:
         return ""
-    left = [item.remaining[-1].median for item in prognosis.forecasts]
-    known = [value for value in left if value is not None]
     unit = "h" if prognosis.unit == "hours" else prognosis.unit
-    if known and min(known) <= 0.0:
-        return f"0 {unit}, limit reached"
-    if known:
-        return f"{two_digits(min(known))} {unit}"
+    if (found := prognosis.first()) and (left := found[1]).median is not None:
+        if left.reached:
+            return f"0 {unit}, limit reached"
+        time = f"{two_digits(left.median)} {unit}"
+        return time if left.median > 0.0 else "may be past its limit"
     few = all(item.too_few for item in prognosis.forecasts)
     return "too few diagnoses" if few else "no number"
 

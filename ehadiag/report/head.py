@@ -192,16 +192,33 @@ def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = No
         left = item.remaining[-1]
         if names is not None and item.name not in names:
             continue
-        if left.median is None or left.low is None or left.high is None or left.high <= 0.0:
+        if left.median is None or left.low is None or left.high is None or left.reached:
             continue
         unit = "h" if prognosis.unit == "hours" else prognosis.unit
-        low, high = two_digits(left.low), two_digits(left.high)
-        when = f"in about {two_digits(left.median)} {unit} (80 %: {low} to {high} {unit})"
-        if left.high > WIDE_RANGE * left.low:
-            when = f"not before about {low} {unit}"
-        text = f"{plain_name(item.name)} reaches its limit {when}."
+        low, high = two_digits(max(left.low, 0.0)), two_digits(left.high)
+        when = f"reaches its limit in about {two_digits(left.median)} {unit}"
+        when += f" (80 %: {low} to {high} {unit})"
+        if left.low > 0.0 and left.high > WIDE_RANGE * left.low:
+            when = f"reaches its limit not before about {low} {unit}"
+        past = left.chance_within(0.0) or 0.0
+        if left.median <= 0.0:
+            when = "may have reached its limit"
+        if left.low <= 0.0:
+            when += f"; it may be past it: {percent(min(past, 0.99))}"
+        text = f"{plain_name(item.name)} {when}{_counted(prognosis)}."
         found.append((left.median, text[0].upper() + text[1:]))
     return [text for _, text in sorted(found)]
+
+
+def _counted(prognosis: Prognosis) -> str:
+    """Say from when on times left are counted, where that is not the day of the last test."""
+    last = (prognosis.last_test or prognosis.now)[:10]
+    if last == prognosis.now[:10]:
+        return ""
+    if prognosis.usage_now is None:
+        return f", from the test of {last}"
+    unit = "h" if prognosis.unit == "hours" else prognosis.unit
+    return "" if unit == "days" else f", from now at about {two_digits(prognosis.usage_now)} {unit}"
 
 
 @cache

@@ -20,12 +20,14 @@ LEVEL_NAMES = ("advisory", "limit")
 SHORT_NAMES = {"Kintas": "filter clogging", "FSS": "spool friction", "FDJ": "jack friction"}
 """Those of the registry, which loads the compiler."""
 AT_LIMIT = "at its limit"
+LEAST_CHANCE = 0.01
+"""Chance, 1, that is worth a word and a number."""
 FIGURES = 2
 """Figures of a time that is printed, 1: an interval of 80 % carries no more."""
 
 
 def print_prognosis(
-    prognosis: Prognosis, console: Console, before: tuple[str, float] | None = None
+    prognosis: Prognosis, console: Console, before: tuple[str, float | None] | None = None
 ) -> None:
     """Print a prognosis.
 
@@ -56,31 +58,33 @@ def print_prognosis(
 
 
 def print_urgencies(
-    found: Sequence[Prognosis], console: Console, before: Sequence[float] | None = None
+    found: Sequence[Prognosis], console: Console, before: Sequence[float | None] | None = None
 ) -> None:
     """Print one line for each unit, those that reach the limit first at the top.
 
     found: of the units, in the order of the table; console: console to print to; before: hours,
-    cycles or days of each until the next inspection.
+    cycles or days of each until the next inspection; None: its use a day is not known.
     """
     firsts = [item.first() for item in found]
     dates = [
-        _date(item, first[1]) if first and first[1].high else None  # not of what is at its limit
+        _date(item, first[1]) if first and not first[1].reached else None
         for item, first in zip(found, firsts, strict=True)
     ]
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2))
-    heads = ["serial", "actuator", "first", "to the limit (80 % interval)"]
+    heads = ["serial", "actuator", "first", "now", "to the limit (80 % interval)"]
     heads += ["about (date)"] * any(dates) + ["chance before"] * bool(before) + ["alarms"]
     for name in heads:
-        table.add_column(name, overflow="fold", no_wrap=name == "actuator")
+        table.add_column(name, overflow="fold", no_wrap=name in ("actuator", "about (date)"))
     for place, (item, first) in enumerate(zip(found, firsts, strict=True)):
         severity, left = ("-", _no_number(item)) if first is None else _urgency_texts(item, first)
-        cells = [str(item.serial), printable(item.actuator or "unknown"), severity, left]
+        kind = printable(item.actuator or "unknown")
+        cells = [str(item.serial), kind, severity, _usage_text(item), left]
         if any(dates):
             cells.append(dates[place] or "-")
         if before:
-            reached = left == AT_LIMIT
-            cells.append(left if reached else _percent(item.chance_within(before[place])))
+            ahead = before[place]
+            chance = "its use a day is not known" if ahead is None else _chance(item, ahead)
+            cells.append(left if left == AT_LIMIT else chance)
         alarms = [SHORT_NAMES[part.name] for part in item.forecasts if part.alarm]
         table.add_row(*cells, ", ".join(alarms) or "-")
     console.print(table, crop=False)
@@ -89,7 +93,7 @@ def print_urgencies(
 def _urgency_texts(prognosis: Prognosis, first: tuple[Forecast, RemainingLife]) -> tuple[str, str]:
     """Plain name of the severity that is first, and time until then."""
     severity, left = first
-    time = AT_LIMIT if left.high == 0.0 else f"{remaining_text(left)} {prognosis.unit}"
+    time = AT_LIMIT if left.reached else remaining_text(left, f" {prognosis.unit}")
     return SHORT_NAMES[severity.name], time
 
 
@@ -100,7 +104,33 @@ def _no_number(prognosis: Prognosis) -> str:
     return remaining_text(max(prognosis.forecasts, key=lambda i: i.value or 0.0).remaining[-1])
 
 
-def _sentences(prognosis: Prognosis, before: tuple[str, float] | None) -> list[str]:
+def _usage_text(prognosis: Prognosis) -> str:
+    """Usage that the times left are counted from, in short."""
+    if prognosis.unit == "days":
+        return "-"
+    if prognosis.usage_told:
+        return f"{prognosis.usage_now:g} {prognosis.unit}"
+    if prognosis.usage_now is not None:
+        return f"about {_rounded(prognosis.usage_now)} {prognosis.unit}"
+    at = max((item.at for item in prognosis.forecasts if item.at is not None), default=0.0)
+    when = f" on {prognosis.last_test[:10]}" if prognosis.last_test else ""
+    return f"{at:g} {prognosis.unit}{when}"
+
+
+def counted_from(prognosis: Prognosis) -> str:
+    """Say from when on times left are counted."""
+    test = f"test of {prognosis.last_test[:10]}" if prognosis.last_test else "last diagnosis"
+    if prognosis.usage_now is None:
+        return f"from the {test}; the usage since then is not known"
+    if prognosis.unit == "days":
+        return "from now"
+    if prognosis.usage_told:
+        return f"from now, {_usage_text(prognosis)}"
+    rate = f"{_rounded(prognosis.per_day or 0.0)} {prognosis.unit} a day"
+    return f"from now, {_usage_text(prognosis)} by {rate} since the {test}"
+
+
+def _sentences(prognosis: Prognosis, before: tuple[str, float | None] | None) -> list[str]:
     """What a planner wants to know, in sentences."""
     out, reached = [], False
     if (first := prognosis.first()) is not None:
@@ -108,32 +138,49 @@ def _sentences(prognosis: Prognosis, before: tuple[str, float] | None) -> list[s
         assert left.median is not None
         assert left.low is not None
         assert left.high is not None
-        reached = left.high == 0.0
+        reached = left.reached
+        chance = left.chance_within(0.0) or 0.0
+        past = _percent(chance)
         if reached:
             out.append(f"First: {SHORT_NAMES[item.name]} is {AT_LIMIT}.")
+        elif left.median <= 0.0:
+            out.append(f"First: {SHORT_NAMES[item.name]} may have reached its limit: {past}.")
         else:
             when = f" ({date})" if (date := _date(prognosis, left)) else ""
             out.append(
                 f"First: {SHORT_NAMES[item.name]} reaches its limit in about"
                 f" {_rounded(left.median)} {prognosis.unit}{when},"
                 f" {_rounded(left.low)} to {_rounded(left.high)} with 80 %."
+                + f" It may be past its limit: {past}."
+                * (chance >= LEAST_CHANCE)
             )
+        if not reached:
+            out.append(f"Counted {counted_from(prognosis)}.")
     if before is not None and not reached:
         name, time = before
-        chance = prognosis.chance_within(time)
+        assert time is not None  # or there is an error
+        if name.replace(".", "", 1).isdecimal():
+            name = f"{name} {prognosis.unit}"
         without = [i.name for i in prognosis.forecasts if i.remaining[-1].median is None]
         rest = f"; without {', '.join(without)}: no number" if without else ""
-        out.append(f"Chance of a severity at its limit before {name}: {_percent(chance)}{rest}.")
+        out.append(
+            f"Chance of a severity at its limit before {name}: {_chance(prognosis, time)}{rest}."
+        )
     return out
 
 
-def remaining_text(left: RemainingLife) -> str:
+def remaining_text(left: RemainingLife, unit: str = "") -> str:
     """Write hours, cycles or days to a level, 80 % interval in brackets, or why there are none."""
     if left.median is None or left.low is None or left.high is None:
         return f"no number: {left.why}"
-    if left.high == 0.0:
+    if left.reached:
         return "reached"
-    return f"{_rounded(left.median)} ({_rounded(left.low)} … {_rounded(left.high)})"
+    past = left.chance_within(0.0) or 0.0
+    may = f"may be past: {_percent(past)}" if past >= LEAST_CHANCE else ""
+    if left.median <= 0.0:
+        return may
+    time = f"{_rounded(left.median)} ({_rounded(left.low)} … {_rounded(left.high)}){unit}"
+    return f"{time}, {may}" if may else time
 
 
 def _rounded(value: float) -> str:
@@ -143,10 +190,16 @@ def _rounded(value: float) -> str:
     return f"{round(value, FIGURES - digits):.{max(FIGURES - digits, 0)}f}"
 
 
+def _chance(prognosis: Prognosis, time: float) -> str:
+    return _percent(prognosis.chance_within(time))
+
+
 def _percent(chance: float | None) -> str:
     if chance is None:
         return "no number"
-    return "below 1 %" if chance < 0.01 else f"{100.0 * min(chance, 0.99):.0f} %"
+    if not LEAST_CHANCE <= chance <= 1.0 - LEAST_CHANCE:
+        return "below 1 %" if chance < LEAST_CHANCE else "above 99 %"
+    return f"{100.0 * chance:.0f} %"
 
 
 def _date(prognosis: Prognosis, left: RemainingLife) -> str | None:
@@ -158,13 +211,15 @@ def named_levels(prognosis: Prognosis) -> list[tuple[str, float]]:
     return list(zip(LEVEL_NAMES, prognosis.levels, strict=True))
 
 
-def prognosis_tree(prognosis: Prognosis, before: tuple[str, float] | None = None) -> dict[str, Any]:
+def prognosis_tree(
+    prognosis: Prognosis, before: tuple[str, float | None] | None = None
+) -> dict[str, Any]:
     """Return a prognosis as a JSON object.
 
     prognosis: what the history says; before: the next inspection: as it was named, and hours,
-    cycles or days until it. Returns plain values, null where there is no number.
+    cycles or days until it; None: not known. Returns plain values, null where there is no number.
     """
-    first = prognosis.first()
+    first, ahead = prognosis.first(), before[1] if before else None
     return {
         "schema": PROGNOSIS_SCHEMA,
         "serial": prognosis.serial,
@@ -175,8 +230,12 @@ def prognosis_tree(prognosis: Prognosis, before: tuple[str, float] | None = None
         "seed": prognosis.seed,
         "first": first and first[0].name,
         "per_day": prognosis.per_day,
+        "today": prognosis.now[:10],
+        "usage_now": prognosis.usage_now,
+        "usage_told": prognosis.usage_told,
+        "last_test": prognosis.last_test,
         "before": before and before[0],
-        "chance_before": before and prognosis.chance_within(before[1]),
+        "chance_before": None if ahead is None else prognosis.chance_within(ahead),
         "severities": {
             item.name: {
                 "at": item.at,
@@ -192,7 +251,9 @@ def prognosis_tree(prognosis: Prognosis, before: tuple[str, float] | None = None
                         "median": left.median,
                         "interval80": None if left.median is None else [left.low, left.high],
                         "date": _date(prognosis, left),
-                        "chance_before": before and left.chance_within(before[1]),
+                        "reached": left.reached,
+                        "chance_past": left.chance_within(0.0),
+                        "chance_before": None if ahead is None else left.chance_within(ahead),
                         "why": left.why or None,
                     }
                     for name, left in zip(LEVEL_NAMES, item.remaining, strict=True)

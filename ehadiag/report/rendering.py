@@ -141,13 +141,17 @@ def _unit_trend(result: Result, levels: Levels, place: Path) -> UnitTrend | None
     from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415
     from ehadiag.report.report_pages import UnitTrend  # noqa: PLC0415
 
-    serial = result.serial
+    serial, kind = result.serial, result.actuator
     if serial is None or not place.exists():
         return None
     with History(place) as history:
-        entries, events = history.alike(serial)
-    mine = counted_entries([item for item in entries if item.serial == serial])
+        entries, events = history.alike(serial, kind)
+    mine = counted_entries(
+        [item for item in entries if item.serial == serial and item.actuator == kind]
+    )
     if not mine:
         return None
-    future = prognosis_of(serial, entries, events, (levels.advisory, levels.limit))
-    return UnitTrend(mine, [item for item in events if item.serial == serial], future)
+    both = (levels.advisory, levels.limit)
+    future = prognosis_of(serial, entries, events, both, actuator=kind)
+    own = [item for item in events if item.serial == serial and item.actuator in (None, kind)]
+    return UnitTrend(mine, own, future)

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.core.conversion import Conversion
-from ehadiag.history.records import Entry, MaintenanceEvent
+from ehadiag.history.records import Entry, MaintenanceEvent, continued_usage
 from ehadiag.report.head import advised, kept_advice, percent, plain_name, remaining_sentences
 from ehadiag.report.picture import (
     Area,
@@ -86,6 +86,7 @@ def trend_column(
     """
     unit = prognosis.unit if prognosis.used else None
     levels = prognosis.levels
+    entries, events, _ = continued_usage(entries, events)
     changes = [(at, item) for item in events if (at := _abscissa(item, unit)) is not None]
     placed = [(at, item) for item in entries if (at := _abscissa(item, unit)) is not None]
     placed.sort(key=lambda pair: pair[0])
@@ -119,7 +120,7 @@ def trend_column(
     ]  # fmt: skip
     tested = [at for at, entry in placed if entry.by_test]
     lines += [ReferenceLine(at, "last test", "last test", upright=True) for at in tested[-1:]]
-    fans = [_fan(item, f"forecast {list(names).index(item.name) % 3}")
+    fans = [_fan(item, prognosis.usage_before, f"forecast {list(names).index(item.name) % 3}")
             for item in prognosis.forecasts if unit is not None and item.name in names]  # fmt: skip
     areas = tuple(area for fan in fans for area in fan[0])
     curves += [curve for fan in fans for curve in fan[1]]
@@ -130,36 +131,38 @@ def trend_column(
     until = None if unit is None else _until(prognosis, [at for at, _ in placed])
     x_range = None if until is None else (placed[0][0] - 0.02 * (until - placed[0][0]), until)
     x_label = "date" if unit is None else X_LABELS.get(unit, unit)
+    x_label += ", with those of units swapped before" * bool(prognosis.usage_before)
     return PictureColumn("", (panel,), x_label, dates=unit is None, x_range=x_range)
 
 
 def _until(prognosis: Prognosis, known: Sequence[float]) -> float | None:
     """End of the picture: the slower severities' forecasts may reach far beyond what matters."""
-    medians = [item.remaining[-1].median for item in prognosis.forecasts]
-    ahead = [max(value, 0.0) for value in medians if value is not None]
+    ahead = [max(item.elapsed + median, 0.0) for item in prognosis.forecasts
+             if (median := item.remaining[-1].median) is not None]  # fmt: skip
     if not ahead or len(known) < 2:
         return None
     until = known[-1] + max(1.5 * min(ahead), 0.5 * (known[-1] - known[0]))
     return until if until > known[0] else None
 
 
-def _fan(item: Forecast, role: str) -> tuple[list[Area], list[Curve]]:
+def _fan(item: Forecast, before: float, role: str) -> tuple[list[Area], list[Curve]]:
     """Area and median of a forecast, from the newest diagnosis to each level; none without one."""
     ahead = [
-        (left.median, left.low, left.high, left.level)
+        (*(item.elapsed + x for x in (left.median, left.low, left.high)), left.level)
         for left in item.remaining
         if left.median is not None
         and left.low is not None
         and left.high is not None
         and math.isfinite(left.high)
-        and left.high > 0.0
+        and not left.reached
     ]
     if not ahead or item.at is None or item.value is None:
         return [], []
     medians, lows, highs, levels = np.array([(0.0, 0.0, 0.0, item.value), *ahead]).T
     border, levels = np.concatenate([lows, highs[::-1]]), 100.0 * levels
-    area = Area(role, item.at + border, np.concatenate([levels, levels[::-1]]))
-    return [area], [Curve(f"{plain_name(item.name)}, forecast", role, levels, item.at + medians)]
+    area = Area(role, before + item.at + border, np.concatenate([levels, levels[::-1]]))
+    name = f"{plain_name(item.name)}, forecast"
+    return [area], [Curve(name, role, levels, before + item.at + medians)]
 
 
 def _abscissa(item: Entry | MaintenanceEvent, unit: str | None) -> float | None:

@@ -172,9 +172,10 @@ class Pages:
     def _unit_page(self, serial: int) -> Page:
         """Return one unit's diagnoses, trend and remaining life."""
         entries, events = self._kept(serial)
-        mine = [entry for entry in entries if entry.serial == serial]
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
+        kind = future.actuator
+        mine = [item for item in entries if (item.serial, item.actuator) == (serial, kind)]
         used = counted_entries(mine)
         last = _last_test(used) if used else None
         first = first_to_the_limit(future, kept_advice(self._result_of(last)))
@@ -182,7 +183,7 @@ class Pages:
         lines += [
             f"{plain_name(item.name)} {item.alarm}" for item in future.forecasts if item.alarm
         ]
-        own = [item for item in events if item.serial == serial]
+        own = [i for i in events if i.serial == serial and i.actuator in (None, kind)]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
         plots = {}
         if has_trend(used):

@@ -14,9 +14,11 @@ from typing import Any
 
 import pytest
 from cli_result import Result, Run
+from history_cases import an_entry
 from places import LOGS, ROOT
 
 from ehadiag.history.records import MAX_DATE_ROUNDING_S
+from ehadiag.history.store import History
 
 HEALTHY = LOGS / "healthy-open.blf"
 WORN = LOGS / "paper-open-4.blf"
@@ -77,6 +79,9 @@ def test_tables_are_broken_between_words_on_a_narrow_terminal(
     run("history", "import", ROOT / "docs" / "examples" / "fleet.csv", "--history", "h.sqlite")
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "80")
+    day = "2026-08-18T08:00:00.000Z"
+    for module in ("prognosis.units", "history.records"):
+        monkeypatch.setattr(f"ehadiag.{module}.current_utc_text", lambda: day)
     for words, kept in (
         (("history", "list"), r"2026-08-20 08:00 .*FAULT"), (("rul", "--all"), "reference-31 "),
         (("rul", "--unit", "1"), r"710\s+to 2500 with 80 %\."),
@@ -204,9 +209,37 @@ def test_plot_draws_a_picture(run: Run) -> None:
 def test_the_largest_serial(run: Run) -> None:
     largest = (1 << 63) - 1
     run("history", "init", *GOOD)
+    with History(Path("good")) as history:
+        history.append(an_entry(largest))
     assert run("history", "event", "--unit", largest, "oiled", *GOOD).code == 0
     listed = run("history", "list", "--unit", largest, "--json", *GOOD).objects
-    assert [item["serial"] for item in listed] == [largest]
+    assert [item["serial"] for item in listed] == [largest, largest]
+
+
+def test_units_of_two_types_with_one_serial_number_are_told_apart(run: Run) -> None:
+    run("history", "init", *GOOD)
+    with History(Path("good")) as history:
+        for kind, day in (("a", "01"), ("b", "02")):
+            for n in (1, 2):
+                when = f"2026-{n:02}-{day}T12:00:00.000Z"
+                history.append(an_entry(1, 100.0 * n, tested=when, actuator=kind))
+    event = ("history", "event", "--unit", 1, "filter changed", "--actuator", "b", *GOOD)
+    assert run(*event).code == 0
+    found = run("history", "list", "--unit", 1, "--actuator", "a", "--json", *GOOD).objects
+    assert [(item["kind"], item["actuator"]) for item in found] == [("diagnosis", "a")] * 2
+    found = run("history", "list", "--unit", 1, "--json", *GOOD).objects
+    assert [item["actuator"] for item in found] == ["a", "a", "b", "b", "b"]
+    assert " a " in run("history", "list", *GOOD).out
+    text = run("history", "export", "--actuator", "b", *GOOD).out
+    assert {row["actuator"] for row in csv.DictReader(io.StringIO(text))} == {"b"}
+    plot = ("history", "plot", "--unit", 1, "--out", "h.png", *GOOD)
+    assert "serial 1 is of a, b: name its actuator" in run(*plot).message
+    assert run(*plot, "--actuator", "a").code == 0
+    with History(Path("good")) as history:
+        assert history.last_identified(1, "b", (), 9) is None
+        kept = history.last_identified(1, "a", (), 9)
+    assert kept is not None
+    assert kept.number == 2
 
 
 @pytest.mark.parametrize(
@@ -221,6 +254,12 @@ def test_the_largest_serial(run: Run) -> None:
         (("history", "list", "--history", "none"), 2, "begin one by ehadiag history init"),
         (("history", "show", "5", *GOOD), 2, "has no diagnosis 5"),
         (("history", "plot", "--unit", "5", "--out", "x.png", *GOOD), 2, "serial 5"),
+        (("history", "list", "--unit", "5", *GOOD), 2, "no diagnosis of it; there are none"),
+        (("history", "list", "--actuator", "x", *GOOD), 2, "--actuator x: there is none"),
+        (("history", "event", "--unit", "5", "a", *GOOD), 2, "no diagnosis of it"),
+        (("history", "event", "--unit", "5", " ", *GOOD), 2, "TEXT: is empty"),
+        (("history", "event", "--unit", "5", "a", "--when", "2999-01-01", *GOOD), 2, "future"),
+        (("history", "export", "--out", "x.xlsx", *GOOD), 2, "need .csv or .parquet"),
         (("history", "event", "--unit", "5", "a", "--resets", "x", *GOOD), 2, "FSS"),
         (("history", "event", "--unit", "5", "a", "--when", "x", *GOOD), 2, "8601"),
         (("history", "export", "--out", "no/x.csv", *GOOD), 3, "No such file"),

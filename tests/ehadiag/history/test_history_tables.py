@@ -40,10 +40,16 @@ def test_parquet_has_the_rows_of_the_csv_file() -> None:
     [
         ("verdict", "opinion", "has no column verdict"),
         ("HEALTHY", "FINE", "line 2: verdict: there is HEALTHY"),
-        ("FSS", "spool", "line 2: severity: there is Kintas"),
-        ("2026-03-01", "yesterday ", "line 2: "),
-        (",7,", ",seven,", "line 2: "),
-        ("0.1,", "nan,", "line 2: a number is not finite"),
+        ("FSS", "spool", "line 3: severity spool: there is Kintas"),
+        ("2026-03-01", "yesterday ", "line 2: when yesterday "),
+        (",7,", ",seven,", "line 2: serial seven: need a whole number, 0 … "),
+        (",7,", ",-7,", "line 2: serial -7: need a whole number, 0 … "),
+        ("0.1,", "nan,", "line 2: estimate nan: need a number, 0 … 1"),
+        (",0.3,", ",5,", "line 4: estimate 5: need a number, 0 … 1"),
+        (",0.0002,", ",-0.004,", "line 2: std -0.004: need a number, 0 … "),
+        (",100.0,", ",-5,", "line 2: hours -5: need a number, 0 … "),
+        ("FDJ", "FSS", "line 4: severity FSS: twice in one diagnosis"),
+        (",0.1,0.0002,", "\r\n0.1,0.0002,", "line 2: estimate: the row ends before it"),
     ],
 )
 def test_a_table_that_is_none_is_one_line(old: str, new: str, words: str) -> None:
@@ -62,6 +68,12 @@ def test_import_appends_all_or_none(tmp_path: Path, capsys: pytest.CaptureFixtur
     with History(place) as history:
         assert len(history.entries()) == 2
     assert "2 diagnoses of" in capsys.readouterr().out
+    table.write_text(history_csv(ENTRIES).replace("2026-03-02", "2026-03-03"))
+    assert main(["history", "import", str(table), "--history", str(place)]) == 0
+    assert "1 diagnoses of" in (said := capsys.readouterr().out)
+    assert "1 more were there already" in said
+    with History(place) as history:
+        assert len(history.entries()) == 3
     out = tmp_path / "b.parquet"
     assert main(["history", "export", "--out", str(out), "--history", str(place)]) == 0
     assert out.read_bytes()[:4] == b"PAR1"

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from history_cases import an_entry, an_event
 
+from ehadiag.history.records import Entry, Usage
 from ehadiag.prognosis.averaging import AVERAGING_RULES, learn_fleet
 from ehadiag.prognosis.forecast import Forecast, forecast
 from ehadiag.prognosis.lives import Life, lives_of
 from ehadiag.prognosis.units import prognosis_of
 from firmware_iface import FREE_MOTION
+from firmware_iface.errors import ConfigurationError
 
 RATE = 2.5e-4
 NOISE = 2e-4
@@ -120,8 +122,6 @@ def test_simulated_units_are_no_fleet_of_real_ones() -> None:
 
 
 def test_cycles_stand_for_hours_where_only_they_are_said() -> None:
-    from ehadiag.history.records import Usage
-
     rows = [an_entry(7, None, (0.03 * n, 0.1, 0.1), usage=Usage(None, n)) for n in range(1, 9)]
     assert prognosis_of(7, rows, [], (0.25, 0.75)).unit == "cycles"
 
@@ -167,7 +167,11 @@ def test_hours_since_the_last_diagnosis_shorten_what_is_left() -> None:
     later = forecast("FSS", "hours", life, FLEET, (0.75,), elapsed=200.0).remaining[0]
     assert whole.median is not None
     assert later.median is not None
-    assert whole.median - 210.0 < later.median < whole.median
+    assert later.median == pytest.approx(whole.median - 200.0)
+    assert later.chance_within(0.0) == whole.chance_within(200.0)
+    past = forecast("FSS", "hours", life, FLEET, (0.75,), elapsed=1e5).remaining[0]
+    assert past.chance_within(0.0) == 1.0
+    assert not past.reached
 
 
 def test_the_chance_within_a_time_is_that_of_the_quantiles() -> None:
@@ -270,3 +274,26 @@ def test_sentences_have_the_names_of_the_registry() -> None:
     from ehadiag.report.prognosis_tables import SHORT_NAMES
 
     assert {item.name: item.short for item in FAULTS} == SHORT_NAMES
+
+
+def test_hours_of_a_swapped_unit_count_anew() -> None:
+    def tested(n: int, hours: float, *values: float) -> Entry:
+        return an_entry(7, hours, values, tested=f"2026-{1 + n // 28:02}-{1 + n % 28:02}T12:00:00Z")
+
+    old = [tested(n, 100.0 * n, 0.03 * n, 0.02 * n, 0.01 * n) for n in range(1, 21)]
+    new = [tested(20 + n, 100.0 * n, 0.03 * n, 0.02 * n, 0.01 * n) for n in range(1, 5)]
+    swap = an_event(
+        "swapped", 2050.0, resets=("Kintas", "FSS", "FDJ"), when="2026-01-21T15:00:00.000Z"
+    )
+    found = prognosis_of(7, [*old, *new], [swap], (0.25, 0.75), now="2026-01-27T00:00:00.000Z")
+    assert [item.diagnoses for item in found.forecasts] == [4, 4, 4]
+    assert [item.at for item in found.forecasts] == [400.0] * 3
+    assert found.usage_now == pytest.approx(600.0, rel=0.2)
+    assert found.forecasts[0].remaining[1].median == pytest.approx(1900.0, rel=0.3)
+    with pytest.raises(ConfigurationError, match="were 400 at the last"):
+        prognosis_of(7, [*old, *new], [swap], (0.25, 0.75), today=Usage(300.0))
+    fewer = prognosis_of(7, [*old, *new[:1]], [swap], (0.25, 0.75)).forecasts[0]
+    assert fewer.remaining[1].why == "1 diagnosis of the unit, needs 3"
+    # Hours that run on across the swap are those of the place.
+    on = [tested(20 + n, 2050.0 + 100.0 * n, 0.03 * n, 0.02 * n, 0.01 * n) for n in range(1, 5)]
+    assert prognosis_of(7, [*old, *on], [swap], (0.25, 0.75)).forecasts[0].at == 2450.0

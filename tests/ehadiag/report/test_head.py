@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from places import LOGS
 from rich.console import Console
@@ -144,6 +145,9 @@ def forecast_of(*lives: tuple[str, float, float, float, float]) -> Any:
     """A prognosis of severities: name, value now, low, median and high of the hours left."""
     return SimpleNamespace(
         unit="hours",
+        now="2026-03-09T00:00:00.000Z",
+        last_test="2026-03-09T12:00:00.000Z",
+        usage_now=3100.0,
         forecasts=[
             SimpleNamespace(
                 name=name, value=now, remaining=[RemainingLife(0.75, low, median, high, "")]
@@ -158,6 +162,20 @@ def test_time_that_is_left_is_no_level_and_not_promised_where_it_is_wide() -> No
     assert remaining_sentences(forecast_of(vague, sure)) == [
         "Jack friction reaches its limit in about 130 h (80 %: 89 to 190 h).",
         "Spool friction reaches its limit not before about 100 h.",
+    ]
+
+
+def test_what_may_be_past_is_not_called_reached_and_now_is_said() -> None:
+    found = forecast_of(("FDJ", 0.6, -300.0, 200.0, 900.0), ("FSS", 0.3, -900.0, -50.0, 90.0))
+    found.last_test = "2026-01-09T12:00:00.000Z"
+    for item, median in zip(found.forecasts, (200.0, -50.0), strict=True):
+        quantiles = tuple(np.linspace(median - 500.0, median + 500.0, 99))
+        item.remaining = [msgspec.structs.replace(item.remaining[0], quantiles=quantiles)]
+    assert remaining_sentences(found) == [
+        "Spool friction may have reached its limit; it may be past it: 55 %, from now at about"
+        " 3100 h.",
+        "Jack friction reaches its limit in about 200 h (80 %: 0 to 900 h); it may be past it:"
+        " 30 %, from now at about 3100 h.",
     ]
 
 
