@@ -144,11 +144,14 @@ def explains_far_more(excess: float, before: float) -> bool:
     return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
 
 
-def likelihood_cost(residuals: Array) -> float:
-    """Twice the negative logarithm of the likelihood of residuals, shape (signals, N), by Cauchy's
-    cost over that of noise, and a constant."""
+def likelihood_ratio_cost(residuals: Array, excesses: Sequence[float]) -> float:
+    """Twice the logarithm of how much likelier other residuals of the same samples are, by Cauchy's
+    cost over that of noise.
+
+    residuals: shape (signals, N); excesses: those of the others, of each signal.
+    """
     counts = np.count_nonzero(residuals, axis=1)
-    return float(np.dot(signal_excess_costs(residuals), counts))
+    return float(np.dot(np.subtract(signal_excess_costs(residuals), excesses), counts))
 
 
 def is_noise(residuals: Array) -> bool:
@@ -262,8 +265,7 @@ def identification_result(
         evaluations=evaluations,
         generations=found.generations,
         cost=refined.cost,
-        likelihood_cost=likelihood_cost(refined.residuals),
-        excess=excess_cost(refined.residuals),
+        excesses=tuple(signal_excess_costs(refined.residuals)),
         converged=refined.converged,
         attempts=attempts,
         timing=timing,

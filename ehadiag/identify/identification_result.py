@@ -92,9 +92,8 @@ class Identification(msgspec.Struct, frozen=True, eq=False):
     """Runs of the model in all stages."""
     generations: int
     cost: float
-    likelihood_cost: float
-    excess: float
-    """Of the residuals, see `ehadiag.identify.estimates`."""
+    excesses: tuple[float, ...]
+    """Cost of each signal's residuals over that of noise, 1: spool, pressure."""
     converged: bool
     attempts: int
     """Searches that it took; more than one where the first did not explain the recording."""

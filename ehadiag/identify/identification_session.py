@@ -29,7 +29,7 @@ from ehadiag.identify.estimates import (
     identification_result,
     independent_covariance,
     is_pressure_misfit,
-    likelihood_cost,
+    likelihood_ratio_cost,
     over_exponents,
     refinement_outlier_share,
 )
@@ -227,12 +227,12 @@ class IdentificationSession:
         others = [item.with_exponent(middle, prior.bridge) for item in experiments]
         values = {**found.values, FRICTION_NAME: min(max(other, 0.0), 1.0)}
         residuals = self._residuals_about(others, found, values, progress)
-        excess = excess_cost(residuals)
-        if found.excess > FIT.max_explained_excess:
-            if explains_far_more(excess, found.excess):
+        before, excess = max(found.excesses), excess_cost(residuals)
+        if before > FIT.max_explained_excess:
+            if explains_far_more(excess, before):
                 return replace(found, better_exponent=middle)
-            return replace(found, exponent_doubted=not explains_far_more(found.excess, excess))
-        more = likelihood_cost(residuals) - found.likelihood_cost
+            return replace(found, exponent_doubted=not explains_far_more(before, excess))
+        more = likelihood_ratio_cost(residuals, found.excesses)
         return replace(found, exponent_doubted=more < 2.0 * math.log(FIT.min_likelihood_ratio))
 
     def _residuals_about(
@@ -254,8 +254,9 @@ class IdentificationSession:
             return attempt.refined.residuals
         free = tuple(parameter(name) for name in found.freed)
         freeing = NuisanceEstimator(self.prior, free, partial(progress, "nuisances"))
-        settings = freeing.one_start(experiments, values)
-        return estimate_nuisances(experiments, settings).refined.residuals
+        resting = [item.without_creep() for item in experiments]
+        settings = freeing.one_start(resting, values)
+        return estimate_nuisances(resting, settings).refined.residuals
 
     def _over_exponents(self, found: Identification, constants: PlantConstants) -> Identification:
         """Return an identification with the friction of all exponents that may be."""

@@ -22,7 +22,7 @@ from ehadiag.identify.estimates import (
     independent_covariance,
     is_pressure_misfit,
     is_unexplainable,
-    likelihood_cost,
+    likelihood_ratio_cost,
     residual_outlier_share,
     signal_excess_costs,
 )
@@ -489,7 +489,8 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         settings = self.one_start(others, hint)
         if to_noise:
             there = estimate_nuisances(others, settings).refined.residuals
-            more = likelihood_cost(there) - likelihood_cost(found.refined.residuals)
+            excesses = signal_excess_costs(found.refined.residuals)
+            more = likelihood_ratio_cost(there, excesses)
             return None, more < 2.0 * math.log(FIT.min_likelihood_ratio)
         residuals = search_in_stages(others, settings).found.residuals
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
