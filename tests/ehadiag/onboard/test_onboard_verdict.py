@@ -16,12 +16,15 @@ from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Verdict, bundled_tests, default_actuator
+from ehadiag import simulate as simulate_test
 from ehadiag.assess import acceptance, verdict
 from ehadiag.assess.diagnosis import diagnose
+from ehadiag.core.actuator import Discrepancy
 from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.export.library import library_plan
+from ehadiag.identify.estimates import FIRST_STAGE_STD, friction_range
 from ehadiag.identify.identification_session import NuisanceMode
-from ehadiag.model.plant import relative_viscosity
+from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard import onboard_optimum
 from ehadiag.onboard.onboard_identification import begin_identification, continue_identification
@@ -42,6 +45,7 @@ from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS
 
 LEVELS = verdict.Levels()
+TESTS = bundled_tests().values()
 ACTUATOR = default_actuator()
 PLAN = library_plan(ACTUATOR, design_cusum(100.0, 1e-3))
 EDGE = 1e-5
@@ -50,18 +54,18 @@ NOT_TESTED = 30.0
 NAMES = ("Kintas", "FSS", "FDJ")
 
 
-def on_board(values, stds, outliers=0.0, rms=1.0):
+def on_board(values, stds, outliers=0.0, rms=1.0, plan=PLAN):
     """Outcome of an identification that has come to these estimates."""
     memory = np.zeros(ONBOARD.end)
     known = OnboardOutcome(*values, *stds, *(0.0,) * 11)._replace(
         samples=1000.0, outliers=outliers, spool_rms=rms, pressure_rms=1.0
     )
     memory[: len(known)] = known
-    assert onboard_optimum.write_verdict(memory.ctypes.data, PLAN) == 0
+    assert onboard_optimum.write_verdict(memory.ctypes.data, plan) == 0
     return OnboardOutcome(*memory[: len(known)].tolist())
 
 
-def judged(values, stds):
+def judged(values, stds, frictions=()):
     """The same by the rule of the package."""
     estimates = [
         SimpleNamespace(
@@ -70,7 +74,13 @@ def judged(values, stds):
         for name, value, std in zip(NAMES, values, stds, strict=True)
     ]
     return verdict.judge(
-        SimpleNamespace(estimates=estimates, nuisances={}, frictions=()),
+        SimpleNamespace(
+            estimates=estimates,
+            nuisances={},
+            frictions=frictions,
+            exponent_doubted=False,
+            named=lambda name: estimates[NAMES.index(name)],
+        ),
         LEVELS,
     )[0], estimates
 
@@ -117,6 +127,41 @@ def test_the_verdict_is_that_of_the_package(values, stds):
     assert found.verdict == float(expected)
 
 
+def of_exponent(exponent, **others):
+    """The reference unit with an exponent of clogging."""
+    valve = replace(ACTUATOR.servovalve, clogging_exponent=exponent)
+    return replace(ACTUATOR, servovalve=valve, **others)
+
+
+RANGE = library_plan(of_exponent((0.0, 2.0)), design_cusum(100.0, 1e-3))
+
+
+@given(
+    st.tuples(*(st.floats(0.0, 1.0),) * 3),
+    st.tuples(*(st.floats(-4.0, -1.5).map(lambda power: 10.0**power),) * 3),
+)
+def test_a_range_of_exponents_does_what_it_does_in_the_package(values, stds):
+    friction = friction_range(
+        dict(zip(NAMES, values, strict=True)), stds[1], plant_constants(ACTUATOR), (0.0, 2.0),
+        with_exponent=2.0,
+    )  # fmt: skip
+    wider = math.hypot(stds[0], FIRST_STAGE_STD * friction.frictions[-1])
+    expected, estimates = judged(
+        (values[0], friction.value, values[2]), (wider, friction.std, stds[2]), friction.frictions
+    )
+    above = [verdict.chance_above(item, LEVELS.advisory) for item in estimates]
+    limits = [verdict.chance_above(item, LEVELS.limit) for item in estimates]
+    assume(abs(sum(above) - verdict.VERDICT.max_chance_false_healthy) > EDGE)
+    assume(all(abs(chance - verdict.VERDICT.min_chance_fault) > EDGE for chance in limits))
+    assume(np.abs(np.array(friction.frictions) - LEVELS.limit).min() > EDGE)
+    found = on_board(values, stds, plan=RANGE)
+    assert found.verdict == float(expected)
+    if found.verdict != NOT_TESTED:
+        assert found[:6] == pytest.approx(
+            [item.value for item in estimates] + [item.std for item in estimates], rel=1e-9
+        )
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"outliers": acceptance.FIT.max_outlier_share + 1e-3}, {"outliers": math.nan},
@@ -134,6 +179,40 @@ def test_a_severity_that_the_test_does_not_show_is_not_tested():
     found = on_board((0.1, 0.1, 0.5), (0.01, 0.01, 0.11))
     assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.hidden)
     assert math.isnan(found.FDJ)
+
+
+FILES = {
+    of_plant: [of_exponent(exponent, discrepancy=Discrepancy()) for exponent in stated]
+    for of_plant, stated in ((0.0, [(0.0, 2.0)]), (2.0, [2.0, (0.0, 2.0)]))
+}
+"""Files that are right of a plant by its exponent: what a file states that states nothing."""
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(k, marks=[] if k in (2, 5) else pytest.mark.slow) for k in range(20)]
+)
+def test_doubt_about_the_faults_laws_is_that_of_the_package(seed):
+    """Intervals and verdict of the library, whatever exponent the plant has."""
+    severities = dict(zip(NAMES, np.random.default_rng(seed).uniform(0.0, 1.0, 3), strict=True))
+    exponent, test = 2.0 * (seed % 2), ("open", "closed")[seed // 2 % 2]
+    recording = simulate_test(test, actuator=of_exponent(exponent), seed=seed, **severities)
+    for actuator in FILES[exponent]:
+        host = diagnose([recording], actuator, TESTS, nuisances=NuisanceMode.NONE)
+        memory = np.zeros(ONBOARD.end)
+        plan = library_plan(actuator, design_cusum(100.0, 1e-3))
+        ticks, unit = np.ascontiguousarray(ticks_of(recording)), np.array(surrounded(recording))
+        places = memory.ctypes.data, plan.ctypes.data
+        assert begin_identification(*places, unit.ctypes.data) == 0
+        assert continue_identification(*places, ticks.ctypes.data, (float(len(ticks)), 1e9)) == 0
+        found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+        assert found.verdict == float(host.verdict)
+        if found.verdict == NOT_TESTED:
+            continue
+        for k, item in enumerate(host.identification.estimates):
+            value, std = found[k], found[ONBOARD_GENES + k]
+            near = max(0.1 * item.std, 1e-3)
+            assert [value, std] == pytest.approx([item.value, item.std], abs=near)
+            assert abs(value - severities[item.name]) < 3.0 * std
 
 
 @pytest.mark.parametrize("oil", [-60.0, -20.0, 0.0, 40.0, 85.3, 100.0, 200.0])
@@ -232,7 +311,7 @@ def test_without_half_the_supply_nothing_is_judged(share, carries):
 @pytest.mark.parametrize("name", DAMAGES)
 def test_what_the_host_does_not_test_the_board_does_not_either(name):
     recording = damaged(DAMAGES[name])
-    found = diagnose([recording], ACTUATOR, bundled_tests().values(), nuisances=NuisanceMode.NONE)
+    found = diagnose([recording], ACTUATOR, TESTS, nuisances=NuisanceMode.NONE)
     assert found.verdict is Verdict.NOT_TESTED
     ticks = np.ascontiguousarray(ticks_of(recording))
     memory, unit = np.zeros(ONBOARD.end), np.array(surrounded(recording), dtype=np.float64)
