@@ -221,7 +221,8 @@ class ChannelSums(NamedTuple):
     cut: float
     """Samples at an end of the converter."""
     rest: float
-    """Sum of the samples at rest, and how many they are."""
+    """Sum of the samples at rest, and how many they are; in a conclusion the sum of the residuals'
+    second differences, whatever their sign."""
     rested: float
 
 

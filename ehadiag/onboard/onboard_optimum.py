@@ -43,6 +43,7 @@ from ehadiag.onboard.onboard_recording import (
     EARLIER,
     LAST,
     OUTLIERS,
+    REST,
     SAMPLES,
     SQUARES,
     channel_sums_at,
@@ -66,6 +67,7 @@ from ehadiag.onboard.onboard_search import (
     identified_constants,
     loosen_anchor,
     parameters_at,
+    second_difference,
     set_density,
     shown_excess,
     shown_noise,
@@ -142,7 +144,7 @@ def write_verdict(address: int, plan: Array) -> int:
     above, at_limit, hidden = 0.0, False, False
     for i in range(ONBOARD_GENES):
         hidden = hidden or not p[ONBOARD_GENES + i] < rules.most_std
-    _doubt_laws(p, rules)
+    _doubt_laws(p, channel_sums_at(address), rules)
     friction, blind = CERTAIN, False
     if rules.exponents > 0.0:
         friction = _over_exponents(p, rules)
@@ -173,9 +175,10 @@ CERTAIN, UNLIKELY_FAULT, LIKELY_FAULT = range(3)
 
 
 @inlined_exact
-def _doubt_laws(p: Array, rules: VerdictRules) -> None:
+def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> None:
     """Widen the deviations, see `ehadiag.identify.prior.UnitPrior.discrepancy_covariance`."""
-    more = 1.0 + math.sqrt(max(shown_excess(p, 0) - 1.0, shown_excess(p, 1) - 1.0, 0.0))
+    excess = max(shown_excess(p, 0, sums[0, REST]), shown_excess(p, 1, sums[1, REST]), 1.0)
+    more = 1.0 + math.sqrt(excess - 1.0)
     clogging, friction = p[KINTAS], p[FSS]
     for i in range(ONBOARD_GENES):
         doubt = rules.law_Kintas * math.sqrt(clogging * clogging + friction * friction)
@@ -315,6 +318,7 @@ def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
     for c in range(2):
         raw = p[ONBOARD.monitors + MONITOR.residual + c]
         count_residual(p, c, raw, sums[c, LAST], sums[c, EARLIER])
+        sums[c, REST] += second_difference(raw, sums[c, LAST], sums[c, EARLIER])
         sums[c, EARLIER], sums[c, LAST] = sums[c, LAST], raw
         if not math.isfinite(raw) or not math.isfinite(ticks[k, 2 + c]):
             continue

@@ -280,6 +280,13 @@ def count_residual(p: Array, channel: int, now: float, before: float, earlier: f
 
 
 @inlined_exact
+def second_difference(now: float, before: float, earlier: float) -> float:
+    """Second difference of a residual as a histogram counts it; 0 of one that it does not count."""
+    second = abs(now - 2.0 * before + earlier)
+    return min(second, ROOT_OF_SIX * SEARCH.histogram_range) if math.isfinite(second) else 0.0
+
+
+@inlined_exact
 def shown_noise(p: Array, channel: int) -> float:
     """Noise that the second differences show, of which the largest 2 % are left out."""
     total, seen, mean = 0.0, 0.0, 0.0
@@ -301,11 +308,20 @@ def shown_noise(p: Array, channel: int) -> float:
 
 
 @inlined_exact
-def shown_excess(p: Array, channel: int) -> float:
-    """Cost of the residuals over that of noise, see `ehadiag.identify.estimates.excess_cost`."""
-    total, cost = 0.0, 0.0
-    scale = ESTIMATION.cauchy_scale * shown_noise(p, channel)
+def shown_excess(p: Array, channel: int, seconds: float) -> float:
+    """Cost of the residuals over that of noise, see `ehadiag.identify.estimates.excess_cost`.
+
+    seconds: sum of their second differences, see `second_difference`: where a converter's steps
+    make them lie beside the middles of their bins, the histogram's noise is off by a few percent.
+    """
+    total, cost, binned = 0.0, 0.0, 0.0
     width = 2.0 * SEARCH.histogram_range / HISTOGRAM_BINS
+    for i in range(HISTOGRAM_BINS):
+        binned += p[ONBOARD.histograms + (2 + channel) * HISTOGRAM_BINS + i] * (i + 0.5)
+    binned *= ROOT_OF_SIX * SEARCH.histogram_range / HISTOGRAM_BINS
+    scale = ESTIMATION.cauchy_scale * shown_noise(p, channel) * seconds / max(binned, 1.0)
+    if not scale > 0.0:
+        return 1.0
     for i in range(HISTOGRAM_BINS):
         share = ((i + 0.5) * width - SEARCH.histogram_range) / scale
         samples = p[ONBOARD.histograms + channel * HISTOGRAM_BINS + i]

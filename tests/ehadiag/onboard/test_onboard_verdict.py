@@ -189,11 +189,11 @@ FILES = {
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(k, marks=[] if k in (2, 5) else pytest.mark.slow) for k in range(20)]
+    "seed", [pytest.param(k, marks=[] if k in (2, 3) else pytest.mark.slow) for k in range(1, 21)]
 )
 def test_doubt_about_the_faults_laws_is_that_of_the_package(seed):
     """Intervals and verdict of the library, whatever exponent the plant has."""
-    severities = dict(zip(NAMES, np.random.default_rng(seed).uniform(0.0, 1.0, 3), strict=True))
+    severities = dict(zip(NAMES, np.random.default_rng(seed).uniform(0.0, 0.6, 3), strict=True))
     exponent, test = 2.0 * (seed % 2), ("open", "closed")[seed // 2 % 2]
     recording = simulate_test(test, actuator=of_exponent(exponent), seed=seed, **severities)
     for actuator in FILES[exponent]:
