@@ -15,13 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ehadiag.core.actuator import Actuator
+from ehadiag.core.conventions import FRICTION_NAME
 from ehadiag.core.conversion import actuator_channels
 from ehadiag.core.criteria import ESTIMATION
+from ehadiag.identify.estimates import FIRST_STAGE_STD, friction_range
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, unknowns_of
 from ehadiag.identify.linearisation import Derivatives
-from ehadiag.identify.prior import basic_nuisances_of, prior_information, unit_prior, usual_prior
+from ehadiag.identify.prior import (
+    UnitPrior,
+    basic_nuisances_of,
+    prior_information,
+    unit_prior,
+    usual_prior,
+)
 from ehadiag.model.laws import ControlState, control_current, control_law
-from ehadiag.model.registry import FAULTS, REGISTRY, SENSOR_OFFSETS
+from ehadiag.model.plant import PlantConstants
+from ehadiag.model.registry import FAULT_NAMES, FAULTS, REGISTRY, SENSOR_OFFSETS
 from ehadiag.model.residual_models import SimdModel
 from ehadiag.monitor.streaming import Monitor, Tick
 from firmware_iface.recording import CHANNELS, CommandMode, Environment, Samples
@@ -120,12 +129,20 @@ class Bound(msgspec.Struct, frozen=True, eq=False):
     """The point."""
     std: NDArray[np.float64]
     """Smallest deviation of an unbiased estimate of each severity, shape (k,)."""
+    laws: NDArray[np.float64]
+    """What laws of the faults and a range of exponents of clogging add, whatever the test, shape
+    (k,)."""
     alone: NDArray[np.float64]
-    """The same if the severities and the sensors' offsets were all that is unknown, shape (k,)."""
+    """As `std` if the severities and the sensors' offsets were all that is unknown, shape (k,)."""
     alike: tuple[tuple[str, str, float], ...]
     """A severity, what it is hardly told apart from, and the correlation of the two."""
     unseen: tuple[str, ...]
     """Parameters of which the test shows nothing."""
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """Deviation that a diagnosis states at best, shape (k,)."""
+        return np.hypot(self.std, self.laws)
 
 
 class Score(msgspec.Struct, frozen=True, eq=False):
@@ -134,7 +151,7 @@ class Score(msgspec.Struct, frozen=True, eq=False):
     bounds: tuple[Bound, ...]
     """At each point."""
     figure: float
-    """Geometric mean of the bounds of all severities at all points."""
+    """Geometric mean of the bounds of all severities at all points, if the laws hold."""
     travel: float
     """Largest distance of the jack from its middle over the points, m."""
     rate: float
@@ -206,9 +223,11 @@ def bound_of(played: PlayedTest, actuator: Actuator, point: tuple[float, ...]) -
     spread = np.sqrt(np.diag(covariance))
     names = [item.name for item in model.estimated]
     before = np.sqrt(1.0 / np.maximum(np.diag(prior), np.finfo(float).tiny))
+    std = (spread * model.scale)[:count]
     return Bound(
         severities=point,
-        std=(spread * model.scale)[:count],
+        std=std,
+        laws=_doubt_about_laws(severities, std, knowledge, played.experiment.constants),
         alone=(np.sqrt(np.diag(alone)) * model.scale[:known])[:count],
         alike=_confusable_pairs(names, covariance / np.outer(spread, spread)),
         unseen=tuple(
@@ -218,6 +237,26 @@ def bound_of(played: PlayedTest, actuator: Actuator, point: tuple[float, ...]) -
             if spread[k] > 0.7 * before[k]
         ),
     )
+
+
+def _doubt_about_laws(
+    severities: Mapping[str, float],
+    std: NDArray[np.float64],
+    knowledge: UnitPrior,
+    constants: PlantConstants,
+) -> NDArray[np.float64]:
+    """Deviation that a diagnosis adds to that of the severities, shape (k,)."""
+    doubt = knowledge.discrepancy_covariance(FAULTS, severities, 1.0)
+    total = np.sqrt(std**2 + np.diag(doubt))
+    low, high = knowledge.exponents
+    if low < high:
+        clogging, friction = (FAULT_NAMES.index(name) for name in ("Kintas", FRICTION_NAME))
+        found = friction_range(
+            severities, total[friction], constants, (low, high), with_exponent=constants.CLE
+        )
+        total[friction] = found.std
+        total[clogging] = np.hypot(total[clogging], FIRST_STAGE_STD * found.frictions[-1])
+    return np.sqrt(np.maximum(total**2 - std**2, 0.0))
 
 
 def _confusable_pairs(

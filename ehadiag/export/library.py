@@ -46,8 +46,9 @@ from ehadiag.export.targets import (
     mark_either_convention,
     static_library,
 )
+from ehadiag.identify.estimates import FIRST_STAGE_STD
 from ehadiag.identify.prior import DAILY_PRIORS, calibration_covariance, unit_prior
-from ehadiag.model.plant import PLANT_FIELDS, PlantConstants, plant_constants
+from ehadiag.model.plant import PlantConstants, plant_constants
 from ehadiag.model.registry import Unknowns, unit_constants
 from ehadiag.model.severities import FAULT_LAWS
 from ehadiag.monitor import monitor_memory
@@ -92,12 +93,17 @@ def library_plan(
     ones. single: whether results are rounded to single precision. Two tests of one kind, or one at
     another rate than the actuator's, raise ConfigurationError.
     """
-    begin = [*monitor_plan(actuator, unit_constants(actuator), design), *verdict_rules(actuator)]
-    directions = [number for row in uncertain_constants(actuator) for number in row]
+    uncertain, base = uncertain_constants(actuator), unit_constants(actuator)
+    rules, rows = verdict_rules(actuator), uncertain
+    begin = [*monitor_plan(actuator, base, design), *rules]
+    if rules.exponents > 0.0:
+        # With the largest exponent friction is less than as new (`over_exponents`).
+        largest = actuator.servovalve.clogging_range[1]
+        rows = [row._replace(CLE=largest, FSS=0.0) for row in (*uncertain, base)]
     end = [
         *_test_numbers(tests or tuple(bundled_tests().values()), actuator.controller.rate),
-        float(len(directions) // PLANT_FIELDS),
-        *directions,
+        float(len(uncertain)),
+        *(number for row in rows for number in row),
     ]
     numbers = np.array([*begin, *end], dtype="<f8")
     # 48 bits: a double holds 53.
@@ -174,7 +180,8 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
     What a calibration of the unit could not explain is no reason against a verdict.
     """
     levels, (outliers, rms) = Levels(), residual_limits(actuator.calibration)
-    discrepancy = unit_prior(actuator).std if actuator.calibration else {}
+    prior, valve = unit_prior(actuator), actuator.servovalve
+    low, high = prior.exponents
     _, spool, pressure, position = (channel.ends for channel in actuator_channels(actuator))
     return VerdictRules(
         advisory=levels.advisory,
@@ -189,10 +196,12 @@ def verdict_rules(actuator: Actuator) -> VerdictRules:
         most_lost=RECORDING.max_missing_share,
         longest_gap=RECORDING.max_sample_gap_s * actuator.controller.rate,
         most_saturated=RECORDING.max_saturated_share,
-        least_supply=RECORDING.min_supply_pressure_share * actuator.servovalve.PSR,
-        discrepancy_Kintas=discrepancy.get("Kintas", 0.0),
-        discrepancy_FSS=discrepancy.get("FSS", 0.0),
-        discrepancy_FDJ=discrepancy.get("FDJ", 0.0),
+        least_supply=RECORDING.min_supply_pressure_share * valve.PSR,
+        **{f"discrepancy_{name}": prior.std.get(name, 0.0) for name in FAULT_LAWS},
+        **{f"law_{name}": size for name, size in prior.discrepancy.items()},
+        exponents=high - low,
+        first_stage=FIRST_STAGE_STD,
+        friction_new=valve.FSS0 / valve.FSS1 if low < high else 0.0,
         spool_low=spool[0],
         spool_high=spool[1],
         pressure_low=pressure[0],

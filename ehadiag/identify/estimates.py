@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -411,6 +412,51 @@ def friction_by_exponent(
     return float((values[FRICTION_NAME] + new) * share**change - new)
 
 
+class FrictionRange(NamedTuple):
+    """Spool friction that exponents of clogging make of one that was found with one of them."""
+
+    frictions: tuple[float, ...]
+    """With each exponent, the largest first."""
+    value: float
+    """Middle of the interval that holds all of them with their own."""
+    std: float
+    """Deviation that goes with the interval."""
+    exponent: float
+    """The exponent that goes with the middle."""
+
+
+def friction_range(
+    values: Mapping[str, float],
+    std: float,
+    constants: PlantConstants,
+    exponents: tuple[float, float],
+    *,
+    with_exponent: float,
+) -> FrictionRange:
+    """Return what exponents of clogging make of a friction, see `over_exponents`.
+
+    values: severities by name, found with one exponent; std: of the friction; constants: of the
+    unit as new; exponents: least and largest one.
+    """
+    low, high = exponents
+    share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
+    new = float(constants.FSS / (constants.FSS1 - constants.FSS))
+    shown = max(values[FRICTION_NAME] + new, 1e-9)
+    ratios = share ** (np.linspace(high, low, EXPONENTS) - with_exponent)
+    frictions = np.clip(shown * ratios - new, 0.0, 1.0).tolist()
+    half = NORMAL_HALF_WIDTH_95 * std * ratios
+    bottom = frictions[0] - float(half[0])
+    top = min(frictions[-1] + float(half[-1]), max(frictions[0] + float(half[0]), 1.0))
+    value = (bottom + top) / 2.0
+    power = math.log((value + new) / shown) / math.log(share) if share < 1.0 else 0.0
+    return FrictionRange(
+        tuple(frictions),
+        value,
+        (top - bottom) / 2.0 / NORMAL_HALF_WIDTH_95,
+        min(max(with_exponent + power, low), high),
+    )
+
+
 def over_exponents(
     found: Identification,
     constants: PlantConstants,
@@ -444,19 +490,11 @@ def over_exponents(
     low, high = exponents
     if low == high:
         return found
-    share = 1.0 + FAULT_LAWS["Kintas"].change * found.named("Kintas").value
-    new = float(constants.FSS / (constants.FSS1 - constants.FSS))
     friction = found.named(FRICTION_NAME)
-    shown = max(friction.value + new, 1e-9)
-    ratios = share ** (np.linspace(high, low, EXPONENTS) - with_exponent)
-    frictions = np.clip(shown * ratios - new, 0.0, 1.0).tolist()
-    half = NORMAL_HALF_WIDTH_95 * friction.std * ratios
-    bottom = frictions[0] - float(half[0])
-    top = min(frictions[-1] + float(half[-1]), max(frictions[0] + float(half[0]), 1.0))
-    value = (bottom + top) / 2.0
-    std = (top - bottom) / 2.0 / NORMAL_HALF_WIDTH_95
-    power = math.log((value + new) / shown) / math.log(share) if share < 1.0 else 0.0
-    exponent = min(max(with_exponent + power, low), high)
+    values = {item.name: item.value for item in found.estimates}
+    frictions, value, std, exponent = friction_range(
+        values, friction.std, constants, exponents, with_exponent=with_exponent
+    )
     estimate = replace(
         friction,
         value=value,
@@ -477,6 +515,6 @@ def over_exponents(
         estimates=tuple(changed.get(item.name, item) for item in found.estimates),
         nuisances={**found.nuisances, EXPONENT_NAME: nuisance},
         covariance=covariance,
-        frictions=tuple(frictions),
+        frictions=frictions,
         response={FRICTION_NAME: friction.value, EXPONENT_NAME: with_exponent - constants.CLE},
     )

@@ -226,7 +226,7 @@ class IdentificationSession:
             return found
         others = [item.with_exponent(middle, prior.bridge) for item in experiments]
         values = {**found.values, FRICTION_NAME: min(max(other, 0.0), 1.0)}
-        residuals = self._residuals_about(others, found, values, progress)
+        residuals = min(self._residuals_about(others, found, values, progress), key=excess_cost)
         before, excess = max(found.excesses), excess_cost(residuals)
         if before > FIT.max_explained_excess:
             if explains_far_more(excess, before):
@@ -241,22 +241,24 @@ class IdentificationSession:
         found: Identification,
         values: Mapping[str, float],
         progress: StageProgress,
-    ) -> Array:
-        """Residuals of one search, weighted, with the parameters that an identification freed.
+    ) -> Iterator[Array]:
+        """Residuals of a search of the severities, and of one with what an identification freed.
 
         values: about which, by name.
         """
-        if not found.freed:
-            start = np.array([values[item.name] for item in FAULTS])
-            stages = self._stages(experiments, start, partial(progress, "search"))
-            searched = staged_search(stages, progress)
-            attempt = refined_attempt(experiments, searched, searched.best, self._first_part)
-            return attempt.refined.residuals
-        free = tuple(parameter(name) for name in found.freed)
-        freeing = NuisanceEstimator(self.prior, free, partial(progress, "nuisances"))
-        resting = [item.without_creep() for item in experiments]
-        settings = freeing.one_start(resting, values)
-        return estimate_nuisances(resting, settings).refined.residuals
+        start = np.array([values[item.name] for item in FAULTS])
+        searched = staged_search(
+            self._stages(experiments, start, partial(progress, "search")), progress
+        )
+        yield refined_attempt(
+            experiments, searched, searched.best, self._first_part
+        ).refined.residuals
+        if found.freed:
+            free = tuple(parameter(name) for name in found.freed)
+            freeing = NuisanceEstimator(self.prior, free, partial(progress, "nuisances"))
+            resting = [item.without_creep() for item in experiments]
+            settings = freeing.one_start(resting, values)
+            yield estimate_nuisances(resting, settings).refined.residuals
 
     def _over_exponents(self, found: Identification, constants: PlantConstants) -> Identification:
         """Return an identification with the friction of all exponents that may be."""

@@ -56,9 +56,9 @@ class OnboardOutcome(NamedTuple):
     samples: float
     """Residuals that it is of."""
     outliers: float
-    """Share of them beyond three deviations."""
+    """Share of them beyond three deviations of noise and of the faults' laws."""
     spool_rms: float
-    """Rms of the spool's residuals, squares capped, in units of the noise that they show."""
+    """Rms of the spool's residuals, squares capped, in such deviations."""
     pressure_rms: float
     """The same of the pressure's."""
     runs: float
@@ -221,7 +221,8 @@ class ChannelSums(NamedTuple):
     cut: float
     """Samples at an end of the converter."""
     rest: float
-    """Sum of the samples at rest, and how many they are."""
+    """Sum of the samples at rest, and how many they are; in a conclusion the sum of the residuals'
+    second differences, whatever their sign."""
     rested: float
 
 
@@ -289,6 +290,17 @@ class VerdictRules(NamedTuple):
     """Deviations of the severities by what no model has."""
     discrepancy_FSS: float
     discrepancy_FDJ: float
+    law_Kintas: float
+    """Deviations of the severities by wrong laws of the faults, over the severity."""
+    law_FSS: float
+    law_FDJ: float
+    exponents: float
+    """Length of the range of exponents of clogging; it is identified with the largest one."""
+    first_stage: float
+    """Deviation of the clogging by it over the friction with the least one, 1."""
+    friction_new: float
+    """With a range, the spool's friction as new over that at the limit: severities of friction are
+    searched from no friction on."""
     spool_low: float
     """Ends of the converters: m of the spool, Pa of the pressure, m of the jack."""
     spool_high: float
@@ -311,7 +323,8 @@ PLAN_DIRECTIONS: Final = PLAN_TESTS + 2 * PLAN_TEST_SIZE
 """Place of the number of directions in which what is held may be off."""
 ONBOARD_PLAN_SIZE: Final = PLAN_DIRECTIONS + 1
 """Of a monitor's plan with these rules, an identity and the tests behind it, in open loop first. In
-a library the plant's constants a deviation off in each direction follow, PLANT_FIELDS numbers each.
+a library the plant's constants a deviation off in each direction follow, PLANT_FIELDS numbers each;
+with a range of exponents, then those with which it is identified.
 """
 verdict_rules_of = unpacker(VerdictRules, MONITOR_PLAN_SIZE)
 

@@ -7,12 +7,13 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from ehadiag.compile.elementary import logarithm, normal_cdf
+from ehadiag.compile.elementary import exponential, logarithm, normal_cdf
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
 from ehadiag.core.criteria import ESTIMATION, NORMAL_HALF_WIDTH_95
 from ehadiag.identify.linearisation import DIFFERENCES
 from ehadiag.model.plant import PLANT_FIELDS
+from ehadiag.model.severities import FAULT_CHANGES
 from ehadiag.model.simd_layout import ROWS
 from ehadiag.monitor.monitor_memory import (
     MODEL,
@@ -42,6 +43,7 @@ from ehadiag.onboard.onboard_recording import (
     EARLIER,
     LAST,
     OUTLIERS,
+    REST,
     SAMPLES,
     SQUARES,
     channel_sums_at,
@@ -55,15 +57,19 @@ from ehadiag.onboard.onboard_refinement import (
 from ehadiag.onboard.onboard_search import (
     FDJ,
     FSS,
+    KINTAS,
     PLAN_PRESSURE_WEIGHT,
     PLAN_SPOOL_WEIGHT,
     SEARCH,
     clear_histograms,
     count_residual,
     fitted_lines,
+    identified_constants,
     loosen_anchor,
     parameters_at,
+    second_difference,
     set_density,
+    shown_excess,
     shown_noise,
     start_model_by,
 )
@@ -129,14 +135,25 @@ def square_at(address: int, place: int) -> Array:
 
 @bare_kernel
 def write_verdict(address: int, plan: Array) -> int:
-    """Write the verdict, see `ehadiag.assess.verdict.judge`; numbers of none are not believed."""
+    """Write the verdict, see `ehadiag.assess.verdict.judge`; numbers of none are not believed.
+
+    The deviations get what laws of the faults and a range of exponents do to them.
+    """
     p, rules = array_at(address, (ONBOARD.end,)), verdict_rules_of(plan)
     o = outcome_of(p)
-    above, at_limit, hidden, blind = 0.0, False, False, False
+    above, at_limit, hidden = 0.0, False, False
+    for i in range(ONBOARD_GENES):
+        hidden = hidden or not p[ONBOARD_GENES + i] < rules.most_std
+    _doubt_laws(p, channel_sums_at(address), rules)
+    friction, blind = CERTAIN, False
+    if rules.exponents > 0.0:
+        friction = _over_exponents(p, rules)
+        blind = friction == LIKELY_FAULT
     for i in range(ONBOARD_GENES):
         std = p[ONBOARD_GENES + i]
-        hidden = hidden or not std < rules.most_std
-        at_limit = at_limit or onboard_chance_above(p[i], std, rules.limit) >= rules.fault_chance
+        if i != FSS or friction == CERTAIN:
+            chance = onboard_chance_above(p[i], std, rules.limit)
+            at_limit = at_limit or chance >= rules.fault_chance
         above += onboard_chance_above(p[i], std, rules.advisory)
         low, high = p[i] - NORMAL_HALF_WIDTH_95 * std, p[i] + NORMAL_HALF_WIDTH_95 * std
         blind = blind or (low < rules.advisory and high > rules.limit)
@@ -151,6 +168,51 @@ def write_verdict(address: int, plan: Array) -> int:
         return refuse_verdict(address, reasons)
     p[ONBOARD_VERDICT] = 20.0 if at_limit else (10.0 if above > rules.false_healthy else 0.0)
     return 0
+
+
+CERTAIN, UNLIKELY_FAULT, LIKELY_FAULT = range(3)
+"""Whether friction is a fault: the same with each exponent; with fewer than half of them; not."""
+
+
+@inlined_exact
+def _doubt_laws(p: Array, sums: Array, rules: VerdictRules) -> None:
+    """Widen the deviations, see `ehadiag.identify.prior.UnitPrior.discrepancy_covariance`."""
+    excess = max(shown_excess(p, 0, sums[0, REST]), shown_excess(p, 1, sums[1, REST]), 1.0)
+    more = 1.0 + math.sqrt(excess - 1.0)
+    clogging, friction = p[KINTAS], p[FSS]
+    for i in range(ONBOARD_GENES):
+        doubt = rules.law_Kintas * math.sqrt(clogging * clogging + friction * friction)
+        if i == FSS:
+            doubt = rules.law_FSS * friction
+        elif i == FDJ:
+            doubt = rules.law_FDJ * p[FDJ]
+        if doubt != 0.0:
+            std = p[ONBOARD_GENES + i]
+            p[ONBOARD_GENES + i] = math.sqrt(std * std + more * doubt * more * doubt)
+
+
+@inlined_exact
+def _over_exponents(p: Array, rules: VerdictRules) -> int:
+    """Write the friction of all exponents, see `ehadiag.identify.estimates.over_exponents`.
+
+    Returns whether it is a fault.
+    """
+    new = rules.friction_new / (1.0 - rules.friction_new)
+    least = min(max(p[FSS], 0.0), 1.0)
+    shown, half = least + new, NORMAL_HALF_WIDTH_95 * p[ONBOARD_GENES + FSS]
+    share = logarithm(1.0 + FAULT_CHANGES[KINTAS] * p[KINTAS])
+    ratio = exponential(-rules.exponents * share)
+    middle = min(shown * exponential(-0.5 * rules.exponents * share) - new, 1.0)
+    most = min(shown * ratio - new, 1.0)
+    bottom, top = least - half, min(most + half * ratio, max(least + half, 1.0))
+    p[FSS], p[ONBOARD_GENES + FSS] = (
+        (bottom + top) / 2.0, (top - bottom) / 2.0 / NORMAL_HALF_WIDTH_95
+    )  # fmt: skip
+    std, wider = p[ONBOARD_GENES + KINTAS], rules.first_stage * most
+    p[ONBOARD_GENES + KINTAS] = math.sqrt(std * std + wider * wider)
+    if least >= rules.limit or most < rules.limit:
+        return CERTAIN
+    return LIKELY_FAULT if middle >= rules.limit else UNLIKELY_FAULT
 
 
 ESTIMATES: Final = OnboardOutcome._fields.index("verdict")
@@ -219,8 +281,12 @@ larger than those."""
 ATTEMPTS = 1.0 + len(SEARCH.stds)
 """Searches that there are, 1: the first approximation, then the genetic ones."""
 ANCHORED_PLACE = ONBOARD.monitors + MODEL.state + ROWS.anchor_count
-USED_SQUARES, USED = ONBOARD.sums, ONBOARD.sums + 1
-"""Sums of the last pass: squares of residuals that the deviations go by, and how many they are."""
+USED_SQUARES, USED, UNEXPLAINED, UNEXPLAINED_SQUARES, _, LAWS, _ = range(
+    ONBOARD.sums, ONBOARD.sums + 7
+)
+"""Sums of the last pass: squares of residuals that the deviations go by, and how many they are;
+residuals beyond three deviations of noise and of the faults' laws, and of spool and pressure capped
+squares in such deviations and the latest variance by the laws."""
 
 
 @bare_kernel
@@ -238,7 +304,7 @@ def start_conclusion(address: int, plan_address: int, plan: Array) -> None:
 def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
     """Add a tick, to which the models are advanced, to what judges an optimum."""
     p, sums = array_at(address, (ONBOARD.end,)), channel_sums_at(address)
-    normal = square_at(address, ONBOARD.normal)
+    rules, normal = verdict_rules_of(plan), square_at(address, ONBOARD.normal)
     shift = parameters_at(address, ONBOARD.normal + MATRIX_SIZE)
     slope = parameters_at(address, ONBOARD.slope)
     along = array_at(address + BYTES_PER_NUMBER * ONBOARD.along, (ONBOARD_GENES, 3))
@@ -252,11 +318,22 @@ def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
     for c in range(2):
         raw = p[ONBOARD.monitors + MONITOR.residual + c]
         count_residual(p, c, raw, sums[c, LAST], sums[c, EARLIER])
+        sums[c, REST] += second_difference(raw, sums[c, LAST], sums[c, EARLIER])
         sums[c, EARLIER], sums[c, LAST] = sums[c, LAST], raw
         if not math.isfinite(raw) or not math.isfinite(ticks[k, 2 + c]):
             continue
         _, scatter = fitted_lines(p, c, along, slope)
         r = raw / p[ONBOARD.noise + c]
+        if r * r < ESTIMATION.residual_cap and scatter < ESTIMATION.max_row_scatter:
+            p[LAWS + c] = (
+                (rules.law_Kintas * p[ONBOARD.point + KINTAS] * slope[KINTAS]) ** 2
+                + (rules.law_FSS * (p[ONBOARD.point + FSS] - rules.friction_new) * slope[FSS]) ** 2
+                + (rules.law_FDJ * p[ONBOARD.point + FDJ] * slope[FDJ]) ** 2
+            )
+        share = r * r / (1.0 + p[LAWS + c])
+        p[UNEXPLAINED_SQUARES + c] += min(share, ESTIMATION.residual_cap)
+        if share >= ESTIMATION.residual_cap:
+            p[UNEXPLAINED] += 1.0
         sums[c, SQUARES] += min(r * r, ESTIMATION.residual_cap)
         sums[c, SAMPLES] += 1.0
         if r * r >= ESTIMATION.residual_cap:
@@ -362,9 +439,9 @@ def end_conclusion(address: int, plan: Array) -> float:
         OnboardOutcome(
             point[0], point[1], point[2], 0.0, 0.0, 0.0,
             point[3] / plan[PLAN_SPOOL_WEIGHT], point[4] / plan[PLAN_PRESSURE_WEIGHT],
-            0.0, 0.0, cost, samples, outliers / max(samples, 1.0),
-            math.sqrt(sums[0, SQUARES] / max(sums[0, SAMPLES], 1.0)),
-            math.sqrt(sums[1, SQUARES] / max(sums[1, SAMPLES], 1.0)),
+            0.0, 0.0, cost, samples, p[UNEXPLAINED] / max(samples, 1.0),
+            math.sqrt(p[UNEXPLAINED_SQUARES] / max(sums[0, SAMPLES], 1.0)),
+            math.sqrt(p[UNEXPLAINED_SQUARES + 1] / max(sums[1, SAMPLES], 1.0)),
             p[ONBOARD_RUNS], p[PROGRESS.settled],
         ),
     )  # fmt: skip
@@ -388,7 +465,7 @@ def start_directions(address: int, plan_address: int, plan: Array, done: int) ->
     for lane in range(ONBOARD_MODELS):
         for i in range(ONBOARD_PARAMETERS):
             trial[i] = p[ONBOARD.point + i]
-        constants = plan_address
+        constants = identified_constants(plan_address, plan)
         if 0 < lane <= ONBOARD_GENES:
             i = lane - 1
             width = min(math.sqrt(ROUNDS.width * p[ONBOARD.believed + i]), MAX_STEP)
@@ -396,7 +473,8 @@ def start_directions(address: int, plan_address: int, plan: Array, done: int) ->
             trial[i] += step[i]
         direction = done * DIRECTIONS_OF_PASS + lane - 1 - ONBOARD_GENES
         if lane > ONBOARD_GENES and direction < direction_count(plan):
-            constants += BYTES_PER_NUMBER * (ONBOARD_PLAN_SIZE + direction * PLANT_FIELDS)
+            behind = ONBOARD_PLAN_SIZE + direction * PLANT_FIELDS
+            constants = plan_address + BYTES_PER_NUMBER * behind
             for i in range(ONBOARD_PARAMETERS):
                 p[ONBOARD.considered + direction * ONBOARD_PARAMETERS + i] = 0.0
         start_model_by(address, constants, plan_address, plan, lane, trial)
@@ -432,8 +510,12 @@ def add_directions(address: int, plan: Array, done: int) -> None:
 @bare_kernel
 def write_result(address: int, plan: Array) -> None:
     """Write deviations and verdict."""
-    p = array_at(address, (ONBOARD.end,))
+    p, new = array_at(address, (ONBOARD.end,)), verdict_rules_of(plan).friction_new
     write_deviations(
         address, plan, direction_count(plan), p[USED_SQUARES] / max(p[USED] - ONBOARD_PARAMETERS, 1)
+    )
+    p[FSS], p[ONBOARD_GENES + FSS] = (
+        (p[FSS] - new) / (1.0 - new),
+        p[ONBOARD_GENES + FSS] / (1.0 - new),
     )
     write_verdict(address, plan)

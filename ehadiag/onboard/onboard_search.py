@@ -12,11 +12,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from ehadiag.compile.elementary import logarithm
 from ehadiag.compile.jit import Array, bare_kernel, inlined_exact, merged
 from ehadiag.compile.vector import BYTES_PER_NUMBER, array_at
-from ehadiag.core.criteria import ESTIMATION, REFINEMENT
+from ehadiag.core.criteria import ESTIMATION, FIT, REFINEMENT
 from ehadiag.identify.compact_ga import CompactGaState, draw_generation, update_state
 from ehadiag.identify.staged_search import SEARCH_STAGES
+from ehadiag.model.plant import PLANT_FIELDS
 from ehadiag.model.sensors import read_pressure
 from ehadiag.model.simd_jack import drive_jacks
 from ehadiag.model.simd_layout import BLOCK, ROWS, block_part, sensor_law_of_lane
@@ -38,8 +40,11 @@ from ehadiag.onboard.onboard_memory import (
     ONBOARD_GENES,
     ONBOARD_MODELS,
     ONBOARD_PARAMETERS,
+    ONBOARD_PLAN_SIZE,
+    PLAN_DIRECTIONS,
     UNIT_PRESSURE_OFFSET,
     UNIT_SPOOL_OFFSET,
+    verdict_rules_of,
 )
 
 PLAN_SPOOL_WEIGHT = MONITOR_PLAN_SETTINGS + MonitorSettings._fields.index("spool_weight")
@@ -97,6 +102,8 @@ class OnboardSearchRules(NamedTuple):
     """Standard deviation of the severities at convergence, 1."""
     cap: float = SEARCH_STAGES.spool_cap
     """Largest square of one residual, in variances, where the model runs free."""
+    noise_cost: float = FIT.expected_cauchy_cost
+    """Mean of Cauchy's cost of noise, 1."""
 
 
 SEARCH = OnboardSearchRules()
@@ -124,7 +131,17 @@ def monitor_at(address: int, lane: int) -> int:
 @inlined_exact
 def start_model(address: int, plan_address: int, plan: Array, lane: int, point: Array) -> int:
     """Prepare a model at a point."""
-    return int(start_model_by(address, plan_address, plan_address, plan, lane, point))
+    constants = identified_constants(plan_address, plan)
+    return int(start_model_by(address, constants, plan_address, plan, lane, point))
+
+
+@inlined_exact
+def identified_constants(plan_address: int, plan: Array) -> int:
+    """Address of the constants that a recording is identified with."""
+    if not verdict_rules_of(plan).exponents > 0.0:
+        return plan_address
+    behind = ONBOARD_PLAN_SIZE + int(plan[PLAN_DIRECTIONS]) * PLANT_FIELDS
+    return plan_address + BYTES_PER_NUMBER * behind
 
 
 @bare_kernel
@@ -263,6 +280,13 @@ def count_residual(p: Array, channel: int, now: float, before: float, earlier: f
 
 
 @inlined_exact
+def second_difference(now: float, before: float, earlier: float) -> float:
+    """Second difference of a residual as a histogram counts it; 0 of one that it does not count."""
+    second = abs(now - 2.0 * before + earlier)
+    return min(second, ROOT_OF_SIX * SEARCH.histogram_range) if math.isfinite(second) else 0.0
+
+
+@inlined_exact
 def shown_noise(p: Array, channel: int) -> float:
     """Noise that the second differences show, of which the largest 2 % are left out."""
     total, seen, mean = 0.0, 0.0, 0.0
@@ -281,6 +305,29 @@ def shown_noise(p: Array, channel: int) -> float:
             )
             seen += taken
     return max(mean / (seen * ESTIMATION.noise_kept_mean * ROOT_OF_SIX), SEARCH.min_noise)
+
+
+@inlined_exact
+def shown_excess(p: Array, channel: int, seconds: float) -> float:
+    """Cost of the residuals over that of noise, see `ehadiag.identify.estimates.excess_cost`.
+
+    seconds: sum of their second differences, see `second_difference`: where a converter's steps
+    make them lie beside the middles of their bins, the histogram's noise is off by a few percent.
+    """
+    total, cost, binned = 0.0, 0.0, 0.0
+    width = 2.0 * SEARCH.histogram_range / HISTOGRAM_BINS
+    for i in range(HISTOGRAM_BINS):
+        binned += p[ONBOARD.histograms + (2 + channel) * HISTOGRAM_BINS + i] * (i + 0.5)
+    binned *= ROOT_OF_SIX * SEARCH.histogram_range / HISTOGRAM_BINS
+    scale = ESTIMATION.cauchy_scale * shown_noise(p, channel) * seconds / max(binned, 1.0)
+    if not scale > 0.0:
+        return 1.0
+    for i in range(HISTOGRAM_BINS):
+        share = ((i + 0.5) * width - SEARCH.histogram_range) / scale
+        samples = p[ONBOARD.histograms + channel * HISTOGRAM_BINS + i]
+        total += samples
+        cost += samples * logarithm(1.0 + share * share)
+    return ESTIMATION.cauchy_scale**2 / SEARCH.noise_cost * cost / max(total, 1.0)
 
 
 @inlined_exact

@@ -424,10 +424,19 @@ def print_score(test: StoredTest, score: Score, console: Console) -> None:
     for bound in score.bounds:
         table.add_row(
             " ".join(f"{value:g}" for value in bound.severities),
-            *(f"{100.0 * value:.4f}" for value in (*bound.std, *bound.alone)),
+            *(f"{100.0 * value:.4f}" for value in (*bound.total, *bound.alone)),
             ", ".join(f"{a} from {b} ({r:+.2f})" for a, b, r in bound.alike) or "-",
         )
     console.print(table, crop=False)
+    laws = [max(bound.laws[k] for bound in score.bounds) for k in range(len(FAULTS))]
+    if any(laws):
+        parts = ", ".join(
+            f"{item.name} {100.0 * value:.2f} %" for item, value in zip(FAULTS, laws, strict=True)
+        )
+        console.print(
+            f"  of it by doubt about the faults' laws ([discrepancy], clogging_exponent), whatever"
+            f" the test: up to {parts}; the mean is without it"
+        )
     unseen = sorted({name for bound in score.bounds for name in bound.unseen})
     if unseen:
         console.print(f"  not shown by the test: {', '.join(unseen)}")
@@ -454,7 +463,8 @@ def _bound_tree(bound: Bound) -> dict[str, Any]:
     names = [item.name for item in FAULTS]
     return {
         "severities": dict(zip(names, bound.severities, strict=True)),
-        "std": dict(zip(names, bound.std.tolist(), strict=True)),
+        "std": dict(zip(names, bound.total.tolist(), strict=True)),
+        "std_by_laws": dict(zip(names, bound.laws.tolist(), strict=True)),
         "std_alone": dict(zip(names, bound.alone.tolist(), strict=True)),
         "hardly_told_apart": [
             {"severity": a, "from": b, "correlation": r} for a, b, r in bound.alike

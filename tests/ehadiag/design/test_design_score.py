@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ehadiag import default_actuator, load_test
-from ehadiag.core.actuator import with_tolerance
+from ehadiag.core.actuator import Discrepancy, with_tolerance
 from ehadiag.design.score import (
     PENALTY_BEYOND_LIMITS,
     MotionLimits,
@@ -114,3 +114,20 @@ def test_limits_that_no_test_keeps_give_none():
     tiny = MotionLimits(travel=1e-6, rate=1e-6, pressure=1.0, duration=5.5)
     assert propose(resolve_test("open"), ACTUATOR, tiny, budget=13) is None
     assert tiny.excess(1.0, 1.0, 1.0, 1.0) * PENALTY_BEYOND_LIMITS > PENALTY_BEYOND_LIMITS
+
+
+def test_doubt_about_the_faults_laws_is_in_the_bound():
+    """With an exponent of clogging from 0 to 2 a diagnosis states friction to some 0.3."""
+    worn, test = [(0.6, 0.6, 0.6)], resolve_test("open")
+    exact = score(test, ACTUATOR, worn).bounds[0]
+    assert not exact.laws.any()
+    assert exact.total.tolist() == exact.std.tolist()
+    valve = msgspec.structs.replace(ACTUATOR.servovalve, clogging_exponent=(0.0, 2.0))
+    ranged = msgspec.structs.replace(ACTUATOR, servovalve=valve)
+    for actuator, sizes in (
+        (msgspec.structs.replace(ACTUATOR, discrepancy=Discrepancy()), (0.0085, 0.018, 0.006)),
+        (ranged, (0.0197, 0.183, 0.0)),
+    ):
+        bound = score(test, actuator, worn).bounds[0]
+        assert bound.laws == pytest.approx(sizes, rel=0.03)
+        assert (bound.total >= bound.laws).all()

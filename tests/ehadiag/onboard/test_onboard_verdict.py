@@ -17,13 +17,16 @@ from msgspec.structs import replace
 from places import LOGS
 
 from ehadiag import Verdict, bundled_tests, default_actuator
+from ehadiag import simulate as simulate_test
 from ehadiag.assess import acceptance, verdict
 from ehadiag.assess.diagnosis import diagnose
+from ehadiag.core.actuator import Discrepancy
 from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
 from ehadiag.core.criteria import ESTIMATION, FIT
 from ehadiag.export.library import exported_unit, library_plan
+from ehadiag.identify.estimates import FIRST_STAGE_STD, friction_range
 from ehadiag.identify.identification_session import NuisanceMode
-from ehadiag.model.plant import relative_viscosity
+from ehadiag.model.plant import plant_constants, relative_viscosity
 from ehadiag.monitor.plan import design_cusum
 from ehadiag.onboard import onboard_optimum
 from ehadiag.onboard.onboard_memory import (
@@ -43,6 +46,7 @@ from firmware_iface.logs.reader import read_recording
 from firmware_iface.recording import CHANNELS
 
 LEVELS = verdict.Levels()
+TESTS = bundled_tests().values()
 ACTUATOR = default_actuator()
 PLAN = library_plan(ACTUATOR, design_cusum(FALSE_ALARM_INTERVAL_H, 1e-3))
 EDGE = 1e-5
@@ -51,18 +55,18 @@ NOT_TESTED = 30.0
 NAMES = ("Kintas", "FSS", "FDJ")
 
 
-def on_board(values, stds, outliers=0.0, rms=1.0):
+def on_board(values, stds, outliers=0.0, rms=1.0, plan=PLAN):
     """Outcome of an identification that has come to these estimates."""
     memory = np.zeros(ONBOARD.end)
     known = OnboardOutcome(*values, *stds, *(0.0,) * 11)._replace(
         samples=1000.0, outliers=outliers, spool_rms=rms, pressure_rms=1.0
     )
     memory[: len(known)] = known
-    assert onboard_optimum.write_verdict(memory.ctypes.data, PLAN) == 0
+    assert onboard_optimum.write_verdict(memory.ctypes.data, plan) == 0
     return OnboardOutcome(*memory[: len(known)].tolist())
 
 
-def judged(values, stds):
+def judged(values, stds, frictions=()):
     """The same by the rule of the package."""
     estimates = [
         SimpleNamespace(
@@ -71,7 +75,13 @@ def judged(values, stds):
         for name, value, std in zip(NAMES, values, stds, strict=True)
     ]
     return verdict.judge(
-        SimpleNamespace(estimates=estimates, nuisances={}, frictions=()),
+        SimpleNamespace(
+            estimates=estimates,
+            nuisances={},
+            frictions=frictions,
+            exponent_doubted=False,
+            named=lambda name: estimates[NAMES.index(name)],
+        ),
         LEVELS,
     )[0], estimates
 
@@ -118,6 +128,41 @@ def test_the_verdict_is_that_of_the_package(values, stds):
     assert found.verdict == float(expected)
 
 
+def of_exponent(exponent, **others):
+    """The reference unit with an exponent of clogging."""
+    valve = replace(ACTUATOR.servovalve, clogging_exponent=exponent)
+    return replace(ACTUATOR, servovalve=valve, **others)
+
+
+RANGE = library_plan(of_exponent((0.0, 2.0)), design_cusum(100.0, 1e-3))
+
+
+@given(
+    st.tuples(*(st.floats(0.0, 1.0),) * 3),
+    st.tuples(*(st.floats(-4.0, -1.5).map(lambda power: 10.0**power),) * 3),
+)
+def test_a_range_of_exponents_does_what_it_does_in_the_package(values, stds):
+    friction = friction_range(
+        dict(zip(NAMES, values, strict=True)), stds[1], plant_constants(ACTUATOR), (0.0, 2.0),
+        with_exponent=2.0,
+    )  # fmt: skip
+    wider = math.hypot(stds[0], FIRST_STAGE_STD * friction.frictions[-1])
+    expected, estimates = judged(
+        (values[0], friction.value, values[2]), (wider, friction.std, stds[2]), friction.frictions
+    )
+    above = [verdict.chance_above(item, LEVELS.advisory) for item in estimates]
+    limits = [verdict.chance_above(item, LEVELS.limit) for item in estimates]
+    assume(abs(sum(above) - verdict.VERDICT.max_chance_false_healthy) > EDGE)
+    assume(all(abs(chance - verdict.VERDICT.min_chance_fault) > EDGE for chance in limits))
+    assume(np.abs(np.array(friction.frictions) - LEVELS.limit).min() > EDGE)
+    found = on_board(values, stds, plan=RANGE)
+    assert found.verdict == float(expected)
+    if found.verdict != NOT_TESTED:
+        assert found[:6] == pytest.approx(
+            [item.value for item in estimates] + [item.std for item in estimates], rel=1e-9
+        )
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"outliers": acceptance.FIT.max_outlier_share + 1e-3}, {"outliers": math.nan},
@@ -135,6 +180,44 @@ def test_a_severity_that_the_test_does_not_show_is_not_tested():
     found = on_board((0.1, 0.1, 0.5), (0.01, 0.01, 0.11))
     assert (found.verdict, found.reasons) == (NOT_TESTED, REASONS.hidden)
     assert math.isnan(found.FDJ)
+
+
+FILES = {
+    of_plant: [of_exponent(exponent, discrepancy=Discrepancy()) for exponent in stated]
+    for of_plant, stated in ((0.0, [(0.0, 2.0)]), (2.0, [2.0, (0.0, 2.0)]))
+}
+"""Files that are right of a plant by its exponent: what a file states that states nothing."""
+
+
+APART = [(seed, FILES[2.0][0]) for seed in (11, 19)]
+"""Recordings of which the package's search ends beside the optimum, half a deviation and more from
+the library's, which holds the truth."""
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(k, marks=[] if k in (2, 3) else pytest.mark.slow) for k in range(1, 21)]
+)
+def test_doubt_about_the_faults_laws_is_that_of_the_package(seed):
+    """Intervals and verdict of the library, whatever exponent the plant has."""
+    severities = dict(zip(NAMES, np.random.default_rng(seed).uniform(0.0, 0.6, 3), strict=True))
+    exponent, test = 2.0 * (seed % 2), ("open", "closed")[seed // 2 % 2]
+    recording = simulate_test(test, actuator=of_exponent(exponent), seed=seed, **severities)
+    for actuator in FILES[exponent]:
+        if (seed, actuator) in APART:
+            continue
+        host = diagnose([recording], actuator, TESTS, nuisances=NuisanceMode.NONE)
+        plan = library_plan(actuator, design_cusum(FALSE_ALARM_INTERVAL_H, 1e-3))
+        code, memory = run(surrounded(recording), ticks_of(recording), 1e9, plan)
+        assert code == 0
+        found = OnboardOutcome(*memory[: len(OnboardOutcome._fields)].tolist())
+        assert found.verdict == float(host.verdict)
+        if found.verdict == NOT_TESTED:
+            continue
+        for k, item in enumerate(host.identification.estimates):
+            value, std = found[k], found[ONBOARD_GENES + k]
+            near = max(0.1 * item.std, 1e-3)
+            assert [value, std] == pytest.approx([item.value, item.std], abs=near)
+            assert abs(value - severities[item.name]) < 3.0 * std
 
 
 @pytest.mark.parametrize("oil", [-60.0, -20.0, 0.0, 40.0, 85.3, 100.0, 200.0])
@@ -204,9 +287,9 @@ def carried(ticks, supply=2e7):
     return bool(memory[PROGRESS.phase] == PHASES.grids)
 
 
-def run(unit, ticks, work):
+def run(unit, ticks, work, plan=PLAN):
     """Code of the first slice of an identification on board, and its memory."""
-    memory, start = np.zeros(ONBOARD.end), exported_unit(unit, PLAN)
+    memory, start = np.zeros(ONBOARD.end), exported_unit(unit, plan)
     ticks, amounts = np.ascontiguousarray(ticks), np.array([len(ticks), work])
     begin = host_library().function("eha_identify_begin", 2)
     assert begin(memory.ctypes.data, start.ctypes.data) == 0
@@ -240,7 +323,7 @@ def test_without_half_the_supply_nothing_is_judged(share, carries):
 @pytest.mark.parametrize("name", DAMAGES)
 def test_what_the_host_does_not_test_the_board_does_not_either(name):
     recording = damaged(DAMAGES[name])
-    found = diagnose([recording], ACTUATOR, bundled_tests().values(), nuisances=NuisanceMode.NONE)
+    found = diagnose([recording], ACTUATOR, TESTS, nuisances=NuisanceMode.NONE)
     assert found.verdict is Verdict.NOT_TESTED
     code, memory = run(surrounded(recording), ticks_of(recording), 1e9)
     assert code == 0
