@@ -209,7 +209,7 @@ def estimate_about(
                 density, valley = _search_valley(fine, search, before, rng)
                 residuals = fine.many(density.x[None, :])[0]
                 creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
-                has_event = _has_event(residuals, creeps.any(axis=0))
+                has_event = _has_event(residuals, creeps)
                 if not (has_event and settings.explains(np.where(creeps, 0.0, residuals))):
                     break
             judged = items
@@ -219,11 +219,15 @@ def estimate_about(
     )
     profile = _profile_covariance(fine, refined) if settings.require_agreement else 0.0
     refined = refined_with_day(fine, refined, linear)
+    ambiguous = _is_hysteresis_small(refined, judged)
+    if along_valley:
+        # What a break-away at a wrong tick leaves, other optima explain as well.
+        ambiguous = _has_event(refined.residuals, refined.weighted)
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
         covariance=covariance
-        + (0.0 if along_valley else _ambiguity_covariance(refined, judged))
+        + independent_covariance(refined.parameters, AMBIGUOUS_STDS if ambiguous else {})
         + profile
         + valley * np.outer(model.scale, model.scale),
         explained=settings.explains(refined.residuals),
@@ -257,16 +261,15 @@ def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
     return np.asarray(extra * np.outer(refined.scale, refined.scale))
 
 
-def _ambiguity_covariance(refined: Refinement, experiments: Sequence[Experiment]) -> Array:
-    """Covariance of equivalent optima where hysteresis is small, SI, shape (k, k)."""
+def _is_hysteresis_small(refined: Refinement, experiments: Sequence[Experiment]) -> bool:
+    """Whether hysteresis is so small in closed loop that the noise breaks the spool away."""
     values = refined.values
-    alike = (
+    return (
         HYSTERESIS_NAME in values
         and all(item.test.closed_loop for item in experiments)
         and values[HYSTERESIS_NAME] + experiments[0].constants.HYS
         < GIVE_UP.min_unambiguous_hysteresis
     )
-    return independent_covariance(refined.parameters, AMBIGUOUS_STDS if alike else {})
 
 
 def _with_judged_noise(experiments: Sequence[Experiment], residuals: Array) -> list[Experiment]:
@@ -342,10 +345,14 @@ def _block_costs(residuals: Array) -> tuple[Array, Array]:
     return costs, np.maximum(costs - usual, 0.0)
 
 
-def _has_event(residuals: Array, ticks: NDArray[np.bool_]) -> bool:
-    """Whether residuals, shape (signals, N), show a break-away at a wrong tick among some ticks."""
+def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
+    """Whether residuals show a break-away at a wrong tick where they count.
+
+    residuals, counted: shape (signals, N).
+    """
     over = _block_costs(residuals)[1]
-    among = ticks[: len(over) * VALLEY.block].reshape(len(over), -1).any(axis=1)
+    ticks = counted.any(axis=0)[: len(over) * VALLEY.block]
+    among = ticks.reshape(len(over), -1).any(axis=1)
     return bool(over[among].max(initial=0.0) > VALLEY.event_cost)
 
 
