@@ -206,7 +206,12 @@ def estimate_about(
             for items in (whole, judged):
                 evaluations += fine.evaluations
                 fine = model_of(items)
-                density, valley = _search_valley(fine, search, before, rng)
+
+                def cost(points: Array, fine: Derivatives = fine) -> Array:
+                    off = points - prior.x
+                    return _event_cost(fine.many(points)) + ((off @ information) * off).sum(axis=1)
+
+                density, valley = _search_valley(fine, partial(search, fine), before, cost, rng)
                 residuals = fine.many(density.x[None, :])[0]
                 creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
                 has_event = _has_event(residuals, creeps)
@@ -221,8 +226,10 @@ def estimate_about(
     refined = refined_with_day(fine, refined, linear)
     ambiguous = _is_hysteresis_small(refined, judged)
     if along_valley:
-        # What a break-away at a wrong tick leaves, other optima explain as well.
-        ambiguous = _has_event(refined.residuals, refined.weighted)
+        # What a first start explains, and all of it, other optima do not.
+        ambiguous = (ambiguous and found.starts > 1) or _has_event(
+            refined.residuals, refined.weighted
+        )
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
@@ -298,6 +305,7 @@ def _search_valley(
     fine: Derivatives,
     search: PosteriorSearch,
     there: ParameterDensity,
+    cost: Callable[[Array], Array],
     rng: np.random.Generator,
 ) -> tuple[ParameterDensity, Array]:
     """Search from the best of points far along the valley in closed loop.
@@ -305,6 +313,8 @@ def _search_valley(
     Friction, hysteresis and backlash trade along it. Break-aways divide it into basins, of which
     several starts may find the same wrong one. Returns the best end, and the covariance of all that
     explain the recording as well, in units of the model's scales, shape (k, k).
+
+    cost: of points, shape (n,) for points of shape (n, k).
     """
     directions, widths, _ = np.linalg.svd(there.root)
     ends = [there]
@@ -314,11 +324,11 @@ def _search_valley(
         shifts = rng.standard_normal((VALLEY.points, len(widths))) * reach
         points[:, fine.curved] += shifts @ directions.T
         points = np.clip(points, fine.lower, fine.upper)
-        best = points[np.argmin(_event_cost(fine.many(points)))]
+        best = points[np.argmin(cost(points))]
         begin = ParameterDensity(best, FINAL_SPREAD_RATIO * there.root)
-        ends.append(search(fine, begin=begin).density)
+        ends.append(search(begin=begin).density)
     places = np.array([item.x for item in ends])
-    costs = _event_cost(fine.many(places))
+    costs = cost(places)
     best = int(np.argmin(costs))
     weights = np.exp(-0.5 * (costs - costs[best]) / VALLEY.unit)
     shifts = places - places[best]
@@ -351,7 +361,7 @@ def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
     residuals, counted: shape (signals, N).
     """
     over = _block_costs(residuals)[1]
-    ticks = counted.any(axis=0)[: len(over) * VALLEY.block]
+    ticks = np.asarray(counted.any(axis=0))[: len(over) * VALLEY.block]
     among = ticks.reshape(len(over), -1).any(axis=1)
     return bool(over[among].max(initial=0.0) > VALLEY.event_cost)
 
