@@ -168,6 +168,11 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         slow = slow_ticks(self.position, self.channels.position, slip_speed * self.tick)
         return replace(self, pressure=np.where(slow, np.nan, self.pressure))
 
+    @property
+    def creeps(self) -> bool:
+        """Whether the noise of the position moves the spool before the command does."""
+        return self.test.closed_loop and not self.rested and self.constants.OIL == 0.0
+
     def without_creep(self) -> Experiment:
         """Return the same, in closed loop without what comes after a hold and before the motion.
 
@@ -176,7 +181,7 @@ class Experiment(msgspec.Struct, frozen=True, eq=False):
         model errs, which hysteresis and a friction far off would explain. With oil in the second
         stage nothing is left out: what rings on from then leads the search.
         """
-        if not self.test.closed_loop or self.rested or self.constants.OIL > 0.0:
+        if not self.creeps:
             return self
         end = _ticks_before_motion(self.test) + round(REST.creep_s * self.test.rate)
         creeps = (np.arange(self.ticks) < end) & np.isfinite(self.pressure)

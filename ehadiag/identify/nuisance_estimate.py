@@ -9,6 +9,7 @@ from functools import partial
 import msgspec
 import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from ehadiag.compile.jit import Array
 from ehadiag.core.actuator import MAX_CLOGGING_EXPONENT
@@ -59,7 +60,12 @@ from ehadiag.identify.posterior import (
     no_interruption,
     search_posterior,
 )
-from ehadiag.identify.prior import UnitPrior, density_about, prior_density, prior_information
+from ehadiag.identify.prior import (
+    UnitPrior,
+    density_about,
+    prior_density,
+    prior_information,
+)
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter
@@ -79,19 +85,17 @@ class ValleyRules(msgspec.Struct, frozen=True):
 
     directions: int = 2
     """Directions of widest spread, 1: friction, hysteresis and backlash trade at one sum."""
-    ratios: tuple[float, ...] = (5.0, 10.0)
-    """Spreads of the points along them, over that of the density, 1: right basins were 12 to 20
-    deviations away, of which the density's width is two."""
-    points: int = 160
-    """Points of each spread, 1: ten blocks of runs."""
+    ratios: tuple[float, ...] = (1.0, 5.0, 10.0)
+    """Spreads of the points along them, over that of the density, 1: what was left out is explained
+    within the first; right basins were 12 to 20 deviations away, of which its width is two."""
+    points: int = 96
+    """Points of each spread, 1: six blocks of runs."""
     block: int = 25
     """Ticks of a block, 1: a break-away at a wrong tick is made good after some."""
     event_cost: float = 30.0
     """Cost of a block beyond the usual from which on it counts by its logarithm."""
     unit: float = 10.0
     """Difference of the cost that is one variance, 1: what the model errs about break-aways."""
-    starts: int = 2
-    """Searches from the best of them, 1: of 12 pairs on such a unit 10 found the right basin."""
 
 
 VALLEY = ValleyRules()
@@ -135,9 +139,22 @@ def estimate_nuisances(
 
     considered: parameters that are held, with a tolerance that counts in the interval.
     """
-    return estimate_about(
-        experiments, settings, search_in_stages(experiments, settings), considered
-    )
+    staged = search_in_stages(_searched(experiments, settings), settings)
+    return estimate_about(experiments, settings, staged, considered)
+
+
+def _searched(
+    experiments: Sequence[Experiment], settings: NuisanceSearchSettings
+) -> Sequence[Experiment]:
+    """Experiments as they are searched."""
+    if not settings.leave_creep_out:
+        return experiments
+    return [item.without_creep() for item in experiments]
+
+
+def _is_near(residuals: Array) -> bool:
+    """Whether so little is left that it may be of break-aways at wrong ticks."""
+    return residual_outlier_share(residuals) <= GIVE_UP.third_start_outliers[1]
 
 
 def estimate_about(
@@ -148,55 +165,86 @@ def estimate_about(
 ) -> NuisanceEstimate:
     """Estimate parameters about the end of a search, see `estimate_nuisances`."""
     model, found = staged.model, staged.found
-    judged = _with_judged_noise(experiments, found.residuals)
+    judged = _with_judged_noise(_searched(experiments, settings), found.residuals)
     held = [item.parameter for item in considered]
-    fine = noise_scaled_model(
-        free_run_model(judged, (*settings.free, *held), staged.levels), judged, considered
-    )
+
+    def model_of(items: Sequence[Experiment]) -> Derivatives:
+        free_run = free_run_model(items, (*settings.free, *held), staged.levels)
+        return noise_scaled_model(free_run, items, considered)
+
+    fine = model_of(judged)
     priors = settings.priors, settings.joint
     prior, information = prior_density(fine, *priors), prior_information(fine, *priors)
     density = ParameterDensity(found.density.x * model.scale / fine.scale, found.density.root)
-    valley = np.zeros((len(fine.scale), len(fine.scale)))
-    given_up = not found.explained and is_unexplainable(found.residuals, found.starts)
+    covariance = optima_covariance(found, model.scale)
+    valley = np.zeros_like(covariance)
+    evaluations = staged.evaluations
+    alone = all(item.test.closed_loop and item.constants.OIL == 0.0 for item in judged)
+    along_valley = alone and settings.joint is None
+    given_up = not found.explained and (
+        is_unexplainable(found.residuals, found.starts)
+        or (along_valley and not _is_near(found.residuals))
+    )
     if not (settings.give_up and given_up):
         rng = np.random.default_rng([settings.seed, -1 % 2**32])
         progress = settings.progress
         search = partial(
             search_posterior,
-            fine,
-            prior,
+            prior=prior,
             information=information,
             linearise=partial(linearised_by_regression, rng=rng),
             schedule=FINAL_SCHEDULE,
             between=no_interruption if progress is None else partial(progress, 1.0),
         )
-        if settings.require_agreement and not found.confirmed:
-            # A break-away may stand between the end of the search and the optimum.
-            density = _search_about(
-                fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain
-            )
-        density = _search_about(fine, search, density, FINAL_SPREAD_RATIO * density.root)
-        alone = all(item.test.closed_loop and item.constants.OIL == 0.0 for item in judged)
-        if settings.joint is None and alone:
-            density, valley = _search_valley(fine, search, density, rng)
+        if not along_valley:
+            if settings.require_agreement and not found.confirmed:
+                # A break-away may stand between the end of the search and the optimum.
+                density = _search_about(
+                    fine, search, density, staged.restart_root, GIVE_UP.min_other_end_gain
+                )
+            density = _search_about(fine, search, density, FINAL_SPREAD_RATIO * density.root)
+        else:
+            late, before = fine, density
+            whole = [a.with_noise(b.noise) for a, b in zip(experiments, judged, strict=True)]
+            for items in (whole, judged):
+                evaluations += fine.evaluations
+                fine = model_of(items)
+
+                def cost(points: Array, fine: Derivatives = fine) -> Array:
+                    off = points - prior.x
+                    return _event_cost(fine.many(points)) + ((off @ information) * off).sum(axis=1)
+
+                density, valley = _search_valley(fine, partial(search, fine), before, cost, rng)
+                residuals = fine.many(density.x[None, :])[0]
+                creeps = (residuals != 0.0) & (late.model.batch.weight == 0.0)
+                has_event = _has_event(residuals, creeps)
+                if not (has_event and settings.explains(np.where(creeps, 0.0, residuals))):
+                    break
+            judged = items
     linear = linearised_by_regression(fine, density, np.random.default_rng(settings.seed))
     refined = refinement_at(
         fine, density.x, linear, settled=found.explained, information=information
     )
     profile = _profile_covariance(fine, refined) if settings.require_agreement else 0.0
     refined = refined_with_day(fine, refined, linear)
+    ambiguous = _is_hysteresis_small(refined, judged)
+    if along_valley:
+        # What a first start explains, and all of it, other optima do not.
+        ambiguous = (ambiguous and found.starts > 1) or _has_event(
+            refined.residuals, refined.weighted
+        )
     return NuisanceEstimate(
         refined=refined,
         experiments=judged,
-        covariance=optima_covariance(found, model.scale)
-        + _ambiguity_covariance(refined, judged)
+        covariance=covariance
+        + independent_covariance(refined.parameters, AMBIGUOUS_STDS if ambiguous else {})
         + profile
         + valley * np.outer(model.scale, model.scale),
         explained=settings.explains(refined.residuals),
         confirmed=found.confirmed,
         excess=excess_cost(refined.residuals),
         starts=found.starts,
-        evaluations=staged.evaluations + fine.evaluations,
+        evaluations=evaluations + fine.evaluations,
     )
 
 
@@ -223,16 +271,15 @@ def _profile_covariance(model: Derivatives, refined: Refinement) -> Array:
     return np.asarray(extra * np.outer(refined.scale, refined.scale))
 
 
-def _ambiguity_covariance(refined: Refinement, experiments: Sequence[Experiment]) -> Array:
-    """Covariance of equivalent optima where hysteresis is small, SI, shape (k, k)."""
+def _is_hysteresis_small(refined: Refinement, experiments: Sequence[Experiment]) -> bool:
+    """Whether hysteresis is so small in closed loop that the noise breaks the spool away."""
     values = refined.values
-    alike = (
+    return (
         HYSTERESIS_NAME in values
         and all(item.test.closed_loop for item in experiments)
         and values[HYSTERESIS_NAME] + experiments[0].constants.HYS
         < GIVE_UP.min_unambiguous_hysteresis
     )
-    return independent_covariance(refined.parameters, AMBIGUOUS_STDS if alike else {})
 
 
 def _with_judged_noise(experiments: Sequence[Experiment], residuals: Array) -> list[Experiment]:
@@ -252,7 +299,7 @@ def _search_about(
 
     root: of the covariance over which it searches.
     """
-    seen = search(begin=ParameterDensity(there.x, root)).density
+    seen = search(fine, begin=ParameterDensity(there.x, root)).density
     costs = cauchy_cost(fine.many(np.vstack([there.x, seen.x])))
     return seen if costs[0] - costs[1] > least_gain else there
 
@@ -261,6 +308,7 @@ def _search_valley(
     fine: Derivatives,
     search: PosteriorSearch,
     there: ParameterDensity,
+    cost: Callable[[Array], Array],
     rng: np.random.Generator,
 ) -> tuple[ParameterDensity, Array]:
     """Search from the best of points far along the valley in closed loop.
@@ -268,6 +316,8 @@ def _search_valley(
     Friction, hysteresis and backlash trade along it. Break-aways divide it into basins, of which
     several starts may find the same wrong one. Returns the best end, and the covariance of all that
     explain the recording as well, in units of the model's scales, shape (k, k).
+
+    cost: of points, shape (n,) for points of shape (n, k).
     """
     directions, widths, _ = np.linalg.svd(there.root)
     ends = [there]
@@ -277,11 +327,11 @@ def _search_valley(
         shifts = rng.standard_normal((VALLEY.points, len(widths))) * reach
         points[:, fine.curved] += shifts @ directions.T
         points = np.clip(points, fine.lower, fine.upper)
-        for place in np.argsort(_event_cost(fine.many(points)))[: VALLEY.starts]:
-            begin = ParameterDensity(points[place], FINAL_SPREAD_RATIO * there.root)
-            ends.append(search(begin=begin).density)
+        best = points[np.argmin(cost(points))]
+        begin = ParameterDensity(best, FINAL_SPREAD_RATIO * there.root)
+        ends.append(search(begin=begin).density)
     places = np.array([item.x for item in ends])
-    costs = _event_cost(fine.many(places))
+    costs = cost(places)
     best = int(np.argmin(costs))
     weights = np.exp(-0.5 * (costs - costs[best]) / VALLEY.unit)
     shifts = places - places[best]
@@ -293,13 +343,30 @@ def _event_cost(residuals: Array) -> Array:
 
     A break-away at a wrong tick costs a block of ticks, which counts by its logarithm.
     """
+    costs, over = _block_costs(residuals)
+    capped = costs - over + VALLEY.event_cost * np.log1p(over / VALLEY.event_cost)
+    return np.asarray(capped.sum(axis=-1))
+
+
+def _block_costs(residuals: Array) -> tuple[Array, Array]:
+    """Cost of each block of residuals, shape (…, signals, N), and what it is over the usual one:
+    shape (…, blocks)."""
     count = residuals.shape[-1] // VALLEY.block * VALLEY.block
     blocks = residuals[..., :count].reshape(*residuals.shape[:-1], -1, VALLEY.block)
     costs = cauchy_costs(blocks).sum(axis=(-3, -1))
     usual = np.median(costs, axis=-1, keepdims=True)
-    over = np.maximum(costs - usual, 0.0)
-    capped = np.minimum(costs, usual) + VALLEY.event_cost * np.log1p(over / VALLEY.event_cost)
-    return np.asarray(capped.sum(axis=-1))
+    return costs, np.maximum(costs - usual, 0.0)
+
+
+def _has_event(residuals: Array, counted: NDArray[np.bool_]) -> bool:
+    """Whether residuals show a break-away at a wrong tick where they count.
+
+    residuals, counted: shape (signals, N).
+    """
+    over = _block_costs(residuals)[1]
+    ticks = np.asarray(counted.any(axis=0))[: len(over) * VALLEY.block]
+    among = ticks.reshape(len(over), -1).any(axis=1)
+    return bool(over[among].max(initial=0.0) > VALLEY.event_cost)
 
 
 def optima_covariance(found: MultistartResult, scale: Array) -> Array:
@@ -369,18 +436,16 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         alone.
         """
         calibrated = self.prior.joint is not None
-        whole, experiments = experiments, [item.without_creep() for item in experiments]
         if calibrated and any(item.slip_speed() > 0.0 for item in experiments):
             return self._of_oil(experiments, hint, before)
         found = self._with(experiments, self.prior, hint, before)
         if not found.explained and any(item.origin_read for item in experiments):
             found = self._from_origin(experiments, found, hint, before)
-        shortened = any(one is not other for one, other in zip(whole, experiments, strict=True))
-        if not found.explained and shortened:
-            most = GIVE_UP.third_start_outliers[1]
-            if residual_outlier_share(found.refined.residuals) <= most:
-                # What creeps leads a search, though it may end it in a wrong place.
-                found = _better_of(found, self._with(whole, self.prior, hint, before))
+        creeps = not found.explained and any(item.creeps for item in experiments)
+        if creeps and _is_near(found.refined.residuals):
+            # What creeps leads a search, though it may end it in a wrong place.
+            with_creep = self._with(experiments, self.prior, hint, before, leave_creep_out=False)
+            found = _better_of(found, with_creep)
         if found.explained:
             return found
         if not self.prior.has_inexact_data:
@@ -529,8 +594,11 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         before: float = float("inf"),
         further: tuple[Parameter, ...] = (),
         budget: int = NUISANCE_RUN_BUDGET,
+        *,
+        leave_creep_out: bool = True,
     ) -> NuisanceEstimate:
         settings, considered = self._search(experiments, prior, hint, before, further, budget)
+        settings = replace(settings, leave_creep_out=leave_creep_out)
         return estimate_nuisances(experiments, settings, considered)
 
     def _search(

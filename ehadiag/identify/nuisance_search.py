@@ -248,6 +248,9 @@ class NuisanceSearchSettings(msgspec.Struct, frozen=True, eq=False):
     """Whether residuals leave no better optimum to search for."""
     require_agreement: bool = False
     """See `multistart_search`."""
+    leave_creep_out: bool = False
+    """Whether to search without what comes before a closed loop's motion, and take it back where
+    that leaves no break-away at a wrong tick."""
 
 
 class StagedSearchResult(msgspec.Struct, frozen=True, eq=False):
