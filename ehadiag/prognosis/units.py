@@ -51,10 +51,10 @@ class Prognosis(msgspec.Struct, frozen=True):
     now: str
     """Begin of the day that it was made: UTC, ISO 8601; the same digits all day."""
     usage_now: float | None = None
-    """Hours or cycles by now, which times left are counted from: told, else by the use a day; None:
-    not known, they are counted from the last diagnosis."""
-    usage_told: bool = False
-    """Whether it was told."""
+    """Hours or cycles by now, which times left are counted from: stated, else by the use a day;
+    None: not known, they are counted from the last diagnosis."""
+    usage_stated: bool = False
+    """Whether the caller stated `usage_now`."""
     last_test: str | None = None
     """Date of the last dated test; None without any."""
     usage_before: float = 0.0
@@ -160,7 +160,7 @@ def prognosis_of(
     Raises
     ------
     ConfigurationError
-        It is told to be used less today than at its last diagnosis, or in another unit of usage.
+        It is used less today than at its last diagnosis, or in another unit of usage.
     """
     counted = counted_entries(entries)
     own = [i for i in counted if i.serial == serial and actuator in (None, i.actuator)]
@@ -180,10 +180,10 @@ def prognosis_of(
     used = [item for item in same if usage_of(item, unit) is not None]
     rate, dated = _use_a_day(used, unit)
     last_at = max((usage_of(item, unit) or 0.0 for item in used), default=0.0)
-    told = _told(today, unit, last_at - before)
+    stated = _stated_usage(today, unit, last_at - before)
     at = None
-    if told is not None:
-        at = before + told
+    if stated is not None:
+        at = before + stated
     elif rate and dated:
         at = max(last_at, dated[1] + rate * max(days_of(now) - dated[0], 0.0))
     forecasts, none = [], np.empty(0)
@@ -201,20 +201,20 @@ def prognosis_of(
         forecasts.append(severity_forecast(name, unit, present, fleet, levels, seed, elapsed))
     return Prognosis(
         serial, kind[0], unit, len(own), len(used), tuple(levels), tuple(forecasts), seed,
-        rate, now, None if at is None else at - before, told is not None,
+        rate, now, None if at is None else at - before, stated is not None,
         max((item.tested for item in used if item.tested), default=None), before,
     )  # fmt: skip
 
 
-def _told(today: Usage | None, unit: str, least: float) -> float | None:
-    """Hours or cycles of today that were told; ConfigurationError where they cannot be."""
+def _stated_usage(today: Usage | None, unit: str, least: float) -> float | None:
+    """Stated hours or cycles of today; ConfigurationError where they cannot be."""
     if today is None or not today.known:
         return None
-    if (told := today.amount(unit) if unit != "days" else None) is None:
-        raise ConfigurationError(f"usage of today: not told in {unit}, those of the answer")
-    if told < least:
-        raise ConfigurationError(f"{unit} {told:g}: were {least:g} at the last diagnosis already")
-    return told
+    if (stated := today.amount(unit) if unit != "days" else None) is None:
+        raise ConfigurationError(f"usage of today: not stated in {unit}, those of the answer")
+    if stated < least:
+        raise ConfigurationError(f"{unit} {stated:g}: were {least:g} at the last diagnosis already")
+    return stated
 
 
 def _use_a_day(

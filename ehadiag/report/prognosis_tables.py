@@ -108,7 +108,7 @@ def _usage_text(prognosis: Prognosis) -> str:
     """Usage that the times left are counted from, in short."""
     if prognosis.unit == "days":
         return "-"
-    if prognosis.usage_told:
+    if prognosis.usage_stated:
         return f"{prognosis.usage_now:g} {prognosis.unit}"
     if prognosis.usage_now is not None:
         return f"about {_rounded(prognosis.usage_now)} {prognosis.unit}"
@@ -124,7 +124,7 @@ def counted_from(prognosis: Prognosis) -> str:
         return f"from the {test}; the usage since then is not known"
     if prognosis.unit == "days":
         return "from now"
-    if prognosis.usage_told:
+    if prognosis.usage_stated:
         return f"from now, {_usage_text(prognosis)}"
     rate = f"{_rounded(prognosis.per_day or 0.0)} {prognosis.unit} a day"
     return f"from now, {_usage_text(prognosis)} by {rate} since the {test}"
@@ -232,7 +232,7 @@ def prognosis_tree(
         "per_day": prognosis.per_day,
         "today": prognosis.now[:10],
         "usage_now": prognosis.usage_now,
-        "usage_told": prognosis.usage_told,
+        "usage_stated": prognosis.usage_stated,
         "last_test": prognosis.last_test,
         "before": before and before[0],
         "chance_before": None if ahead is None else prognosis.chance_within(ahead),

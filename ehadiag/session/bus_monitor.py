@@ -122,9 +122,9 @@ class BusMonitor:
         """Number of ticks since the beginning, lost ones too."""
         self.pushed = 0
         """Number of ticks with a spool position after the monitor had settled."""
-        self.told = 0
+        self.environment_count = 0
         """Number of messages with oil or supply."""
-        self.disbelieved = 0
+        self.environment_left_out = 0
         """Number of those in which two senders are seen: the file's values hold in their place."""
         self.alarms = 0
         """Number of alarms, without repeated ones."""
@@ -145,7 +145,7 @@ class BusMonitor:
     @property
     def conflicts(self) -> int:
         """Counter values with different payloads, and frames of an environment in conflict."""
-        return self._live.conflicts + self.disbelieved
+        return self._live.conflicts + self.environment_left_out
 
     @property
     def mode(self) -> CommandMode:
@@ -262,9 +262,9 @@ class BusMonitor:
         key = (frame.can_id, frame.extended)
         message, watch = self._environment[key], self._environment_watches[key]
         count = counter_key(message, message.counter, frame.data)
-        self.told += 1
+        self.environment_count += 1
         if watch.take(frame.time_ns, count[0] if count else None, frame.data, values):
-            self.disbelieved += 1
+            self.environment_left_out += 1
             self._environment_values.clear()
             self._averaged.clear()
             return

@@ -66,7 +66,7 @@ class MonitorSummary(msgspec.Struct, frozen=True):
     """Why the bus failed; empty where it did not."""
     begun: str | None = None
     """Time of the first frame, UTC, ISO 8601; None: not known."""
-    disbelieved: float = 0.0
+    environment_left_out: float = 0.0
     """Share of the messages with oil or supply that were left out for a second sender, 1."""
     enough: bool = False
     """Whether `least_monitored` of the ticks were monitored."""
@@ -252,8 +252,8 @@ class MonitorSession:
             lost=watcher.lost,
             breaks=watcher.breaks,
             conflicts=watcher.conflicts,
-            told=watcher.told,
-            disbelieved=watcher.disbelieved,
+            environment_messages=watcher.environment_count,
+            environment_left_out=watcher.environment_left_out,
             frames=self._traffic.frames,
             dropped=source.overflow,
             bus_lost=self._bus_lost or None,
@@ -270,7 +270,7 @@ class MonitorSession:
         count, newest = self._alarms
         return MonitorSummary(
             newest, count, watcher.repeated, watcher.ticks, watcher.pushed, watcher.lost,
-            self._bus_lost, self._begun, self._disbelieved, self._enough,
+            self._bus_lost, self._begun, self._environment_left_out, self._enough,
         )  # fmt: skip
 
     def _begin_at(self, time_ns: int) -> None:
@@ -278,9 +278,9 @@ class MonitorSession:
             self._begun = date_text(time_ns) if self._of_log else utc_now_text()
 
     @property
-    def _disbelieved(self) -> float:
+    def _environment_left_out(self) -> float:
         """Share of the messages with oil or supply that were left out, 1."""
-        return self.watcher.disbelieved / max(self.watcher.told, 1)
+        return self.watcher.environment_left_out / max(self.watcher.environment_count, 1)
 
     @property
     def _share(self) -> float:
@@ -354,10 +354,10 @@ class MonitorSession:
     def _ending(self) -> Ending:
         watcher = self.watcher
         reasons = [self._bus_lost] if self._bus_lost else []
-        if watcher.disbelieved:
+        if watcher.environment_left_out:
             reasons.append(
-                f"{self._disbelieved:.0%} of the messages with oil and supply left out for a second"
-                " sender: the values of the actuator's file hold"
+                f"{self._environment_left_out:.0%} of the messages with oil and supply left out"
+                " for a second sender: the values of the actuator's file hold"
             )
         if watcher.alarms:
             reasons.append(f"{watcher.alarms} alarms: the unit is not as it was")

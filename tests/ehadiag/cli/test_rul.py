@@ -124,7 +124,7 @@ def test_a_date_is_a_time_at_the_units_own_use(
         (("--unit", "1", "--before", "1e300"), "--before 1e300: need 0 … 1e+09"),
         (("--all", "--before", "soon"), "--before soon: need a date"),
         (("--unit", "1", "--hours", "100"), "hours 100: were 2000 at the last diagnosis"),
-        (("--unit", "1", "--cycles", "5"), "not told in hours"),
+        (("--unit", "1", "--cycles", "5"), "not stated in hours"),
         (("--all", "--actuator", "foo"), "--actuator foo: there is other, reference-31"),
         (("--all", "--hours", "3"), "of one unit"),
     ],

@@ -167,10 +167,10 @@ def test_a_monitor_says_what_it_did_not_believe(tmp_path: Path) -> None:
         outlets=AlarmOutlets(AlarmLog(tmp_path / "a.jsonl")),
         snapshots=snapshots.append,
     )
-    assert 0.5 < found.disbelieved < 1.0
+    assert 0.5 < found.environment_left_out < 1.0
     end = json.loads((tmp_path / "a.jsonl").read_text().splitlines()[-1])
-    assert end["disbelieved"] / end["told"] == found.disbelieved
-    said = f"{found.disbelieved:.0%} of the messages with oil and supply left out"
+    assert end["environment_left_out"] / end["environment_messages"] == found.environment_left_out
+    said = f"{found.environment_left_out:.0%} of the messages with oil and supply left out"
     assert any(said in reason for reason in snapshots[-1].ending.reasons)
 
 
