@@ -32,11 +32,11 @@ def _exported(name, place, ticks):
     return _export(name, place / f"{name}-{ticks}", ticks)
 
 
-def _export(name, out, ticks=0):
+def _export(name, out, ticks=0, actuator=None):
     out.mkdir()
     tests = [short_test(ticks)] if ticks else None
     with Folder.at(out, RESULT_MODE) as folder:
-        export_library(default_actuator(), find_target(name), folder, tests=tests)
+        export_library(actuator or default_actuator(), find_target(name), folder, tests=tests)
     return out
 
 
@@ -100,8 +100,9 @@ class Loaded:
 
 
 @cache
-def host_library():
-    """The export for this computer, of the reference actuator."""
+def host_library(actuator=None):
+    """The export for this computer, of an actuator; None: the reference."""
     with TemporaryDirectory() as place:
-        code = (_export("host", Path(place, "host")) / "libeha.a").read_bytes()
+        out = _export("host", Path(place, "host"), actuator=actuator)
+        code = (out / "libeha.a").read_bytes()
     return Loaded(object_of(code))
