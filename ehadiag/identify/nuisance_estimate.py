@@ -529,8 +529,9 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         since it stands in for what that law leaves out. Where neither end leaves half of what the
         other one does, the recording shows `FSS / k^m` alone (PHY-45): 0 is not believed then,
         which a file says that does not say anything. Where the model explains the unit to the
-        noise, as new and now, 0 is believed if the recording is likelier with it, or if the other
-        end's friction is within the law's discrepancy: a file may say that its laws are exact.
+        noise, as new and now, 0 is believed if the recording is likelier with it than with the
+        middle (one search may end beside the optimum) and the other end, or if the other end's
+        friction is within the law's discrepancy: a file may say that its laws are exact.
         """
         low, stated = self.prior.exponents
         before, own = (
@@ -549,20 +550,29 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             shows = False
         if low < stated or not shows:
             return None, False
+        if to_noise:
+            middle = MAX_CLOGGING_EXPONENT / 2.0
+            return None, any(self._is_likely(experiments, found, m) for m in (middle, other))
         others = [item.with_exponent(other, self.prior.bridge) for item in experiments]
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
-        settings = self.one_start(others, hint)
-        if to_noise:
-            there = estimate_nuisances(others, settings).refined.residuals
-            excesses = signal_excess_costs(found.refined.residuals)
-            more = likelihood_ratio_cost(there, excesses)
-            return None, more < 2.0 * math.log(FIT.min_likelihood_ratio)
-        residuals = search_in_stages(others, settings).found.residuals
+        residuals = search_in_stages(others, self.one_start(others, hint)).found.residuals
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
         least = min(own, before)
         if least > FIT.max_explained_excess and explains_far_more(left, least):
             return other, False
         return None, stated == 0.0 and not explains_far_more(before, left)
+
+    def _is_likely(
+        self, experiments: Sequence[Experiment], found: NuisanceEstimate, exponent: float
+    ) -> bool:
+        """Whether another exponent than the stated 0 is not ten times less likely."""
+        values, excesses = found.refined.values, signal_excess_costs(found.refined.residuals)
+        friction = friction_by_exponent(values, experiments[0].constants, exponent)
+        others = [item.with_exponent(exponent, self.prior.bridge) for item in experiments]
+        hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
+        there = estimate_nuisances(others, self.one_start(others, hint)).refined.residuals
+        more = likelihood_ratio_cost(there, excesses)
+        return more < 2.0 * math.log(FIT.min_likelihood_ratio)
 
     def one_start(
         self, experiments: Sequence[Experiment], hint: Mapping[str, float]
