@@ -145,14 +145,13 @@ def explains_far_more(excess: float, before: float) -> bool:
     return excess - 1.0 < GIVE_UP.max_changed_share * (before - 1.0)
 
 
-def likelihood_ratio_cost(residuals: Array, excesses: Sequence[float]) -> float:
-    """Twice the logarithm of how much likelier other residuals of the same samples are, by Cauchy's
-    cost over that of noise.
-
-    residuals: shape (signals, N); excesses: those of the others, of each signal.
+def likelihood_ratio_cost(residuals: Array, others: Array) -> float:
+    """Twice the logarithm of how much likelier other residuals are, by Cauchy's cost over that of
+    noise, on the samples that count in both; shape (signals, N).
     """
-    counts = np.count_nonzero(residuals, axis=1)
-    return float(np.dot(np.subtract(signal_excess_costs(residuals), excesses), counts))
+    both = (residuals != 0.0) & (others != 0.0)
+    ours, theirs = (signal_excess_costs(np.where(both, rows, 0.0)) for rows in (residuals, others))
+    return float(np.dot(np.subtract(ours, theirs), both.sum(axis=1)))
 
 
 def is_noise(residuals: Array) -> bool:
@@ -266,7 +265,7 @@ def identification_result(
         evaluations=evaluations,
         generations=found.generations,
         cost=refined.cost,
-        excesses=tuple(signal_excess_costs(refined.residuals)),
+        residuals=refined.residuals,
         converged=refined.converged,
         attempts=attempts,
         timing=timing,

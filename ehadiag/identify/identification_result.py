@@ -92,8 +92,8 @@ class Identification(msgspec.Struct, frozen=True, eq=False):
     """Runs of the model in all stages."""
     generations: int
     cost: float
-    excesses: tuple[float, ...]
-    """Cost of each signal's residuals over that of noise, 1: spool, pressure."""
+    residuals: Array
+    """Over the noise, 0 where no sample counts, shape (signals, N)."""
     converged: bool
     attempts: int
     """Searches that it took; more than one where the first did not explain the recording."""

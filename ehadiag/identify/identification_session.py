@@ -36,11 +36,7 @@ from ehadiag.identify.estimates import (
 from ehadiag.identify.experiment import Experiment, build_experiment, lay_out_spans, share_offsets
 from ehadiag.identify.identification_result import Identification, IdentificationTiming
 from ehadiag.identify.least_squares import Refinement
-from ehadiag.identify.nuisance_estimate import (
-    NuisanceEstimate,
-    NuisanceEstimator,
-    estimate_nuisances,
-)
+from ehadiag.identify.nuisance_estimate import NuisanceEstimate, NuisanceEstimator
 from ehadiag.identify.partial_refinement import (
     FirstPart,
     StartResiduals,
@@ -76,7 +72,7 @@ from ehadiag.identify.staged_search import (
     staged_search,
 )
 from ehadiag.model.plant import PlantConstants
-from ehadiag.model.registry import FAULTS, parameter
+from ehadiag.model.registry import FAULTS
 from ehadiag.model.residual_models import model_response
 from firmware_iface.recording import CommandMode, Environment, Samples
 from firmware_iface.stored_test import Line, SearchWindows, StoredTest
@@ -202,7 +198,7 @@ class IdentificationSession:
         experiments: Sequence[Experiment],
         progress: StageProgress,
     ) -> Identification:
-        """Return an identification with its exponent of 0 tested by one of the middle exponent.
+        """Return an identification with its exponent of 0 tested by the middle and the largest one.
 
         `FSS / k^m` is what a recording shows (PHY-45): a valve with m > 0 is explained nearly as
         well with 0, and its friction is beyond the interval. Not tested: a file that states the law
@@ -224,41 +220,23 @@ class IdentificationSession:
             or (prior.joint is not None and any(item.slip_speed() > 0.0 for item in experiments))
         ):
             return found
-        others = [item.with_exponent(middle, prior.bridge) for item in experiments]
-        values = {**found.values, FRICTION_NAME: min(max(other, 0.0), 1.0)}
-        residuals = min(self._residuals_about(others, found, values, progress), key=excess_cost)
-        before, excess = max(found.excesses), excess_cost(residuals)
+        mode = self.nuisances if found.freed else NuisanceMode.NONE
+        before, excesses, ratios = excess_cost(found.residuals), {}, []
+        for exponent in (middle, MAX_CLOGGING_EXPONENT):
+            of_other = replace(prior, exponents=(exponent, exponent))
+            session = IdentificationSession(self.solver, self.seed, mode, of_other)
+            others = [item.with_exponent(exponent, prior.bridge) for item in experiments]
+            there = session.finish(others, progress).residuals
+            excesses[exponent] = excess_cost(there)
+            ratios.append(likelihood_ratio_cost(there, found.residuals))
+        better = min(excesses, key=lambda exponent: excesses[exponent])
         if before > FIT.max_explained_excess:
-            if explains_far_more(excess, before):
-                return replace(found, better_exponent=middle)
-            return replace(found, exponent_doubted=not explains_far_more(before, excess))
-        more = likelihood_ratio_cost(residuals, found.excesses)
-        return replace(found, exponent_doubted=more < 2.0 * math.log(FIT.min_likelihood_ratio))
-
-    def _residuals_about(
-        self,
-        experiments: Sequence[Experiment],
-        found: Identification,
-        values: Mapping[str, float],
-        progress: StageProgress,
-    ) -> Iterator[Array]:
-        """Residuals of a search of the severities, and of one with what an identification freed.
-
-        values: about which, by name.
-        """
-        start = np.array([values[item.name] for item in FAULTS])
-        searched = staged_search(
-            self._stages(experiments, start, partial(progress, "search")), progress
-        )
-        yield refined_attempt(
-            experiments, searched, searched.best, self._first_part
-        ).refined.residuals
-        if found.freed:
-            free = tuple(parameter(name) for name in found.freed)
-            freeing = NuisanceEstimator(self.prior, free, partial(progress, "nuisances"))
-            resting = [item.without_creep() for item in experiments]
-            settings = freeing.one_start(resting, values)
-            yield estimate_nuisances(resting, settings).refined.residuals
+            if explains_far_more(excesses[better], before):
+                return replace(found, better_exponent=better)
+            borne_out = explains_far_more(before, excesses[better])
+            return replace(found, exponent_doubted=not borne_out)
+        doubted = min(ratios) < 2.0 * math.log(FIT.min_likelihood_ratio)
+        return replace(found, exponent_doubted=doubted)
 
     def _over_exponents(self, found: Identification, constants: PlantConstants) -> Identification:
         """Return an identification with the friction of all exponents that may be."""

@@ -555,7 +555,7 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
             return None, any(self._is_likely(experiments, found, m) for m in (middle, other))
         others = [item.with_exponent(other, self.prior.bridge) for item in experiments]
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
-        residuals = search_in_stages(others, self.one_start(others, hint)).found.residuals
+        residuals = search_in_stages(others, self._one_start(others, hint)).found.residuals
         left = float(signal_excess_costs(residuals)[SPOOL_ROW])
         least = min(own, before)
         if least > FIT.max_explained_excess and explains_far_more(left, least):
@@ -566,15 +566,15 @@ class NuisanceEstimator(msgspec.Struct, frozen=True):
         self, experiments: Sequence[Experiment], found: NuisanceEstimate, exponent: float
     ) -> bool:
         """Whether another exponent than the stated 0 is not ten times less likely."""
-        values, excesses = found.refined.values, signal_excess_costs(found.refined.residuals)
+        values = found.refined.values
         friction = friction_by_exponent(values, experiments[0].constants, exponent)
         others = [item.with_exponent(exponent, self.prior.bridge) for item in experiments]
         hint = {**values, FRICTION_NAME: min(max(friction, 0.0), 1.0)}
-        there = estimate_nuisances(others, self.one_start(others, hint)).refined.residuals
-        more = likelihood_ratio_cost(there, excesses)
+        there = estimate_nuisances(others, self._one_start(others, hint)).refined.residuals
+        more = likelihood_ratio_cost(there, found.refined.residuals)
         return more < 2.0 * math.log(FIT.min_likelihood_ratio)
 
-    def one_start(
+    def _one_start(
         self, experiments: Sequence[Experiment], hint: Mapping[str, float]
     ) -> NuisanceSearchSettings:
         """Settings of one start from values, by name, with what may have changed since a

@@ -21,7 +21,6 @@ from ehadiag.identify.estimates import (
     interval95,
     likelihood_ratio_cost,
     over_exponents,
-    signal_excess_costs,
 )
 from ehadiag.identify.identification_result import (
     Estimate,
@@ -75,7 +74,7 @@ def identified(*values):
         evaluations=1,
         generations=1,
         cost=1.0,
-        excesses=(1.0, 1.0),
+        residuals=np.ones((2, 1)),
         converged=True,
         attempts=1,
         timing=IdentificationTiming(0.0, 0.0, 0.0),
@@ -244,9 +243,9 @@ def test_evidence_counts_each_signal_by_its_own_samples() -> None:
     rng = np.random.default_rng(0)
     residuals = rng.standard_normal((2, 4000))
     worse = residuals * np.array([[1.0], [1.2]])
-    whole = likelihood_ratio_cost(worse, signal_excess_costs(residuals))
+    whole = likelihood_ratio_cost(worse, residuals)
     residuals[1, 2000:] = worse[1, 2000:] = 0.0
-    half = likelihood_ratio_cost(worse, signal_excess_costs(residuals))
+    half = likelihood_ratio_cost(worse, residuals)
     assert half == pytest.approx(0.5 * whole, rel=0.2, abs=1.0)
 
 
