@@ -58,6 +58,7 @@ from ehadiag.onboard.onboard_search import (
     FDJ,
     FSS,
     KINTAS,
+    LARGEST_SECOND_DIFFERENCE,
     PLAN_PRESSURE_WEIGHT,
     PLAN_SPOOL_WEIGHT,
     SEARCH,
@@ -67,7 +68,6 @@ from ehadiag.onboard.onboard_search import (
     identified_constants,
     loosen_anchor,
     parameters_at,
-    second_difference,
     set_density,
     shown_excess,
     shown_noise,
@@ -318,7 +318,9 @@ def add_evidence(address: int, plan: Array, ticks: Array, k: int) -> None:
     for c in range(2):
         raw = p[ONBOARD.monitors + MONITOR.residual + c]
         count_residual(p, c, raw, sums[c, LAST], sums[c, EARLIER])
-        sums[c, REST] += second_difference(raw, sums[c, LAST], sums[c, EARLIER])
+        second = abs(raw - 2.0 * sums[c, LAST] + sums[c, EARLIER])
+        if math.isfinite(second):
+            sums[c, REST] += min(second, LARGEST_SECOND_DIFFERENCE)
         sums[c, EARLIER], sums[c, LAST] = sums[c, LAST], raw
         if not math.isfinite(raw) or not math.isfinite(ticks[k, 2 + c]):
             continue

@@ -259,6 +259,10 @@ def clear_histograms(p: Array) -> None:
         p[ONBOARD.histograms + i] = 0.0
 
 
+LARGEST_SECOND_DIFFERENCE: Final = ROOT_OF_SIX * SEARCH.histogram_range
+"""Largest second difference of residuals that a histogram holds, in units of the plan's noise."""
+
+
 @inlined_exact
 def count_residual(p: Array, channel: int, now: float, before: float, earlier: float) -> None:
     """Count a residual and its second difference, in units of the plan's noise; NaN counts not."""
@@ -273,17 +277,8 @@ def count_residual(p: Array, channel: int, now: float, before: float, earlier: f
         p[ONBOARD.histograms + channel * HISTOGRAM_BINS + int(place)] += 1.0
     second = abs(now - 2.0 * before + earlier)
     if math.isfinite(second):
-        place = min(
-            second * (HISTOGRAM_BINS / (ROOT_OF_SIX * SEARCH.histogram_range)), HISTOGRAM_BINS - 1.0
-        )
+        place = min(second * (HISTOGRAM_BINS / LARGEST_SECOND_DIFFERENCE), HISTOGRAM_BINS - 1.0)
         p[ONBOARD.histograms + (2 + channel) * HISTOGRAM_BINS + int(place)] += 1.0
-
-
-@inlined_exact
-def second_difference(now: float, before: float, earlier: float) -> float:
-    """Second difference of a residual as a histogram counts it; 0 of one that it does not count."""
-    second = abs(now - 2.0 * before + earlier)
-    return min(second, ROOT_OF_SIX * SEARCH.histogram_range) if math.isfinite(second) else 0.0
 
 
 @inlined_exact
@@ -311,7 +306,7 @@ def shown_noise(p: Array, channel: int) -> float:
 def shown_excess(p: Array, channel: int, seconds: float) -> float:
     """Cost of the residuals over that of noise, see `ehadiag.identify.estimates.excess_cost`.
 
-    seconds: sum of their second differences, see `second_difference`: where a converter's steps
+    seconds: sum of their second differences, capped as in the histogram: where a converter's steps
     make them lie beside the middles of their bins, the histogram's noise is off by a few percent.
     """
     total, cost, binned = 0.0, 0.0, 0.0

@@ -428,7 +428,7 @@ def print_score(test: StoredTest, score: Score, console: Console) -> None:
             ", ".join(f"{a} from {b} ({r:+.2f})" for a, b, r in bound.alike) or "-",
         )
     console.print(table, crop=False)
-    laws = [max(bound.laws[k] for bound in score.bounds) for k in range(len(FAULTS))]
+    laws = [max((bound.laws[k] for bound in score.bounds), default=0.0) for k in range(len(FAULTS))]
     if any(laws):
         parts = ", ".join(
             f"{item.name} {100.0 * value:.2f} %" for item, value in zip(FAULTS, laws, strict=True)
