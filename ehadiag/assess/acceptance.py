@@ -11,7 +11,7 @@ from ehadiag.assess.lost_samples import objection_to_lost_positions
 from ehadiag.assess.plausibility import objections_to_readings
 from ehadiag.core.actuator import WEAR_EXCESS_FACTOR, Actuator, Calibration
 from ehadiag.core.conversion import conversion_of
-from ehadiag.core.criteria import FIT, RECORDING
+from ehadiag.core.criteria import FIT, READINGS, RECORDING
 from ehadiag.identify.experiment import Experiment
 from ehadiag.identify.identification_result import Fit, Identification
 from ehadiag.identify.prior import has_further_effects
@@ -189,6 +189,12 @@ def objections_to_conditions(
         share = float(np.mean(saturated[index]))
         if share > RECORDING.max_saturated_share:
             out.append(f"{share:.0%} of the {name} samples stand at the converter's end")
+    return out + objections_to_environment(environment, actuator)
+
+
+def objections_to_environment(environment: Environment, actuator: Actuator) -> list[str]:
+    """Why the model must not be run with this oil and supply; empty if it may."""
+    out = []
     temperature = environment.oil_temperature
     if (
         temperature is not None
@@ -202,10 +208,12 @@ def objections_to_conditions(
         )
     if environment.supply_pressure is not None and environment.return_pressure is not None:
         supply = environment.supply_pressure - environment.return_pressure
-        if supply < RECORDING.min_supply_pressure_share * actuator.servovalve.PSR:
+        usual = actuator.servovalve.PSR
+        least = RECORDING.min_supply_pressure_share
+        if not least * usual <= supply <= READINGS.max_reading_factor * usual:
             out.append(
                 f"supply {supply / 1e6:.1f} MPa above return, "
-                f"the actuator's data say {actuator.servovalve.PSR / 1e6:.1f} MPa"
+                f"the actuator's data say {usual / 1e6:.1f} MPa"
             )
     return out
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -190,7 +190,7 @@ def run_test(
 
 
 def watch(
-    bus: Bus | PathLike | Iterator[DecodedItem],
+    bus: Bus | PathLike | Iterable[DecodedItem],
     *,
     unit: KnownUnit | None = None,
     find: Callable[[int], KnownUnit | None] | None = None,
@@ -210,9 +210,9 @@ def watch(
 
     Parameters
     ----------
-    bus : Bus | PathLike | Iterator[DecodedItem]
+    bus : Bus | PathLike | Iterable[DecodedItem]
         Open bus of python-can, transport, options of a bus, or a log, of decoded signals too. Or an
-        iterator of decoded signals: a `Tick` for each control tick; between them a `CommandMode`
+        iterable of decoded signals: a `Tick` for each control tick; between them a `CommandMode`
         says what commands are, an `Environment` what oil and supply are from there on.
     unit : KnownUnit | None
         Last result of the unit, or its JSON file; None: as new, or as calibrated.
@@ -303,15 +303,16 @@ def watch(
 
 @contextmanager
 def _open_source(
-    bus: Bus | PathLike | Iterator[DecodedItem], setup: Setup, notes: list[str]
+    bus: Bus | PathLike | Iterable[DecodedItem], setup: Setup, notes: list[str]
 ) -> Iterator[FrameSource | DecodedSource]:
     """Give what frames or decoded signals come from; notes: takes what there is to say of them."""
     from ehadiag.session.monitor_session import DecodedSource  # noqa: PLC0415 - loads kernels
     from firmware_iface.transport.base import open_source  # noqa: PLC0415
 
     tick_ns = round(1e9 / setup.actuator.controller.rate)
-    if isinstance(bus, Iterator):
-        yield DecodedSource(bus, "decoded signals", tick_ns)
+    # A bus of python-can gives its frames one by one, too.
+    if isinstance(bus, Iterable) and not (isinstance(bus, str) or hasattr(bus, "recv")):
+        yield DecodedSource(iter(bus), "decoded signals", tick_ns)
         return
     if isinstance(bus, str | os.PathLike):
         from firmware_iface.logs.log_files import holds_signals  # noqa: PLC0415
@@ -326,7 +327,7 @@ def _open_source(
             yield DecodedSource(items, f"replay of {name}", tick_ns, whole.start_ns or 0)
             return
     with (
-        open_transport(bus, budget=setup.budget) as transport,
+        open_transport(cast("Bus | PathLike", bus), budget=setup.budget) as transport,
         open_source(transport) as source,
     ):
         yield source

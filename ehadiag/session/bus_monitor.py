@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from ehadiag.assess.acceptance import objections_to_environment
 from ehadiag.core.actuator import Actuator
 from ehadiag.core.conversion import stated_channels
 from ehadiag.estimate import Severity, finite
@@ -125,7 +126,9 @@ class BusMonitor:
         self.environment_count = 0
         """Number of messages with oil or supply."""
         self.environment_left_out = 0
-        """Number of those in which two senders are seen: the file's values hold in their place."""
+        """Number of those in which two senders are seen: the file's values hold in their place; or
+        with values out of range: the last ones in range hold."""
+        self._environment_conflicts = 0
         self.alarms = 0
         """Number of alarms, without repeated ones."""
         self.repeated = 0
@@ -145,7 +148,7 @@ class BusMonitor:
     @property
     def conflicts(self) -> int:
         """Counter values with different payloads, and frames of an environment in conflict."""
-        return self._live.conflicts + self.environment_left_out
+        return self._live.conflicts + self._environment_conflicts
 
     @property
     def mode(self) -> CommandMode:
@@ -181,6 +184,7 @@ class BusMonitor:
     def take_decoded(self, item: DecodedItem, time_ns: int) -> None:
         """Take a decoded tick, or what holds from the next one on, at this time (ns)."""
         if isinstance(item, Environment):
+            self.environment_count += 1
             self._believe(
                 {
                     f"environment.{key}": value
@@ -265,15 +269,29 @@ class BusMonitor:
         self.environment_count += 1
         if watch.take(frame.time_ns, count[0] if count else None, frame.data, values):
             self.environment_left_out += 1
+            self._environment_conflicts += 1
             self._environment_values.clear()
             self._averaged.clear()
             return
         self._believe(values)
 
     def _believe(self, values: Mapping[str, float]) -> None:
-        self._environment_values |= values
-        for name, value in values.items():
+        found = self._in_range(values)
+        self.environment_left_out += len(found) < len(values)
+        self._environment_values |= found
+        for name, value in found.items():
             self._averaged.setdefault(name, []).append(value)
+
+    def _in_range(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Values that the model may be run with; of the two pressures both or neither."""
+        found = dict(values)
+        held = self._environment_values | found
+        for keys in (ENVIRONMENT_KEYS[:2], ENVIRONMENT_KEYS[2:]):
+            roles = {f"environment.{key}" for key in keys}
+            part = _environment_of({role: held[role] for role in roles & held.keys()})
+            if objections_to_environment(part, self._actuator):
+                found = {role: found[role] for role in found.keys() - roles}
+        return found
 
     def _push(self, tick: LiveTick, time_ns: int) -> None:
         self.ticks += 1
@@ -348,7 +366,7 @@ class BusMonitor:
 
     def _build(self) -> None:
         """Make the monitor for the environment on the bus, after a time for the file's."""
-        environment = self._bus_environment()
+        environment = _environment_of(self._environment_values)
         waits = bool(self._environment) and None in (
             environment.supply_pressure,
             environment.oil_temperature,
@@ -397,9 +415,9 @@ class BusMonitor:
     def _tune(self, monitor: FreeMotionMonitor) -> None:
         """Take oil and supply on the bus, averaged since the last time."""
         means = {name: sum(values) / len(values) for name, values in self._averaged.items()}
-        self._environment_values |= means
+        self._environment_values |= self._in_range(means)
         self._averaged.clear()
-        environment = self._bus_environment()
+        environment = _environment_of(self._environment_values)
         if environment == self._made_for:
             return
         self._made_for = environment
@@ -407,10 +425,10 @@ class BusMonitor:
         if self._changes is not None:
             self._changes.tune(environment)
 
-    def _bus_environment(self) -> Environment:
-        values = self._environment_values
-        supply, drain, oil = (values.get(f"environment.{key}") for key in ENVIRONMENT_KEYS)
-        return Environment(supply, drain, oil)
+
+def _environment_of(values: Mapping[str, float]) -> Environment:
+    supply, drain, oil = (values.get(f"environment.{key}") for key in ENVIRONMENT_KEYS)
+    return Environment(supply, drain, oil)
 
 
 def _ticks_of(bus_map: BusMap, *, whole: bool) -> LiveTicks | StretchTicks:

@@ -13,10 +13,12 @@ from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, date_text
 from ehadiag.live import Alarm, BusState, BusTraffic, Ending, Residuals, SignalTrace, Snapshot
 from ehadiag.monitor.change_test import LEAST
 from ehadiag.session.alarm_outlets import AlarmCommand, AlarmLog, AlarmRecorder, utc_now_text
-from ehadiag.session.bus_monitor import BusMonitor, MonitorAlarm
+from ehadiag.session.bus_monitor import ENVIRONMENT_KEYS, BusMonitor, MonitorAlarm
 from ehadiag.session.unit_state import UnitState, new_unit_state
 from firmware_iface.bus_map import BusMap
-from firmware_iface.errors import BusLostError, EhadiagError
+from firmware_iface.errors import BusLostError, ConfigurationError, EhadiagError, printable
+from firmware_iface.live_decode import LiveTick
+from firmware_iface.recording import CommandMode, Environment
 from firmware_iface.stored_test import StoredTest
 from firmware_iface.transport.base import RECEIVE_POLL_S, TransportState
 from firmware_iface.transport.frames import Frame
@@ -67,7 +69,8 @@ class MonitorSummary(msgspec.Struct, frozen=True):
     begun: str | None = None
     """Time of the first frame, UTC, ISO 8601; None: not known."""
     environment_left_out: float = 0.0
-    """Share of the messages with oil or supply that were left out for a second sender, 1."""
+    """Share of the messages with oil or supply that were left out: second sender, or out of range,
+    1."""
     enough: bool = False
     """Whether `least_monitored` of the ticks were monitored."""
     result: Result | None = None
@@ -96,14 +99,36 @@ class DecodedSource:
 
     def receive(self, _timeout: float) -> DecodedItem | None:
         """Return the next item, None at the end."""
-        item = next(self._items, None)
-        self.at_end = item is None
+        try:
+            item = _checked_item(next(self._items))
+        except StopIteration:
+            self.at_end = True
+            return None
         self._now += self._tick_ns * isinstance(item, tuple)
         return item
 
     def now_ns(self) -> int:
         """Time of the latest tick's end, ns."""
         return self._now
+
+
+def _checked_item(item: DecodedItem) -> DecodedItem:
+    """Return an item of plain numbers; ConfigurationError: it is no decoded item."""
+    try:
+        if isinstance(item, CommandMode):
+            return item
+        if isinstance(item, Environment):
+            values = (getattr(item, key) for key in ENVIRONMENT_KEYS)
+            supply, drain, oil = (None if value is None else float(value) for value in values)
+            return Environment(supply, drain, oil)
+        if isinstance(item, tuple):
+            return LiveTick(*map(float, item))
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ConfigurationError(
+        f"decoded item {printable(repr(item)[:80])}: need a Tick of five numbers,"
+        " a CommandMode or an Environment"
+    )
 
 
 class MonitorSession:
@@ -226,8 +251,9 @@ class MonitorSession:
                     if source.at_end:
                         break
                 elif not isinstance(frame, Frame):
-                    self._begin_at(source.now_ns())
-                    self._traffic.take(0)
+                    self._begin_at(begin)
+                    if isinstance(frame, tuple):
+                        self._traffic.take(0)
                     watcher.take_decoded(frame, source.now_ns())
                 else:
                     self._begin_at(frame.time_ns)
@@ -357,15 +383,15 @@ class MonitorSession:
         if watcher.environment_left_out:
             reasons.append(
                 f"{self._environment_left_out:.0%} of the messages with oil and supply left out"
-                " for a second sender: the values of the actuator's file hold"
+                " for a second sender or out of range: those before or of the actuator's file hold"
             )
         if watcher.alarms:
             reasons.append(f"{watcher.alarms} alarms: the unit is not as it was")
             return Ending(verdict="ALARM", reasons=tuple(reasons))
         if not watcher.pushed:
-            return Ending(
-                verdict="NOT MONITORED", reasons=(*reasons, not_monitored_reason(self._traffic))
-            )
+            decoded = isinstance(self._source, DecodedSource)
+            why = not_monitored_reason(self._traffic, decoded=decoded)
+            return Ending(verdict="NOT MONITORED", reasons=(*reasons, why))
         if not self._enough:
             reasons.append(
                 f"{self._share:.0%} of the ticks only, {self._least_monitored:.0%} are needed"
@@ -374,8 +400,10 @@ class MonitorSession:
         return Ending(verdict="NO ALARM", reasons=tuple(reasons))
 
 
-def not_monitored_reason(traffic: BusTraffic) -> str:
-    """Say why nothing was monitored."""
+def not_monitored_reason(traffic: BusTraffic, *, decoded: bool) -> str:
+    """Say why nothing was monitored; decoded: the traffic is ticks of decoded signals."""
+    if decoded:
+        return f"{traffic.frames} ticks of decoded signals, too few with a spool position to settle"
     if not traffic.frames:
         return "the bus was silent"
     return f"{traffic.frames} frames, but no ticks to monitor among them: see ehadiag check-bus"

@@ -96,7 +96,7 @@ def decoded_items(
     clock = readings[0].clock
     whole = _on_ticks(signals, readings[0], columns.tick_ns, start, str(path))
     assert whole.samples is not None
-    told = {
+    held_values = {
         key: item.value[np.maximum(np.searchsorted(item.time, clock.begin, side="right") - 1, 0)]
         for key in ("supply_pressure", "return_pressure", "oil_temperature")
         if (item := signals.get(f"environment.{key}")) is not None
@@ -107,7 +107,7 @@ def decoded_items(
         last = Environment()
         yield samples.mode
         for tick, row in enumerate(live_ticks(samples)):
-            now = Environment(**{key: float(value[tick]) for key, value in told.items()})
+            now = Environment(**{key: float(value[tick]) for key, value in held_values.items()})
             if now != last:
                 last = now
                 yield now

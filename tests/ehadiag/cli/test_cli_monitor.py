@@ -267,6 +267,9 @@ def test_a_column_of_decoded_signals_is_named_as_for_a_diagnosis(run: Run, tmp_p
     # A second for oil and supply, which may come, and 300 ticks to settle.
     assert end["monitored"] > 0.75 * end["ticks"] > 4000
     assert end["lost"] < 5
+    table.head(300).to_csv(tmp_path / "short.csv")
+    short = run("monitor", "--log", "short.csv", *columns)
+    assert "NOT MONITORED: 299 ticks of decoded signals, too few" in short.err
     unnamed = run("monitor", "--log", "rig.csv", "--column", "current_command=cmd")
     assert unnamed.code == 2
     assert "no column for channels.position" in unnamed.err

@@ -279,6 +279,21 @@ def test_decoded_signals_are_watched_live_as_the_frames_are(tmp_path: Path) -> N
         assert found.enough
 
 
+def test_a_list_of_decoded_signals_is_watched() -> None:
+    found = ehadiag.watch([Environment(20.7e6, 0.7e6, 40.0), *[ehadiag.Tick(*[0.0] * 5)] * 400])
+    assert (found.ticks, found.monitored) == (400, 101)
+
+
+@pytest.mark.parametrize(
+    "item",
+    [(1.0,) * 4, "12345", {}, None, ehadiag.Tick(None, *[0.0] * 4), Environment("hot")],  # type: ignore[arg-type]
+)
+def test_what_is_no_decoded_signal_is_said(item: Any) -> None:
+    with pytest.raises(ehadiag.ConfigurationError, match=r"^decoded item .*need a Tick") as caught:
+        ehadiag.watch([item])
+    assert "\n" not in str(caught.value)
+
+
 def test_what_cannot_be_watched_is_said() -> None:
     log = LOGS / "paper-closed-4.blf"
     for wrong, said in (

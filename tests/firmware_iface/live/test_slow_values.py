@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from ehadiag.session.unit_state import new_unit_state
 from firmware_iface.bus_map import BusMap, default_map
 from firmware_iface.codec import Encoder
 from firmware_iface.logs.recorder import ReplayTransport
+from firmware_iface.recording import Environment
 from firmware_iface.slow_values import SlowValueWatch, spread_conflict
 from firmware_iface.transport.frames import ColumnBuilder, Frame
 
@@ -172,6 +174,42 @@ def test_a_monitor_says_what_it_did_not_believe(tmp_path: Path) -> None:
     assert end["environment_left_out"] / end["environment_messages"] == found.environment_left_out
     said = f"{found.environment_left_out:.0%} of the messages with oil and supply left out"
     assert any(said in reason for reason in snapshots[-1].ending.reasons)
+
+
+@pytest.mark.parametrize(
+    ("supply", "degc", "kept"),
+    [
+        (0.0, 60.0, Environment(20.7e6, 0.7e6, 60.0)),
+        (2e9, 60.0, Environment(20.7e6, 0.7e6, 60.0)),
+        (math.nan, 60.0, Environment(20.7e6, 0.7e6, 60.0)),
+        (19e6, -300.0, Environment(19e6, 0.7e6, 40.0)),
+        (19e6, 5000.0, Environment(19e6, 0.7e6, 40.0)),
+    ],
+)
+def test_a_monitor_keeps_the_last_values_in_range(
+    supply: float, degc: float, kept: Environment
+) -> None:
+    unit = default_actuator()
+    monitor = BusMonitor(unit, BUS, new_unit_state(unit), (), 100.0, lambda _: None)
+    for environment in (Environment(20.7e6, 0.7e6, 40.0), Environment(supply, 0.7e6, degc)):
+        monitor.take_decoded(environment, 0)
+        for tick in range(1500):
+            monitor.take_decoded((0.0, 0.0, 0.0, 0.0, 0.0), tick * TICK)
+    assert monitor.environment == kept
+    assert (monitor.environment_count, monitor.environment_left_out, monitor.conflicts) == (2, 1, 0)
+
+
+def test_a_monitor_outlives_the_hydraulics() -> None:
+    unit, encoder = default_actuator(), Encoder(BUS)
+    monitor = BusMonitor(unit, BUS, new_unit_state(unit), (), 100.0, lambda _: None)
+    others = [item for item in mixed([]) if item.can_id != ENVIRONMENT]
+    for at in range(0, TEST_TICKS, 100):
+        supply = 20.7e6 if at < 3000 else 0.0
+        others += encoder.environment(supply, 0.7e6, 40.0, START + at * TICK)
+    for frame in sorted(others, key=lambda item: item.time_ns):
+        monitor.take(frame)
+    assert monitor.environment.supply_pressure == pytest.approx(20.7e6, rel=1e-3)
+    assert (monitor.environment_left_out, monitor.conflicts) == (25, 0)
 
 
 @pytest.mark.parametrize(("paged", "found"), [(True, False), (False, True)])
