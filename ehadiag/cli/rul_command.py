@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -153,10 +152,10 @@ def _given_up(which: tuple[str, int]) -> Prognosis:
     raise InputOutputError(f"serial {which[1]} of {which[0]}: the process that forecast it ended")
 
 
-def _urgency(item: Prognosis) -> tuple[float, str, int]:
+def _urgency(item: Prognosis) -> tuple[bool, bool, float, str, int]:
     first = item.first()
-    left = math.inf if first is None else first[1].median or 0.0
-    return left, item.actuator or "", item.serial
+    reached, left = (first[1].reached, first[1].median or 0.0) if first else (False, 0.0)
+    return first is None, not reached, left, item.actuator or "", item.serial
 
 
 def _time_before(item: Prognosis, text: str, *, alone: bool) -> float | None:

@@ -77,7 +77,7 @@ class Prognosis(msgspec.Struct, frozen=True):
 
     def date_after(self, time: float) -> str | None:
         """Return the day a time from now at the unit's use a day; None where that is not known."""
-        if not self.per_day or time / self.per_day > 36500.0:
+        if not self.per_day or abs(time / self.per_day) > 36500.0:
             return None
         moment = datetime.fromisoformat(self.now) + timedelta(days=time / self.per_day)
         return moment.date().isoformat()

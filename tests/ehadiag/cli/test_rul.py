@@ -236,3 +236,25 @@ def test_python_says_in_one_line_what_is_wrong(
     with pytest.raises(ehadiag.ConfigurationError, match=words):
         ehadiag.forecast(str(place), **({"serial": 1} | wrong))  # type: ignore[arg-type]
     ehadiag.History(str(place)).close()
+
+
+def test_hours_far_beyond_have_no_date(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, place, "--unit", "1", "--hours", "5e6", "--json")
+    assert code == 0
+    assert json.loads(out)["severities"]["FDJ"]["remaining"]["limit"]["date"] is None
+
+
+def test_a_unit_at_its_limit_is_before_one_that_may_be_past_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "h"
+    with History(place, create=True) as history:
+        for n in range(1, 15):
+            day = f"2026-01-{n:02}T12:00:00.000Z"
+            history.append(an_entry(1, 100.0 * n, (0.1, 0.2, 0.04 * n), tested=day))
+            history.append(an_entry(2, 100.0 * n, (0.1, 0.2, 0.06 * n), tested=day))
+    set_today(monkeypatch, "2026-03-31")
+    trees = [json.loads(line) for line in run(capsys, place, "--all", "--json")[1].splitlines()]
+    limits = [tree["severities"]["FDJ"]["remaining"]["limit"] for tree in trees]
+    assert [limit["reached"] for limit in limits] == [True, False]
+    assert limits[1]["median"] < 0.0

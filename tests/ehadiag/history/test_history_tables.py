@@ -77,3 +77,20 @@ def test_import_appends_all_or_none(tmp_path: Path, capsys: pytest.CaptureFixtur
     out = tmp_path / "b.parquet"
     assert main(["history", "export", "--out", str(out), "--history", str(place)]) == 0
     assert out.read_bytes()[:4] == b"PAR1"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("HEALTHY,Kintas,0.1", "FAULT,Kintas,0.9"), ("0.0,", "1.0,")]
+)
+def test_another_diagnosis_of_the_same_time_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str
+) -> None:
+    place, table = tmp_path / "h", tmp_path / "a.csv"
+    with History(place, create=True) as history:
+        history.append_all(ENTRIES[:1])
+    assert old in (text := history_csv(ENTRIES))
+    table.write_text(text.replace(old, new, 1))
+    assert main(["history", "import", str(table), "--history", str(place)]) == 2
+    assert "has other diagnoses of 2026-03-01T12:00:00.000Z (serial 7)" in capsys.readouterr().err
+    with History(place) as history:
+        assert len(history.entries()) == 1
