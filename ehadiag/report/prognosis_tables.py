@@ -112,7 +112,9 @@ def _usage_text(prognosis: Prognosis) -> str:
         return f"{prognosis.usage_now:g} {prognosis.unit}"
     if prognosis.usage_now is not None:
         return f"about {_rounded(prognosis.usage_now)} {prognosis.unit}"
-    at = max((item.at for item in prognosis.forecasts if item.at is not None), default=0.0)
+    ages = [item.at for item in prognosis.forecasts if item.at is not None]
+    if (at := max(ages, default=prognosis.usage_tested)) is None:
+        return "-"
     when = f" on {prognosis.last_test[:10]}" if prognosis.last_test else ""
     return f"{at:g} {prognosis.unit}{when}"
 

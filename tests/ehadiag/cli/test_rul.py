@@ -91,12 +91,14 @@ def test_a_table_of_units_says_in_words_what_has_no_number(
             history.append(an_entry(1, 100.0 * n, (0.1, 0.2, 0.2 * n), tested=day))
             history.append(an_entry(2, 100.0 * n, (0.1, 0.2, 0.3)))
         history.append(an_entry(3, 100.0, (0.1, 0.2, 0.3)))
+        history.append(an_entry(4, 10.0, severities=(), verdict="NOT_TESTED"))
     _, out, _ = run(capsys, place, "--all", "--before", "400")
     assert "about (date)" not in out  # the only unit with a use a day is at its limit
-    worn, still, new = (" ".join(line.split()) for line in out.splitlines()[1:])
+    worn, still, new, bare = (" ".join(line.split()) for line in out.splitlines()[1:])
     assert worn == "1 reference-31 jack friction about 430 hours at its limit at its limit -"
     assert "no number: 4 diagnoses over 300 hours show no growth" in still
     assert "too few diagnoses" in new
+    assert bare.startswith("4 reference-31 - 10 hours too few diagnoses")
     _, out, _ = run(capsys, place, "--unit", "1", "--before", "400")
     assert "First: jack friction is at its limit." in out
     assert "%." not in out
