@@ -57,6 +57,15 @@ def test_a_unit_in_a_sentence(place: Path, capsys: pytest.CaptureFixture[str]) -
     assert "Chance of a severity at its limit before 2000 hours: " in out
 
 
+def test_the_next_inspection_is_named_with_its_unit_or_is_a_date(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for text, said in (("1e3", "1e3 hours: "), ("20261231", "20261231: ")):
+        code, out, _ = run(capsys, place, "--unit", "1", "--before", text)
+        assert code == 0
+        assert f"at its limit before {said}" in out
+
+
 def test_all_units_by_urgency(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, place, "--all", "--json", "--before", "500")
     assert code == 0
@@ -123,6 +132,7 @@ def test_a_date_is_a_time_at_the_units_own_use(
         (("--unit", "3", "--actuator", "x"), "actuator x: serial 3 is of other"),
         (("--unit", "1", "--before", "soon"), "--before soon: need a date"),
         (("--unit", "1", "--before", "2020-01-01"), "--before 2020-01-01: is past"),
+        (("--unit", "1", "--before", "20200101"), "--before 20200101: is past"),
         (("--unit", "1", "--before", "1e300"), "--before 1e300: need 0 … 1e+09"),
         (("--all", "--before", "soon"), "--before soon: need a date"),
         (("--unit", "1", "--hours", "100"), "hours 100: were 2000 at the last diagnosis"),
