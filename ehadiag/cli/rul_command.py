@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -153,24 +152,24 @@ def _given_up(which: tuple[str, int]) -> Prognosis:
     raise InputOutputError(f"serial {which[1]} of {which[0]}: the process that forecast it ended")
 
 
-def _urgency(item: Prognosis) -> tuple[float, str, int]:
+def _urgency(item: Prognosis) -> tuple[bool, bool, float, str, int]:
     first = item.first()
-    left = math.inf if first is None else first[1].median or 0.0
-    return left, item.actuator or "", item.serial
+    reached, left = (first[1].reached, first[1].median or 0.0) if first else (False, 0.0)
+    return first is None, not reached, left, item.actuator or "", item.serial
 
 
 def _time_before(item: Prognosis, text: str, *, alone: bool) -> float | None:
     """Hours, cycles or days until the next inspection; None: one of many has no use a day."""
+    from ehadiag.report.prognosis_tables import is_number  # noqa: PLC0415
+
+    if is_number(text):
+        if not 0.0 <= (time := float(text)) <= MAX_TIME:
+            raise ConfigurationError(f"--before {text}: need 0 … {MAX_TIME:g}, or a date")
+        return time
+    known = bool(item.per_day)
+    dated = item if known or alone else replace(item, per_day=1.0)
     try:
-        time = float(text)
-    except ValueError:
-        known = bool(item.per_day)
-        dated = item if known or alone else replace(item, per_day=1.0)
-        try:
-            time = dated.time_until(text)
-        except ConfigurationError as error:
-            raise ConfigurationError(f"--before {error}") from None
-        return time if known else None
-    if not 0.0 <= time <= MAX_TIME:
-        raise ConfigurationError(f"--before {text}: need 0 … {MAX_TIME:g}, or a date")
-    return time
+        time = dated.time_until(text)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"--before {error}") from None
+    return time if known else None

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +44,7 @@ __all__ = [
     "hash_of_file",
     "hash_of_samples",
     "history_entry",
+    "is_swap",
     "user_history_path",
 ]
 
@@ -94,8 +95,8 @@ class Usage(msgspec.Struct, frozen=True):
                 raise ConfigurationError(f"{name} {value:g}: need a number of at least 0")
 
     def amount(self, unit: str) -> float | None:
-        """Hours or cycles, by the name of the unit."""
-        return self.hours if unit == "hours" else self.cycles
+        """Hours or cycles, by the name of the unit; None of days."""
+        return {"hours": self.hours, "cycles": self.cycles}.get(unit)
 
     @property
     def known(self) -> bool:
@@ -180,6 +181,9 @@ class MaintenanceEvent(msgspec.Struct, frozen=True):
     """Why it counts no more; None: it counts."""
 
 
+RESTARTED_SHARE = 0.5
+"""Share of a unit's hours, 1, below which those after a swap are another unit's; rounded hours and
+typing errors are above it."""
 MAX_DATE_ROUNDING_S = 2.0
 """Time, s, by which formats of logs round dates."""
 
@@ -242,8 +246,13 @@ def counted_entries(entries: Sequence[Entry]) -> list[Entry]:
     return out[::-1]
 
 
+def is_swap(event: MaintenanceEvent, names: Collection[str]) -> bool:
+    """Whether an event renews all severities, by their names."""
+    return bool(event.resets) and {*names} <= {*event.resets}
+
+
 def continued_usage(
-    entries: Sequence[Entry], events: Sequence[MaintenanceEvent]
+    entries: Sequence[Entry], events: Sequence[MaintenanceEvent], names: Collection[str]
 ) -> tuple[list[Entry], list[MaintenanceEvent], dict[int, Usage]]:
     """Count hours and cycles on where those of a unit that was swapped begin anew.
 
@@ -252,16 +261,17 @@ def continued_usage(
     entries : Sequence[Entry]
         Diagnoses of units of one actuator.
     events : Sequence[MaintenanceEvent]
-        Their maintenance. After one that renews all severities fewer hours than before it are those
-        of the new unit.
+        Their maintenance. After one that renews all severities less than half of the hours before
+        it are those of the new unit; other falls are rounding.
+    names : Collection[str]
+        Of all severities.
 
     Returns
     -------
     tuple[list[Entry], list[MaintenanceEvent], dict[int, Usage]]
         Both in the same order, and what each serial number's usage was counted on by at last.
     """
-    names = {item.name for entry in entries for item in entry.severities}
-    swaps = {id(item) for item in events if item.resets and names <= {*item.resets}}
+    swaps = {id(item) for item in events if is_swap(item, names)}
     if not swaps:
         return list(entries), list(events), {}
     pairs: list[Entry | MaintenanceEvent] = [*entries, *events]
@@ -271,11 +281,12 @@ def continued_usage(
     for place in sorted(range(len(pairs)), key=lambda at: (pairs[at].when, at >= len(entries))):
         item, amounts = pairs[place], dict[str, float]()
         for unit in ("hours", "cycles"):
-            base, last, swapped = state.get((item.serial, unit), (0.0, 0.0, False))
-            swapped, amount = swapped or id(item) in swaps, item.usage.amount(unit)
+            base, last, before = state.get((item.serial, unit), (0.0, 0.0, False))
+            swap, amount = id(item) in swaps, item.usage.amount(unit)
+            swapped = before or swap
             if amount is not None:
-                if swapped and amount < last:
-                    base, swapped = base + last, False
+                if swapped and amount < RESTARTED_SHARE * last:
+                    base, swapped = base + last, before and swap
                 last, swapped = amount, swapped and place >= len(entries)
                 amounts[unit] = base + amount
             state[item.serial, unit] = base, last, swapped

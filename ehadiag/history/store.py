@@ -24,6 +24,7 @@ from ehadiag.history.records import (
     EVENT_TABLE,
     Entry,
     MaintenanceEvent,
+    counted_entries,
     hash_of_samples,
 )
 from ehadiag.history.schema import MIGRATION_STEPS, migrate, refuse_foreign_schema, schema_version
@@ -177,6 +178,7 @@ class History:
         ----------
         entries : Sequence[Entry]
             What is kept of them; one of a time, actuator and serial number that count is there.
+            Tests, verdicts, usage and severities are compared.
 
         Returns
         -------
@@ -185,18 +187,26 @@ class History:
 
         Raises
         ------
+        ConfigurationError
+            One is there with other contents.
         InputOutputError
             They could not be written: nothing of them was.
         """
         with self._one_line_errors(), self._transaction():
-            withdrawn = self._withdrawn(DIAGNOSIS_TABLE)
-            rows = self._rows("SELECT id, tested, appended, actuator, serial FROM diagnosis")
-            there = {
-                (row["tested"] or row["appended"], row["actuator"], row["serial"])
-                for row in rows
-                if row["id"] not in withdrawn
-            }
-            new = [i for i in entries if (i.when, i.actuator, i.serial) not in there]
+            kept = self.entries(brief=True)
+            there: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
+            for item in (*kept, *counted_entries(kept)):
+                there.setdefault(_identity(item), []).append(_contents(item))
+            others = [
+                f"{item.when} (serial {item.serial})"
+                for item in entries
+                if _contents(item) not in there.get(_identity(item), [_contents(item)])
+            ]
+            if others:
+                raise ConfigurationError(
+                    f"has other diagnoses of {', '.join(others[:MAX_LISTED_SERIALS])}"
+                )
+            new = [item for item in entries if _identity(item) not in there]
             for entry in new:
                 self._append(entry)
         return len(new)
@@ -651,6 +661,16 @@ class HistorySnapshot(NamedTuple):
             return None, ""
         words = "" if entry is None else f"diagnosis {entry.number} of history {self.path}"
         return result, words
+
+
+def _identity(entry: Entry) -> tuple[Any, ...]:
+    return entry.when, entry.actuator, entry.serial
+
+
+def _contents(entry: Entry) -> tuple[Any, ...]:
+    """What tells apart diagnoses of a time and unit."""
+    severities = {(item.name, item.estimate, item.std) for item in entry.severities}
+    return entry.test, entry.verdict, entry.usage, severities
 
 
 def _severity(row: sqlite3.Row) -> dict[str, Any]:

@@ -27,10 +27,10 @@ HISTORY_COLUMNS: dict[str, type] = {
 """Columns with the kinds of their values."""
 NEEDED_COLUMNS = ("when", "actuator", "serial", "verdict", "severity", "estimate", "std")
 COLUMN_RANGES = {
-    "hours": (0.0, 1e9), "cycles": (0.0, 1e9), "estimate": (0.0, 1.0), "std": (0.0, 1e3),
+    "hours": (0.0, 1e9), "cycles": (0.0, 1e9), "estimate": (0.0, 1.0), "std": (1e-9, 1e3),
     "low95": (-1e4, 1e4), "high95": (-1e4, 1e4),
 }  # fmt: skip
-"""What is read; a severity that a test does not show has a wide interval."""
+"""What is read; a severity that a test does not show has a wide interval, none has none."""
 FORMULA_PREFIXES = ("=", "+", "-", "@", "\t", "\r")
 IMPORT_SCHEMA = "ehadiag.history-import/1"
 KNOWN_VERDICTS = ("HEALTHY", "DEGRADED", "FAULT", "NOT_TESTED")
@@ -138,13 +138,13 @@ def entries_from_csv(text: str, name: str, severities: Sequence[str]) -> list[En
     missing = [item for item in NEEDED_COLUMNS if item not in (reader.fieldnames or ())]
     if missing:
         raise ConfigurationError(f"{name}: has no column {missing[0]}; see ehadiag history export")
-    diagnoses: dict[tuple[str | None, ...], Entry] = {}
+    diagnoses: dict[tuple[str | int | None, ...], Entry] = {}
     try:
         for row in reader:
             if row.get("withdrawn"):
                 continue
-            key = tuple(row.get(column) for column in ("number", *NEEDED_COLUMNS[:3]))
             entry = _entry_of(row, severities)
+            key = (row.get("number"), entry.tested, entry.actuator, entry.serial)
             if (before := diagnoses.get(key)) is not None:
                 both = before.severities + entry.severities
                 if len({item.name for item in both}) < len(both):
@@ -162,13 +162,15 @@ def _entry_of(row: dict[str, str], severities: Sequence[str]) -> Entry:
     verdict = _text(row["verdict"])
     if verdict not in KNOWN_VERDICTS:
         raise ConfigurationError(f"verdict: there is {', '.join(KNOWN_VERDICTS)}")
+    if not (actuator := _text(row["actuator"])).strip():
+        raise ConfigurationError("actuator: is empty")
     found = [_severity_of(row, severities)] if row["severity"] else []
     path, sha256 = _text(row.get("recording") or ""), row.get("sha256") or None
     origin = {"schema": IMPORT_SCHEMA, "number": row.get("number")}
     return Entry(
         appended=current_utc_text(),
         tested=_time(row["when"]),
-        actuator=_text(row["actuator"]),
+        actuator=actuator,
         serial=_serial(row["serial"]),
         test=_text(row.get("test") or "") or None,
         verdict=verdict,
@@ -223,9 +225,12 @@ def _serial(text: str) -> int:
 
 def _time(text: str) -> str:
     try:
-        return utc_time_text(text)
+        when = utc_time_text(text)
     except (ValueError, OverflowError):
         raise ConfigurationError(f"when {text}: need ISO 8601, such as 2026-03-01T12:00") from None
+    if when > current_utc_text():
+        raise ConfigurationError(f"when {text}: is in the future")
+    return when
 
 
 def _text(text: str) -> str:

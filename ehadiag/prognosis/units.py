@@ -12,7 +12,13 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
-from ehadiag.history.records import Usage, continued_usage, counted_entries, current_utc_text
+from ehadiag.history.records import (
+    Usage,
+    continued_usage,
+    counted_entries,
+    current_utc_text,
+    is_swap,
+)
 from ehadiag.history.store import History
 from ehadiag.prognosis.averaging import learn_fleet
 from ehadiag.prognosis.forecast import Forecast, RemainingLife
@@ -59,6 +65,8 @@ class Prognosis(msgspec.Struct, frozen=True):
     """Date of the last dated test; None without any."""
     usage_before: float = 0.0
     """Hours or cycles of units that were swapped before this one."""
+    usage_tested: float | None = None
+    """Hours or cycles at the last diagnosis; None: none says, or the unit was swapped since."""
 
     def first(self, place: int = -1) -> tuple[Forecast, RemainingLife] | None:
         """Return the severity whose median reaches a level first; None without a number."""
@@ -77,7 +85,7 @@ class Prognosis(msgspec.Struct, frozen=True):
 
     def date_after(self, time: float) -> str | None:
         """Return the day a time from now at the unit's use a day; None where that is not known."""
-        if not self.per_day or time / self.per_day > 36500.0:
+        if not self.per_day or abs(time / self.per_day) > 36500.0:
             return None
         moment = datetime.fromisoformat(self.now) + timedelta(days=time / self.per_day)
         return moment.date().isoformat()
@@ -172,22 +180,28 @@ def prognosis_of(
     kind = (last.actuator, last.simulated) if last else (None, False)
     alike = [item for item in counted if (item.actuator, item.simulated) == kind]
     now = f"{(now or current_utc_text())[:10]}T00:00:00.000Z"
+    names = dict.fromkeys(part.name for item in alike for part in item.severities)
     alike, changes, bases = continued_usage(
-        alike, [item for item in events if item.actuator in (None, kind[0])]
+        alike, [item for item in events if item.actuator in (None, kind[0])], names
     )
     before = bases.get(serial, Usage()).amount(unit) or 0.0
     same = [item for item in alike if item.serial == serial]
     used = [item for item in same if usage_of(item, unit) is not None]
     rate, dated = _use_a_day(used, unit)
-    last_at = max((usage_of(item, unit) or 0.0 for item in used), default=0.0)
-    stated = _stated_usage(today, unit, last_at - before)
+    if dated and dated[0] >= days_of(now) + 1.0:
+        rate = None  # the clock is wrong
+    last_at = max((usage_of(item, unit) or 0.0 for item in used), default=None)
+    tested = max((item.when for item in used), default="")
+    if any(i.serial == serial and i.when >= tested and is_swap(i, names) for i in changes):
+        last_at = rate = None  # those of the unit that was taken out
+    stated = _stated_usage(today, unit, (last_at or 0.0) - before)
     at = None
     if stated is not None:
         at = before + stated
     elif rate and dated:
-        at = max(last_at, dated[1] + rate * max(days_of(now) - dated[0], 0.0))
+        at = max(last_at or 0.0, dated[1] + rate * max(days_of(now) - dated[0], 0.0))
     forecasts, none = [], np.empty(0)
-    for name in dict.fromkeys(part.name for item in alike for part in item.severities):
+    for name in names:
         lives = lives_of(alike, changes, name, unit)
         mine = lives.pop(serial, [])
         present = mine[-1] if mine else Life(serial, none, none, none, 0.0)
@@ -203,6 +217,7 @@ def prognosis_of(
         serial, kind[0], unit, len(own), len(used), tuple(levels), tuple(forecasts), seed,
         rate, now, None if at is None else at - before, stated is not None,
         max((item.tested for item in used if item.tested), default=None), before,
+        None if last_at is None else last_at - before,
     )  # fmt: skip
 
 
@@ -210,7 +225,7 @@ def _stated_usage(today: Usage | None, unit: str, least: float) -> float | None:
     """Stated hours or cycles of today; ConfigurationError where they cannot be."""
     if today is None or not today.known:
         return None
-    if (stated := today.amount(unit) if unit != "days" else None) is None:
+    if (stated := today.amount(unit)) is None:
         raise ConfigurationError(f"usage of today: not stated in {unit}, those of the answer")
     if stated < least:
         raise ConfigurationError(f"{unit} {stated:g}: were {least:g} at the last diagnosis already")

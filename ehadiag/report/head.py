@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 INCONCLUSIVE = "INCONCLUSIVE"
 """Word for a test that ran and was identified, but not explained; its verdict is NOT TESTED."""
+LEAST_CHANCE = 0.01
+"""Chance, 1, that is worth a word and a number."""
 
 
 class Bar(msgspec.Struct, frozen=True):
@@ -202,9 +204,9 @@ def remaining_sentences(prognosis: Prognosis, names: Collection[str] | None = No
             when = f"reaches its limit not before about {low} {unit}"
         past = left.chance_within(0.0) or 0.0
         if left.median <= 0.0:
-            when = "may have reached its limit"
-        if left.low <= 0.0:
-            when += f"; it may be past it: {percent(min(past, 0.99))}"
+            when = f"may have reached its limit: {chance_text(past)}"
+        elif left.low <= 0.0:
+            when += f"; it may be past it: {chance_text(past)}"
         text = f"{plain_name(item.name)} {when}{_counted(prognosis)}."
         found.append((left.median, text[0].upper() + text[1:]))
     return [text for _, text in sorted(found)]
@@ -255,6 +257,13 @@ def percent(value: float, *others: float) -> str:
         if all(text != f"{100.0 * other:.{digits}f}" for other in others if other != value):
             break
     return f"{text} %"
+
+
+def chance_text(chance: float) -> str:
+    """Write a chance in percent; none is promised or ruled out."""
+    if not LEAST_CHANCE <= chance <= 1.0 - LEAST_CHANCE:
+        return "below 1 %" if chance < LEAST_CHANCE else "above 99 %"
+    return f"{100.0 * chance:.0f} %"
 
 
 def plain_name(name: str) -> str:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
+from ehadiag.report.head import LEAST_CHANCE, chance_text
 from firmware_iface.errors import printable
 
 if TYPE_CHECKING:
@@ -20,8 +23,6 @@ LEVEL_NAMES = ("advisory", "limit")
 SHORT_NAMES = {"Kintas": "filter clogging", "FSS": "spool friction", "FDJ": "jack friction"}
 """Those of the registry, which loads the compiler."""
 AT_LIMIT = "at its limit"
-LEAST_CHANCE = 0.01
-"""Chance, 1, that is worth a word and a number."""
 FIGURES = 2
 """Figures of a time that is printed, 1: an interval of 80 % carries no more."""
 
@@ -112,7 +113,9 @@ def _usage_text(prognosis: Prognosis) -> str:
         return f"{prognosis.usage_now:g} {prognosis.unit}"
     if prognosis.usage_now is not None:
         return f"about {_rounded(prognosis.usage_now)} {prognosis.unit}"
-    at = max((item.at for item in prognosis.forecasts if item.at is not None), default=0.0)
+    ages = [item.at for item in prognosis.forecasts if item.at is not None]
+    if (at := max(ages, default=prognosis.usage_tested)) is None:
+        return "-"
     when = f" on {prognosis.last_test[:10]}" if prognosis.last_test else ""
     return f"{at:g} {prognosis.unit}{when}"
 
@@ -140,7 +143,7 @@ def _sentences(prognosis: Prognosis, before: tuple[str, float | None] | None) ->
         assert left.high is not None
         reached = left.reached
         chance = left.chance_within(0.0) or 0.0
-        past = _percent(chance)
+        past = chance_text(chance)
         if reached:
             out.append(f"First: {SHORT_NAMES[item.name]} is {AT_LIMIT}.")
         elif left.median <= 0.0:
@@ -159,7 +162,7 @@ def _sentences(prognosis: Prognosis, before: tuple[str, float | None] | None) ->
     if before is not None and not reached:
         name, time = before
         assert time is not None  # or there is an error
-        if name.replace(".", "", 1).isdecimal():
+        if is_number(name):
             name = f"{name} {prognosis.unit}"
         without = [i.name for i in prognosis.forecasts if i.remaining[-1].median is None]
         rest = f"; without {', '.join(without)}: no number" if without else ""
@@ -169,6 +172,14 @@ def _sentences(prognosis: Prognosis, before: tuple[str, float | None] | None) ->
     return out
 
 
+def is_number(text: str) -> bool:
+    """Whether the next inspection was named by a number; 20261231 is a date."""
+    for kind in (datetime.fromisoformat, float):
+        with contextlib.suppress(ValueError):
+            return isinstance(kind(text), float)
+    return False
+
+
 def remaining_text(left: RemainingLife, unit: str = "") -> str:
     """Write hours, cycles or days to a level, 80 % interval in brackets, or why there are none."""
     if left.median is None or left.low is None or left.high is None:
@@ -176,7 +187,7 @@ def remaining_text(left: RemainingLife, unit: str = "") -> str:
     if left.reached:
         return "reached"
     past = left.chance_within(0.0) or 0.0
-    may = f"may be past: {_percent(past)}" if past >= LEAST_CHANCE else ""
+    may = f"may be past: {chance_text(past)}" if past >= LEAST_CHANCE else ""
     if left.median <= 0.0:
         return may
     time = f"{_rounded(left.median)} ({_rounded(left.low)} … {_rounded(left.high)}){unit}"
@@ -191,15 +202,8 @@ def _rounded(value: float) -> str:
 
 
 def _chance(prognosis: Prognosis, time: float) -> str:
-    return _percent(prognosis.chance_within(time))
-
-
-def _percent(chance: float | None) -> str:
-    if chance is None:
-        return "no number"
-    if not LEAST_CHANCE <= chance <= 1.0 - LEAST_CHANCE:
-        return "below 1 %" if chance < LEAST_CHANCE else "above 99 %"
-    return f"{100.0 * chance:.0f} %"
+    chance = prognosis.chance_within(time)
+    return "no number" if chance is None else chance_text(chance)
 
 
 def _date(prognosis: Prognosis, left: RemainingLife) -> str | None:

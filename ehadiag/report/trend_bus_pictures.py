@@ -86,7 +86,8 @@ def trend_column(
     """
     unit = prognosis.unit if prognosis.used else None
     levels = prognosis.levels
-    entries, events, _ = continued_usage(entries, events)
+    known = [item.name for item in prognosis.forecasts]
+    entries, events, _ = continued_usage(entries, events, known)
     changes = [(at, item) for item in events if (at := _abscissa(item, unit)) is not None]
     placed = [(at, item) for item in entries if (at := _abscissa(item, unit)) is not None]
     placed.sort(key=lambda pair: pair[0])

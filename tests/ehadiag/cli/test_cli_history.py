@@ -84,11 +84,16 @@ def test_tables_are_broken_between_words_on_a_narrow_terminal(
         monkeypatch.setattr(f"ehadiag.{module}.current_utc_text", lambda: day)
     for words, kept in (
         (("history", "list"), r"2026-08-20 08:00 .*FAULT"), (("rul", "--all"), "reference-31 "),
-        (("rul", "--unit", "1"), r"710\s+to 2500 with 80 %\."),
+        (("rul", "--unit", "1"), r"690\s+to 2100 with 80 %\."),
     ):  # fmt: skip
         out = re.sub(r"\x1b\[[\d;]*m", "", run(*words, "--history", "h.sqlite").out)
         assert max(map(len, out.splitlines())) <= 80
         assert re.search(kept, out), out
+    page = (ROOT / "docs" / "how-to" / "remaining-life.md").read_text()
+    (said,) = re.findall(r"\*(First: .*?)\*", page, re.DOTALL)
+    out = run("rul", "--unit", "1", "--hours", 2210, "--history", "h.sqlite").out
+    plain = re.sub(r"\([\d-]+\)", "(…)", re.sub(r"\x1b\[[\d;]*m", "", out))
+    assert " ".join(said.split()) in " ".join(plain.split())
 
 
 def test_a_simulated_unit_goes_into_a_named_history_only(run: Run) -> None:

@@ -57,6 +57,15 @@ def test_a_unit_in_a_sentence(place: Path, capsys: pytest.CaptureFixture[str]) -
     assert "Chance of a severity at its limit before 2000 hours: " in out
 
 
+def test_the_next_inspection_is_named_with_its_unit_or_is_a_date(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for text, said in (("1e3", "1e3 hours: "), ("20261231", "20261231: ")):
+        code, out, _ = run(capsys, place, "--unit", "1", "--before", text)
+        assert code == 0
+        assert f"at its limit before {said}" in out
+
+
 def test_all_units_by_urgency(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, place, "--all", "--json", "--before", "500")
     assert code == 0
@@ -91,12 +100,14 @@ def test_a_table_of_units_says_in_words_what_has_no_number(
             history.append(an_entry(1, 100.0 * n, (0.1, 0.2, 0.2 * n), tested=day))
             history.append(an_entry(2, 100.0 * n, (0.1, 0.2, 0.3)))
         history.append(an_entry(3, 100.0, (0.1, 0.2, 0.3)))
+        history.append(an_entry(4, 10.0, severities=(), verdict="NOT_TESTED"))
     _, out, _ = run(capsys, place, "--all", "--before", "400")
     assert "about (date)" not in out  # the only unit with a use a day is at its limit
-    worn, still, new = (" ".join(line.split()) for line in out.splitlines()[1:])
+    worn, still, new, bare = (" ".join(line.split()) for line in out.splitlines()[1:])
     assert worn == "1 reference-31 jack friction about 430 hours at its limit at its limit -"
     assert "no number: 4 diagnoses over 300 hours show no growth" in still
     assert "too few diagnoses" in new
+    assert bare.startswith("4 reference-31 - 10 hours too few diagnoses")
     _, out, _ = run(capsys, place, "--unit", "1", "--before", "400")
     assert "First: jack friction is at its limit." in out
     assert "%." not in out
@@ -121,6 +132,7 @@ def test_a_date_is_a_time_at_the_units_own_use(
         (("--unit", "3", "--actuator", "x"), "actuator x: serial 3 is of other"),
         (("--unit", "1", "--before", "soon"), "--before soon: need a date"),
         (("--unit", "1", "--before", "2020-01-01"), "--before 2020-01-01: is past"),
+        (("--unit", "1", "--before", "20200101"), "--before 20200101: is past"),
         (("--unit", "1", "--before", "1e300"), "--before 1e300: need 0 … 1e+09"),
         (("--all", "--before", "soon"), "--before soon: need a date"),
         (("--unit", "1", "--hours", "100"), "hours 100: were 2000 at the last diagnosis"),
@@ -236,3 +248,25 @@ def test_python_says_in_one_line_what_is_wrong(
     with pytest.raises(ehadiag.ConfigurationError, match=words):
         ehadiag.forecast(str(place), **({"serial": 1} | wrong))  # type: ignore[arg-type]
     ehadiag.History(str(place)).close()
+
+
+def test_hours_far_beyond_have_no_date(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, place, "--unit", "1", "--hours", "5e6", "--json")
+    assert code == 0
+    assert json.loads(out)["severities"]["FDJ"]["remaining"]["limit"]["date"] is None
+
+
+def test_a_unit_at_its_limit_is_before_one_that_may_be_past_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "h"
+    with History(place, create=True) as history:
+        for n in range(1, 15):
+            day = f"2026-01-{n:02}T12:00:00.000Z"
+            history.append(an_entry(1, 100.0 * n, (0.1, 0.2, 0.04 * n), tested=day))
+            history.append(an_entry(2, 100.0 * n, (0.1, 0.2, 0.06 * n), tested=day))
+    set_today(monkeypatch, "2026-03-31")
+    trees = [json.loads(line) for line in run(capsys, place, "--all", "--json")[1].splitlines()]
+    limits = [tree["severities"]["FDJ"]["remaining"]["limit"] for tree in trees]
+    assert [limit["reached"] for limit in limits] == [True, False]
+    assert limits[1]["median"] < 0.0

@@ -46,7 +46,10 @@ def test_parquet_has_the_rows_of_the_csv_file() -> None:
         (",7,", ",-7,", "line 2: serial -7: need a whole number, 0 … "),
         ("0.1,", "nan,", "line 2: estimate nan: need a number, 0 … 1"),
         (",0.3,", ",5,", "line 4: estimate 5: need a number, 0 … 1"),
-        (",0.0002,", ",-0.004,", "line 2: std -0.004: need a number, 0 … "),
+        (",0.0002,", ",-0.004,", "line 2: std -0.004: need a number, 1e-09 … "),
+        (",0.0002,", ",0,", "line 2: std 0: need a number, 1e-09 … "),
+        ("reference-31", "", "line 2: actuator: is empty"),
+        ("2026-03-01", "2999-03-01", "line 2: when 2999-03-01T12:00:00.000Z: is in the future"),
         (",100.0,", ",-5,", "line 2: hours -5: need a number, 0 … "),
         ("FDJ", "FSS", "line 4: severity FSS: twice in one diagnosis"),
         (",0.1,0.0002,", "\r\n0.1,0.0002,", "line 2: estimate: the row ends before it"),
@@ -77,3 +80,27 @@ def test_import_appends_all_or_none(tmp_path: Path, capsys: pytest.CaptureFixtur
     out = tmp_path / "b.parquet"
     assert main(["history", "export", "--out", str(out), "--history", str(place)]) == 0
     assert out.read_bytes()[:4] == b"PAR1"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("HEALTHY,Kintas,0.1", "FAULT,Kintas,0.9"), ("0.0,", "1.0,")]
+)
+def test_another_diagnosis_of_the_same_time_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str
+) -> None:
+    place, table = tmp_path / "h", tmp_path / "a.csv"
+    with History(place, create=True) as history:
+        history.append_all(ENTRIES[:1])
+    table.write_text(history_csv(ENTRIES).replace(old, new, 1))
+    assert main(["history", "import", str(table), "--history", str(place)]) == 2
+    assert "has other diagnoses of 2026-03-01T12:00:00.000Z (serial 7)" in capsys.readouterr().err
+    with History(place) as history:
+        assert len(history.entries()) == 1
+
+
+def test_rows_of_one_diagnosis_may_be_written_in_several_ways() -> None:
+    first, *others = history_csv(ENTRIES[:1]).splitlines()[1:]
+    other = others[0].replace(",7,", ",07,").replace(":00.000Z", ":00Z")
+    table = "\n".join([history_csv([]).strip(), first, other])
+    (found,) = entries_from_csv(table, "a.csv", FAULT_NAMES)
+    assert [item.name for item in found.severities] == ["Kintas", "FSS"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from history_cases import an_entry, an_event
 
-from ehadiag.history.records import Entry, Usage
+from ehadiag.history.records import Entry, MaintenanceEvent, Usage, continued_usage
 from ehadiag.prognosis.averaging import AVERAGING_RULES, learn_fleet
 from ehadiag.prognosis.forecast import Forecast, forecast
 from ehadiag.prognosis.lives import Life, lives_of
@@ -297,3 +297,51 @@ def test_hours_of_a_swapped_unit_count_anew() -> None:
     # Hours that run on across the swap are those of the place.
     on = [tested(20 + n, 2050.0 + 100.0 * n, 0.03 * n, 0.02 * n, 0.01 * n) for n in range(1, 5)]
     assert prognosis_of(7, [*old, *on], [swap], (0.25, 0.75)).forecasts[0].at == 2450.0
+
+
+ALL = ("Kintas", "FSS", "FDJ")
+
+
+def a_unit(*hours: float, first: int = 1) -> list[Entry]:
+    """Diagnoses of a unit, one a day."""
+    return [
+        an_entry(7, at, (0.02 * n, 0.2, 0.3), tested=f"2026-01-{first + n:02}T12:00:00.000Z")
+        for n, at in enumerate(hours)
+    ]
+
+
+def a_swap(day: int, hours: float | None = None) -> MaintenanceEvent:
+    return an_event("swapped", hours, resets=ALL, when=f"2026-01-{day:02}T15:00:00.000Z")
+
+
+def test_hours_begin_anew_at_each_of_two_swaps_without_a_test_between() -> None:
+    entries = [*a_unit(100.0, 900.0), *a_unit(10.0, first=9)]
+    events = [a_swap(4, 950.0), a_swap(6, 30.0)]
+    counted, changes, _ = continued_usage(entries, events, ALL)
+    assert [item.usage.hours for item in counted] == [100.0, 900.0, 990.0]
+    assert [item.usage.hours for item in changes] == [950.0, 980.0]
+
+
+def test_rounded_hours_after_an_overhaul_are_of_the_same_unit() -> None:
+    entries = [*a_unit(900.0), *a_unit(880.0, 1000.0, first=9)]
+    counted, _, _ = continued_usage(entries, [a_swap(4)], ALL)
+    assert [item.usage.hours for item in counted] == [900.0, 880.0, 1000.0]
+
+
+def test_a_unit_swapped_in_has_no_usage_until_it_is_tested_or_stated() -> None:
+    entries, day = a_unit(*(100.0 * n for n in range(1, 11))), "2026-03-01T00:00:00.000Z"
+    found = prognosis_of(7, entries, [a_swap(20)], (0.25, 0.75), now=day)
+    assert (found.usage_now, found.usage_tested, found.per_day) == (None, None, None)
+    today = Usage(hours=30.0)
+    stated = prognosis_of(7, entries, [a_swap(20, 950.0)], (0.25, 0.75), today=today, now=day)
+    assert stated.usage_now == 30.0
+    assert prognosis_of(7, entries, [], (0.25, 0.75), now=day).usage_tested == 1000.0
+
+
+def test_a_clock_before_the_last_test_gives_no_dates() -> None:
+    entries = a_unit(*(100.0 * n for n in range(1, 11)))
+    wrong = prognosis_of(7, entries, [], (0.25, 0.75), now="2026-01-02T00:00:00.000Z")
+    assert (wrong.usage_now, wrong.date_after(100.0)) == (None, None)
+    right = prognosis_of(7, entries, [], (0.25, 0.75), now="2026-01-10T00:00:00.000Z")
+    assert right.usage_now == 1000.0
+    assert right.date_after(100.0) == "2026-01-11"

@@ -172,8 +172,7 @@ def test_what_may_be_past_is_not_called_reached_and_now_is_said() -> None:
         quantiles = tuple(np.linspace(median - 500.0, median + 500.0, 99))
         item.remaining = [msgspec.structs.replace(item.remaining[0], quantiles=quantiles)]
     assert remaining_sentences(found) == [
-        "Spool friction may have reached its limit; it may be past it: 55 %, from now at about"
-        " 3100 h.",
+        "Spool friction may have reached its limit: 55 %, from now at about 3100 h.",
         "Jack friction reaches its limit in about 200 h (80 %: 0 to 900 h); it may be past it:"
         " 30 %, from now at about 3100 h.",
     ]
