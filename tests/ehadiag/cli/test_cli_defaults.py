@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_result import COMMAND, Run
-from places import LOGS
+from places import LOGS, ROOT
 
 import ehadiag
 from ehadiag import CommandMode, bundled_tests, default_actuator
@@ -138,9 +138,11 @@ def test_verbs_and_options_that_exclude_each_other_have_defaults(
     monkeypatch.setenv("EHADIAG_UNIT", "7")
     own.write_text('[history]\nhistory = "h.sqlite"\n[export]\nfmu = true\nlist = false\n')
     result = run("history", "plot", "--out", "x.png")
-    assert "serial 7: no diagnosis with severities" in result.message
+    assert "serial 7: the history has no diagnosis of it" in result.message
+    run("history", "import", ROOT / "docs" / "examples" / "fleet.csv")
+    monkeypatch.setenv("EHADIAG_UNIT", "2")
     assert run("history", "event", "oiled").code == 0
-    assert run("history", "list", "--json").objects[0]["serial"] == 7
+    assert {item["serial"] for item in run("history", "list", "--json").objects} == {2}
     assert run("history", "--history", "none.sqlite", "list").code == 2
     assert "need --out DIR" in run("export").message
     assert run("export", "--list").code == 0

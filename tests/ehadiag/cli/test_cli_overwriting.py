@@ -104,15 +104,17 @@ def test_the_history_of_the_environment_is_kept_too(
         history.execute("SELECT * FROM diagnosis").fetchall()
 
 
-@pytest.mark.parametrize("verb", [("export",), ("plot", "--unit", 1)])
+@pytest.mark.parametrize(
+    ("verb", "name"), [(("export",), "h.csv"), (("plot", "--unit", 1), "h.png")]
+)
 def test_exports_of_a_history_do_not_replace_it(
-    verb: tuple[object, ...], place: Path, run: Run
+    verb: tuple[object, ...], name: str, place: Path, run: Run
 ) -> None:
-    run("diagnose", "v.blf", "--history", "h.sqlite")
-    result = run("history", *verb, "--history", "h.sqlite", "--out", "h.sqlite")
+    run("diagnose", "v.blf", "--history", name)
+    result = run("history", *verb, "--history", name, "--out", name)
     assert result.code == 2
-    assert "--out h.sqlite: is the health history h.sqlite as well" in result.message
-    assert len(run("history", "list", "--json", "--history", "h.sqlite").objects) == 1
+    assert f"--out {name}: is the health history {name} as well" in result.message
+    assert len(run("history", "list", "--json", "--history", name).objects) == 1
 
 
 def test_a_report_replaces_neither_a_result_nor_another_report(place: Path, run: Run) -> None:
