@@ -16,7 +16,7 @@ from ehadiag.cli.history_options import add_history_option, append_result, histo
 from ehadiag.cli.result_output import OutputFile, refuse_overwriting
 from ehadiag.cli.simulator_options import add_simulator_options, simulator_settings
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, LEAST_MONITORED
 from ehadiag.core.conversion import conversion_of
 from ehadiag.core.interruption import stop_on_signals
 from ehadiag.estimate import INTERVAL_STDS
@@ -95,8 +95,9 @@ def define_monitor(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--least-monitored",
         type=partial(options.positive_number, most=1.0),
+        default=LEAST_MONITORED,
         metavar="SHARE",
-        help="share of the ticks below which the exit code is 30 (default 0.5)",
+        help="share of the ticks below which the exit code is 30 (default %(default)g)",
     )
     group.add_argument(
         "--log-file", metavar="FILE", help="append alarms to this file, JSON lines with their time"

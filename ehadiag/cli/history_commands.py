@@ -243,7 +243,7 @@ def _import(arguments: argparse.Namespace) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> None:
-    from ehadiag.history.records import counted_entries  # noqa: PLC0415
+    from ehadiag.history.records import counted_entries, of_unit  # noqa: PLC0415
     from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415 - slow
     from ehadiag.report.rendering import isolated_png  # noqa: PLC0415
     from ehadiag.report.trend_bus_pictures import has_trend, history_picture  # noqa: PLC0415
@@ -252,12 +252,8 @@ def _plot(arguments: argparse.Namespace) -> None:
     with open_named_history(arguments) as history:
         kind = history.actuator_of(arguments.unit, arguments.actuator)
         whole, changes = history.alike(arguments.unit, kind)
-    own = [item for item in whole if (item.serial, item.actuator) == (arguments.unit, kind)]
+    own, events = of_unit(whole, changes, arguments.unit, kind)
     entries = counted_entries(own)
-    events = [
-        item for item in changes
-        if item.serial == arguments.unit and item.actuator in (None, kind)
-    ]  # fmt: skip
     if not has_trend(entries):
         raise ConfigurationError(f"serial {arguments.unit}: no diagnosis with severities to draw")
     both = (levels.advisory, levels.limit)

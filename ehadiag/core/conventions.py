@@ -124,5 +124,7 @@ def fingerprint(content: Any) -> str:
     return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()
 
 
+LEAST_MONITORED: Final = 0.5
+"""Share of the ticks below which too little was monitored, 1: what is left is no majority."""
 FALSE_ALARM_INTERVAL_H: Final = 100.0
 """Mean time between false alarms of a monitor as a whole, h."""

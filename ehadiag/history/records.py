@@ -45,6 +45,7 @@ __all__ = [
     "hash_of_samples",
     "history_entry",
     "is_swap",
+    "of_unit",
     "user_history_path",
 ]
 
@@ -244,6 +245,19 @@ def counted_entries(entries: Sequence[Entry]) -> list[Entry]:
             seen.setdefault(item.samples, []).append(item)
         out.append(entry if usage is entry.usage else replace(entry, usage=usage))
     return out[::-1]
+
+
+def of_unit(
+    entries: Sequence[Entry], events: Sequence[MaintenanceEvent], serial: int, actuator: str | None
+) -> tuple[list[Entry], list[MaintenanceEvent]]:
+    """Diagnoses and maintenance of one unit among those of others.
+
+    serial, actuator: of the unit; an event without an actuator is of every one.
+    """
+    return (
+        [item for item in entries if (item.serial, item.actuator) == (serial, actuator)],
+        [i for i in events if i.serial == serial and i.actuator in (None, actuator)],
+    )
 
 
 def is_swap(event: MaintenanceEvent, names: Collection[str]) -> bool:

@@ -406,9 +406,14 @@ def friction_by_exponent(
 
     values: severities, by name; constants: of the unit as new; change: of the exponent.
     """
-    share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
-    new = constants.FSS / (constants.FSS1 - constants.FSS)
+    share, new = _clogging_terms(values, constants)
     return float((values[FRICTION_NAME] + new) * share**change - new)
+
+
+def _clogging_terms(values: Mapping[str, float], constants: PlantConstants) -> tuple[float, float]:
+    """Flow that clogging leaves, over that as new, and the spool's friction as new, a severity."""
+    share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
+    return share, float(constants.FSS / (constants.FSS1 - constants.FSS))
 
 
 class FrictionRange(NamedTuple):
@@ -438,8 +443,7 @@ def friction_range(
     unit as new; exponents: least and largest one.
     """
     low, high = exponents
-    share = 1.0 + FAULT_LAWS["Kintas"].change * values["Kintas"]
-    new = float(constants.FSS / (constants.FSS1 - constants.FSS))
+    share, new = _clogging_terms(values, constants)
     shown = max(values[FRICTION_NAME] + new, 1e-9)
     ratios = share ** (np.linspace(high, low, EXPONENTS) - with_exponent)
     frictions = np.clip(shown * ratios - new, 0.0, 1.0).tolist()

@@ -221,22 +221,23 @@ class IdentificationSession:
         ):
             return found
         mode = self.nuisances if found.freed else NuisanceMode.NONE
-        before, excesses, ratios = excess_cost(found.residuals), {}, []
+        before, excesses = excess_cost(found.residuals), {}
+        to_noise = before <= FIT.max_explained_excess
         for exponent in (middle, MAX_CLOGGING_EXPONENT):
             of_other = replace(prior, exponents=(exponent, exponent))
             session = IdentificationSession(self.solver, self.seed, mode, of_other)
             others = [item.with_exponent(exponent, prior.bridge) for item in experiments]
             there = session.finish(others, progress).residuals
             excesses[exponent] = excess_cost(there)
-            ratios.append(likelihood_ratio_cost(there, found.residuals))
+            more = likelihood_ratio_cost(there, found.residuals)
+            if to_noise and more < 2.0 * math.log(FIT.min_likelihood_ratio):
+                return replace(found, exponent_doubted=True)
+        if to_noise:
+            return found
         better = min(excesses, key=lambda exponent: excesses[exponent])
-        if before > FIT.max_explained_excess:
-            if explains_far_more(excesses[better], before):
-                return replace(found, better_exponent=better)
-            borne_out = explains_far_more(before, excesses[better])
-            return replace(found, exponent_doubted=not borne_out)
-        doubted = min(ratios) < 2.0 * math.log(FIT.min_likelihood_ratio)
-        return replace(found, exponent_doubted=doubted)
+        if explains_far_more(excesses[better], before):
+            return replace(found, better_exponent=better)
+        return replace(found, exponent_doubted=not explains_far_more(before, excesses[better]))
 
     def _over_exponents(self, found: Identification, constants: PlantConstants) -> Identification:
         """Return an identification with the friction of all exponents that may be."""

@@ -60,12 +60,7 @@ from ehadiag.identify.posterior import (
     no_interruption,
     search_posterior,
 )
-from ehadiag.identify.prior import (
-    UnitPrior,
-    density_about,
-    prior_density,
-    prior_information,
-)
+from ehadiag.identify.prior import UnitPrior, density_about, prior_density, prior_information
 from ehadiag.model.batch import SPOOL_ROW
 from ehadiag.model.parameter import Parameter
 from ehadiag.model.registry import SENSOR_OFFSETS, parameter

@@ -136,7 +136,7 @@ def calibration_html_page(found: Calibrated) -> bytes:
 
 
 def _unit_trend(result: Result, levels: Levels, place: Path) -> UnitTrend | None:
-    from ehadiag.history.records import counted_entries  # noqa: PLC0415
+    from ehadiag.history.records import counted_entries, of_unit  # noqa: PLC0415
     from ehadiag.history.store import History  # noqa: PLC0415
     from ehadiag.prognosis.units import prognosis_of  # noqa: PLC0415
     from ehadiag.report.report_pages import UnitTrend  # noqa: PLC0415
@@ -146,12 +146,9 @@ def _unit_trend(result: Result, levels: Levels, place: Path) -> UnitTrend | None
         return None
     with History(place) as history:
         entries, events = history.alike(serial, kind)
-    mine = counted_entries(
-        [item for item in entries if item.serial == serial and item.actuator == kind]
-    )
-    if not mine:
+    mine, own = of_unit(entries, events, serial, kind)
+    if not (mine := counted_entries(mine)):
         return None
     both = (levels.advisory, levels.limit)
     future = prognosis_of(serial, entries, events, both, actuator=kind)
-    own = [item for item in events if item.serial == serial and item.actuator in (None, kind)]
     return UnitTrend(mine, own, future)

@@ -16,7 +16,7 @@ from msgspec import structs
 
 from ehadiag.assess.verdict import Verdict
 from ehadiag.core.conventions import MAX_RESULT_BYTES
-from ehadiag.history.records import counted_entries
+from ehadiag.history.records import counted_entries, of_unit
 from ehadiag.history.store import History
 from ehadiag.model.registry import FAULT_NAMES
 from ehadiag.prognosis.units import prognosis_of
@@ -174,8 +174,7 @@ class Pages:
         entries, events = self._kept(serial)
         levels = (self._levels.advisory, self._levels.limit)
         future = prognosis_of(serial, entries, events, levels)
-        kind = future.actuator
-        mine = [item for item in entries if (item.serial, item.actuator) == (serial, kind)]
+        mine, own = of_unit(entries, events, serial, future.actuator)
         used = counted_entries(mine)
         last = _last_test(used) if used else None
         first = first_to_the_limit(future, kept_advice(self._result_of(last)))
@@ -183,7 +182,6 @@ class Pages:
         lines += [
             f"{plain_name(item.name)} {item.alarm}" for item in future.forecasts if item.alarm
         ]
-        own = [i for i in events if i.serial == serial and i.actuator in (None, kind)]
         lines += [f"{item.when[:10]}: {printable(item.text)}" for item in own]
         plots = {}
         if has_trend(used):

@@ -20,7 +20,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ehadiag.api import PathLike, log_if_compiling, setup_for
-from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, LEAST_MONITORED
 from firmware_iface.errors import ConfigurationError, valid_text
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def watch(
     find: Callable[[int], KnownUnit | None] | None = None,
     hours: float = FALSE_ALARM_INTERVAL_H,
     least: float | None = None,
-    least_monitored: float | None = None,
+    least_monitored: float = LEAST_MONITORED,
     duration_s: float | None = None,
     stop: threading.Event | None = None,
     bitrate: float | None = None,
@@ -223,9 +223,8 @@ def watch(
         Mean time between false alarms, h; between tests at least 2.
     least : float | None
         Least change of a severity worth an alarm, 1; None: `ehadiag.monitor.change_test.LEAST`.
-    least_monitored : float | None
-        Share of the ticks, 0 … 1, below which too little was monitored; None:
-        `ehadiag.session.monitor_session.LEAST_MONITORED`.
+    least_monitored : float
+        Share of the ticks, 0 … 1, below which too little was monitored.
     duration_s : float | None
         Longest duration, s; None: until `stop`, or the end of the log.
     stop : threading.Event | None
@@ -258,7 +257,6 @@ def watch(
     from ehadiag.live import publish  # noqa: PLC0415
     from ehadiag.monitor.change_test import LEAST  # noqa: PLC0415 - loads kernels
     from ehadiag.session.monitor_session import (  # noqa: PLC0415 - loads kernels
-        LEAST_MONITORED,
         AlarmOutlets,
         MonitorSession,
     )
@@ -267,9 +265,8 @@ def watch(
     setup = setup_for(request, options)
     if duration_s is not None and not duration_s > 0.0:
         raise ConfigurationError(f"duration_s {duration_s:g}: need more than 0 s")
-    share = LEAST_MONITORED if least_monitored is None else least_monitored
-    if not 0.0 <= share <= 1.0:
-        raise ConfigurationError(f"least_monitored {share:g}: need a share, 0 … 1")
+    if not 0.0 <= least_monitored <= 1.0:
+        raise ConfigurationError(f"least_monitored {least_monitored:g}: need a share, 0 … 1")
 
     def look_up(serial: int) -> UnitState | None:
         known = find(serial) if find else None
@@ -288,7 +285,7 @@ def watch(
             bitrate=bitrate,
             find=None if find is None else look_up,
             on_alarm=on_alarm,
-            least_monitored=share,
+            least_monitored=least_monitored,
         )
         with (
             _open_source(bus, setup, session.notes) as source,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 import msgspec
 
 from ehadiag.core.actuator import Actuator
-from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, date_text
+from ehadiag.core.conventions import FALSE_ALARM_INTERVAL_H, LEAST_MONITORED, date_text
 from ehadiag.live import Alarm, BusState, BusTraffic, Ending, Residuals, SignalTrace, Snapshot
 from ehadiag.monitor.change_test import LEAST
 from ehadiag.session.alarm_outlets import AlarmCommand, AlarmLog, AlarmRecorder, utc_now_text
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from firmware_iface.live_decode import BitStatus
     from firmware_iface.signals.recordings import DecodedItem
     from firmware_iface.transport.base import FrameSource
-
-LEAST_MONITORED = 0.5
-"""Share of the ticks below which too little was monitored, 1: what is left is no majority."""
 
 
 class AlarmOutlets(msgspec.Struct, frozen=True):
