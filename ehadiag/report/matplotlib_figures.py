@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 import warnings
 from typing import Any
 
@@ -24,6 +25,8 @@ from ehadiag.report.picture import (
 
 LINE_STYLES = {"": "", "solid": "-", "dashed": "--", "dotdash": "-.", "dotted": ":"}
 MARKERS = {"": "", "circle": "o", "square": "s", "triangle": "^", "x": "x"}
+TITLE_CHARACTERS = 10.0
+"""Characters of a title, an inch of the picture's width: 11 fit in bold."""
 
 
 class NotebookFigure(Figure):
@@ -54,8 +57,11 @@ def draw_picture(picture: Picture) -> NotebookFigure:
     second_axis = any(panel.full_scale for column in picture.columns for panel in column.panels)
     # Inches; set here, since matplotlib's own layouts take twice as long as all else.
     left, right, gap, bottom = 0.95, 0.8 if second_axis else 0.25, 0.25, 0.5
-    top = 0.6 + 0.2 * (picture.title.count("\n") + 1)
     inside, width = max(3.5, 0.95 * sum(ratios)), 10.0 * len(columns)
+    title = "\n".join(
+        textwrap.fill(line, int(TITLE_CHARACTERS * width)) for line in picture.title.split("\n")
+    )
+    top = 0.6 + 0.2 * (title.count("\n") + 1)
     height = bottom + inside + gap * (len(ratios) - 1) + top
     figure = NotebookFigure(figsize=(width, height))
     FigureCanvasAgg(figure)
@@ -75,7 +81,7 @@ def draw_picture(picture: Picture) -> NotebookFigure:
         _draw_column(list(axes), rows, column)
     # Names of others are no formulae.
     figure.suptitle(
-        picture.title, y=1.0 - 0.08 / height, fontsize=11, va="top", parse_math=False,
+        title, y=1.0 - 0.08 / height, fontsize=11, va="top", parse_math=False,
         fontweight="bold" if picture.bold else "normal",
     )  # fmt: skip
     return figure

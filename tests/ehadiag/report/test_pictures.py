@@ -220,6 +220,23 @@ def test_a_severity_at_its_limit_is_the_title_of_the_trend():
     ]  # fmt: skip
 
 
+def test_a_long_title_stays_within_the_picture():
+    """That of a unit whose usage goes on since its last test was cut at both ends."""
+    days = [f"2026-01-{n:02}T12:00:00.000Z" for n in range(1, 13)]
+    worn = [
+        an_entry(1, 100.0 * (n + 1), (0.01 * n, 0.03 * n, 0.01 * n), tested=day)
+        for n, day in enumerate(days)
+    ]
+    now = "2026-01-20T00:00:00.000Z"
+    found = prognosis_of(1, worn, [], (0.25, 0.75), actuator=worn[0].actuator, now=now)
+    picture = history_picture(worn, [], found)
+    assert "it may be past it: 17 %, from now at about" in picture.title
+    figure = draw_picture(picture)
+    box = figure._suptitle.get_window_extent(figure.canvas.get_renderer())
+    assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1
+    assert " ".join(figure.get_suptitle().split()) == " ".join(picture.title.split())
+
+
 def test_picture(stated):
     (axes,) = draw_picture(history_picture(stated, [], future(stated))).axes
     assert len(axes.containers) == len(stated[0].severities)
