@@ -59,6 +59,8 @@ def compile_together(names, place):
     for name in names:
         with patch.object(libraries, "object_code", refuse), suppress(_WantedError):
             _export(name, place / f"wanted-{name}")
+    if not wanted:  # all of them are in the cache
+        return
     for name, code in zip(wanted, object_code(*wanted.values()), strict=True):
         with patch.object(libraries, "object_code", lambda _, code=code: [code]):
             _export(name, place / f"together-{name}")
