@@ -9,9 +9,9 @@ from typing import TypeAlias
 import msgspec
 from msgspec.structs import replace
 
-from firmware_iface.dbc import MAX_DBC_BYTES, DbcMessage, DbcSignal, SignalLayout, cached_dbc
+from firmware_iface.dbc import DbcMessage, DbcSignal, SignalLayout, cached_dbc
 from firmware_iface.errors import ConfigurationError
-from firmware_iface.files import decode_toml, read_small_file, read_toml
+from firmware_iface.files import MAX_DBC_BYTES, decode_toml, read_small_file, read_toml
 from firmware_iface.mapping_file import (
     ChannelRef,
     MappingFile,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.errors import ConfigurationError, reason_of
-from firmware_iface.files import Folder, private_folder, warn_once
+from firmware_iface.files import MAX_DBC_BYTES, Folder, private_folder, warn_once
 from firmware_iface.recording import MAX_CAN_ID, BoolArray, FloatArray, IntArray
 
 FLOAT_FORMATS = {16: "<e", 32: "<f", 64: "<d"}
@@ -150,7 +150,6 @@ def _as_float(pattern: NDArray[np.uint64], length: int) -> FloatArray:
         return single.astype(np.float64)
 
 
-MAX_DBC_BYTES = 2 << 20
 MAX_CACHED_BYTES = 32 << 20
 MAX_CACHED_FILES = 16
 """Largest number of files in the cache; the oldest goes."""

@@ -58,6 +58,8 @@ def _read_up_to(handle: int, size: int) -> bytes:
 
 MAX_TOML_BYTES = 256 << 10
 """Largest configuration file that is read; configuration is untrusted input."""
+MAX_DBC_BYTES = 2 << 20
+"""Largest DBC file that is read, bytes."""
 MAX_DOTS_PER_LINE = 50
 """In a line, besides those of numbers: the parser's work grows with the square of a key's parts."""
 TOML_NUMBER = re.compile(rb"\d\.\d[\d_]*(?:[eE][+-]?\d+)?(?=[\s,\]}]|$)")

@@ -108,6 +108,8 @@ CHANNELS = Channels(
 """Converters of PHY-23, of a bus and an actuator file that state none."""
 CHANNEL_NAMES = tuple(channel.name for channel in CHANNELS)
 CHANNEL_ROLES = tuple(f"channels.{name}" for name in CHANNEL_NAMES)
+MAX_GRID_TICKS = 1_000_000
+"""Most ticks onto which a recording is laid, 1: about a quarter of an hour at 1 kHz."""
 MAX_SAMPLE_GAP_S = 0.25
 """Longest span of a test without a sample, s; a longer one makes it NOT TESTED."""
 

@@ -185,8 +185,6 @@ MAX_ODTS = 0xFC
 """First bytes below are those of measurements: so many ODTs in all DAQ lists together."""
 CLOCK_STEP_NS = 1000
 """Of the DAQ clock, ns."""
-CLOCK_UNIT = 3
-"""The same as XCP codes it: 1 µs."""
 
 
 def event_cycle(period_ns: int) -> tuple[int, int]:

@@ -49,9 +49,9 @@ class Levels(msgspec.Struct, frozen=True):
     Levels that are not 0 < advisory < limit <= 1 raise ConfigurationError.
     """
 
-    advisory: float = 0.25
+    advisory: float = VERDICT.advisory
     """DEGRADED at or above."""
-    limit: float = 0.75
+    limit: float = VERDICT.limit
     """FAULT at or above."""
     rule: VerdictRule = VerdictRule.INTERVAL
     """What a verdict goes by."""

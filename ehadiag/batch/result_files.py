@@ -52,7 +52,7 @@ PATHS = {
     "error": ("error.text", str),
 }
 """Of a column the place in the result, and its kind; of several recordings the first counts."""
-HEAD = 6
+HEAD = list(PATHS).index("spool_rms")
 """Columns before the severities."""
 OF_SEVERITY: dict[str, Callable[[Severity], Cell]] = {
     "": lambda item: item.estimate,

@@ -17,6 +17,8 @@ MAX_RESULT_BYTES = 1 << 20
 """Size of the largest JSON result that is read, bytes."""
 MAX_HISTORY_SERIAL = (1 << 63) - 1
 """Largest serial number that a history can hold, 1."""
+PIPE_COLUMNS = 10_000
+"""Columns of a table that no terminal bounds: its lines are not broken."""
 SIGNAL_FILE_KINDS = ("mf4", "mcap")
 """Formats of files with recorded and modelled signals."""
 SIGNAL_FILE_SUFFIXES = tuple(f".signals.{kind}" for kind in SIGNAL_FILE_KINDS)

@@ -22,8 +22,12 @@ NORMAL_HALF_WIDTH_95 = NormalDist().inv_cdf(0.975)
 
 
 class VerdictCriteria(msgspec.Struct, frozen=True):
-    """Chances that decide a verdict."""
+    """Levels of a severity and chances that decide a verdict."""
 
+    advisory: float = 0.25
+    """Severity from which a unit is DEGRADED, 1 (PHY-12)."""
+    limit: float = 0.75
+    """Severity from which a unit has a FAULT, 1 (PHY-12)."""
     max_chance_false_healthy: float = 0.025
     """Largest chance that a severity is at or above the advisory level for HEALTHY, 1: the specific
     consumer's risk of JCGM 106:2012."""

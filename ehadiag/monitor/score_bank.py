@@ -22,7 +22,7 @@ from ehadiag.model.laws import jack_law
 from ehadiag.model.plant import REFERENCE_TEMPERATURE
 from ehadiag.model.registry import FAULT_NAMES, parameter
 from ehadiag.monitor.plan import default_noise
-from ehadiag.monitor.streaming import Monitor, undecided_spool
+from ehadiag.monitor.streaming import PAUSE_TICKS, Monitor, undecided_spool
 from firmware_iface.recording import Channels, CommandMode, Environment
 
 
@@ -87,8 +87,6 @@ CURRENT_LSB: Final = 0.58
 """Noise of the measured current, converter steps: half a step of noise and a rounding's."""
 TRAVEL_LSB: Final = 0.82
 """Noise of a travel, converter steps: that of two positions."""
-PAUSE_TICKS: Final = 5
-"""Ticks without pressure after the last undecided one, 1: the jack may still stick."""
 
 
 class BlockScore(msgspec.Struct, frozen=True, eq=False):

@@ -313,7 +313,7 @@ UNDECIDED_SPOOL_STEPS = 3.0
 """Uncertainty of the modelled spool position, in converter steps."""
 SETTLING_TICKS = 300
 """Ticks with a spool sample until alarms count, 1."""
-PRESSURE_PAUSE_TICKS = 5
+PAUSE_TICKS = 5
 """Ticks without pressure after the last undecided one, 1: the jack may still stick."""
 
 
@@ -348,7 +348,7 @@ class FreeMotionMonitor:
         command, current, spool, _, position = sample
         monitor, near = self.monitor, self._undecided
         if abs(spool - self._offset) < near or abs(monitor.reading.predicted[0]) < near:
-            self._resting = PRESSURE_PAUSE_TICKS
+            self._resting = PAUSE_TICKS
         if self._resting:
             self._resting -= 1
             sample = command, current, spool, math.nan, position
@@ -366,7 +366,7 @@ class FreeMotionMonitor:
 
     def reset(self, spool: float = 0.0) -> None:
         """Restart from rest with the spool there (m)."""
-        self._resting, self._age = PRESSURE_PAUSE_TICKS, 0
+        self._resting, self._age = PAUSE_TICKS, 0
         self.monitor.reset(spool)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ehadiag.assess.verdict import Levels
+from ehadiag.core.criteria import VERDICT
 from ehadiag.history.records import (
     Usage,
     continued_usage,
@@ -254,8 +255,8 @@ def forecast(
     history: History | str | PathLike[str],
     serial: int,
     *,
-    advisory: float = 0.25,
-    limit: float = 0.75,
+    advisory: float = VERDICT.advisory,
+    limit: float = VERDICT.limit,
     unit: str | None = None,
     today: Usage | None = None,
     actuator: str | None = None,

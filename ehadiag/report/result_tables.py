@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ehadiag.assess.verdict import Levels, Verdict
-from ehadiag.core.conventions import display_unit, to_precision
+from ehadiag.core.conventions import PIPE_COLUMNS, display_unit, to_precision
 from ehadiag.estimate import AT_BOUND, NOT_SHOWN
 from ehadiag.model.registry import FAULTS, SENSOR_OFFSETS
 from ehadiag.report.head import CUT_NOTE, CUT_OFF, full_name, head_of, percent
@@ -40,8 +40,6 @@ STATE_STYLES = {
 }
 NAMED_COLUMNS = 76
 """Columns from which on the table of the severities has their plain names too."""
-TEXT_COLUMNS = 10_000
-"""Columns of a text that no terminal bounds: nothing of ours is cut."""
 FLAG_REMARKS = {AT_BOUND: "at its bound", NOT_SHOWN: "not shown by the test"}
 """What the table says of a severity's flags."""
 
@@ -49,7 +47,7 @@ FLAG_REMARKS = {AT_BOUND: "at its bound", NOT_SHOWN: "not shown by the test"}
 def diagnosis_text(result: Result, *, verbose: bool = False) -> str:
     """Return a result as plain lines of text, the last one without its end."""
     console = Console(
-        file=io.StringIO(), width=TEXT_COLUMNS, highlight=False, record=True, force_jupyter=False
+        file=io.StringIO(), width=PIPE_COLUMNS, highlight=False, record=True, force_jupyter=False
     )
     print_result(result, console, verbose=verbose)
     return "\n".join(line.rstrip() for line in console.export_text().splitlines())

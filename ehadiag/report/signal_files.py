@@ -33,14 +33,12 @@ from firmware_iface.errors import (
     install_command,
     printable,
 )
-from firmware_iface.files import read_small_file
+from firmware_iface.files import MAX_DBC_BYTES, read_small_file
 from firmware_iface.recording import CommandMode, Recording
 
 LIBRARIES = {"mf4": "asammdf", "mcap": "mcap.writer"}
 """Module that writes a kind; an extra of the kind's name installs it."""
 BUNDLED_DBC = "eha_fcc.dbc"
-MAX_DBC_BYTES = 2 << 20
-"""Bytes: the most that a DBC is read of, too."""
 LOG_LEVELS = {"HEALTHY": 2, "DEGRADED": 3, "FAULT": 4, "NOT_TESTED": 3}
 """Level of a verdict as `foxglove.Log` counts: 2 information, 3 warning, 4 error."""
 

@@ -22,7 +22,6 @@ ASCII_SPARK_BLOCKS = " .:-=+*#%@"
 BUS_STATE_STYLES = {"open": "green", "silent": "yellow", "degraded": "yellow", "failed": "bold red"}
 ENDING_STYLES = {"NO ALARM": "bold green", "ALARM": "bold red"}
 BAR_COLUMNS = 20
-FULL_BAR = 1.0
 
 
 def draw_snapshot(snapshot: Snapshot, width: int, *, unicode: bool = True) -> RenderableType:
@@ -138,7 +137,7 @@ def _test(test: RunningTest, mode: str | None, *, unicode: bool) -> Text:
 
 def _bar(share: float, *, unicode: bool, length: int = BAR_COLUMNS) -> str:
     full, empty = ("█", "·") if unicode else ("#", "-")
-    done = round(min(max(share, 0.0), FULL_BAR) * length)
+    done = round(min(max(share, 0.0), 1.0) * length)
     return full * done + empty * (length - done)
 
 
@@ -181,7 +180,7 @@ def _residuals(found: Residuals | None, width: int, *, unicode: bool) -> Rendera
         value = "   at rest" if residual is None else f"{residual:+8.1f} σ"
         high = max(above, below)
         side = "" if high == 0.0 else ", above" if above >= below else ", below"
-        style = "bold red" if high >= FULL_BAR else ""
+        style = "bold red" if high >= 1.0 else ""
         table.add_row(
             Text(f"residual {name:8s}{value}"),
             Text(_bar(high, unicode=unicode, length=length), style=style),

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO, cast
 
+from ehadiag.core.conventions import PIPE_COLUMNS
 from firmware_iface.errors import (
     ConfigurationError,
     EhadiagError,
@@ -53,8 +54,6 @@ def exit_code_of_inputs(codes: Sequence[int]) -> int:
 
 TABLE_COLUMNS = 100
 """Columns that our widest tables need; a narrower terminal breaks their lines."""
-PIPE_COLUMNS = 10_000
-"""Columns where no terminal bounds them: lines are not broken."""
 
 
 def print_status(text: str) -> None:

@@ -16,10 +16,7 @@ from firmware_iface.alignment.ticks import TickAxis
 from firmware_iface.bus_map import BusMap
 from firmware_iface.codec import DecodedTable
 from firmware_iface.protection import NO_POSITION
-from firmware_iface.recording import BitOutcome, BitReason, BitState, IntArray
-
-MAX_GRID_TICKS = 1_000_000
-"""Longest test that is unfolded onto a tick grid."""
+from firmware_iface.recording import MAX_GRID_TICKS, BitOutcome, BitReason, BitState, IntArray
 
 END_STATES = (BitState.COMPLETE, BitState.ABORTED)
 

@@ -28,6 +28,7 @@ from firmware_iface.logs.log_files import Budget, holds_signals
 from firmware_iface.logs.reader import iterate_recordings, read_frames
 from firmware_iface.recording import (
     CHANNELS,
+    MAX_GRID_TICKS,
     Acquisition,
     BitOutcome,
     CommandMode,
@@ -52,8 +53,6 @@ from firmware_iface.signals.resample import (
 from firmware_iface.signals.tables import join_tables, read_signals
 from firmware_iface.transport.frames import FrameTable, concatenate
 
-MAX_SIGNAL_TICKS = 1_000_000
-"""About a quarter of an hour at 1 kHz; what is behind it is not looked at."""
 MEASURED_ROLES = ("channels.spool", "channels.pressure", "channels.position")
 
 
@@ -188,7 +187,7 @@ def _readings(
     """Ways to put signals on the ticks of a test, the likelier first."""
     first = max(signals[role].time[0] for role in NEEDED_COLUMN_ROLES)
     last = min(signals[role].time[-1] for role in NEEDED_COLUMN_ROLES)
-    ticks = min(max(int((last - first) / period), 1), MAX_SIGNAL_TICKS)
+    ticks = min(max(int((last - first) / period), 1), MAX_GRID_TICKS)
     even = TickClock.even(first, period, ticks)
     samples, _ = _samples(signals, {}, even, round(period * 1e9), first)
     found = match_test(samples, candidates.tests, candidates.controller)
@@ -239,7 +238,7 @@ def _readings(
 def _cut_off(signals: Mapping[str, RecordedSignal], clock: TickClock) -> tuple[str, ...]:
     """Say where more was recorded than is looked at."""
     left = min(signals[role].time[-1] for role in NEEDED_COLUMN_ROLES) - float(clock.begin[-1])
-    if clock.ticks < MAX_SIGNAL_TICKS or left <= 0.0:
+    if clock.ticks < MAX_GRID_TICKS or left <= 0.0:
         return ()
     seen = float(clock.begin[-1] - clock.begin[0])
     return (f"the first {seen:.0f} s are looked at, the {left:.0f} s behind them are not",)

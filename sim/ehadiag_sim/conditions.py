@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 from firmware_iface.errors import ConfigurationError
+from firmware_iface.recording import CHANNELS
 
 
 class ConditionOption(NamedTuple):
@@ -68,7 +69,7 @@ def condition_options(kind: type[Any]) -> list[ConditionOption]:
 
 
 def check_ranges(item: Any, kind: str) -> None:
-    """Raise ConfigurationError for a field of `condition_field` outside its range.
+    """Raise ConfigurationError for a field of `condition_field` outside its range or length.
 
     kind: what the fields are, for the message ("fault").
     """
@@ -77,6 +78,11 @@ def check_ranges(item: Any, kind: str) -> None:
             low, high = entry.metadata["range"]
             what = entry.metadata["what"] or f"{kind} {entry.name}"
             value = getattr(item, entry.name)
+            if isinstance(value, tuple) and len(value) != len(entry.default):
+                named = f"{kind} {entry.name.removesuffix('_lsb')}"
+                raise ConfigurationError(
+                    f"{named}: need {len(entry.default)} values, not {len(value)}"
+                )
             for number in value if isinstance(value, tuple) else (value,):
                 check_within(what, number, low, high)
 
@@ -85,9 +91,6 @@ def check_within(what: str, value: float, low: float, high: float) -> None:
     """Raise ConfigurationError unless `value` is finite and from `low` to `high`."""
     if not (math.isfinite(value) and low <= value <= high):
         raise ConfigurationError(f"{what}: {value:g} is outside {low:g} … {high:g}")
-
-
-LAND_COUNT = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +136,7 @@ class UnmodelledEffects:
     spool_end_volume: float = condition_field(0.0, 0.0, 1e-5,
         option="--spool-end-volume-ul ul", scale=1e-9,
         help="oil at each end of the spool, which yields; a size to try: 20")
-    underlap_errors: tuple[float, ...] = condition_field((0.0,) * LAND_COUNT, -0.9, 0.9,
+    underlap_errors: tuple[float, ...] = condition_field((0.0,) * 4, -0.9, 0.9,
         option="--underlap-errors FRACTION",
         help="by how much the underlap of each of the four lands of an orifice stage is off"
         " 2·PSR/GP; a size to try: ±0.08")
@@ -141,14 +144,6 @@ class UnmodelledEffects:
 
     def __post_init__(self) -> None:
         check_ranges(self, "unmodelled effect")
-        if len(self.underlap_errors) != LAND_COUNT:
-            raise ConfigurationError(
-                f"unmodelled effect underlap_errors: need {LAND_COUNT} values, not"
-                f" {len(self.underlap_errors)}"
-            )
-
-
-CHANNEL_COUNT = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,9 +280,9 @@ class Sensors:
     noise_lsb: float = condition_field(0.5, 0.0, 100.0, "sensor noise (LSB)",
         option="--noise LSB", help="rms noise of the converters (default 0.5)", basic=True)
     offsets_lsb: tuple[float, ...] = condition_field(
-        (0.0,) * CHANNEL_COUNT, -4096.0, 4096.0, "sensor offset (LSB)",
+        (0.0,) * len(CHANNELS), -4096.0, 4096.0, "sensor offset (LSB)",
         option="--offsets LSB", help="offsets of current, spool, pressure, position", basic=True)
-    gains: tuple[float, ...] = condition_field((0.0,) * CHANNEL_COUNT, -1.0, 1.0, "sensor gain",
+    gains: tuple[float, ...] = condition_field((0.0,) * len(CHANNELS), -1.0, 1.0, "sensor gain",
         option="--sensor-gains FRACTION",
         help="gain errors of current, spool, pressure, position; usual: ±0.005")
     filter_time: float = condition_field(0.0, 0.0, 0.1, "sensor filter_time (s)",
@@ -304,9 +299,4 @@ class Sensors:
     # fmt: on
 
     def __post_init__(self) -> None:
-        for name, values in (("offsets", self.offsets_lsb), ("gains", self.gains)):
-            if len(values) != CHANNEL_COUNT:
-                raise ConfigurationError(
-                    f"sensor {name}: need {CHANNEL_COUNT} values, not {len(values)}"
-                )
         check_ranges(self, "sensor")

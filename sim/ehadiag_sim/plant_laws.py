@@ -17,7 +17,6 @@ MAX_FLOW_GAIN_LOSS = 0.8
 """Share of the first-stage flow gain that is lost at the limit of damage (PHY-13)."""
 
 CELSIUS_OFFSET_K = 273.15
-REFERENCE_OIL_TEMPERATURE_DEGC = 40.0
 OIL_VISCOSITY_POINTS = ((40.0, 14.5), (100.0, 3.5))
 """degC and mm²/s of MIL-PRF-83282 (PHY-19)."""
 WALTHER_SHIFT = 0.7
@@ -303,16 +302,8 @@ def relative_viscosity(temperature: float) -> float:
     Walther's law (ASTM D341), lg lg(ν + 0.7) = a - b·lg T, through the two known viscosities.
     """
     slope = (WALTHER_W1 - WALTHER_W0) / (WALTHER_X1 - WALTHER_X0)
-    at = 10.0 ** (
-        10.0 ** (WALTHER_W0 + slope * (math.log10(temperature + CELSIUS_OFFSET_K) - WALTHER_X0))
-    )
-    reference = 10.0 ** (
-        10.0
-        ** (
-            WALTHER_W0
-            + slope * (math.log10(REFERENCE_OIL_TEMPERATURE_DEGC + CELSIUS_OFFSET_K) - WALTHER_X0)
-        )
-    )
+    exponent = WALTHER_W0 + slope * (math.log10(temperature + CELSIUS_OFFSET_K) - WALTHER_X0)
+    at, reference = (10.0 ** (10.0**w) for w in (exponent, WALTHER_W0))
     return float((at - WALTHER_SHIFT) / (reference - WALTHER_SHIFT))
 
 

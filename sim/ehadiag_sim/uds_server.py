@@ -7,6 +7,7 @@ from dataclasses import astuple
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from ehadiag.core.criteria import VERDICT
 from firmware_iface.bus_map import ONBOARD_SEVERITIES
 from firmware_iface.live_decode import BitStatus
 from firmware_iface.mapping_file import UdsIdentifiers
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
 
 SEVERITY_STD = 1e-3
 """Standard deviation, 1, that the computer states for the severities, which it knows exactly."""
-ADVISORY, LIMIT = 0.25, 0.75
-"""Severities, 1, from which the computer's own verdict is DEGRADED and FAULT."""
 ENDED = (BitState.COMPLETE, BitState.ABORTED, BitState.REFUSED)
 
 
@@ -183,9 +182,9 @@ class UdsServer:
         if self._computer.faults is None:
             return None
         worst = max(astuple(self._computer.faults))
-        if worst < ADVISORY:
+        if worst < VERDICT.advisory:
             return OnboardVerdict.HEALTHY
-        return OnboardVerdict.DEGRADED if worst < LIMIT else OnboardVerdict.FAULT
+        return OnboardVerdict.DEGRADED if worst < VERDICT.limit else OnboardVerdict.FAULT
 
     def _trouble_codes(self, data: bytes) -> bytes:
         report, rest = data[:1], data[1:]

@@ -13,7 +13,6 @@ from firmware_iface.transport.frames import Frame
 from firmware_iface.xcp import (
     BASE_ADDRESS,
     CLOCK_STEP_NS,
-    CLOCK_UNIT,
     ERROR,
     IDENTITY,
     MAX_DTO_BYTES,
@@ -40,7 +39,6 @@ DAQ_BY_EVENT = 0x84
 DAQ_RUNNING = 0x40
 LIST_TIMESTAMP = 0x10
 """Mode of a DAQ list: its first ODT begins with a time stamp."""
-LIST_MODES = {0: "stopped", 1: "running", 2: "selected"}
 DYNAMIC_WITH_PRESCALER_AND_STAMPS = 0x13
 """Properties of the DAQ processor."""
 
@@ -269,7 +267,7 @@ class XcpSlave:
 
     def _start_stop_list(self, data: bytes) -> bytes:
         found = self._list(data)
-        if data[1] not in LIST_MODES:
+        if data[1] > 2:  # 0 stopped, 1 running, 2 selected
             raise _CommandError(ErrorCode.MODE_NOT_VALID)
         if data[1]:
             self._refuse_overlong(found)
@@ -305,7 +303,8 @@ class XcpSlave:
         return struct.pack("<BHHBB", DYNAMIC_WITH_PRESCALER_AND_STAMPS, len(self._lists), 1, 0, 0)
 
     def _resolution(self, _: bytes) -> bytes:
-        stamp = TIMESTAMP_BYTES | CLOCK_UNIT << 4
+        _, unit = event_cycle(CLOCK_STEP_NS)
+        stamp = TIMESTAMP_BYTES | unit << 4
         return struct.pack("<BBBBBH", 1, MAX_ENTRY_BYTES, 0, 0, stamp, 1)
 
     def _event(self, data: bytes) -> bytes:
